@@ -1,0 +1,39 @@
+# Two commands do everything on a machine with python3 and make: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+STAMP = $(VENV)/.installed
+CUDA ?= # make install CUDA=1 adds the CUDA build of JAX
+
+.PHONY: help install demo test test-slow check notebook clean
+
+help: ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
+
+install: $(STAMP) ## virtual environment in .venv with everything in tested versions
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: Python 3.11 or newer is needed, this is " + sys.version.split()[0])'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev$(if $(CUDA),$(comma)cuda)]'
+	@touch $@
+comma := ,
+
+demo: $(STAMP) ## train cars on generated roads, evaluate them on unseen ones, write a report and a video
+	$(BIN)/python -m scenefactory_jax train experiment=demo out=runs/demo
+
+test: $(STAMP) ## the fast tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-slow: $(STAMP) ## the tests that take minutes
+	$(BIN)/python -m pytest -m slow
+
+check: $(STAMP) ## style and types
+	$(BIN)/ruff check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+notebook: $(STAMP) ## run the quickstart notebook and keep its outputs
+	$(BIN)/jupyter execute --inplace notebooks/01_quickstart.ipynb
+
+clean: ## remove what was built, not what was trained
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache *.egg-info

@@ -1,0 +1,18 @@
+"""GPU-batched driving simulation with real physics: scenes, MJX cars and PPO in one XLA graph.
+
+    import jax, scenefactory_jax as sf
+
+    config = sf.load("train", "experiment=demo")    # the same config as on the command line
+    env = sf.make(config)                           # pure functions for one world: env.reset, env.step
+    scenes = sf.scenes(config)                      # worlds stacked along the first axis
+    state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
+
+Everything under `run/` (`train`, `evaluate`, `convert`, `render`) takes such a config too.
+"""
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run.config import load
+from scenefactory_jax.world import assemble, make
+
+__version__ = "0.1.0"
+__all__ = ["ConfigError", "__version__", "assemble", "load", "make"]

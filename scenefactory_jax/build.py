@@ -1,0 +1,112 @@
+"""A config entry -> a function with its numbers bound.
+
+The one extension mechanism. An entry is a mapping with `_target_` and numbers: `{_target_: my_terms.jerk, limit: 3.0}`. A target without a dot
+is looked up among the built-ins of a module, a dotted one is imported. The numbers must be the function's keyword-only parameters,
+all of them, with the annotated types: a misspelt, missing or mistyped key fails here, by name, with what would be valid.
+"""
+
+import functools
+import importlib
+import inspect
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+class ConfigError(ValueError):
+    """A config entry that cannot be used; the message names the key, the value and what would be valid."""
+
+
+def build(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
+    """Bind the numbers of `entry` to the function that `_target_` names.
+
+    Args:
+        entry: mapping with `_target_`, and a value for every keyword-only parameter of the target.
+        builtins: module in which a target without a dot is looked up.
+        where: the entry's place in the config, for messages ("reward.progress").
+        context: values that the program supplies to targets that declare them (time steps, grip): they need no key.
+
+    Raises:
+        ConfigError: no or unknown target, an unknown or missing key, a value of the wrong type.
+    """
+    if not isinstance(entry, Mapping) or "_target_" not in entry:
+        raise ConfigError(f"{where}: {entry!r} is no entry; write a mapping with `_target_` and its numbers")
+    function = find(entry["_target_"], builtins=builtins, where=where)
+    parameters = {p.name: p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY}
+    numbers = {key: value for key, value in entry.items() if key != "_target_"}
+    supplied = {key: value for key, value in context.items() if key in parameters}
+    tunable = [name for name in parameters if name not in supplied]
+
+    if unknown := [key for key in numbers if key not in tunable]:
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key of {entry['_target_']}; valid: {', '.join(sorted(tunable)) or 'none'}")
+    missing = [name for name in tunable if name not in numbers and parameters[name].default is inspect.Parameter.empty]
+    if missing:
+        raise ConfigError(f"{where}.{missing[0]}: missing; {entry['_target_']} needs {', '.join(sorted(tunable))}")
+    hints = typing.get_type_hints(inspect.unwrap(function))
+    for key, value in numbers.items():
+        check_type(value, hints.get(key, Any), where=f"{where}.{key}")
+    return functools.partial(function, **numbers, **supplied)
+
+
+def find(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
+    """The function that `target` names: a public name of `builtins`, or a dotted path to import."""
+    module = importlib.import_module(builtins) if isinstance(builtins, str) else builtins
+    if not isinstance(target, str):
+        raise ConfigError(f"{where}._target_: {target!r} is no name of a function")
+    if "." in target:
+        path, name = target.rsplit(".", 1)
+        try:
+            module = importlib.import_module(path)
+        except ImportError as error:
+            raise ConfigError(f"{where}._target_: cannot import {path!r} for {target!r}: {error}") from error
+    else:
+        name = target
+    function = getattr(module, name, None)
+    if not callable(function) or name.startswith("_"):
+        valid = ", ".join(names(module))
+        raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path of your own")
+    return function
+
+
+def names(module: types.ModuleType) -> list[str]:
+    """Public functions that a module defines itself."""
+    own = [n for n, f in vars(module).items() if inspect.isfunction(f) and inspect.unwrap(f).__module__ == module.__name__]
+    return sorted(n for n in own if not n.startswith("_"))
+
+
+def check_type(value: Any, hint: Any, *, where: str) -> None:
+    """Refuse a config value that does not fit the annotation; an int passes for a float, never a bool for a number.
+
+    Raises:
+        ConfigError: naming `where`, the value and the type that is wanted.
+    """
+    if not _fits(value, hint):
+        wanted = getattr(hint, "__name__", None) if not typing.get_args(hint) else None
+        raise ConfigError(f"{where}: {value!r} is of type {type(value).__name__}, wanted {wanted or hint}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any or isinstance(hint, typing.TypeVar):
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, option) for option in args)
+    if origin is typing.Literal:
+        return value in args
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (bool, str, type(None)):
+        return isinstance(value, hint if hint is not None else type(None))
+    if origin in (list, tuple) or hint in (list, tuple):
+        if not isinstance(value, (list, tuple)):
+            return False
+        fixed = origin is tuple and Ellipsis not in args
+        if fixed:
+            return len(value) == len(args) and all(_fits(v, a) for v, a in zip(value, args, strict=True))
+        return not args or all(_fits(v, args[0]) for v in value)
+    if origin in (dict, Mapping) or hint in (dict, Mapping) or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        return isinstance(value, Mapping) and (not args or all(_fits(v, args[1]) for v in value.values()))
+    return True  # a type that no config value can be checked against (arrays, callables): the function's own business

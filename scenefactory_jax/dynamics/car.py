@@ -1,0 +1,220 @@
+"""The car as a MuJoCo model: one box chassis on four sprung wheels, 6 + 10 degrees of freedom.
+
+Each wheel is one body with its joints in a row (suspension slide, steering hinge in front, spin hinge), instead of a carrier, a knuckle and
+a wheel: the motion is the same, the kinematic tree is two levels deep instead of four, and MJX compiles and runs that much
+faster. What does not spin adds to the wheel body's mass, and to its inertia about the two axes across the spin axis.
+"""
+
+import dataclasses
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from scenefactory_jax.build import ConfigError
+
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
+FRONT = WHEELS[:2]
+LATENT_FRICTION = 1e-3  # N m; the brakes' solver rows exist only if the model is compiled with a positive friction loss
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CarParameters:
+    """Every number of the car. Sources: SceneFactory's vehicle (URDF and system identification), facts sheet section 2."""
+
+    length: float  # of the chassis box, m
+    width: float  # of the chassis box, m
+    height: float  # of the chassis box, m
+    mass: float  # of the chassis, kg
+    inertia: tuple[float, float, float] | list[float]  # of the chassis about its centre of mass, roll, pitch, yaw, kg m^2
+    mass_height: float  # of the chassis' centre of mass above the box's centre, m
+    wheelbase: float  # m
+    track: float  # between the wheels' centres, m
+    wheel_height: float  # of the wheels' centres above the box's centre at mid travel, m
+    wheel_radius: float  # m
+    wheel_width: float  # m
+    wheel_mass: float  # of what spins, kg
+    wheel_inertia: tuple[float, float] | list[float]  # of what spins, about and across the spin axis, kg m^2
+    wheel_damping: float  # rolling drag of a wheel's bearing, N m s/rad
+    carrier_mass: float  # of what moves with a wheel and does not spin, kg
+    carrier_inertia: float  # of the same, about any axis, kg m^2
+    knuckle_mass: float  # of a steering knuckle, front only, kg
+    knuckle_inertia: float  # of the same, kg m^2
+    suspension_stiffness: float  # of a corner, N/m
+    suspension_damping: float  # of a corner, N s/m
+    suspension_preload: float  # spring force of a corner at mid travel, N; a quarter of the chassis' weight rides at mid travel
+    suspension_travel: float  # from mid travel to either stop, m
+    stop_stiffness: float  # of the bump stops beyond the travel, N/m
+    steering_limit: float  # rad
+    steering_stiffness: float  # of the steering servo, N m/rad
+    steering_damping: float  # of the steering servo, N m s/rad
+    steering_torque: float  # largest, of the steering servo, N m
+    steering_friction: float  # viscous, of the steering joint, N m s/rad
+    drive_torque: float  # of each front wheel at full throttle, N m
+    brake_torque_front: float  # of each front wheel at full brake, N m
+    brake_torque_rear: float  # of each rear wheel at full brake, N m
+    lateral_damping: float  # force against sideways speed of the chassis, N s/m
+    yaw_damping: float  # torque against yaw rate of the chassis, N m s/rad
+    tyre_time_constant: float  # of the wheel-ground contact (MuJoCo solref), s
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Solver:
+    """How MuJoCo solves contacts and friction. Elliptic cones always: pyramidal ones gave NaN at few iterations."""
+
+    algorithm: Literal["Newton", "CG"]
+    integrator: Literal["Euler", "implicitfast"]
+    iterations: int
+    line_search: int  # iterations
+    tolerance: float
+
+
+def spec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:
+    """One car without ground: body `chassis`, joints `root`, `suspension_*`, `steer_*`, `spin_*`, geoms `box` and `tyre_*`.
+
+    Args:
+        visual: add cabin, cylinder wheels and a spoke to see them turn. Physics ignores them and MJX is faster without.
+        brake_rows: compile a friction loss into the wheels, for brakes that are friction.
+    """
+    model = mujoco.MjSpec()
+    model.modelname = "car"
+    model.compiler.autolimits = False
+    chassis = model.worldbody.add_body(name="chassis", pos=[0, 0, car.wheel_radius - car.wheel_height])
+    chassis.add_freejoint(name="root")
+    _inertial(chassis, car.mass, car.inertia, at=[0, 0, car.mass_height])
+    _solid(chassis, "box", mujoco.mjtGeom.mjGEOM_BOX, [car.length / 2, car.width / 2, car.height / 2], rgba=[0.2, 0.4, 0.8, 1])
+    for name in WHEELS:
+        _add_wheel(chassis, name, car, visual=visual, brake_rows=brake_rows)
+    if visual:
+        _decorate(chassis, car)
+    return model
+
+
+def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual: bool, brake_rows: bool) -> None:
+    """Wheel body with its joints and its tyre geom."""
+    front = name in FRONT
+    x = car.wheelbase / 2 * (1 if front else -1)
+    y = car.track / 2 * (1 if name.endswith("left") else -1)
+    wheel = chassis.add_body(name=f"wheel_{name}", pos=[x, y, car.wheel_height])
+    hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    spring = wheel.add_joint(name=f"suspension_{name}", type=slide, axis=[0, 0, 1])
+    spring.stiffness, spring.damping = _linear(car.suspension_stiffness), _linear(car.suspension_damping)
+    spring.springref = -car.suspension_preload / car.suspension_stiffness
+    if front:
+        wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1]).damping = _linear(car.steering_friction)
+    spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
+    spin.damping = _linear(car.wheel_damping)
+    spin.frictionloss = LATENT_FRICTION if brake_rows else 0.0
+    about, across = car.wheel_inertia
+    still = car.carrier_inertia + (car.knuckle_inertia if front else 0.0)
+    mass = car.wheel_mass + car.carrier_mass + (car.knuckle_mass if front else 0.0)
+    _inertial(wheel, mass, [across + still, about, across + still], at=[0, 0, 0])
+    radii = [car.wheel_radius, car.wheel_width / 2, car.wheel_radius]
+    tyre = _solid(wheel, f"tyre_{name}", mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, rgba=[0.1, 0.1, 0.1, 1])
+    if visual:
+        tyre.rgba = [0, 0, 0, 0]
+        lie = [0.5**0.5, 0.5**0.5, 0, 0]
+        size = [car.wheel_radius, car.wheel_width / 2, 0]
+        _solid(wheel, f"rim_{name}", mujoco.mjtGeom.mjGEOM_CYLINDER, size, rgba=[0.1, 0.1, 0.1, 1], quat=lie)
+        spoke = [0.9 * car.wheel_radius, car.wheel_width / 2 + 0.005, 0.04]
+        _solid(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1])
+
+
+def _linear(coefficient: float) -> list[float]:
+    """MuJoCo's springs and dampers are cubic polynomials; MJX reads the linear coefficient only."""
+    return [coefficient, 0.0, 0.0]
+
+
+def _decorate(chassis: mujoco.MjsBody, car: CarParameters) -> None:
+    """Cut the visible box into a lower body, a cabin and lamps; the box itself stays, invisible."""
+    length, width, height = car.length / 2, car.width / 2, car.height / 2
+    for geom in chassis.geoms:
+        geom.rgba = [*geom.rgba[:3], 0.0]
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _solid(chassis, "hull", box, [length, 0.9 * width, 0.5 * height], rgba=[0.2, 0.4, 0.8, 1], pos=[0, 0, -0.5 * height])
+    glass = [0.5 * length, 0.8 * width, 0.5 * height]
+    _solid(chassis, "cabin", box, glass, rgba=[0.15, 0.2, 0.3, 1], pos=[-0.12 * length, 0, 0.5 * height])
+    for side in (-1, 1):
+        y = 0.6 * side * width
+        lamp = [0.02, 0.15 * width, 0.08 * height]
+        _solid(chassis, f"head_{side}", box, lamp, rgba=[1, 1, 0.8, 1], pos=[length, y, -0.25 * height])
+        _solid(chassis, f"tail_{side}", box, lamp, rgba=[0.8, 0.1, 0.1, 1], pos=[-length, y, -0.25 * height])
+
+
+def _inertial(body: mujoco.MjsBody, mass: float, inertia: tuple[float, ...] | list[float], at: list[float]) -> None:
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos = mass, list(inertia), at
+
+
+def _solid(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: list[float], **options: list[float]) -> mujoco.MjsGeom:
+    """A geom without mass that collides with nothing: contacts are explicit pairs."""
+    return body.add_geom(name=name, type=kind, size=size, mass=0, contype=0, conaffinity=0, **options)
+
+
+def add_ground_pairs(model: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "") -> None:
+    """Tyre contacts with the geom `ground`, as explicit pairs: MuJoCo would otherwise take the larger friction of the two geoms."""
+    for name in WHEELS:
+        pair = model.add_pair(name=f"{prefix}ground_{name}", geomname1=ground, geomname2=f"{prefix}tyre_{name}")
+        pair.condim = 3
+        pair.friction = [1.0, 1.0, 0.005, 1e-4, 1e-4]
+        pair.solref = [car.tyre_time_constant, 1.0]
+
+
+def set_options(model: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> None:
+    """Time step and solver, for a model with cars."""
+    option = model.option
+    option.timestep = physics_dt
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}[solver.algorithm]
+    option.integrator = {
+        "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+        "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    }[solver.integrator]
+    option.iterations, option.ls_iterations, option.tolerance = solver.iterations, solver.line_search, solver.tolerance
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # the dampings are stable at 120 Hz; a second factorisation is not free
+
+
+def standalone(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool, brake_rows: bool) -> mujoco.MjModel:
+    """One car on an infinite flat ground, compiled."""
+    model = spec(car, visual=visual, brake_rows=brake_rows)
+    model.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
+    add_ground_pairs(model, car, ground="ground")
+    set_options(model, solver, physics_dt=physics_dt)
+    return model.compile()
+
+
+def stable_limits(car: CarParameters, *, physics_dt: float) -> None:
+    """Refuse springs and dampings that the explicit integrator cannot carry.
+
+    A mass m on an explicit spring k and damper c is stable under semi-implicit Euler if k dt^2 / m + 2 c dt / m < 4.
+
+    Raises:
+        ConfigError: naming the spring, the sum and the bound.
+    """
+    unsprung = car.wheel_mass + car.carrier_mass
+    about_steer = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia
+    springs = {
+        "suspension and stop": (unsprung, car.suspension_stiffness + car.stop_stiffness, car.suspension_damping),
+        "steering": (about_steer, car.steering_stiffness, car.steering_damping + car.steering_friction),
+    }
+    for name, (mass, stiffness, damping) in springs.items():
+        load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
+        if load >= 4.0:
+            message = f"(k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}; it must stay below 4"
+            raise ConfigError(f"dynamics.car: the {name} cannot be integrated: {message}")
+
+
+def rest(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
+    """Joint positions of the car standing still on the ground, from 5 s of settling in the C engine."""
+    data = mujoco.MjData(model)
+    suspension = [model.joint(f"suspension_{name}") for name in WHEELS]
+    position = np.array([j.qposadr[0] for j in suspension])
+    velocity = np.array([j.dofadr[0] for j in suspension])
+    for _ in range(round(5.0 / model.opt.timestep)):
+        travel = data.qpos[position]
+        data.qfrc_applied[velocity] = -car.stop_stiffness * (travel - np.clip(travel, -car.suspension_travel, car.suspension_travel))
+        mujoco.mj_step(model, data)
+    settled = model.qpos0.copy()
+    settled[2] = data.qpos[2]
+    settled[position] = data.qpos[position].mean()
+    return settled

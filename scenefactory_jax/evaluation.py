@@ -1,0 +1,122 @@
+"""One deterministic episode a world, measured on device: what happened to every agent, and what a viewer needs to draw it.
+
+Events are counted from the facts, not from the exclusive events that rewards use: an agent that touches an edge and another car in one step
+has done both. Nothing is counted after an agent's end or the world's.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax import ends
+from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.types import Env, Events, Outcome, Scene, State
+
+Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
+
+
+@struct
+class Tally:
+    """Running record of one episode."""
+
+    happened: Events
+    ended: Bool[Array, " A"]
+    steps: Int[Array, " A"]
+    goal_distance: Float[Array, " A"]
+    drac_max: Float[Array, " A"]
+    ttc_min: Float[Array, " A"]
+    ttc_sum: Float[Array, " A"]
+    ttc_steps: Int[Array, " A"]
+    speed_sum: Float[Array, " A"]
+    grip_sum: Float[Array, " A"]
+    force_max: Float[Array, " A"]
+
+
+@struct
+class Frame:
+    """What one moment looks like from above."""
+
+    position: Float[Array, "A 2"]
+    yaw: Float[Array, " A"]
+    speed: Float[Array, " A"]
+    active: Bool[Array, " A"]
+    goal: Float[Array, "A 2"]
+    events: Events
+
+
+@struct
+class Episode:
+    """Everything that a running episode carries."""
+
+    state: State
+    observation: Any
+    tally: Tally
+    over: Bool[Array, ""]
+
+
+def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
+    """An episode at its start."""
+    state, observation = env.reset(key, scene)
+    count = state.active.shape[0]
+    zero, none = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32)
+    distance = jnp.linalg.norm(state.agents.goal - state.motion.position[:, :2], axis=1)
+    tally = Tally(
+        happened=ends.none(count),
+        ended=jnp.zeros(count, bool),
+        steps=none,
+        goal_distance=distance,
+        drac_max=zero,
+        ttc_min=zero + jnp.inf,
+        ttc_sum=zero,
+        ttc_steps=none,
+        speed_sum=zero,
+        grip_sum=zero,
+        force_max=zero,
+    )
+    return Episode(state, observation, tally, ~jnp.any(state.active))
+
+
+def play(
+    env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float
+) -> tuple[Episode, Frame]:
+    """Drive on for that many control steps; frames come back with a leading step axis.
+
+    Args:
+        ttc_limit_s: TTC above this counts as this in an agent's mean (the published evaluation uses 10 s).
+    """
+
+    def body(episode: Episode, _: None) -> tuple[Episode, Frame]:
+        before = replace(episode.state, active=episode.state.active & ~episode.over)
+        action = act(parameters, episode.observation)
+        state, outcome = env.step(scene, before, action)
+        tally = _note(episode.tally, before.active, outcome, ttc_limit_s=ttc_limit_s)
+        motion = state.motion
+        frame = Frame(
+            motion.position[:, :2], motion.yaw, jnp.linalg.norm(motion.velocity[:, :2], axis=1), before.active, state.agents.goal, outcome.events
+        )
+        return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
+
+    return jax.lax.scan(body, episode, None, length=steps)
+
+
+def _note(tally: Tally, active: Bool[Array, " A"], outcome: Outcome, *, ttc_limit_s: float) -> Tally:
+    facts = outcome.facts
+    seen = active & jnp.isfinite(facts.ttc)
+    happened = jax.tree.map(lambda old, new: old | (new & active), tally.happened, facts.events)
+    add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
+    return Tally(
+        happened=happened,
+        ended=tally.ended | (outcome.done & active),
+        steps=tally.steps + active.astype(jnp.int32),
+        goal_distance=jnp.where(active, facts.goal_distance, tally.goal_distance),
+        drac_max=jnp.maximum(tally.drac_max, jnp.where(active, facts.drac, 0.0)),
+        ttc_min=jnp.minimum(tally.ttc_min, jnp.where(active, facts.ttc, jnp.inf)),
+        ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(facts.ttc, ttc_limit_s), 0.0),
+        ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
+        speed_sum=add(tally.speed_sum, facts.speed),
+        grip_sum=add(tally.grip_sum, facts.grip),
+        force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
+    )

@@ -1,0 +1,107 @@
+"""Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent.
+
+A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them and the dictionary of their results is the observation. One's own group
+is the same with a dotted target. The policy encodes vectors and sets by their type, so a new group needs no change anywhere else.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax import conflict
+from scenefactory_jax.build import build
+from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
+from scenefactory_jax.types import SURFACES, Observation, Rows, Scene, State
+
+Group = Callable[[Scene, State], Float[Array, "A F"] | Rows]
+
+
+def ego(scene: Scene, state: State, *, distance_scale_m: float, speed_scale_mps: float) -> Float[Array, "A 7"]:
+    """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's own velocity x, y (paper, section 4)."""
+    motion = state.motion
+    goal = to_frame(state.agents.goal - motion.position[:, :2], motion.yaw)
+    distance = norm(goal)
+    bearing = goal / jnp.maximum(distance, 1e-6)[:, None]
+    velocity = to_frame(motion.velocity[:, :2], motion.yaw)
+    parts = [goal / distance_scale_m, bearing[:, 1:], bearing[:, :1], distance[:, None] / distance_scale_m, velocity / speed_scale_mps]
+    return jnp.concatenate(parts, axis=1)
+
+
+def weather(scene: Scene, state: State, *, film_scale_mm: float) -> Float[Array, "A 4"]:
+    """Water film and one-hot surface [film, AC, SMA, OGFC] (Eq. 2 of the paper), the same for every car of a world."""
+    surface = jax.nn.one_hot(state.weather.surface, len(SURFACES), dtype=jnp.float32)
+    token = jnp.concatenate([(state.weather.film_mm / film_scale_mm)[None], surface])
+    return jnp.broadcast_to(token, (len(state.active), len(token)))
+
+
+def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float) -> Rows:
+    """Road segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y.
+
+    Storage order starts with lanes, so a crowded place drops road edges first: the published `road_running` mode.
+    """
+    position, yaw = state.motion.position[:, :2], state.motion.yaw
+    offset = position[:, None, :] - scene.road.midpoint
+    near = scene.road.valid & (dot(offset, offset) <= radius_m**2)
+    index, mask = first_hits(near, count=count)
+    frame = yaw[:, None]
+    place = to_frame(scene.road.midpoint[index] - position[:, None, :], frame) / radius_m
+    kind = scene.road.kind[index][..., None].astype(jnp.float32) / kind_scale
+    features = jnp.concatenate([place, kind, to_frame(scene.road.direction[index], frame)], axis=-1)
+    return Rows(jnp.where(mask[..., None], features, 0.0), mask)
+
+
+def neighbours(
+    scene: Scene, state: State, *, count: int, distance_scale_m: float, speed_scale_mps: float, ttc_scale_s: float, circles: dict[str, float]
+) -> Rows:
+    """The nearest other active cars: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
+    motion, agents = state.motion, state.agents
+    position, velocity = motion.position[:, :2], motion.velocity[:, :2]
+    others = state.active[None] & ~jnp.eye(len(state.active), dtype=bool)
+    apart = position[None] - position[:, None]
+    squared = jnp.where(others, dot(apart, apart), jnp.inf)
+    rows = min(count, len(state.active))
+    order = jnp.argsort(squared, axis=1)[:, :rows]
+    mask = jnp.take_along_axis(others, order, axis=1)
+
+    centres, radius = car_circles(position, motion.yaw, agents.size, **circles)
+    ttc, _ = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=1.0)
+    time = jnp.minimum(jnp.take_along_axis(ttc, order, axis=1) / ttc_scale_s, 1.0)
+    place = to_frame(position[order] - position[:, None], motion.yaw[:, None]) / distance_scale_m
+    yaw = wrap_angle(motion.yaw[order] - motion.yaw[:, None]) / jnp.pi
+    speed = norm(velocity)[order] / speed_scale_mps
+    columns = [place, agents.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
+    features = jnp.where(mask[..., None], jnp.concatenate(columns, axis=-1), 0.0)
+    padding = count - rows
+    return Rows(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))
+
+
+def first_hits(hits: Bool[Array, "A P"], *, count: int) -> tuple[Int[Array, "A {count}"], Bool[Array, "A {count}"]]:
+    """Columns of the first `count` true entries of each row, in order, and which of them exist.
+
+    The k-th hit is the first column whose running number of hits reaches k, so a binary search finds it: no sort and no scatter.
+    """
+    running = jnp.cumsum(hits, axis=1, dtype=jnp.int32)
+    wanted = jnp.arange(1, count + 1, dtype=jnp.int32)
+    index = jax.vmap(lambda row: jnp.searchsorted(row, wanted, method="scan_unrolled"))(running)
+    mask = wanted <= running[:, -1:]
+    return jnp.where(mask, index, 0), mask
+
+
+def make(entries: Mapping[str, Mapping[str, Any]], *, where: str = "observe", **context: Any) -> dict[str, Group]:
+    """Config entries -> name -> group with its numbers bound; an entry of null is left out."""
+    return {
+        name: build(entry, builtins=__name__, where=f"{where}.{name}", **context) for name, entry in entries.items() if entry is not None
+    }
+
+
+def observe(scene: Scene, state: State, groups: Mapping[str, Group]) -> Observation:
+    """All groups of one moment; zeros and false masks for agents that are not active."""
+
+    def hide(leaf: Array) -> Array:
+        mask = state.active.reshape((-1,) + (1,) * (leaf.ndim - 1))
+        return jnp.where(mask, leaf, jnp.zeros((), leaf.dtype))
+
+    return {name: jax.tree.map(hide, group(scene, state)) for name, group in groups.items()}

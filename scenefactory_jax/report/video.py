@@ -1,0 +1,346 @@
+"""Bird's-eye videos of a few worlds side by side.
+
+The road is rendered once a world; a frame is a copy of it with trails, goals, cars and marks on top, drawn at twice the size and
+reduced, which smooths the edges. Titles, clock and counters frame the picture.
+"""
+
+import importlib.util
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import imageio
+import matplotlib
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from scenefactory_jax.report import canvas, gif
+from scenefactory_jax.report.canvas import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
+
+_FINE = 2  # pictures are drawn at this many times their size and reduced
+_FLASH_S, _FADE_S = 1.2, 0.6  # how long an event is flashed, and a car that has finished fades
+_GAP = 6  # pixels between panels
+_BINS = 6  # steps of fading along a trail
+
+
+class VideoError(ValueError):
+    """A video that cannot be written; the message names the argument and what would be valid."""
+
+
+class _Stage(NamedTuple):
+    """One world made ready: what does not change, and everything in pixels of the fine picture."""
+
+    trajectory: Trajectory
+    view: View
+    background: Image.Image
+    way: np.ndarray  # [T, A, 2] pixels
+    driven: np.ndarray  # [T, A]
+    ended: np.ndarray  # [T, A] steps since the agent was last active
+    happened: list[tuple[int, int, str]]  # (step, agent, event)
+    counts: dict[str, np.ndarray]  # event -> [T] agents so far
+    names: list[Image.Image]  # an agent's number, one image each
+    labels: dict[str, Image.Image]  # event -> its label
+
+
+def write(
+    path: Path, trajectories: Sequence[Trajectory], *, fps: float, stride: int, columns: int, panel: int, trail_s: float
+) -> Path:
+    """Write a video; `.gif` needs nothing more, `.mp4` needs the extra `video`.
+
+    Args:
+        path: ends in .gif or .mp4.
+        trajectories: the worlds, one panel each, left to right and top to bottom.
+        fps: frames a second of the video. With `stride` it sets the speed: 15 and 2 show 30 Hz control at real speed.
+        stride: control steps from frame to frame; the last step is always shown.
+        columns: panels in a row.
+        panel: side of a panel in pixels.
+        trail_s: seconds of the past that a trail shows.
+
+    Raises:
+        VideoError: another suffix, no trajectory, a number out of range, or no ffmpeg for an .mp4.
+        TrajectoryError: arrays that do not belong together.
+    """
+    if path.suffix not in (".gif", ".mp4"):
+        raise VideoError(f"{path}: suffix {path.suffix!r} is no video; valid are .gif and .mp4")
+    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise VideoError(f"{path}: writing .mp4 needs ffmpeg; `pip install scenefactory_jax[video]`, or choose a .gif")
+    if fps <= 0 or (path.suffix == ".gif" and fps > 50):
+        raise VideoError(f"fps: {fps}; wanted above 0, and for a .gif at most 50: players slow down anything faster")
+    pictures = frames(trajectories, fps=fps, stride=stride, columns=columns, panel=panel, trail_s=trail_s)
+    if path.suffix == ".gif":
+        longest = max((len(t.active) for t in trajectories), default=0)
+        few = frames(trajectories, fps=fps, stride=max(longest // 6, 1), columns=columns, panel=panel, trail_s=trail_s)
+        gif.write(path, pictures, colours=gif.palette(list(few), keep=_key_colours()), fps=fps)
+        return path
+    settings = {"codec": "libx264", "macro_block_size": 2, "ffmpeg_log_level": "error", "output_params": ["-preset", "veryfast", "-crf", "20"]}
+    with imageio.get_writer(path, fps=fps, **settings) as writer:  # pyright: ignore[reportArgumentType]
+        for picture in pictures:
+            writer.append_data(picture)  # pyright: ignore[reportAttributeAccessIssue]
+    return path
+
+
+def frames(
+    trajectories: Sequence[Trajectory], *, fps: float, stride: int, columns: int, panel: int, trail_s: float
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """The pictures of `write`, one after the other; shorter worlds hold their last step.
+
+    Raises:
+        VideoError, TrajectoryError: see `write`.
+    """
+    for name, value, least in (("stride", stride, 1), ("columns", columns, 1), ("panel", panel, 120)):
+        if value < least:
+            raise VideoError(f"{name}: {value}; wanted at least {least}")
+    if not trajectories:
+        raise VideoError("trajectories: empty; wanted at least one recorded world")
+    stages = [_prepare(trajectory, panel) for trajectory in trajectories]
+    return _film(stages, fps=fps, stride=stride, columns=min(columns, len(stages)), panel=panel, trail_s=trail_s)
+
+
+def shown_steps(length: int, stride: int) -> list[int]:
+    """The control steps that become frames: every `stride`-th one, and the last."""
+    steps = list(range(0, length, stride))
+    return steps if steps[-1] == length - 1 else [*steps, length - 1]
+
+
+def _film(stages: list[_Stage], *, fps: float, stride: int, columns: int, panel: int, trail_s: float) -> Iterator[np.ndarray]:
+    """Panels pasted on a sheet, frame by frame."""
+    bar, rows = _bar(panel), math.ceil(len(stages) / columns)
+    tall = panel + 2 * bar
+    size = (columns * (panel + _GAP) + _GAP, rows * (tall + _GAP) + _GAP + bar)
+    sheet = Image.new("RGB", (size[0] + size[0] % 2, size[1] + size[1] % 2), (255, 255, 255))
+    corners = [(_GAP + (i % columns) * (panel + _GAP), _GAP + (i // columns) * (tall + _GAP)) for i in range(len(stages))]
+    speed = fps * stride / stages[0].trajectory.control_hz
+    _draw_legend(sheet, size[1] - bar, panel, speed=speed)
+    for stage, (left, top) in zip(stages, corners, strict=True):
+        _draw_header(sheet, left, top, panel, stage.trajectory)
+    for step in shown_steps(max(len(stage.driven) for stage in stages), stride):
+        for stage, (left, top) in zip(stages, corners, strict=True):
+            now = min(step, len(stage.driven) - 1)
+            sheet.paste(_draw_world(stage, now, trail_s=trail_s), (left, top + bar))
+            _draw_footer(sheet, left, top + bar + panel, panel, stage, now)
+        yield np.array(sheet)
+
+
+def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
+    """Everything of a world that does not change from frame to frame."""
+    canvas.check(trajectory)
+    view = View(*canvas.around(canvas.places(trajectory), margin=9.0, smallest=50.0), panel * _FINE)
+    steps = np.arange(len(trajectory.active))[:, None]
+    last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
+    events = {name: happened & trajectory.present for name, happened in trajectory.events.items()}
+    happened = sorted((int(t), int(a), name) for name, where in events.items() for t, a in np.argwhere(where))
+    respawned = np.ndim(trajectory.goal) == 3
+    counts = {n: np.cumsum(e.sum(1)) if respawned else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()}
+    font = _font(max(9, panel // 44), bold=True)
+    return _Stage(
+        trajectory=trajectory,
+        view=view,
+        background=road_image(canvas.strokes(trajectory.scene.road), view),
+        way=canvas.to_pixels(view, trajectory.position),
+        driven=canvas.moves(trajectory),
+        ended=steps - last,
+        happened=happened,
+        counts=counts,
+        names=[_sprite(str(agent), font, canvas.colour_of(agent)) for agent in range(len(trajectory.present))],
+        labels={name: _sprite(mark.label, font, mark.colour) for name, mark in MARKS.items()},
+    )
+
+
+def road_image(lines: Sequence[Stroke], view: View) -> Image.Image:
+    """The static picture of a road in a window, with a 20 m scale bar in its lower left corner."""
+    fine = view._replace(pixels=view.pixels * 2)
+    image = Image.new("RGB", (fine.pixels, fine.pixels), GROUND)
+    draw = ImageDraw.Draw(image)
+    scale = fine.pixels / view.side
+    for stroke in lines:
+        width = max(stroke.width * scale, stroke.thinnest * _FINE * 2)
+        ends = canvas.to_pixels(fine, stroke.lines)
+        near = (ends.max(axis=(1, 2)) > -width) & (ends.min(axis=(1, 2)) < fine.pixels + width)
+        for (x0, y0), (x1, y1) in ends[near]:
+            draw.line((x0, y0, x1, y1), fill=stroke.colour, width=round(width))
+            if width > 6:  # round ends close the gaps between the segments of a bend
+                for x, y in ((x0, y0), (x1, y1)):
+                    draw.ellipse((x - width / 2, y - width / 2, x + width / 2, y + width / 2), fill=stroke.colour)
+    left, low, thick = 0.03 * fine.pixels, 0.97 * fine.pixels, 0.004 * fine.pixels
+    draw.rectangle((left, low - thick, left + 20.0 * scale, low), fill=INK)
+    draw.text((left, low - 2 * thick), "20 m", font=_font(round(fine.pixels / 38)), fill=INK, anchor="lb")
+    return image.reduce(2)
+
+
+def _draw_world(stage: _Stage, now: int, *, trail_s: float) -> Image.Image:
+    """The picture between header and footer at one step."""
+    image = stage.background.copy()
+    draw = ImageDraw.Draw(image)
+    _draw_trails(draw, stage, now, round(trail_s * stage.trajectory.control_hz))
+    shares = np.clip(1 - stage.ended[now] / (_FADE_S * stage.trajectory.control_hz), 0.0, 1.0) * stage.trajectory.present
+    on_stage = np.flatnonzero(shares > 0)
+    _draw_goals(draw, stage, now, on_stage, shares)
+    for agent in on_stage:
+        _draw_car(draw, stage, now, int(agent), float(shares[agent]))
+    flashes = _draw_marks(draw, stage, now)
+    image = image.reduce(_FINE)
+    lift = 0.5 * np.hypot(*stage.trajectory.size.T) * image.width / stage.view.side
+    for agent in on_stage[shares[on_stage] == 1.0]:
+        x, y = stage.way[now, agent] / _FINE
+        _stamp(image, stage.names[agent], x, y - lift[agent] - 5)
+    for x, y, name in flashes:
+        _stamp(image, stage.labels[name], x / _FINE, y / _FINE + 22)
+    return image
+
+
+def _draw_trails(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, length: int) -> None:
+    """Where each car was in the last `length` steps, fading with age."""
+    edges = np.unique(np.linspace(max(now - length, 0), now, _BINS + 1).round().astype(int))
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        strength = 0.75 * (1 - (now - last) / max(length, 1)) + 0.1
+        for agent in np.flatnonzero(stage.driven[first + 1 : last + 1].any(axis=0)):
+            colour = canvas.blend(canvas.colour_of(agent), canvas.ASPHALT, strength)
+            way, driven = stage.way[first : last + 1, agent], stage.driven[first + 1 : last + 1, agent]
+            if driven.all():
+                draw.line(way.ravel().tolist(), fill=colour, width=2 * _FINE, joint="curve")
+            else:
+                for step in np.flatnonzero(driven):
+                    draw.line(way[step : step + 2].ravel().tolist(), fill=colour, width=2 * _FINE)
+
+
+def _draw_goals(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, agents: np.ndarray, shares: np.ndarray) -> None:
+    """A circle of the goal's radius with a dot, in the agent's colour."""
+    radius = canvas.GOAL_RADIUS * stage.view.pixels / stage.view.side
+    for agent, (x, y) in zip(agents, canvas.to_pixels(stage.view, canvas.goal_at(stage.trajectory, now)[agents]), strict=True):
+        colour = canvas.blend(canvas.colour_of(agent), canvas.ASPHALT, 0.9 * shares[agent])
+        for reach, fill, width in ((radius, None, round(1.6 * _FINE)), (1.6 * _FINE, colour, 1)):
+            draw.ellipse((x - reach, y - reach, x + reach, y + reach), fill=fill, outline=colour, width=width)
+
+
+def _draw_car(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, agent: int, share: float) -> None:
+    """An oriented box with an arrowhead; `share` fades a car that has finished."""
+    trajectory = stage.trajectory
+    box, arrow = canvas.car_shape(trajectory.position[now, agent], float(trajectory.yaw[now, agent]), trajectory.size[agent])
+    colour = canvas.colour_of(agent)
+    parts = ((box, colour, canvas.blend(INK, colour, 0.55)), (arrow, canvas.blend((255, 255, 255), colour, 0.85), None))
+    for shape, fill, outline in parts:
+        corners = (canvas.to_pixels(stage.view, shape) - 0.5).ravel().tolist()
+        line = None if outline is None else canvas.blend(outline, canvas.ASPHALT, share)
+        draw.polygon(corners, fill=canvas.blend(fill, canvas.ASPHALT, share), outline=line, width=_FINE)
+
+
+def _draw_marks(draw: ImageDraw.ImageDraw, stage: _Stage, now: int) -> list[tuple[float, float, str]]:
+    """Events so far: flashed when new, small afterwards (an arrival leaves nothing). Returns the flashes that want a label."""
+    flashes = []
+    for step, agent, name in stage.happened:
+        age = (now - step) / (_FLASH_S * stage.trajectory.control_hz)
+        if age < 0 or (age > 1 and name == "reached"):
+            continue
+        x, y = (float(v) for v in stage.way[step, agent])
+        size = (7.0 + 9.0 * (1 - age) if age <= 1 else 5.0) * _FINE
+        draw_mark(draw, name, x, y, size, thick=2 * _FINE)
+        if age <= 1:
+            flashes.append((x, y, name))
+    return flashes
+
+
+def draw_mark(draw: ImageDraw.ImageDraw, name: str, x: float, y: float, size: float, *, thick: int) -> None:
+    """An event's shape about (x, y): ring, star, cross, diamond or square, edged in white."""
+    colour = MARKS[name].colour
+    angles = np.arange(10) * np.pi / 5 - np.pi / 2
+    reach = size * np.where(np.arange(10) % 2 == 0, 1.0, 0.42)
+    star = np.stack([x + reach * np.cos(angles), y + reach * np.sin(angles)], axis=1).ravel().tolist()
+    if name == "reached":
+        draw.ellipse((x - size, y - size, x + size, y + size), outline=colour, width=thick)
+    elif name == "collided":
+        draw.polygon(star, fill=colour, outline=(255, 255, 255), width=max(thick // 4, 1))
+    elif name == "touched_edge":
+        arm = 0.75 * size
+        for extra, fill in ((thick, (255, 255, 255)), (0, colour)):
+            for side in (-1, 1):
+                draw.line((x - arm, y - side * arm, x + arm, y + side * arm), fill=fill, width=round(0.35 * size) + thick // 2 + extra)
+    else:
+        arm = 0.8 * size
+        square = [x - arm, y - arm, x + arm, y - arm, x + arm, y + arm, x - arm, y + arm]
+        diamond = [x, y - size, x + size, y, x, y + size, x - size, y]
+        draw.polygon(diamond if name == "crashed" else square, fill=colour, outline=(255, 255, 255), width=max(thick // 4, 1))
+
+
+def _draw_header(sheet: Image.Image, left: int, top: int, panel: int, trajectory: Trajectory) -> None:
+    """Title and weather above a panel."""
+    draw, bar, small = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel))
+    draw.text((left + panel, top + bar // 2), trajectory.weather, font=small, fill=QUIET, anchor="rm")
+    bold, title = _font(_text_size(panel), bold=True), trajectory.title
+    room = panel - small.getlength(trajectory.weather) - 12
+    while bold.getlength(title) > room and len(title) > 2:
+        title = title[:-2].rstrip() + "…"
+    draw.text((left, top + bar // 2), title, font=bold, fill=INK, anchor="lm")
+
+
+def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _Stage, now: int) -> None:
+    """Clock and counters below a panel."""
+    draw, bar, font = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel))
+    draw.rectangle((left, top, left + panel, top + bar - 1), fill=(255, 255, 255))
+    draw.text((left, top + bar // 2), f"{now / stage.trajectory.control_hz:.1f} s", font=font, fill=INK, anchor="lm")
+    right = left + panel
+    total = int(stage.trajectory.present.sum())
+    for name in reversed(list(stage.counts)):
+        count = int(stage.counts[name][now])
+        if name == "fault" and not count:
+            continue
+        once = name == "reached" and np.ndim(stage.trajectory.goal) == 2
+        entry = f"{MARKS[name].label} {count}" + (f" of {total}" if once else "")
+        draw.text((right, top + bar // 2), entry, font=font, fill=MARKS[name].colour if count else QUIET, anchor="rm")
+        right -= round(font.getlength(entry)) + 12
+
+
+def _draw_legend(sheet: Image.Image, top: int, panel: int, *, speed: float) -> None:
+    """What the shapes mean, along the bottom."""
+    draw, bar, font = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel) - 1)
+    x, middle = _GAP + 7, top + bar // 2 - 2
+    patch = Image.new("RGB", (16 * 4, 16 * 4), (255, 255, 255))
+    for name, mark in MARKS.items():
+        patch.paste((255, 255, 255), (0, 0, 64, 64))
+        draw_mark(ImageDraw.Draw(patch), name, 32, 32, 24, thick=7)
+        sheet.paste(patch.reduce(4), (x - 7, middle - 8))
+        draw.text((x + 12, middle), mark.label, font=font, fill=INK, anchor="lm")
+        x += 26 + round(font.getlength(mark.label))
+    circle = "circle: goal of the car of that colour"
+    pace = "real speed" if abs(speed - 1) < 0.01 else f"{speed:.2g} x real speed"
+    for note in (f"{circle}  ·  {pace}", pace):
+        if x + font.getlength(note) < sheet.width - _GAP:
+            draw.text((sheet.width - _GAP, middle), note, font=font, fill=QUIET, anchor="rm")
+            break
+
+
+def _stamp(image: Image.Image, sprite: Image.Image, x: float, y: float) -> None:
+    """Paste a label centred at a point, kept inside the picture."""
+    left = min(max(round(x - sprite.width / 2), 0), image.width - sprite.width)
+    top = min(max(round(y - sprite.height / 2), 0), image.height - sprite.height)
+    image.paste(sprite, (left, top), sprite)
+
+
+def _sprite(text: str, font: ImageFont.FreeTypeFont, colour: Colour) -> Image.Image:
+    """A label with a light halo, on a transparent ground."""
+    left, top, right, bottom = (round(v) for v in font.getbbox(text, stroke_width=2))
+    image = Image.new("RGBA", (right - left, bottom - top), (*GROUND, 0))
+    ImageDraw.Draw(image).text((-left, -top), text, font=font, fill=(*colour, 255), stroke_width=2, stroke_fill=(*GROUND, 235))
+    return image
+
+
+def _bar(panel: int) -> int:
+    """Height of a header or footer."""
+    return 2 * round(_text_size(panel) * 0.9)
+
+
+def _text_size(panel: int) -> int:
+    return max(11, round(panel / 36))
+
+
+def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib ships."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), max(size, 8))
+
+
+def _key_colours() -> list[Colour]:
+    """Colours that a GIF must show right, however few pixels they have."""
+    agents = [canvas.blend(colour, canvas.ASPHALT, share) for colour in canvas.AGENTS for share in (1.0, 0.7, 0.4)]
+    return [*agents, *(mark.colour for mark in MARKS.values()), INK, QUIET, GROUND, (255, 255, 255)]

@@ -1,0 +1,113 @@
+"""Hydra configs -> plain dicts. Hydra decides nothing but configuration; past this door there are only mappings."""
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException, HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from scenefactory_jax.build import ConfigError
+
+COMMANDS = ("train", "evaluate", "convert", "scenes", "render")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
+
+
+def folder() -> Path:
+    """The folder of the configs: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent.parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "train.yaml").is_file():
+            return candidate
+    raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
+
+
+def load(name: str = "train", *overrides: str) -> dict[str, Any]:
+    """A command's config as a plain dict: `load("train", "experiment=demo", "worlds=8")`.
+
+    Args:
+        name: a top-level config: train, evaluate, convert, scenes, render, or task (the environment alone).
+        overrides: as on the command line.
+
+    Raises:
+        ConfigError: an unknown config, key or option, naming it and what would be valid.
+    """
+    known = sorted(path.stem for path in folder().glob("*.yaml"))
+    if name not in known:
+        raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(folder()), version_base="1.3"):
+            return plain(hydra_compose(name, overrides=list(overrides)))
+    except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_explain(name, error)) from error
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """An OmegaConf config with everything resolved, as dicts and lists."""
+    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # pyright: ignore[reportReturnType]
+
+
+def _explain(name: str, error: Exception) -> str:
+    """Hydra's message, and the keys that the place in question has."""
+    text = str(error) + (f" ({error.__cause__})" if error.__cause__ else "")
+    text = " ".join(text.split())
+    match = re.search(r"Could not override '([^']+)'", text)
+    if not match:
+        return text
+    path = match.group(1).split(".")
+    node: Any = load(name)
+    for depth, key in enumerate(path):
+        if not isinstance(node, Mapping) or key not in node:
+            where = ".".join(path[:depth]) or "the top level"
+            valid = ", ".join(sorted(map(str, node))) if isinstance(node, Mapping) else "nothing: it is a value"
+            return f"{match.group(1)}: unknown key {key!r}; {where} has: {valid}"
+        node = node[key]
+    return text
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The config that a run was made with (`config.yaml` of its folder).
+
+    Raises:
+        ConfigError: no such run, naming the folder.
+    """
+    file = Path(path) / "config.yaml"
+    if not file.is_file():
+        raise ConfigError(f"{path} is no run: it has no config.yaml; give the folder that `train` wrote")
+    return yaml.safe_load(file.read_text())
+
+
+def write(path: Path, config: Mapping[str, Any]) -> None:
+    """Keep a run's config and the versions it ran with beside its results."""
+    Path(path).mkdir(parents=True, exist_ok=True)
+    (Path(path) / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    (Path(path) / "versions.yaml").write_text(yaml.safe_dump(versions(), sort_keys=False))
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of what its numbers depend on, and the device."""
+    import jax
+
+    found = {"scenefactory_jax": _version("scenefactory_jax")} | {name: _version(name) for name in PACKAGES}
+    device = jax.devices()[0]
+    return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def as_overrides(arguments: Sequence[str]) -> list[str]:
+    """Command-line arguments that are overrides, without Hydra's own flags."""
+    return [argument for argument in arguments if not argument.startswith("-") and not argument.startswith("hydra")]

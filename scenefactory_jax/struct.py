@@ -1,0 +1,48 @@
+"""Frozen dataclasses that are JAX pytrees.
+
+`flax.struct` rebuilds a dataclass through `__init__` when a pytree is unflattened, so a shape check on the fields would see
+the tracers, `None`s and batched arrays that `vmap`, `scan` and `eval_shape` put there. Here unflattening bypasses `__init__`:
+shapes are checked where people build a value, never where JAX rebuilds one.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+replace = dataclasses.replace
+
+
+def static(**options: Any) -> Any:
+    """A field that is part of the tree's structure (hashable, no array)."""
+    return dataclasses.field(metadata={"static": True}, **options)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static))
+def struct(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen dataclass and a pytree; every field not declared `static()` is a child."""
+    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+    data = [f.name for f in fields if not f.metadata.get("static")]
+    meta = [f.name for f in fields if f.metadata.get("static")]
+
+    def flatten_with_keys(value: T):
+        children = [(jax.tree_util.GetAttrKey(name), getattr(value, name)) for name in data]
+        return children, tuple(getattr(value, name) for name in meta)
+
+    def flatten(value: T):
+        return [getattr(value, name) for name in data], tuple(getattr(value, name) for name in meta)
+
+    def unflatten(aux: Iterable[Any], children: Iterable[Any]) -> T:
+        value = object.__new__(cls)
+        for name, child in zip(data, children, strict=True):
+            object.__setattr__(value, name, child)
+        for name, constant in zip(meta, aux, strict=True):
+            object.__setattr__(value, name, constant)
+        return value
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls

@@ -1,0 +1,188 @@
+"""Rain and road surface to tyre friction: the modified average lumped LuGre model (ALL), in closed form.
+
+A thin water film separates the tread from the road's texture and partly lifts the tyre; what contact is left carries a LuGre bristle whose
+steady state is algebraic. The integrator of the bristle's differential equation lives in the tests, as an oracle. Constants are those
+of Zhao et al. (2024) as published with SceneFactory: `conf/weather/base.yaml` holds each of them, with its unit.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.types import SURFACES, Scene, Weather
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tyre:
+    """Constants of one tyre and of the water under it; SI units."""
+
+    load: float  # normal load of the wheel, N
+    pressure: float  # inflation pressure, Pa
+    width: float  # of the tyre, m
+    patch_length: float  # of the contact patch, m
+    patch_width: float  # of the contact patch, m
+    radius: float  # of the wheel, m
+    tread_radius: float  # of the tread, m
+    water_density: float  # kg/m^3
+    water_viscosity: float  # Pa s
+    minimum_spacing: float  # between tread and texture, m
+    spacing_ratio: float  # initial spacing / water film
+    bristle_stiffness: float  # sigma0, 1/m
+    coulomb: float  # mu_c
+    static: float  # mu_s
+    stribeck_exponent: float  # alpha
+    stribeck_velocity: tuple[float, float, float, float] | list[float]  # b1..b4: v_s(h) = b1 exp(b2 h_mm + b3) + b4, m/s
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Surface:
+    """What a road surface adds: the ratio of its friction to asphalt concrete's, and the amplitude of its texture."""
+
+    theta: float
+    texture_mm: float
+
+
+def friction(
+    speed: Float[Array, "*shape"],
+    film_mm: Float[Array, "*shape"],
+    theta: Float[Array, "*shape"],
+    texture_mm: Float[Array, "*shape"],
+    slip: Float[Array, "*shape"],
+    *,
+    tyre: Tyre,
+) -> Float[Array, "*shape"]:
+    """Steady-state friction coefficient of a tyre that runs at `speed` m/s with longitudinal slip `slip` on a film of water.
+
+    mu = max(theta Y_R - Y_F, 0) sigma0 s / (sigma0 s / g(s v) + K (1 + s)): the stationary point of the bristle's equation, with the
+    speed cancelled from numerator and denominator (v_r = s v, w_r = (1 + s) v). Finite with finite gradients at rest and on a dry road.
+    The published bristle dampings sigma1 and sigma2 are zero and left out. It has no floor: zero means that the tyre floats.
+    """
+    contact = jnp.maximum(theta * spacing(speed, film_mm, texture_mm, tyre=tyre) - lift(speed, film_mm, tyre=tyre), 0.0)
+    b1, b2, b3, b4 = tyre.stribeck_velocity
+    stribeck = b1 * jnp.exp(b2 * film_mm + b3) + b4
+    # the floor keeps the gradient of x^alpha finite at rest; it moves g by less than 4e-5 and only below 1e-8 of a metre a second
+    ratio = jnp.maximum(slip * speed / stribeck, 1e-9)
+    g = tyre.coulomb + (tyre.static - tyre.coulomb) * jnp.exp(-(ratio**tyre.stribeck_exponent))
+    lumping = 7.0 / (6.0 * tyre.patch_length)  # K of the average lumped model
+    bristle = tyre.bristle_stiffness * slip
+    return contact * bristle / (bristle / g + lumping * (1.0 + slip))
+
+
+def spacing(
+    speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], texture_mm: Float[Array, "*shape"], *, tyre: Tyre
+) -> Float[Array, "*shape"]:
+    """Y_R: the share of the contact patch in which water is squeezed out to the minimum spacing.
+
+    The published bracket 1/(h_m^2 + 2 T h_m) - 1/(h0^2 + 2 T h0) turns negative for h0 < h_m, where the clip gives one: holding h0 at h_m or
+    above says the same without a division by zero on a dry road. The difference is written as one fraction for float32's sake.
+    """
+    texture = texture_mm * 1e-3
+    least, first = tyre.minimum_spacing, jnp.maximum(tyre.spacing_ratio * film_mm * 1e-3, tyre.minimum_spacing)
+    patch = tyre.patch_length * tyre.patch_width
+    squeeze = 12.0 * speed * tyre.water_viscosity * tyre.tread_radius**2 / (patch * jnp.pi * tyre.pressure * tyre.patch_length)
+    bracket = (first - least) * (first + least + 2.0 * texture) / (least * (least + 2.0 * texture) * first * (first + 2.0 * texture))
+    return jnp.clip(1.0 - squeeze * bracket, 0.0, 1.0)
+
+
+def lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre: Tyre) -> Float[Array, "*shape"]:
+    """Y_F: the share of the wheel's load that the water wedge in front of the tyre carries."""
+    a, q = tyre.patch_length / (2.0 * tyre.radius), jnp.maximum(film_mm, 0.0) * 1e-3 / tyre.radius
+    wedge = q * (2.0 * max(1.0 - a * a, 0.0) ** 0.5 - q)
+    depth = wedge / (jnp.sqrt(jnp.maximum(a * a + wedge, 1e-12)) + a)  # sqrt(a^2 + wedge) - a without cancellation
+    return jnp.clip(tyre.water_density * tyre.width * tyre.radius * speed**2 / (3.0 * tyre.load) * depth, 0.0, 1.0)
+
+
+def grip(
+    weather: Weather,
+    position: Float[Array, "*shape 2"],
+    speed: Float[Array, "*shape"],
+    *,
+    mode: Literal["static", "dynamic", "speed"],
+    reference_speed: float,
+    slip_static: float,
+    slip_dynamic: float,
+    floor: float,
+    tyre: dict[str, Any],
+    surfaces: dict[str, Any],
+) -> Float[Array, "*shape"]:
+    """Friction coefficient of wheels at places of the plane.
+
+    Args:
+        weather: this world's road condition.
+        position: of the wheels, m; a uniform road does not read it.
+        speed: of the cars, m/s.
+        mode: `static` and `dynamic` evaluate the model at `reference_speed` and `slip_static` or `slip_dynamic` (the published choice is
+            `static`); `speed` evaluates it at each car's own speed and `slip_static`.
+        floor: smallest coefficient that a contact may have.
+        tyre: the numbers of `Tyre`.
+        surfaces: for every name of `types.SURFACES` the numbers of `Surface`.
+
+    Raises:
+        ConfigError: an unknown mode, tyre constant or surface, by name.
+    """
+    constants = build({**tyre, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
+    theta, texture = _surfaces(surfaces)
+    if mode not in ("static", "dynamic", "speed"):
+        raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
+    place = jnp.broadcast_to(weather.film_mm, position.shape[:-1])
+    v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
+    s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
+    at = lambda table: jnp.broadcast_to(jnp.asarray(table, jnp.float32)[weather.surface], speed.shape)
+    return jnp.maximum(friction(v, place, at(theta), at(texture), s, tyre=constants), floor)
+
+
+def _surfaces(surfaces: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+    if set(surfaces) != set(SURFACES):
+        raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
+    rows = [build({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
+    return [row.theta for row in rows], [row.texture_mm for row in rows]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """One road condition that may be drawn, and how often relative to the others."""
+
+    surface: str
+    film_mm: float
+    weight: float
+
+
+def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Weather:
+    """A road condition for one episode, drawn from `cases` with probability proportional to their weights.
+
+    Raises:
+        ConfigError: no case, an unknown surface, a negative film or weight, or no positive weight.
+    """
+    chosen = _cases(cases)
+    weights = jnp.asarray([case.weight for case in chosen], jnp.float32)
+    index = jax.random.choice(key, len(chosen), p=weights / weights.sum())
+    film = jnp.asarray([case.film_mm for case in chosen], jnp.float32)
+    surface = jnp.asarray([SURFACES.index(case.surface) for case in chosen], jnp.int32)
+    return Weather(film_mm=film[index], surface=surface[index])
+
+
+def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
+    make: Callable[..., Case]
+    chosen = []
+    for i, numbers in enumerate(cases):
+        where = f"weather.draw.cases[{i}]"
+        make = build({**numbers, "_target_": "Case"}, builtins=__name__, where=where)
+        case = make()
+        if case.surface not in SURFACES:
+            raise ConfigError(f"{where}.surface: {case.surface!r}; valid: {', '.join(SURFACES)}")
+        if case.film_mm < 0 or case.weight < 0:
+            raise ConfigError(f"{where}: film_mm {case.film_mm} and weight {case.weight} must not be negative")
+        chosen.append(case)
+    if sum(case.weight for case in chosen) <= 0:
+        raise ConfigError("weather.draw.cases: no case with a positive weight")
+    return chosen
+
+
+def keep(key: PRNGKeyArray, scene: Scene) -> Weather:
+    """The scene's own road condition, as it was packed."""
+    return scene.weather

@@ -1,0 +1,191 @@
+"""Env for ONE world, made of dynamics, spawn, weather, facts, ends, rewards and observations.
+
+`make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both give
+pure functions to put under one's own `jit`, `vmap` and `scan`.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from scenefactory_jax import ends, facts, observations, rewards, spawn
+from scenefactory_jax.build import ConfigError, build, check_type
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Agents, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
+
+
+def make(config: Mapping[str, Any]) -> Env:
+    """The environment of a config with the groups timing, dynamics, weather, spawn, facts, ends, reward and observe.
+
+    Raises:
+        ConfigError: naming the entry and key that does not fit, with the valid ones.
+    """
+    _require(config, ("timing", "dynamics", "weather", "spawn", "facts", "ends", "reward", "observe"))
+    timing = config["timing"]
+    for key in ("physics_hz", "control_hz", "episode_s"):
+        if key not in timing:
+            raise ConfigError(f"timing.{key}: missing; timing needs physics_hz, control_hz, episode_s")
+        check_type(timing[key], float, where=f"timing.{key}")
+    context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
+    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
+    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    bound = functools.partial(build, builtins="scenefactory_jax.facts")
+    ends.check(config["ends"].get("ending", []), where="ends")
+    return assemble(
+        dynamics,
+        draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
+        draw_weather=build(config["weather"]["draw"], builtins="scenefactory_jax.weather", where="weather.draw"),
+        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
+        judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.ends", where="ends"),
+        terms=rewards.make(config["reward"], **context),
+        groups=observations.make(config["observe"], **context),
+        episode_steps=episode_steps(timing),
+        respawn_clear_m=config["spawn"]["respawn_clear_m"],
+    )
+
+
+def episode_steps(timing: Mapping[str, float]) -> int:
+    """Control steps in an episode."""
+    return round(timing["episode_s"] * timing["control_hz"])
+
+
+def assemble(
+    dynamics: Dynamics,
+    *,
+    draw_agents: Callable[[PRNGKeyArray, Scene], Agents],
+    draw_weather: Callable[[PRNGKeyArray, Scene], Weather],
+    measure: Callable[[Scene, State, State], Facts],
+    judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]],
+    terms: Mapping[str, tuple[float, rewards.Term]],
+    groups: Mapping[str, observations.Group],
+    episode_steps: int,
+    respawn_clear_m: float | None,
+) -> Env:
+    """Join bound parts into an environment.
+
+    Args:
+        episode_steps: control steps after which a world is truncated.
+        respawn_clear_m: None parks finished agents until the world ends (the paper's rule); a number starts them again at a fresh draw once
+            no active car stands within that distance.
+    """
+
+    def start(key: PRNGKeyArray, scene: Scene) -> State:
+        agents_key, weather_key, key = jax.random.split(key, 3)
+        agents, weather = draw_agents(agents_key, scene), draw_weather(weather_key, scene)
+        body = dynamics.init(replace(scene, agents=agents, weather=weather))
+        count = agents.present.shape[0]
+        state = State(
+            body=body,
+            motion=dynamics.read(body),
+            agents=agents,
+            weather=weather,
+            active=agents.present,
+            happened=ends.none(count),
+            age=jnp.zeros(count, jnp.int32),
+            previous_action=jnp.zeros((count, 3), jnp.float32),
+            step=jnp.int32(0),
+            key=key,
+        )
+        return _strong(state)
+
+    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        scene = replace(scene, agents=state.agents, weather=state.weather)
+        action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
+        after = _advance(dynamics, scene, state, action)
+        measured = measure(scene, state, after)
+        measured, after = _quarantine(measured, state, after)
+        events, done = judge(measured, state.happened, state.active)
+        after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
+        reward, parts = rewards.weigh(Step(scene, state, action, after, measured, events), terms)
+        truncated = after.step >= episode_steps
+        if respawn_clear_m is None:
+            over = truncated | ~jnp.any(after.active)
+        else:
+            over = truncated
+            after = _respawn(dynamics, draw_agents, scene, after, clear_m=respawn_clear_m)
+        outcome = Outcome(None, reward, parts, events, done, truncated, over, measured)
+        return _strong(after), outcome
+
+    def observe(scene: Scene, state: State) -> Observation:
+        return observations.observe(replace(scene, agents=state.agents, weather=state.weather), state, groups)
+
+    def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
+        state = start(key, scene)
+        return state, observe(scene, state)
+
+    def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        state, outcome = transition(scene, state, action)
+        return state, replace(outcome, observation=observe(scene, state))
+
+    return Env(reset, step, start, transition, observe)
+
+
+def choose(condition: Bool[Array, " A"], chosen: Any, other: Any) -> Any:
+    """Row by row of two pytrees whose leaves all start with the agent axis."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, chosen, other)
+
+
+def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
+    body = dynamics.advance(scene, state.body, action, state.active)
+    return replace(
+        state,
+        body=body,
+        motion=dynamics.read(body),
+        age=state.age + state.active.astype(jnp.int32),
+        previous_action=action,
+        step=state.step + 1,
+    )
+
+
+def _quarantine(measured: Facts, before: State, after: State) -> tuple[Facts, State]:
+    """A car whose motion is no longer finite is put back where it last was: its NaN reaches neither rewards nor anybody else."""
+    fault = measured.events.fault
+    clean = Facts(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
+    body, motion = choose(fault, (before.body, before.motion), (after.body, after.motion))
+    return clean, replace(after, body=body, motion=motion)
+
+
+def _finite(value: Array) -> Array:
+    """NaN becomes zero; infinities keep their meaning (no TTC)."""
+    return value if value.dtype == bool else jnp.where(jnp.isnan(value), 0.0, value)
+
+
+def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
+    """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
+    draw_key, key = jax.random.split(state.key)
+    fresh = draw_agents(draw_key, scene)
+    waiting = ~state.active & fresh.present
+    clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, clear_m=clear_m)
+    begins = waiting & clear
+    agents = choose(begins, fresh, state.agents)
+    body = choose(begins, dynamics.init(replace(scene, agents=agents)), state.body)
+    count = begins.shape[0]
+    return replace(
+        state,
+        body=body,
+        motion=dynamics.read(body),
+        agents=agents,
+        active=state.active | begins,
+        happened=choose(begins, ends.none(count), state.happened),
+        age=jnp.where(begins, 0, state.age),
+        previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
+        key=key,
+    )
+
+
+def _strong(tree: Any) -> Any:
+    """Cast away weak types, so that a second step does not trace again."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
+
+
+def _require(config: Mapping[str, Any], groups: tuple[str, ...]) -> None:
+    if missing := [name for name in groups if name not in config]:
+        raise ConfigError(f"config: group {missing[0]!r} is missing; an environment needs {', '.join(groups)}")

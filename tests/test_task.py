@@ -1,0 +1,329 @@
+"""Facts, ends, rewards, observations, spawns and the environment, on a stand-in body that moves as it is told."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import road_of, scene_of
+
+import scenefactory_jax
+from scenefactory_jax import conflict, ends, geometry, observations, spawn, world
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Dynamics, Motion
+from scenefactory_jax.weather import keep
+
+CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
+
+
+def glide() -> Dynamics:
+    """Cars that keep their velocity; action 0 steers the speed directly. Throttle above 0.99 breaks the car (NaN)."""
+
+    def init(scene):
+        a = scene.agents
+        return {"p": a.position, "yaw": a.yaw, "v": a.speed, "force": jnp.zeros_like(a.speed)}
+
+    def advance(scene, body, action, active):
+        v = jnp.where(active, body["v"] + action[:, 0], body["v"])
+        v = jnp.where(action[:, 0] > 0.99, jnp.nan, v)
+        p = body["p"] + jnp.where(active, v / 30, 0.0)[:, None] * geometry.heading(body["yaw"])
+        return {**body, "p": p, "v": v, "force": jnp.where(action[:, 2] > 0.5, 100.0, 0.0)}
+
+    def read(body):
+        zero = jnp.zeros_like(body["v"])
+        flat = lambda xy, z: jnp.concatenate([xy, z[:, None]], axis=1)  # noqa: E731
+        velocity = body["v"][:, None] * geometry.heading(body["yaw"])
+        return Motion(flat(body["p"], zero + 0.6), flat(velocity, zero), body["yaw"], zero, zero + 1, zero, body["force"], zero + 1, zero, zero)
+
+    return Dynamics(init, advance, read)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return scenefactory_jax.load("task")
+
+
+def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None):
+    bound = functools.partial(
+        world.assemble,
+        glide(),
+        draw_agents=draw,
+        draw_weather=keep,
+        measure=functools.partial(world.facts.measure, **config["facts"]),
+        judge=functools.partial(ends.judge, ending=ending or config["ends"]["ending"]),
+        terms=world.rewards.make(config["reward"]),
+        groups=observations.make({**config["observe"], "road": {**config["observe"]["road"], "count": 40}}),
+        episode_steps=steps,
+        respawn_clear_m=respawn,
+    )
+    return bound()
+
+
+# ---- geometry and conflicts ----
+
+
+def test_angles_wrap_and_frames_invert():
+    angle = jnp.array([0.0, 4.0, -4.0, 100.0])
+    wrapped = geometry.wrap_angle(angle)
+    assert jnp.all(jnp.abs(wrapped) <= jnp.pi)
+    np.testing.assert_allclose(jnp.cos(wrapped), jnp.cos(angle), atol=1e-5)
+    vector = jnp.array([[1.0, 2.0]] * 4)
+    np.testing.assert_allclose(geometry.to_frame(geometry.rotate(vector, angle), angle), vector, atol=1e-5)
+
+
+def test_norm_has_a_gradient_at_rest():
+    assert jnp.all(jnp.isfinite(jax.grad(lambda v: geometry.norm(v).sum())(jnp.zeros((2, 2)))))
+
+
+def test_car_circles_are_the_published_ones():
+    centres, radius = geometry.car_circles(jnp.zeros((1, 2)), jnp.zeros(1), jnp.array([[4.0, 2.0]]), **CIRCLES)
+    np.testing.assert_allclose(radius, [1.1], rtol=1e-6)
+    np.testing.assert_allclose(centres[0, :, 0], [1.12, 0, -1.12], atol=1e-6)
+
+
+def brute_force_ttc(centres, radius, velocity, yaw, dt=0.002, until=12.0):
+    count = len(radius)
+    found = np.full((count, count), np.inf)
+    for i in range(count):
+        forward = np.array([np.cos(yaw[i]), np.sin(yaw[i])])
+        for j in range(count):
+            if i == j:
+                continue
+            pairs = [(a, b) for a in range(3) for b in range(3) if (centres[j, b] - centres[i, a]) @ forward > 0]
+            for t in np.arange(0, until, dt):
+                apart = [np.linalg.norm(centres[j, b] - centres[i, a] + (velocity[j] - velocity[i]) * t) for a, b in pairs]
+                if apart and min(apart) <= radius[i] + radius[j]:
+                    found[i, j] = t
+                    break
+    return found
+
+
+def test_ttc_equals_a_simulated_one():
+    rng = np.random.default_rng(0)
+    position, yaw = rng.uniform(-12, 12, (5, 2)), rng.uniform(-3, 3, 5)
+    velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
+    centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
+    ttc, drac = conflict.pairwise(centres, radius, jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32), drac_gap_floor_m=1.0)
+    ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
+    expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
+    assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
+    np.testing.assert_allclose(ttc, expected, atol=0.02)
+    assert np.all(np.diag(drac) == 0) and np.all(np.asarray(drac) >= 0)
+
+
+def test_head_on_ttc_and_drac_by_hand():
+    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.array([0.0, jnp.pi]), jnp.full((2, 2), 2.0) * jnp.array([2.0, 1.0]), **CIRCLES)
+    velocity = jnp.array([[5.0, 0], [-5.0, 0]])
+    ttc, drac = conflict.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    gap = 20 - 2 * 1.12 - 2 * 1.1
+    np.testing.assert_allclose(ttc[0, 1], gap / 10, rtol=1e-5)
+    np.testing.assert_allclose(drac[0, 1], 100 / (2 * gap), rtol=1e-5)
+
+
+def test_parting_cars_never_meet():
+    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), jnp.tile(jnp.array([4.0, 2.0]), (2, 1)), **CIRCLES)
+    ttc, _ = conflict.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
+    assert jnp.isinf(ttc).all()
+
+
+def test_first_hits_keeps_storage_order():
+    rng = np.random.default_rng(1)
+    hits = rng.random((7, 90)) < 0.2
+    index, mask = observations.first_hits(jnp.asarray(hits), count=12)
+    for row in range(7):
+        expected = np.flatnonzero(hits[row])[:12]
+        assert list(np.asarray(index[row])[np.asarray(mask[row])]) == list(expected)
+
+
+# ---- the environment ----
+
+
+@pytest.fixture(scope="module")
+def env(config):
+    return build_env(config)
+
+
+@pytest.fixture(scope="module")
+def two_cars():
+    return scene_of([[0, 0], [30, 0.5]], [[20, 0], [60, 0.5]], speeds=[6.0, 0.0])
+
+
+def test_reset_is_pure_and_shapes_are_the_published_ones(env, two_cars, config):
+    state, observation = env.reset(jax.random.key(0), two_cars)
+    again, _ = env.reset(jax.random.key(0), two_cars)
+    same = jax.tree.map(lambda a, b: bool(jnp.all(jax.random.key_data(a) == jax.random.key_data(b))) if a.dtype == jax.random.key(0).dtype else bool(jnp.all(a == b)), state, again)
+    assert all(jax.tree.leaves(same))
+    assert observation["ego"].shape == (2, 7) and observation["weather"].shape == (2, 4)
+    assert observation["road"].features.shape == (2, 40, 5) and observation["neighbours"].features.shape == (2, 24, 7)
+    np.testing.assert_allclose(observation["ego"][0], [0.2, 0, 0, 1, 0.2, 0.6, 0], atol=1e-6)
+    np.testing.assert_allclose(observation["neighbours"].features[0, 0, :4], [0.3, 0.005, 0.04, 0.02], atol=1e-6)
+    assert config["observe"]["road"]["count"] == 350
+
+
+def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
+    state, observation = env.reset(jax.random.key(0), two_cars)
+    rows = observation["road"]
+    points = np.asarray(two_cars.road.midpoint)
+    near = [i for i in range(len(points)) if np.hypot(*(points[i] - [0, 0])) <= 10][:40]
+    np.testing.assert_allclose(rows.features[0, : len(near), :2] * 10, points[near], atol=1e-5)
+    assert rows.mask[0].sum() == len(near)
+
+
+def drive(env, scene, action, steps, key=0):
+    state, _ = env.reset(jax.random.key(key), scene)
+    step = jax.jit(env.step)
+    history = []
+    for _ in range(steps):
+        state, outcome = step(scene, state, action)
+        history.append(outcome)
+    return state, history
+
+
+def test_goal_ends_a_car_once_and_pays_once(env, two_cars):
+    state, history = drive(env, two_cars, jnp.zeros((2, 3)), 110)
+    goals = np.array([h.terms["goal"][0] for h in history])
+    assert goals.sum() == 45.0 and np.count_nonzero(goals) == 1
+    when = int(np.argmax(goals))
+    assert history[when].done[0] and abs(when / 30 - 17 / 6) < 0.05  # 20 m - 3 m at 6 m/s
+    assert not state.active[0] and state.active[1]
+    assert all(h.reward[0] == 0 for h in history[when + 1 :]), "a finished car earns nothing"
+    assert not history[-1].observation["neighbours"].mask[1].any(), "a finished car is not seen"
+    assert all(float(jnp.abs(h.reward - sum(h.terms.values())).max()) < 1e-5 for h in history)
+
+
+def test_progress_sums_to_the_way_driven(env, two_cars):
+    _, history = drive(env, two_cars, jnp.zeros((2, 3)), 60)
+    np.testing.assert_allclose(sum(float(h.facts.progress[0]) for h in history), 60 * 6 / 30, rtol=1e-4)
+
+
+def test_collision_needs_force_and_grace(env, two_cars):
+    action = jnp.array([[0.0, 0, 0], [0.0, 0, 1.0]])
+    _, history = drive(env, two_cars, action, 30)
+    collided = [bool(h.events.collided[1]) for h in history]
+    assert collided.index(True) == 23, "the first 23 control steps are masked"
+    assert sum(collided) == 1
+
+
+def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
+    action = jnp.array([[1.0, 0, 0], [0.0, 0, 0]])
+    state, history = drive(env, two_cars, action, 2)
+    assert history[0].events.fault[0] and not history[0].events.fault[1]
+    for leaf in jax.tree.leaves((state.motion, state.body, history[0].reward, history[0].observation, history[1].observation)):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert not state.active[0] and state.active[1]
+
+
+def test_edges_are_touched_by_circles(config):
+    env = build_env(config)
+    scene = scene_of([[0, 4.6]], [[50, 0]], yaws=[np.pi / 2], speeds=[3.0])
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 3)
+    # front circle: 4.6 + 1.12 + 1.10 reaches the edge at 6 - 0.05 already in the first step
+    assert history[0].events.touched_edge[0]
+    assert history[0].facts.edge_gap[0] < 0
+
+
+def test_leaving_the_box_is_a_crash(config):
+    env = build_env(config)
+    scene = scene_of([[95, 0]], [[0, 50]], speeds=[6.0], half_width=60, length=120)
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 30)
+    crashed = [bool(h.events.crashed[0]) for h in history]
+    assert crashed.index(True) == 25, "x > 100 m after 26 steps of 0.2 m"
+
+
+def test_invincible_cars_drive_on(config):
+    env = build_env(config, ending=["fault", "reached"])
+    scene = scene_of([[0, 5.4]], [[50, 5.4]], speeds=[5.0])
+    state, history = drive(env, scene, jnp.zeros((1, 3)), 20)
+    assert sum(bool(h.events.touched_edge[0]) for h in history) == 1, "noted once"
+    assert state.active[0]
+
+
+def test_time_out_and_over(config):
+    env = build_env(config, steps=5)
+    scene = scene_of([[0, 0]], [[50, 0]])
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 5)
+    assert [bool(h.truncated) for h in history] == [False] * 4 + [True]
+    assert bool(history[-1].over)
+
+
+def test_absent_agents_change_nothing(config):
+    env = build_env(config)
+    alone = scene_of([[0, 0], [30, 0.5]], [[20, 0], [60, 0.5]], speeds=[6, 0], present=[True, False])
+    moved = scene_of([[0, 0], [3, 0.5]], [[20, 0], [60, 0.5]], speeds=[6, 9], present=[True, False])
+    _, a = drive(env, alone, jnp.zeros((2, 3)), 3)
+    _, b = drive(env, moved, jnp.zeros((2, 3)), 3)
+    for x, y in zip(jax.tree.leaves(a[-1].observation), jax.tree.leaves(b[-1].observation), strict=True):
+        np.testing.assert_array_equal(x[0], y[0])
+        assert not np.any(np.asarray(x[1])), "an absent car sees nothing"
+    np.testing.assert_array_equal(a[-1].reward, b[-1].reward)
+
+
+def test_se2_equivariance(env, two_cars):
+    """Turning and moving the whole world changes no reward and no observation."""
+    angle, shift = 0.7, jnp.array([11.0, -5.0])
+    turn = lambda p: geometry.rotate(p, jnp.float32(angle)) + shift  # noqa: E731
+    road = lambda r: replace(r, midpoint=turn(r.midpoint), direction=geometry.rotate(r.direction, jnp.float32(angle)))  # noqa: E731
+    agents = replace(two_cars.agents, position=turn(two_cars.agents.position), goal=turn(two_cars.agents.goal), yaw=two_cars.agents.yaw + angle)
+    moved = replace(two_cars, road=road(two_cars.road), lanes=road(two_cars.lanes), edges=road(two_cars.edges), agents=agents)
+    _, a = drive(env, two_cars, jnp.zeros((2, 3)), 2)
+    _, b = drive(env, moved, jnp.zeros((2, 3)), 2)
+    np.testing.assert_allclose(a[-1].reward, b[-1].reward, atol=2e-4)
+    np.testing.assert_allclose(a[-1].observation["ego"], b[-1].observation["ego"], atol=1e-4)
+    np.testing.assert_allclose(a[-1].observation["neighbours"].features, b[-1].observation["neighbours"].features, atol=1e-4)
+
+
+def test_steps_trace_once_under_vmap(env, two_cars):
+    scenes = jax.tree.map(lambda x: jnp.stack([x, x]), two_cars)
+    traces = []
+
+    @jax.jit
+    def step(scenes, states, action):
+        traces.append(1)
+        return jax.vmap(env.step)(scenes, states, action)
+
+    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2), scenes)
+    for _ in range(3):
+        states, _ = step(scenes, states, jnp.zeros((2, 2, 3)))
+    assert len(traces) == 1
+
+
+# ---- spawns ----
+
+
+def test_random_pairs_keep_their_promises():
+    x = np.arange(-60, 60.1, 0.5)
+    lines = [(2, np.stack([x, 0 * x + y], -1)) for y in (-4.0, 0.0, 4.0)]
+    slots = 8
+    scene = scene_of(np.zeros((slots, 2)), np.ones((slots, 2)))
+    scene = replace(scene, lanes=road_of(lines, capacity=900))
+    numbers = dict(travel_min_m=10.0, travel_max_m=50.0, margin_m=2.0, start_gap_m=8.0, goal_gap_m=6.0, candidates=64, car_size_m=[4.0, 2.0])
+    draw = jax.jit(jax.vmap(lambda key: spawn.random_pairs(key, scene, **numbers)))
+    agents = draw(jax.random.split(jax.random.key(3), 20))
+    assert agents.present.mean() > 0.9
+    for world_index in range(20):
+        rows = np.flatnonzero(agents.present[world_index])
+        start, goal = np.asarray(agents.position[world_index])[rows], np.asarray(agents.goal[world_index])[rows]
+        travel = np.linalg.norm(goal - start, axis=1)
+        np.testing.assert_allclose(travel, agents.route[world_index][rows], atol=0.05)
+        assert travel.min() >= 9.9 and travel.max() <= 50.1
+        assert np.abs(start[:, 0]).max() <= 58.1 and np.abs(goal[:, 0]).max() <= 58.1
+        assert np.all(np.isin(np.round(start[:, 1], 3), [-4, 0, 4])) and np.allclose(start[:, 1], goal[:, 1], atol=1e-3)
+        apart = np.linalg.norm(start[:, None] - start[None], axis=-1) + 1e3 * np.eye(len(rows))
+        assert apart.min() >= 8.0
+        assert np.all(goal[:, 0] > start[:, 0]), "along the lane's own direction"
+
+
+def test_respawn_starts_finished_cars_again(config):
+    env = build_env(config, respawn=10.0)
+    scene = scene_of([[0, 0], [40, 0]], [[6, 0], [60, 0]], speeds=[6.0, 0.0])
+    state, history = drive(env, scene, jnp.zeros((2, 3)), 40)
+    assert sum(bool(h.events.reached[0]) for h in history) >= 2, "the car reaches its goal, starts again and reaches it again"
+    assert state.active.all() and not any(bool(h.over) for h in history)
+
+
+def test_unknown_ending_is_refused():
+    with pytest.raises(ConfigError, match="unknown event 'colided'; valid: fault, reached"):
+        ends.check(["fault", "reached", "colided"], where="ends")
