@@ -14,6 +14,9 @@ GROUND: Colour = (246, 246, 243)
 ASPHALT: Colour = (221, 222, 224)
 INK: Colour = (38, 42, 48)
 QUIET: Colour = (112, 118, 126)
+WHITE: Colour = (255, 255, 255)
+YELLOW: Colour = (226, 170, 0)
+EDGE: Colour = (92, 97, 104)
 GOAL_RADIUS = 3.0  # m, of the goal's circle: the reference task's goal radius
 
 # One colour an agent, repeated after 16: Okabe and Ito's and Tol's colour-blind safe sets without their palest and without pure red,
@@ -85,6 +88,20 @@ def check(trajectory: Trajectory) -> None:
         raise TrajectoryError(f"trajectory {trajectory.title!r}: no steps, so there is nothing to draw")
 
 
+def settle(trajectory: Trajectory) -> Trajectory:
+    """Checked, and without numbers that cannot be drawn: after a fault of the simulation a car stays, inactive, where it last was.
+
+    Raises:
+        TrajectoryError: see `check`.
+    """
+    check(trajectory)
+    sound = np.isfinite(trajectory.position).all(axis=-1) & np.isfinite(trajectory.yaw)
+    last = np.maximum.accumulate(np.where(sound, np.arange(len(sound))[:, None], 0), axis=0)
+    agents = np.arange(sound.shape[1])
+    position, yaw = (np.nan_to_num(column[last, agents]) for column in (trajectory.position, trajectory.yaw))
+    return trajectory._replace(position=position, yaw=yaw, active=trajectory.active & sound)
+
+
 class View(NamedTuple):
     """A square window on the plane: its lower left corner and side in metres, and its side in pixels."""
 
@@ -96,7 +113,7 @@ class View(NamedTuple):
 
 def to_pixels(view: View, points: Num[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     """World coordinates to (column, row); rows count downward, and pixel (i, j) covers [i, i + 1) x [j, j + 1)."""
-    scale = view.pixels / view.side
+    points, scale = np.asarray(points, float), view.pixels / view.side
     columns = (points[..., 0] - view.left) * scale
     rows = (view.bottom + view.side - points[..., 1]) * scale
     return np.stack([columns, rows], axis=-1)
@@ -121,6 +138,11 @@ def places(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
 def goal_at(trajectory: Trajectory, step: int) -> Float[np.ndarray, "A 2"]:
     """Goals in force at a step."""
     return trajectory.goal[step] if np.ndim(trajectory.goal) == 3 else trajectory.goal
+
+
+def respawns(trajectory: Trajectory) -> bool:
+    """Whether finished agents start again: goals change."""
+    return np.ndim(trajectory.goal) == 3 and bool((trajectory.goal != trajectory.goal[:1]).any())
 
 
 def colour_of(agent: int) -> Colour:
@@ -162,7 +184,6 @@ class Stroke(NamedTuple):
 
 
 # kind (WOMD map.proto) -> colour, width in metres, thinnest width in pixels, dashed; in the order of drawing
-_WHITE, _YELLOW, _DARK = (255, 255, 255), (226, 170, 0), (92, 97, 104)
 _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
     (DRIVABLE, ASPHALT, 3.9, 3.0, False),
     ((LANE_BIKE,), (214, 224, 212), 1.8, 2.0, False),
@@ -170,11 +191,11 @@ _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
     (DRIVABLE, (203, 205, 209), 0.12, 0.8, True),  # the lane's centre
     ((18,), (178, 190, 206), 0.4, 1.2, False),  # crosswalk
     ((19,), (190, 160, 120), 0.4, 1.2, False),  # speed bump
-    ((6,), _WHITE, 0.2, 1.0, True),
-    ((7, 8), _WHITE, 0.25, 1.2, False),
-    ((9, 10, 13), _YELLOW, 0.2, 1.0, True),
-    ((11, 12), _YELLOW, 0.25, 1.2, False),
-    ((15, 16), _DARK, 0.35, 1.4, False),
+    ((6,), WHITE, 0.2, 1.0, True),
+    ((7, 8), WHITE, 0.25, 1.2, False),
+    ((9, 10, 13), YELLOW, 0.2, 1.0, True),
+    ((11, 12), YELLOW, 0.25, 1.2, False),
+    ((15, 16), EDGE, 0.35, 1.4, False),
     ((17,), (208, 28, 40), 0.8, 3.0, False),  # stop sign
 )
 _DASH, _PERIOD = 3.0, 9.0  # m; dashes and their repetition on US roads are 10 and 40 feet, too sparse for a picture

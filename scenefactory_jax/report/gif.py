@@ -21,21 +21,16 @@ def palette(samples: Sequence[UInt8[np.ndarray, "H W 3"]], *, keep: Sequence[tup
     codes, counts = np.unique(pixels[:, 0] << 16 | pixels[:, 1] << 8 | pixels[:, 2], return_counts=True)
     common = codes[np.argsort(-counts, kind="stable")][:20_000]
     candidates = np.stack([common >> 16, common >> 8 & 255, common & 255], axis=1).astype(np.int32)
-    chosen = np.full((_CLEAR, 3), 10_000, np.int32)
+    chosen = np.zeros((_CLEAR, 3), np.int32)
     size = 0
-    for colour in [*np.unique(candidates[:8], axis=0), *(np.array(k, np.int32) for k in keep), *candidates]:
-        if size < _CLEAR and np.abs(chosen[:size] - colour).max(axis=1, initial=0).size == size:
-            distance = np.abs(chosen[:size] - colour).max(axis=1) if size else np.array([255])
-            if distance.min() >= 6:
-                chosen[size] = colour
-                size += 1
-        if size == _CLEAR:
-            break
-    chosen[size:] = 0
+    for colour in np.concatenate([np.array(keep, np.int32).reshape(-1, 3), candidates]):
+        if size < _CLEAR and (np.abs(chosen[:size] - colour).max(axis=1) >= 6).all():
+            chosen[size] = colour
+            size += 1
     return chosen.astype(np.uint8)
 
 
-def write(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, colours: UInt8[np.ndarray, "255 3"], fps: float) -> int:
+def write(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], *, colours: UInt8[np.ndarray, "255 3"], fps: float | int) -> int:
     """Write a looping GIF and return the number of frames. Frame times are whole hundredths of a second that add up to the right speed."""
     table, before, count = _nearest(colours), None, 0
     with path.open("wb") as file:

@@ -78,25 +78,26 @@ METRICS: dict[str, Metric] = {
     "clean_success_rate": _share(
         "Clean success rate", "Agents that reached the goal and had no other event, of all spawned agents.", "clean"),
     "collision_rate": _share(
-        "Collision rate", "Agents with a car-to-car contact above the force threshold, of all spawned agents. Both parties count.", "collided"),
+        "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collided"),
     "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "touched_edge"),
     "crash_rate": _share("Crash rate", "Agents that tipped over, fell or strayed too far, of all spawned agents.", "crashed"),
     "fault_rate": _share("Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "fault"),
     "unfinished_rate": Metric(
         "Out of time", SHARE, "Agents with no event at all when the episode's time was up, of all spawned agents.", _unfinished, _spawned),
     "mean_max_drac": Metric(
-        "Mean max DRAC", "m/s²", "Deceleration rate to avoid a crash: each agent's largest value; mean over the agents of a world, then over "
-        "worlds with equal weight.", lambda records: records["max_drac"], _spawned, by_world=True),
+        "Mean max DRAC", "m/s²", "Deceleration rate to avoid a crash: each agent's largest value; mean over the agents of a world, then "
+        "over worlds with equal weight.", lambda records: records["max_drac"], _spawned, by_world=True),
     "high_drac_rate": Metric(
         f"DRAC > {HIGH_DRAC:g} m/s²", SHARE, f"Agents whose largest DRAC exceeds {HIGH_DRAC:g} m/s², of all spawned agents.",
         lambda records: records["max_drac"] > HIGH_DRAC, _spawned),
     "mean_min_ttc_s": Metric(
-        "Mean TTC", "s", "Time to collision with the nearest other car, clamped to 10 s: mean over the steps at which it is finite, then over the "
-        "agents of a world with any such step, then over worlds with equal weight.",
+        "Mean TTC", "s", "Time to collision with the nearest other car, clamped to 10 s: mean over the steps at which it is finite, then "
+        "over the agents of a world with any such step, then over worlds with equal weight.",
         lambda records: records["mean_ttc_s"], lambda records: np.asarray(records["has_ttc"], bool), by_world=True),
     "near_miss_rate": Metric(
-        f"TTC < {NEAR_MISS_TTC:g} s", SHARE, f"Agents with a time to collision below {NEAR_MISS_TTC:g} s at any step: share of a world's spawned "
-        "agents, then mean over worlds with equal weight.", lambda records: records["min_ttc_s"] < NEAR_MISS_TTC, _spawned, by_world=True),
+        f"TTC < {NEAR_MISS_TTC:g} s", SHARE, f"Agents with a time to collision below {NEAR_MISS_TTC:g} s at any step: share of a world's "
+        "spawned agents, then mean over worlds with equal weight.",
+        lambda records: records["min_ttc_s"] < NEAR_MISS_TTC, _spawned, by_world=True),
     "mean_time_to_goal_s": Metric(
         "Time to goal", "s", "Mean time from start to goal of the agents that reached it.",
         lambda records: records["time_s"], lambda records: np.asarray(records["reached"], bool)),
@@ -225,7 +226,7 @@ def wilson(share: float, count: int) -> tuple[float, float]:
     z = 1.959963984540054
     middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
     half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    return float(max(middle - half, 0.0)), float(min(middle + half, 1.0))
+    return float(np.clip(middle - half, 0.0, share)), float(np.clip(middle + half, share, 1.0))
 
 
 def text(estimate: Estimate, *, signed: bool = False) -> str:
@@ -305,7 +306,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         options = [COLUMNS[name]] if name in COLUMNS else [int, float, bool, str]
         column = next((c for c in (_column(cells, option) for option in options) if c is not None), None)
         if column is None:
-            raise RecordsError(f"{path}: column {name!r} holds a cell that is no {options[0].__name__}; wanted {options[0].__name__} throughout")
+            raise RecordsError(f"{path}: column {name!r} holds a cell that is no {options[0].__name__}; every cell must be one")
         records[name] = column
     check(records)
     return records

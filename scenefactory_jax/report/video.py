@@ -5,12 +5,13 @@ reduced, which smooths the edges. Titles, clock and counters frame the picture.
 """
 
 import importlib.util
+import itertools
 import math
+import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import imageio
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
@@ -21,7 +22,7 @@ from scenefactory_jax.report.canvas import GROUND, INK, MARKS, QUIET, Colour, St
 
 _FINE = 2  # pictures are drawn at this many times their size and reduced
 _FLASH_S, _FADE_S = 1.2, 0.6  # how long an event is flashed, and a car that has finished fades
-_GAP = 6  # pixels between panels
+_GAP = 14  # pixels between panels
 _BINS = 6  # steps of fading along a trail
 
 
@@ -41,11 +42,12 @@ class _Stage(NamedTuple):
     happened: list[tuple[int, int, str]]  # (step, agent, event)
     counts: dict[str, np.ndarray]  # event -> [T] agents so far
     names: list[Image.Image]  # an agent's number, one image each
+    goals: list[Image.Image]  # the same for the fine picture
     labels: dict[str, Image.Image]  # event -> its label
 
 
 def write(
-    path: Path, trajectories: Sequence[Trajectory], *, fps: float, stride: int, columns: int, panel: int, trail_s: float
+    path: Path, trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int
 ) -> Path:
     """Write a video; `.gif` needs nothing more, `.mp4` needs the extra `video`.
 
@@ -74,15 +76,12 @@ def write(
         few = frames(trajectories, fps=fps, stride=max(longest // 6, 1), columns=columns, panel=panel, trail_s=trail_s)
         gif.write(path, pictures, colours=gif.palette(list(few), keep=_key_colours()), fps=fps)
         return path
-    settings = {"codec": "libx264", "macro_block_size": 2, "ffmpeg_log_level": "error", "output_params": ["-preset", "veryfast", "-crf", "20"]}
-    with imageio.get_writer(path, fps=fps, **settings) as writer:  # pyright: ignore[reportArgumentType]
-        for picture in pictures:
-            writer.append_data(picture)  # pyright: ignore[reportAttributeAccessIssue]
+    _write_mp4(path, pictures, fps=fps)
     return path
 
 
 def frames(
-    trajectories: Sequence[Trajectory], *, fps: float, stride: int, columns: int, panel: int, trail_s: float
+    trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """The pictures of `write`, one after the other; shorter worlds hold their last step.
 
@@ -104,7 +103,27 @@ def shown_steps(length: int, stride: int) -> list[int]:
     return steps if steps[-1] == length - 1 else [*steps, length - 1]
 
 
-def _film(stages: list[_Stage], *, fps: float, stride: int, columns: int, panel: int, trail_s: float) -> Iterator[np.ndarray]:
+def _write_mp4(path: Path, pictures: Iterator[np.ndarray], *, fps: float | int) -> None:
+    """Pipe raw pictures to the ffmpeg of imageio-ffmpeg; H.264 in 4:2:0, which every player shows."""
+    from imageio_ffmpeg import get_ffmpeg_exe  # an optional dependency
+
+    first = next(pictures)
+    height, width, _ = first.shape
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"]
+    target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "20", "-movflags", "+faststart", str(path)]
+    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            for picture in itertools.chain([first], pictures):
+                process.stdin.write(picture.tobytes())  # pyright: ignore[reportOptionalMemberAccess]
+        except BrokenPipeError:
+            pass  # ffmpeg gave up; its message follows
+        message = process.communicate()[1].decode(errors="replace").strip()
+    if process.returncode:
+        raise VideoError(f"{path}: ffmpeg could not write it: {message}")
+
+
+def _film(stages: list[_Stage], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int) -> Iterator[np.ndarray]:
     """Panels pasted on a sheet, frame by frame."""
     bar, rows = _bar(panel), math.ceil(len(stages) / columns)
     tall = panel + 2 * bar
@@ -125,15 +144,16 @@ def _film(stages: list[_Stage], *, fps: float, stride: int, columns: int, panel:
 
 def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
     """Everything of a world that does not change from frame to frame."""
-    canvas.check(trajectory)
+    trajectory = canvas.settle(trajectory)
     view = View(*canvas.around(canvas.places(trajectory), margin=9.0, smallest=50.0), panel * _FINE)
     steps = np.arange(len(trajectory.active))[:, None]
     last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
     events = {name: happened & trajectory.present for name, happened in trajectory.events.items()}
     happened = sorted((int(t), int(a), name) for name, where in events.items() for t, a in np.argwhere(where))
-    respawned = np.ndim(trajectory.goal) == 3
-    counts = {n: np.cumsum(e.sum(1)) if respawned else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()}
-    font = _font(max(9, panel // 44), bold=True)
+    again = canvas.respawns(trajectory)
+    counts = {n: np.cumsum(e.sum(1)) if again else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()}
+    small, bold = max(9, panel // 44), _font(max(9, panel // 44), bold=True)
+    numbers = [(str(agent), canvas.blend(canvas.colour_of(agent), INK, 0.7)) for agent in range(len(trajectory.present))]
     return _Stage(
         trajectory=trajectory,
         view=view,
@@ -143,8 +163,9 @@ def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
         ended=steps - last,
         happened=happened,
         counts=counts,
-        names=[_sprite(str(agent), font, canvas.colour_of(agent)) for agent in range(len(trajectory.present))],
-        labels={name: _sprite(mark.label, font, mark.colour) for name, mark in MARKS.items()},
+        names=[_sprite(number, bold, colour) for number, colour in numbers],
+        goals=[_sprite(number, _font(small * _FINE), colour) for number, colour in numbers],
+        labels={name: _sprite(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
     )
 
 
@@ -169,14 +190,14 @@ def road_image(lines: Sequence[Stroke], view: View) -> Image.Image:
     return image.reduce(2)
 
 
-def _draw_world(stage: _Stage, now: int, *, trail_s: float) -> Image.Image:
+def _draw_world(stage: _Stage, now: int, *, trail_s: float | int) -> Image.Image:
     """The picture between header and footer at one step."""
     image = stage.background.copy()
     draw = ImageDraw.Draw(image)
     _draw_trails(draw, stage, now, round(trail_s * stage.trajectory.control_hz))
     shares = np.clip(1 - stage.ended[now] / (_FADE_S * stage.trajectory.control_hz), 0.0, 1.0) * stage.trajectory.present
     on_stage = np.flatnonzero(shares > 0)
-    _draw_goals(draw, stage, now, on_stage, shares)
+    _draw_goals(image, stage, now, on_stage, shares)
     for agent in on_stage:
         _draw_car(draw, stage, now, int(agent), float(shares[agent]))
     flashes = _draw_marks(draw, stage, now)
@@ -193,10 +214,10 @@ def _draw_world(stage: _Stage, now: int, *, trail_s: float) -> Image.Image:
 def _draw_trails(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, length: int) -> None:
     """Where each car was in the last `length` steps, fading with age."""
     edges = np.unique(np.linspace(max(now - length, 0), now, _BINS + 1).round().astype(int))
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         strength = 0.75 * (1 - (now - last) / max(length, 1)) + 0.1
         for agent in np.flatnonzero(stage.driven[first + 1 : last + 1].any(axis=0)):
-            colour = canvas.blend(canvas.colour_of(agent), canvas.ASPHALT, strength)
+            colour = canvas.blend(canvas.colour_of(int(agent)), canvas.ASPHALT, strength)
             way, driven = stage.way[first : last + 1, agent], stage.driven[first + 1 : last + 1, agent]
             if driven.all():
                 draw.line(way.ravel().tolist(), fill=colour, width=2 * _FINE, joint="curve")
@@ -205,13 +226,14 @@ def _draw_trails(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, length: int
                     draw.line(way[step : step + 2].ravel().tolist(), fill=colour, width=2 * _FINE)
 
 
-def _draw_goals(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, agents: np.ndarray, shares: np.ndarray) -> None:
-    """A circle of the goal's radius with a dot, in the agent's colour."""
-    radius = canvas.GOAL_RADIUS * stage.view.pixels / stage.view.side
+def _draw_goals(image: Image.Image, stage: _Stage, now: int, agents: np.ndarray, shares: np.ndarray) -> None:
+    """A circle of the goal's radius with the agent's number, in its colour."""
+    draw, reach = ImageDraw.Draw(image), canvas.GOAL_RADIUS * stage.view.pixels / stage.view.side
     for agent, (x, y) in zip(agents, canvas.to_pixels(stage.view, canvas.goal_at(stage.trajectory, now)[agents]), strict=True):
-        colour = canvas.blend(canvas.colour_of(agent), canvas.ASPHALT, 0.9 * shares[agent])
-        for reach, fill, width in ((radius, None, round(1.6 * _FINE)), (1.6 * _FINE, colour, 1)):
-            draw.ellipse((x - reach, y - reach, x + reach, y + reach), fill=fill, outline=colour, width=width)
+        colour = canvas.blend(canvas.colour_of(int(agent)), canvas.ASPHALT, 0.9 * float(shares[agent]))
+        draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=colour, width=round(1.6 * _FINE))
+        if shares[agent] == 1.0:
+            _stamp(image, stage.goals[agent], x, y)
 
 
 def _draw_car(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, agent: int, share: float) -> None:
@@ -234,7 +256,7 @@ def _draw_marks(draw: ImageDraw.ImageDraw, stage: _Stage, now: int) -> list[tupl
         if age < 0 or (age > 1 and name == "reached"):
             continue
         x, y = (float(v) for v in stage.way[step, agent])
-        size = (7.0 + 9.0 * (1 - age) if age <= 1 else 5.0) * _FINE
+        size = (7.0 + 6.0 * (1 - age) if age <= 1 else 5.0) * _FINE
         draw_mark(draw, name, x, y, size, thick=2 * _FINE)
         if age <= 1:
             flashes.append((x, y, name))
@@ -281,11 +303,11 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
     draw.text((left, top + bar // 2), f"{now / stage.trajectory.control_hz:.1f} s", font=font, fill=INK, anchor="lm")
     right = left + panel
     total = int(stage.trajectory.present.sum())
-    for name in reversed(list(stage.counts)):
+    for name in [name for name in reversed(MARKS) if name in stage.counts]:
         count = int(stage.counts[name][now])
         if name == "fault" and not count:
             continue
-        once = name == "reached" and np.ndim(stage.trajectory.goal) == 2
+        once = name == "reached" and not canvas.respawns(stage.trajectory)
         entry = f"{MARKS[name].label} {count}" + (f" of {total}" if once else "")
         draw.text((right, top + bar // 2), entry, font=font, fill=MARKS[name].colour if count else QUIET, anchor="rm")
         right -= round(font.getlength(entry)) + 12
@@ -294,11 +316,11 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
 def _draw_legend(sheet: Image.Image, top: int, panel: int, *, speed: float) -> None:
     """What the shapes mean, along the bottom."""
     draw, bar, font = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel) - 1)
-    x, middle = _GAP + 7, top + bar // 2 - 2
+    x, middle = _GAP + 8, top + bar // 2 - 2
     patch = Image.new("RGB", (16 * 4, 16 * 4), (255, 255, 255))
     for name, mark in MARKS.items():
         patch.paste((255, 255, 255), (0, 0, 64, 64))
-        draw_mark(ImageDraw.Draw(patch), name, 32, 32, 24, thick=7)
+        draw_mark(ImageDraw.Draw(patch), name, 32.0, 32.0, 24.0, thick=7)
         sheet.paste(patch.reduce(4), (x - 7, middle - 8))
         draw.text((x + 12, middle), mark.label, font=font, fill=INK, anchor="lm")
         x += 26 + round(font.getlength(mark.label))

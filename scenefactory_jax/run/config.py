@@ -1,5 +1,6 @@
 """Hydra configs -> plain dicts. Hydra decides nothing but configuration; past this door there are only mappings."""
 
+import copy
 import re
 from collections.abc import Mapping, Sequence
 from importlib import metadata
@@ -42,12 +43,16 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     known = sorted(path.stem for path in folder().glob("*.yaml"))
     if name not in known:
         raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
-    GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(folder()), version_base="1.3"):
-            return plain(hydra_compose(name, overrides=list(overrides)))
+        return _compose(name, overrides)
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(name, error)) from error
+        raise ConfigError(_explain(name, error)) from None
+
+
+def _compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(folder()), version_base="1.3"):
+        return plain(hydra_compose(name, overrides=list(overrides)))
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -63,7 +68,10 @@ def _explain(name: str, error: Exception) -> str:
     if not match:
         return text
     path = match.group(1).split(".")
-    node: Any = load(name)
+    try:
+        node: Any = _compose(name, [])
+    except (ConfigCompositionException, HydraException, OmegaConfBaseException):
+        return text  # the config itself is at fault
     for depth, key in enumerate(path):
         if not isinstance(node, Mapping) or key not in node:
             where = ".".join(path[:depth]) or "the top level"
@@ -83,6 +91,30 @@ def read(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise ConfigError(f"{path} is no run: it has no config.yaml; give the folder that `train` wrote")
     return yaml.safe_load(file.read_text())
+
+
+def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A run's config with other settings: `dynamics=bicycle` replaces a whole group of the environment, `timing.episode_s=20` one number.
+
+    Raises:
+        ConfigError: no such group, option or key in the run's config, with the valid ones.
+    """
+    result = copy.deepcopy(dict(config))
+    for override in overrides:
+        path, separator, value = override.partition("=")
+        *parents, last = path.split(".")
+        if not separator:
+            raise ConfigError(f"overrides: {override!r} is no setting; write key=value")
+        if not parents and (folder() / last).is_dir():
+            result[last] = load("task", override)[last]
+            continue
+        node: Any = result
+        for key in [*parents, last]:
+            if not isinstance(node, Mapping) or key not in node:
+                raise ConfigError(f"overrides: {path}: the run has no {key!r} there; valid: {', '.join(sorted(map(str, node)))}")
+            node, holder = node[key], node
+        holder[last] = yaml.safe_load(value)
+    return result
 
 
 def write(path: Path, config: Mapping[str, Any]) -> None:

@@ -1,0 +1,127 @@
+"""Kinematic single-track cars: one integration a control step, no forces, no tyres.
+
+The same wheelbase, steering limit and longitudinal capability as the articulated car, so that the two differ in physics and in nothing
+else. Contact is reported with the articulated cars' contact model, as the force that would act, and moves nobody.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.build import build
+from scenefactory_jax.geometry import heading
+from scenefactory_jax.struct import struct
+from scenefactory_jax.types import Dynamics, Motion, Scene
+
+GRAVITY = 9.81
+
+
+@struct
+class Body:
+    """Cars of one world; every leaf has the agent axis first."""
+
+    position: Float[Array, "A 2"]  # of the box's centre
+    yaw: Float[Array, " A"]
+    speed: Float[Array, " A"]
+    steer: Float[Array, " A"]
+    slip_angle: Float[Array, " A"]  # between the heading and the velocity of the box's centre
+    yaw_rate: Float[Array, " A"]
+    contact_force: Float[Array, " A"]
+    grip: Float[Array, " A"]
+    grip_use: Float[Array, " A"]
+
+
+def make(
+    *,
+    wheelbase: float,
+    rear_length: float,
+    centre_height: float,
+    steering_limit: float,
+    acceleration: float,
+    deceleration: float,
+    drag: float,
+    speed_limit: float,
+    contact: dict[str, Any],
+    grip: Callable[..., Any],
+    control_dt: float,
+) -> Dynamics:
+    """Kinematic bicycles, facts sheet 6.6, integrated once a control step as the paper says (the published code does it four times).
+
+    Args:
+        wheelbase: m.
+        rear_length: from the rear axle to the box's centre, m.
+        centre_height: of the box's centre above the ground, m.
+        steering_limit: rad; steering follows the command at once.
+        acceleration: at full throttle, m/s^2.
+        deceleration: at full brake, m/s^2; it stops the car and never reverses it.
+        drag: deceleration per speed, 1/s.
+        speed_limit: m/s.
+        contact: stiffness, damping and friction of `contact.forces`.
+        grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `grip_use` is the acceleration over friction times
+            gravity and exceeds one where a real car would slide.
+
+    Raises:
+        ConfigError: an unknown or missing number of `contact`.
+    """
+    entry = {**contact, "_target_": "forces"}
+    meet = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)
+
+    def init(scene: Scene) -> Body:
+        agents = scene.agents
+        zero = jnp.zeros(agents.yaw.shape, jnp.float32)
+        return Body(agents.position, agents.yaw, agents.speed, zero, zero, zero, zero, zero, zero)
+
+    def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
+        action = jnp.clip(action, -1.0, 1.0)
+        push = acceleration * jnp.maximum(action[:, 0], 0.0) - deceleration * jnp.maximum(action[:, 2], 0.0) - drag * body.speed
+        speed = jnp.clip(body.speed + push * control_dt, 0.0, speed_limit)
+        mean = 0.5 * (body.speed + speed)
+        steer = steering_limit * action[:, 1]
+        slip_angle = jnp.arctan(rear_length / wheelbase * jnp.tan(steer))
+        yaw_rate = mean * jnp.cos(slip_angle) * jnp.tan(steer) / wheelbase
+        # the chord of an arc points along the heading half way
+        along = heading(body.yaw + 0.5 * yaw_rate * control_dt + slip_angle)
+        position = body.position + mean[:, None] * control_dt * along
+        mu = grip(scene.weather, body.position, body.speed)
+        wanted = jnp.sqrt(jnp.maximum(((speed - body.speed) / control_dt) ** 2 + (mean * yaw_rate) ** 2, 1e-12))
+        moved = Body(
+            position=position,
+            yaw=body.yaw + yaw_rate * control_dt,
+            speed=speed,
+            steer=steer,
+            slip_angle=slip_angle,
+            yaw_rate=yaw_rate,
+            contact_force=jnp.zeros_like(speed),
+            grip=mu,
+            grip_use=wanted / (mu * GRAVITY),
+        )
+        motion = read(moved)
+        _, _, force = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
+        zero = jnp.zeros_like(speed)
+        held = Body(
+            body.position, body.yaw, body.speed, body.steer, body.slip_angle, body.yaw_rate, contact_force=zero, grip=body.grip, grip_use=zero
+        )
+        keep = lambda new, old: jnp.where(active.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+        return jax.tree.map(keep, Body(**{**vars(moved), "contact_force": force}), held)
+
+    def read(body: Body) -> Motion:
+        flat = body.speed[:, None] * heading(body.yaw + body.slip_angle)
+        zero = jnp.zeros_like(body.speed)
+        return Motion(
+            position=jnp.concatenate([body.position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
+            velocity=jnp.concatenate([flat, zero[:, None]], axis=-1),
+            yaw=jnp.arctan2(jnp.sin(body.yaw), jnp.cos(body.yaw)),
+            yaw_rate=body.yaw_rate,
+            upright=jnp.ones_like(zero),
+            steer=body.steer,
+            contact_force=body.contact_force,
+            grip=body.grip,
+            grip_use=body.grip_use,
+            slip=zero,
+        )
+
+    return Dynamics(init=init, advance=advance, read=read)

@@ -1,0 +1,206 @@
+"""Late-fusion policy: every observation group has its own encoder, what they say is joined, a trunk decides (paper, section 4).
+
+Actor and critic are two towers without shared weights. Vector groups are concatenated in the order of their names and go through one
+encoder; each set of rows goes through its own row encoder and is max-pooled over the rows that its mask shows. An observation group that
+a config adds is picked up by its kind: a vector joins the vector encoder, rows get an encoder of `rows_default` widths.
+
+Rows are pooled before the last activation, which is the same since activations increase. A pooled channel depends on one row alone, its
+winner, so that the gradient recomputes the winners and keeps no activation of the others: exact, and the largest saving in training.
+
+Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
+"""
+
+import functools
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.types import Observation, Policy, Rows
+
+ACTIONS = 3  # throttle, steer, brake
+
+# Increasing, and zero at zero: only so may rows be pooled before the activation, and an empty set be zeros on both sides of it
+ACTIVATIONS = {"elu": jax.nn.elu, "relu": jax.nn.relu, "tanh": jnp.tanh}
+
+
+def make(
+    *,
+    vector: list[int],
+    rows: dict[str, list[int]],
+    rows_default: list[int],
+    trunk: list[int],
+    activation: Literal["elu", "relu", "tanh"],
+    log_std_init: float,
+    actor_head_scale: float,
+    dtype: Literal["float32", "bfloat16"],
+) -> Policy:
+    """Two late-fusion towers and a state-independent log standard deviation.
+
+    Args:
+        vector: widths of the encoder of all vector groups together.
+        rows: widths of the row encoder of each named group of rows.
+        rows_default: widths for groups of rows that `rows` does not name.
+        trunk: widths of the layers between fusion and head.
+        log_std_init: logarithm of the first standard deviation of every action.
+        actor_head_scale: gain of the orthogonal kernel of the actor's last layer; small, so that the first actions are near zero whatever
+            is seen (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's
+            default there.
+        dtype: of activations; parameters, means and values stay float32.
+
+    Raises:
+        ConfigError: a width below one; at `init`, an observation without groups, or widths for a group of rows that it does not have.
+    """
+    named = {"vector": vector, "rows_default": rows_default, "trunk": trunk}
+    for name, widths in {**named, **{f"rows.{group}": widths for group, widths in rows.items()}}.items():
+        if not widths or min(widths) < 1:
+            raise ConfigError(f"policy.{name}: {list(widths)} are no layer widths; wanted is a list of positive numbers")
+    network = ActorCritic(
+        vector=tuple(vector),
+        rows=tuple((name, tuple(widths)) for name, widths in sorted(rows.items())),
+        rows_default=tuple(rows_default),
+        trunk=tuple(trunk),
+        activation=activation,
+        log_std_init=float(log_std_init),
+        actor_head_scale=float(actor_head_scale),
+        dtype=dtype,
+    )
+
+    def init(key: PRNGKeyArray, observation: Observation) -> Any:
+        groups = sorted(name for name, group in observation.items() if isinstance(group, Rows))
+        if unknown := sorted(set(rows) - set(groups)):
+            raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such group of rows; valid: {', '.join(groups) or 'none'}")
+        if not observation:
+            raise ConfigError("policy: the observation has no group at all; add one to `observe`")
+        return network.init(key, observation)
+
+    return Policy(init, network.apply)  # pyright: ignore[reportArgumentType]
+
+
+class ActorCritic(nn.Module):
+    """Both towers and the log standard deviation: observation -> (mean, log_std, value)."""
+
+    vector: tuple[int, ...]
+    rows: tuple[tuple[str, tuple[int, ...]], ...]
+    rows_default: tuple[int, ...]
+    trunk: tuple[int, ...]
+    activation: str
+    log_std_init: float
+    actor_head_scale: float
+    dtype: str
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
+        shared = {name: getattr(self, name) for name in ("vector", "rows", "rows_default", "trunk", "activation", "dtype")}
+        mean = Tower(**shared, outputs=ACTIONS, head_scale=self.actor_head_scale, name="actor")(observation)
+        value = Tower(**shared, outputs=1, head_scale=1.0, name="critic")(observation)
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (ACTIONS,), jnp.float32)
+        return mean, log_std, value[..., 0]
+
+
+class Tower(nn.Module):
+    """Encoders, fusion, trunk and a linear head."""
+
+    vector: tuple[int, ...]
+    rows: tuple[tuple[str, tuple[int, ...]], ...]
+    rows_default: tuple[int, ...]
+    trunk: tuple[int, ...]
+    activation: str
+    dtype: str
+    outputs: int
+    head_scale: float
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> Float[Array, "*batch outputs"]:
+        activate = ACTIVATIONS[self.activation]
+        widths = dict(self.rows)
+        vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, Rows)]
+        fused = []
+        if vectors:
+            layers = Layers(self.vector, self.activation, self.dtype, name="vector")
+            fused.append(activate(layers(jnp.concatenate(vectors, axis=-1))))
+        for name, group in sorted(observation.items()):
+            if isinstance(group, Rows):
+                layers = Layers(widths.get(name, self.rows_default), self.activation, self.dtype, name=f"{name}_rows")
+                fused.append(activate(layers(group.features, group.mask)))
+        x = activate(Layers(self.trunk, self.activation, self.dtype, name="trunk")(jnp.concatenate(fused, axis=-1)))
+        head = nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.head_scale), dtype=jnp.float32, name="head")
+        return head(x.astype(jnp.float32))
+
+
+class Layers(nn.Module):
+    """Dense layers with activations between them and none after the last; with a mask, max-pooled over the rows of a set."""
+
+    widths: tuple[int, ...]
+    activation: str
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "..."], mask: Bool[Array, "..."] | None = None) -> Float[Array, "..."]:
+        weights, inputs = [], x.shape[-1]
+        for index, width in enumerate(self.widths):
+            weights.append(Affine(inputs, width, name=f"layer_{index}")())
+            inputs = width
+        weights, x = jax.tree.map(lambda leaf: leaf.astype(self.dtype), (weights, x))
+        return affine(self.activation, weights, x) if mask is None else encode_set(self.activation, weights, x, mask)
+
+
+class Affine(nn.Module):
+    """Kernel and bias of one dense layer, initialised as `flax.linen.Dense` does."""
+
+    inputs: int
+    outputs: int
+
+    @nn.compact
+    def __call__(self) -> tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]]:
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.inputs, self.outputs), jnp.float32)
+        return kernel, self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32)
+
+
+def affine(activation: str, weights: list, x: Float[Array, "*batch F"]) -> Float[Array, "*batch G"]:
+    """x through dense layers with activations between them."""
+    for index, (kernel, bias) in enumerate(weights):
+        x = (ACTIVATIONS[activation](x) if index else x) @ kernel + bias
+    return x
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def encode_set(activation: str, weights: list, x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[Array, "*batch G"]:
+    """Rows through `affine`, then the largest value of each channel over the rows that the mask shows; zeros for an empty set.
+
+    Of equal rows the first one takes the gradient. Forward-mode differentiation is not defined.
+    """
+    return pool(affine(activation, weights, x), mask)
+
+
+def pool(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[Array, "*batch F"]:
+    """Largest value of each channel over the rows that the mask shows; zeros for an empty set."""
+    largest = jnp.max(jnp.where(mask[..., None], x, -jnp.inf), axis=-2, initial=-jnp.inf)
+    return jnp.where(jnp.any(mask, axis=-1)[..., None], largest, 0.0)
+
+
+def _encode_forward(activation: str, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:
+    rows = jnp.where(mask[..., None], affine(activation, weights, x), -jnp.inf)
+    shown = jnp.any(mask, axis=-1)[..., None]
+    winner = jnp.argmax(rows, axis=-2).astype(jnp.int32)
+    return jnp.where(shown, jnp.max(rows, axis=-2), 0.0), (weights, x, winner, shown)
+
+
+def _encode_backward(activation: str, kept: tuple, cotangent: Array) -> tuple[list, Array, None]:
+    weights, x, winner, shown = kept
+
+    def at_winners(weights: list, x: Array) -> Array:
+        rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the row that each channel took
+        kernel, bias = weights[-1]
+        if len(weights) > 1:
+            rows = ACTIVATIONS[activation](affine(activation, weights[:-1], rows))
+        return jnp.where(shown, jnp.einsum("...gh,hg->...g", rows, kernel) + bias, 0.0)
+
+    _, pull = jax.vjp(at_winners, weights, x)
+    return (*pull(cotangent), None)
+
+
+encode_set.defvjp(_encode_forward, _encode_backward)

@@ -1,0 +1,179 @@
+"""Train states on disk, by orbax: a folder of checkpoints, one for each saved iteration.
+
+A checkpoint is written aside and renamed when it is whole, so that an interrupted save leaves the ones before it as they were. On disk
+stand plain nested dicts of arrays, named as the fields and keys of the train state; random keys as their data, empty arrays not at all.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from jaxtyping import Array
+
+from scenefactory_jax.build import ConfigError
+
+LEARNT, REST = "parameters", "rest"  # apart, so that an evaluation reads no more than it needs
+
+
+def save(folder: Path | str, train_state: Any, *, keep: int) -> Path:
+    """Write a train state under its iteration's number and keep the `keep` newest checkpoints of the folder.
+
+    Blocks until the checkpoint is whole: the train state may be donated afterwards.
+
+    Raises:
+        ConfigError: `keep` below one.
+    """
+    if keep < 1:
+        raise ConfigError(f"keep: {keep} checkpoints; wanted is at least 1")
+    iteration = int(train_state.iteration)
+    learnt, rest = _halves(_stored(train_state))
+    with _manager(Path(folder), keep=keep) as manager:
+        if iteration in manager.all_steps():
+            manager.delete(iteration)
+        halves = ocp.args.Composite(parameters=ocp.args.StandardSave(learnt), rest=ocp.args.StandardSave(rest))
+        manager.save(iteration, args=halves, force=True)
+    return Path(folder) / str(iteration)
+
+
+def latest(folder: Path | str) -> int | None:
+    """Iteration of the newest whole checkpoint; None if the folder holds none."""
+    if not Path(folder).is_dir():
+        return None
+    with _manager(Path(folder)) as manager:
+        return manager.latest_step()
+
+
+def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
+    """The train state of an iteration (the newest by default), in the structure and on the devices of `like`.
+
+    Args:
+        like: a train state of the same config, for example a fresh `trainer.init(...)`.
+
+    Raises:
+        FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
+        ConfigError: the checkpoint was made with another config; the message names the arrays that differ.
+    """
+    wanted = _stored(like)
+    with _manager(Path(folder)) as manager:
+        step = _find(manager, Path(folder), iteration)
+        held = manager.item_metadata(step)
+        shapes = {name: (tuple(x.shape), str(x.dtype)) for name, x in wanted.items()}
+        _compare(_shapes(held[LEARNT], LEARNT) | _shapes(held[REST]), shapes, f"{folder}: checkpoint {step}")
+        learnt, rest = _halves(wanted)
+        halves = ocp.args.Composite(parameters=ocp.args.StandardRestore(learnt), rest=ocp.args.StandardRestore(rest))
+        found = manager.restore(step, args=halves)
+    flat = _flat(found[LEARNT], LEARNT) | _flat(found[REST])
+    return _like(flat, like)
+
+
+def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
+    """Only what the policy learnt, as nested dicts of numpy arrays: for evaluation, on whatever device.
+
+    Raises:
+        FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
+    """
+    with _manager(Path(folder)) as manager:
+        step = _find(manager, Path(folder), iteration)
+        plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), manager.item_metadata(step)[LEARNT], is_leaf=_is_metadata)
+        found = manager.restore(step, args=ocp.args.Composite(parameters=ocp.args.StandardRestore(plain)))
+    return jax.tree.map(np.asarray, found[LEARNT])
+
+
+@contextlib.contextmanager
+def _manager(folder: Path, *, keep: int | None = None) -> Iterator[ocp.CheckpointManager]:
+    options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=keep is not None, enable_async_checkpointing=False)
+    handlers = {LEARNT: ocp.StandardCheckpointHandler(), REST: ocp.StandardCheckpointHandler()}
+    with ocp.CheckpointManager(folder.absolute(), options=options, item_handlers=handlers) as manager:
+        yield manager
+
+
+def _find(manager: ocp.CheckpointManager, folder: Path, iteration: int | None) -> int:
+    held = sorted(manager.all_steps())
+    if not held:
+        raise FileNotFoundError(f"{folder}: no checkpoint there")
+    if iteration is not None and iteration not in held:
+        raise FileNotFoundError(f"{folder}: no checkpoint of iteration {iteration}; there are {', '.join(map(str, held))}")
+    return held[-1] if iteration is None else iteration
+
+
+def _compare(held: dict[str, tuple], wanted: dict[str, tuple], where: str) -> None:
+    """Refuse a checkpoint whose arrays differ, in shape or type, from the wanted ones."""
+    differ = [name for name in sorted(held.keys() | wanted.keys()) if held.get(name) != wanted.get(name)]
+    learnt = [name for name in differ if name.startswith(f"{LEARNT}/")]
+    told = learnt or differ  # moments of differing parameters differ too: no news
+    if not told:
+        return
+    lines = []
+    for name in told[:8]:
+        there, here = held.get(name), wanted.get(name)
+        if there is None or here is None:
+            lines.append(f"checkpoint has {'no' if there is None else 'a'} {name}, config wants {'none' if here is None else 'one'}")
+        else:
+            which = int(there[0] == here[0])  # the shape, or if that is the same, the type
+            lines.append(f"checkpoint has {name} {there[which]}, config wants {here[which]}")
+    more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
+    raise ConfigError(f"{where} does not fit this config: {'; '.join(lines)}{more}")
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+    """Leaves and their paths: 'parameters/params/actor/trunk/layer_0/kernel'."""
+    return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def _stored(train_state: Any) -> dict[str, Array]:
+    """What goes to disk, by name."""
+    return {name: _data(leaf) for name, leaf in _named(train_state) if leaf.size}
+
+
+def _data(leaf: Any) -> Array:
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def _like(flat: dict[str, Any], like: Any) -> Any:
+    """`like` with the values of `flat`."""
+
+    def put(name: str, leaf: Any) -> Any:
+        if not leaf.size:
+            return leaf
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(flat[name], impl=jax.random.key_impl(leaf))
+        return flat[name]
+
+    return jax.tree.unflatten(jax.tree.structure(like), [put(name, leaf) for name, leaf in _named(like)])
+
+
+def _halves(stored: dict[str, Any]) -> tuple[dict, dict]:
+    """(what was learnt, the rest), nested."""
+    prefix = f"{LEARNT}/"
+    learnt = {name.removeprefix(prefix): x for name, x in stored.items() if name.startswith(prefix)}
+    return _nest(learnt), _nest({name: x for name, x in stored.items() if not name.startswith(prefix)})
+
+
+def _nest(flat: dict[str, Any]) -> dict:
+    nested: dict = {}
+    for name, leaf in flat.items():
+        *path, last = name.split("/")
+        inner = nested
+        for part in path:
+            inner = inner.setdefault(part, {})
+        inner[last] = leaf
+    return nested
+
+
+def _flat(nested: Any, prefix: str = "") -> dict[str, Any]:
+    return {f"{prefix}/{name}" if prefix else name: leaf for name, leaf in _named(nested)}
+
+
+def _shapes(metadata: Any, prefix: str = "") -> dict[str, tuple]:
+    flat = jax.tree_util.tree_leaves_with_path(metadata, is_leaf=_is_metadata)
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): (tuple(m.shape), str(np.dtype(m.dtype))) for path, m in flat}
+    return {f"{prefix}/{name}" if prefix else name: what for name, what in named.items()}
+
+
+def _is_metadata(x: Any) -> bool:
+    return hasattr(x, "shape") and hasattr(x, "dtype")

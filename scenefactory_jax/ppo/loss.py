@@ -1,0 +1,102 @@
+"""The PPO loss (Schulman et al. 2017) with the details of RSL-RL: clipped value loss, exact KL of diagonal Gaussians.
+
+Every mean is over the samples that carry weight: a slot without an active agent moves nothing.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.struct import struct
+from scenefactory_jax.types import Observation, Policy
+
+
+@struct
+class Batch:
+    """Samples to learn from, in any order; what the policy said about them when it acted."""
+
+    observation: Observation
+    action: Float[Array, "N 3"]
+    mean: Float[Array, "N 3"]
+    log_probability: Float[Array, " N"]
+    value: Float[Array, " N"]
+    advantage: Float[Array, " N"]
+    returns: Float[Array, " N"]
+    weight: Float[Array, " N"]
+
+
+def ppo(
+    parameters: Any, batch: Batch, log_std_old: Float[Array, " 3"], *, policy: Policy, clip: float, entropy: float, value: float
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Clipped surrogate + value loss - entropy bonus, and what is worth watching.
+
+    Args:
+        log_std_old: of the policy that acted.
+        clip: epsilon of both the probability ratio and the value's distance from the value at acting time.
+        entropy: weight of the entropy bonus.
+        value: weight of the value loss.
+    """
+    mean, log_std, estimate = policy.apply(parameters, batch.observation)
+    weight = batch.weight
+
+    log_ratio = log_probability(batch.action, mean, log_std) - batch.log_probability
+    ratio = jnp.exp(log_ratio)
+    surrogate = jnp.minimum(ratio * batch.advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * batch.advantage)
+    policy_loss = -weighted_mean(surrogate, weight)
+
+    near = batch.value + jnp.clip(estimate - batch.value, -clip, clip)
+    value_loss = weighted_mean(jnp.maximum((estimate - batch.returns) ** 2, (near - batch.returns) ** 2), weight)
+
+    bonus = weighted_mean(jnp.broadcast_to(gaussian_entropy(log_std), weight.shape), weight)
+    loss = policy_loss + value * value_loss - entropy * bonus
+    facts = {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "entropy": bonus,
+        "kl": weighted_mean(kl(batch.mean, log_std_old, mean, log_std), weight),
+        "clip_fraction": weighted_mean((jnp.abs(ratio - 1.0) > clip).astype(jnp.float32), weight),
+    }
+    return loss, jax.lax.stop_gradient(facts)
+
+
+def log_probability(
+    action: Float[Array, "*batch D"], mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]
+) -> Float[Array, "*batch"]:
+    """Log density of an action, before any clipping, under a diagonal Gaussian."""
+    z = (action - mean) * jnp.exp(-log_std)
+    return -0.5 * jnp.sum(z**2 + 2.0 * log_std + jnp.log(2.0 * jnp.pi), axis=-1)
+
+
+def gaussian_entropy(log_std: Float[Array, " D"]) -> Float[Array, ""]:
+    """Differential entropy of a diagonal Gaussian, nats."""
+    return jnp.sum(log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e))
+
+
+def kl(
+    mean_old: Float[Array, "*batch D"], log_std_old: Float[Array, " D"], mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]
+) -> Float[Array, "*batch"]:
+    """KL(old || new) of diagonal Gaussians, nats."""
+    variance_ratio = jnp.exp(2.0 * (log_std_old - log_std))
+    shift = (mean_old - mean) * jnp.exp(-log_std)
+    return 0.5 * jnp.sum(variance_ratio + shift**2 - 1.0 - 2.0 * (log_std_old - log_std), axis=-1)
+
+
+def weighted_mean(x: Float[Array, "*batch"], weight: Float[Array, "*batch"]) -> Float[Array, ""]:
+    """Mean over what carries weight; zero if nothing does. A value without weight may be anything, even NaN."""
+    return jnp.sum(jnp.where(weight > 0.0, x * weight, 0.0)) / jnp.maximum(jnp.sum(weight), 1e-8)
+
+
+def normalise(x: Float[Array, "*batch"], weight: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """To zero mean and unit standard deviation over what carries weight; zero elsewhere."""
+    centred = jnp.where(weight > 0.0, x - weighted_mean(x, weight), 0.0)
+    return centred / (jnp.sqrt(weighted_mean(centred**2, weight)) + 1e-8)
+
+
+def explained_variance(value: Float[Array, "*batch"], returns: Float[Array, "*batch"], weight: Float[Array, "*batch"]) -> Float[Array, ""]:
+    """1 - Var[return - value] / Var[return]: 1 is a perfect critic, 0 one no better than a constant."""
+    error = returns - value
+    spread = weighted_mean((returns - weighted_mean(returns, weight)) ** 2, weight)
+    left = weighted_mean((error - weighted_mean(error, weight)) ** 2, weight)
+    return 1.0 - left / jnp.maximum(spread, 1e-8)

@@ -1,0 +1,120 @@
+"""Acting: a scan over time of policy, environment and restarts, for all worlds at once."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from scenefactory_jax.ppo.loss import log_probability
+from scenefactory_jax.struct import struct
+from scenefactory_jax.types import Env, Observation, Outcome, Policy, Scene, State
+
+
+@struct
+class Lives:
+    """What each slot's agent has collected since its own start."""
+
+    returns: Float[Array, "W A"]  # undiscounted
+    steps: Float[Array, "W A"]
+
+
+@struct
+class Sample:
+    """One step of every slot, as the learner needs it."""
+
+    observation: Observation
+    action: Float[Array, "W A 3"]  # before the environment's clipping
+    mean: Float[Array, "W A 3"]
+    log_probability: Float[Array, "W A"]
+    value: Float[Array, "W A"]
+    reward: Float[Array, "W A"]
+    active: Bool[Array, "W A"]  # on stage before the step
+    done: Bool[Array, "W A"]  # ended by an event in the step
+    truncated: Bool[Array, "W A"]  # alive when the world's time ran out in the step
+
+
+Tally = dict[str, Array]
+"""Sums over worlds and agents of one step: what metrics are made of."""
+
+
+def collect(
+    env: Env,
+    policy: Policy,
+    parameters: Any,
+    scenes: Scene,
+    worlds: State,
+    observation: Observation,
+    lives: Lives,
+    key: PRNGKeyArray,
+    *,
+    horizon: int,
+) -> tuple[State, Observation, Lives, Sample, Tally]:
+    """Act for `horizon` steps in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
+
+    Returns:
+        worlds and observation to go on from, lives, samples `[T, W, A]`, and tallies summed over time.
+    """
+
+    def step(carry: tuple[State, Observation, Lives], key: PRNGKeyArray) -> tuple[tuple[State, Observation, Lives], tuple[Sample, Tally]]:
+        worlds, observation, lives = carry
+        action_key, start_key = jax.random.split(key)
+        mean, log_std, value = policy.apply(parameters, observation)
+        action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape, mean.dtype)
+        after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
+        truncated = outcome.truncated[:, None] & worlds.active & ~outcome.done
+        sample = Sample(
+            observation=observation,
+            action=action,
+            mean=mean,
+            log_probability=log_probability(action, mean, log_std),
+            value=value,
+            reward=jnp.where(worlds.active, outcome.reward, 0.0),
+            active=worlds.active,
+            done=outcome.done & worlds.active,
+            truncated=truncated,
+        )
+        lives, counts = _tally(worlds, outcome, sample, lives)
+        fresh = jax.vmap(env.start)(jax.random.split(start_key, outcome.over.shape[0]), scenes)
+        worlds = choose_worlds(outcome.over, fresh, after)
+        return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
+
+    (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
+    return worlds, observation, lives, samples, jax.tree.map(lambda x: jnp.sum(x, axis=0), counts)
+
+
+def choose_worlds(condition: Bool[Array, " W"], chosen: State, other: State) -> State:
+    """World by world, one of two states."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, chosen, other)
+
+
+def no_lives(worlds: State) -> Lives:
+    """Nothing collected yet."""
+    return Lives(jnp.zeros(worlds.active.shape, jnp.float32), jnp.zeros(worlds.active.shape, jnp.float32))
+
+
+def _tally(worlds: State, outcome: Outcome, sample: Sample, lives: Lives) -> tuple[Lives, Tally]:
+    """Carry lives on, and sum up the step. Float32 holds sums of up to 16.7 million agent steps exactly."""
+
+    def total(x: Array, where: Array) -> Array:
+        return jnp.sum(jnp.where(where, x, 0), dtype=jnp.float32)
+
+    active, ended = sample.active, sample.done | sample.truncated
+    lives = Lives(lives.returns + sample.reward, lives.steps + active)
+    counts = {
+        "spawned": jnp.sum(worlds.agents.present, dtype=jnp.int32),
+        "active": total(active, active),
+        "reward": total(sample.reward, active),
+        "speed": total(outcome.facts.speed, active),
+        "ended": total(ended, ended),
+        "return": total(lives.returns, ended),
+        "length": total(lives.steps, ended),
+        **{f"reward/{name}": total(term, active) for name, term in outcome.terms.items()},
+        **{f"events/{name}": total(event, active) for name, event in vars(outcome.events).items()},
+    }
+    gone = ended | outcome.over[:, None]
+    return Lives(jnp.where(gone, 0.0, lives.returns), jnp.where(gone, 0.0, lives.steps)), counts

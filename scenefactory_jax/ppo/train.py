@@ -1,0 +1,273 @@
+"""Multi-agent PPO: one jitted iteration = rollout, advantages, epochs of minibatches. All agents share one policy.
+
+    trainer = make(env, policy, horizon=128, ...)
+    train_state = trainer.init(key, scenes)                         # scenes: worlds stacked along the first axis
+    train_state, metrics = trainer.iterate(train_state, scenes)     # `train_state` is donated: use the returned one
+
+Scenes are an argument of the compiled functions, never a constant in them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ppo import gae, loss, rollout, update
+from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.types import Env, Observation, Policy, Scene, State
+
+Metrics = dict[str, Float[Array, ""]]
+MILLION = 1_000_000
+
+
+@struct
+class TrainState:
+    """All that training carries from one iteration to the next: saving it and going on is the same as going on."""
+
+    parameters: Any
+    optimiser: optax.OptState
+    worlds: State  # with the axis W in front
+    observation: Observation  # of `worlds`
+    lives: rollout.Lives
+    key: PRNGKeyArray
+    iteration: Int[Array, ""]
+    steps: Int[Array, " 2"]  # steps of spawned slots so far: whole millions and the rest, since int32 ends at 2.1 billion
+
+
+class Trainer(NamedTuple):
+    """Training as functions of a train state. `restart` puts all worlds at their start in other scenes and keeps what was learnt."""
+
+    init: Callable[[PRNGKeyArray, Scene], TrainState]
+    iterate: Callable[[TrainState, Scene], tuple[TrainState, Metrics]]
+    restart: Callable[[TrainState, Scene], TrainState]
+
+
+def make(
+    env: Env,
+    policy: Policy,
+    *,
+    horizon: int,
+    epochs: int,
+    minibatches: int,
+    sample_share: float,
+    permutation: Literal["once", "each_epoch"],
+    learning_rate: float,
+    desired_kl: float | None,
+    learning_rate_min: float,
+    learning_rate_max: float,
+    gamma: float,
+    gae_lambda: float,
+    clip: float,
+    entropy: float,
+    value: float,
+    max_grad_norm: float,
+    normalise_advantage: bool,
+    initial_phase: bool,
+    episode_steps: int,
+) -> Trainer:
+    """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
+
+    Args:
+        horizon: control steps of a rollout.
+        epochs, minibatches: passes over a rollout, and gradient steps in each.
+        sample_share: share of a rollout's samples that an epoch visits, active agents first; 1 visits all. Samples without an active agent
+            carry no weight: a larger share than the active one costs only time, a smaller one leaves out random active samples.
+        permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
+        learning_rate: of Adam; the first one if `desired_kl` is a number.
+        desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
+        gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
+        clip: of the probability ratio and of the value loss.
+        entropy, value: weights of entropy bonus and value loss.
+        normalise_advantage: over the active samples of the whole rollout.
+        initial_phase: worlds start at a random time of their episode, so that they do not all run out of time together.
+        episode_steps: control steps of an episode.
+
+    Raises:
+        ConfigError: a number out of range; at `init`, samples that the minibatches do not divide.
+    """
+    _check(locals())
+    adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
+    objective = functools.partial(loss.ppo, policy=policy, clip=clip, entropy=entropy, value=value)
+    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max)
+    each = permutation == "each_epoch"
+    learn = functools.partial(
+        update.learn, loss=objective, optimiser=adam, rate=rate, epochs=epochs, minibatches=minibatches, permute_each_epoch=each
+    )
+    start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
+    act = functools.partial(rollout.collect, env, policy, horizon=horizon)
+    prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage)
+    size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
+    return Trainer(
+        init=jax.jit(functools.partial(_init, policy=policy, optimiser=adam, start=start, size=size)),
+        iterate=jax.jit(functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size), donate_argnums=0),
+        restart=jax.jit(functools.partial(_restart, start=start), donate_argnums=0),
+    )
+
+
+def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[State, Observation]:
+    """All worlds at their start, each at one of the first `phases` steps of its episode."""
+
+    def one(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
+        phase_key, start_key = jax.random.split(key)
+        world = env.start(start_key, scene)
+        world = replace(world, step=jax.random.randint(phase_key, (), 0, phases, world.step.dtype))
+        return world, env.observe(scene, world)
+
+    return jax.vmap(one)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
+
+
+def _init(
+    key: PRNGKeyArray, scenes: Scene, *, policy: Policy, optimiser: optax.GradientTransformation, start: Callable, size: Callable
+) -> TrainState:
+    policy_key, start_key, key = jax.random.split(key, 3)
+    worlds, observation = start(start_key, scenes)
+    size(worlds)
+    parameters = policy.init(policy_key, observation)
+    train_state = TrainState(
+        parameters=parameters,
+        optimiser=optimiser.init(parameters),
+        worlds=worlds,
+        observation=observation,
+        lives=rollout.no_lives(worlds),
+        key=key,
+        iteration=jnp.int32(0),
+        steps=jnp.zeros(2, jnp.int32),
+    )
+    return _own(train_state)
+
+
+def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> TrainState:
+    start_key, key = jax.random.split(train_state.key)
+    worlds, observation = start(start_key, scenes)
+    return _own(replace(train_state, worlds=worlds, observation=observation, lives=rollout.no_lives(worlds), key=key))
+
+
+def _iterate(
+    train_state: TrainState, scenes: Scene, *, policy: Policy, act: Callable, prepare: Callable, learn: Callable, size: Callable
+) -> tuple[TrainState, Metrics]:
+    """Rollout, advantages, updates."""
+    act_key, learn_key, key = jax.random.split(train_state.key, 3)
+    acted = act(train_state.parameters, scenes, train_state.worlds, train_state.observation, train_state.lives, act_key)
+    worlds, observation, lives, samples, tally = acted
+    _, log_std, bootstrap = policy.apply(train_state.parameters, observation)
+    batch = prepare(samples, bootstrap)
+    parameters, optimiser, facts = learn(train_state.parameters, train_state.optimiser, batch, log_std, learn_key, size=size(worlds))
+    facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight)
+    following = TrainState(
+        parameters=parameters,
+        optimiser=optimiser,
+        worlds=worlds,
+        observation=observation,
+        lives=lives,
+        key=key,
+        iteration=train_state.iteration + 1,
+        steps=_add(train_state.steps, tally["spawned"]),
+    )
+    return _strong(following), measure(tally, facts)
+
+
+def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float) -> int:
+    """Samples in a minibatch.
+
+    Raises:
+        ConfigError: the whole rollout (`sample_share` 1) does not divide into the minibatches, or a minibatch would be empty.
+    """
+    count, agents = worlds.active.shape
+    samples = horizon * count * agents
+    size = int(samples * sample_share) // minibatches
+    if size < 1 or (sample_share == 1.0 and samples % minibatches):
+        counted = f"horizon {horizon} x {count} worlds x {agents} agents = {samples} samples"
+        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_share}) do not divide into {minibatches} minibatches")
+    return size
+
+
+def spawned_steps(train_state: TrainState) -> int:
+    """Steps of spawned slots since the start of training, on the host."""
+    millions, rest = (int(x) for x in train_state.steps)
+    return millions * MILLION + rest
+
+
+def measure(tally: rollout.Tally, facts: dict[str, Array]) -> Metrics:
+    """Scalars of one iteration.
+
+    `reward` and `reward/...`: mean of a step of an active agent. `events/...`: new events for each agent's life that ended, by event or by
+    time; `count/...`: the same as a number. `life/...`: undiscounted return and steps of those lives. `share/active`: of the steps of
+    spawned slots; `steps/...`: of this iteration. `speed`: m/s. `ppo/...`: means over the minibatches; `ppo/skipped`: minibatches that were
+    not finite and therefore moved nothing; `ppo/left_out`: active samples that `sample_share` left out, as a share.
+    """
+    steps, ends = jnp.maximum(tally["active"], 1.0), jnp.maximum(tally["ended"], 1.0)
+    spawned = tally["spawned"].astype(jnp.float32)
+    metrics = {name: tally[name] / steps for name in tally if name == "reward" or name.startswith("reward/")}
+    for name in (name.removeprefix("events/") for name in tally if name.startswith("events/")):
+        metrics[f"events/{name}"] = tally[f"events/{name}"] / ends
+        metrics[f"count/{name}"] = tally[f"events/{name}"]
+    return {
+        **metrics,
+        "life/return": tally["return"] / ends,
+        "life/steps": tally["length"] / ends,
+        "count/lives": tally["ended"],
+        "share/active": tally["active"] / jnp.maximum(spawned, 1.0),
+        "steps/spawned": spawned,
+        "steps/active": tally["active"],
+        "speed": tally["speed"] / steps,
+        **{f"ppo/{name}": fact for name, fact in facts.items()},
+    }
+
+
+def _batch(samples: rollout.Sample, bootstrap: Array, *, gamma: float, gae_lambda: float, normalise_advantage: bool) -> loss.Batch:
+    """Samples [T, W, A] with their advantages, as one flat batch. Only active agents whose time did not run out carry weight."""
+    advantage, returns = gae.estimate(
+        samples.reward, samples.value, bootstrap, samples.active, samples.done, samples.truncated, gamma=gamma, gae_lambda=gae_lambda
+    )
+    weight = (samples.active & ~samples.truncated).astype(jnp.float32)
+    batch = loss.Batch(
+        observation=jax.tree.map(_flat, samples.observation),
+        action=_flat(samples.action),
+        mean=_flat(samples.mean),
+        log_probability=_flat(samples.log_probability),
+        value=_flat(samples.value),
+        advantage=_flat(advantage),
+        returns=_flat(returns),
+        weight=_flat(weight),
+    )
+    return replace(batch, advantage=loss.normalise(batch.advantage, batch.weight)) if normalise_advantage else batch
+
+
+def _flat(x: Array) -> Array:
+    return x.reshape(-1, *x.shape[3:])
+
+
+def _add(steps: Array, more: Array) -> Array:
+    rest = steps[1] + more
+    return jnp.stack([steps[0] + rest // MILLION, rest % MILLION])
+
+
+def _strong(tree: Any) -> Any:
+    """Cast away weak types, so that a second iteration does not trace again."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
+
+
+def _own(tree: Any) -> Any:
+    """Buffers of its own: `jit` may hand an argument (a scene's spawn points) straight through, and donating it would delete the scene."""
+    return jax.tree.map(jnp.copy, _strong(tree))
+
+
+def _check(numbers: dict[str, Any]) -> None:
+    """Refuse numbers that cannot work, by name."""
+    for name in ("horizon", "epochs", "minibatches", "episode_steps"):
+        if numbers[name] < 1:
+            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a whole number of at least 1")
+    for name in ("learning_rate", "max_grad_norm", "clip", "sample_share"):
+        if not numbers[name] > 0:
+            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number above 0")
+    for name in ("gamma", "gae_lambda", "sample_share"):
+        if not 0 <= numbers[name] <= 1:
+            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number from 0 to 1")
+    if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
+        bounds = f"[{numbers['learning_rate_min']}, {numbers['learning_rate_max']}]"
+        raise ConfigError(f"ppo.learning_rate: {numbers['learning_rate']} is outside [learning_rate_min, learning_rate_max] = {bounds}")

@@ -1,0 +1,130 @@
+"""Still bird's-eye pictures: a scene as it starts, and the ways that cars took through it."""
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon
+
+from scenefactory_jax.report import canvas
+from scenefactory_jax.report.canvas import ASPHALT, GROUND, INK, MARKS, Colour, Trajectory
+from scenefactory_jax.report.plots import STYLE
+from scenefactory_jax.types import Road, Scene
+
+_INCHES, _SHARE = 6.4, 0.84  # side of the figure, and the axes' share of it
+
+
+def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figure:
+    """A scene as it starts: road, cars as oriented boxes, goals as circles of the same colour and number.
+
+    Args:
+        scene: one packed world with numpy or JAX arrays.
+        title: above the picture.
+        whole: show the whole road; otherwise the square around starts and goals.
+    """
+    agents = scene.agents
+    present = np.flatnonzero(np.asarray(agents.present))
+    start, goal = np.asarray(agents.position, float), np.asarray(agents.goal, float)
+    points = np.concatenate([start[present], goal[present]])
+    if whole or not len(present):
+        points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
+    with matplotlib.rc_context(STYLE):
+        figure, axes, scale = _stage(scene, canvas.around(points, margin=12.0, smallest=50.0), title=title)
+        for agent in present.tolist():
+            look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
+            axes.plot(*np.stack([start[agent], goal[agent]]).T, color=_rgb(canvas.colour_of(agent)), **look)
+            _draw_goal(axes, goal[agent], agent, scale)
+            _draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), agent)
+        _legend(figure, [], car="start", road=scene.road)
+    return figure
+
+
+def trajectory_figure(trajectory: Trajectory) -> Figure:
+    """The ways of an episode's cars from hollow start to filled end, their goals, and where events happened.
+
+    Raises:
+        TrajectoryError: arrays that do not belong together.
+    """
+    trajectory = canvas.settle(trajectory)
+    driven = canvas.moves(trajectory)
+    with matplotlib.rc_context(STYLE):
+        view = canvas.around(canvas.places(trajectory), margin=12.0, smallest=50.0)
+        title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
+        figure, axes, scale = _stage(trajectory.scene, view, title=title)
+        for agent in np.flatnonzero(trajectory.present).tolist():
+            steps = np.flatnonzero(driven[:, agent])
+            way = trajectory.position[:, agent]
+            segments = np.stack([way[steps - 1], way[steps]], axis=1)
+            look = {"linewidths": 1.6, "capstyle": "round", "zorder": 3}
+            axes.add_collection(LineCollection(list(segments), colors=[_rgb(canvas.colour_of(agent))], **look))
+            shown = np.flatnonzero(trajectory.active[:, agent])
+            for step, hollow in ((shown[0], True), (steps[-1] if len(steps) else shown[-1], False)) if len(shown) else ():
+                place, yaw = way[step], float(trajectory.yaw[step, agent])
+                _draw_car(axes, place, yaw, trajectory.size[agent], agent, hollow=hollow)
+            last = int(shown[-1]) if len(shown) else 0
+            _draw_goal(axes, canvas.goal_at(trajectory, last)[agent], agent, scale)
+        seen = [name for name in MARKS if name in trajectory.events and (trajectory.events[name] & trajectory.present).any()]
+        for name in seen:
+            if name != "reached":
+                points = trajectory.position[trajectory.events[name] & trajectory.present]
+                look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
+                axes.plot(*points.T, color=_rgb(MARKS[name].colour), **look)
+        _legend(figure, [name for name in seen if name != "reached"], car="end (start: outline)", road=None)
+    return figure
+
+
+def _stage(scene: Scene, window: tuple[float, float, float], *, title: str) -> tuple[Figure, Axes, float]:
+    """A square figure with the road; also its scale in points a metre."""
+    left, bottom, side = window
+    figure = Figure(figsize=(_INCHES, _INCHES))
+    axes = figure.add_axes((0.11, 0.115, _SHARE, _SHARE))
+    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal", xlabel="x, m", ylabel="y, m", facecolor=_rgb(GROUND))
+    axes.grid(False)
+    axes.set_title(title)
+    scale = _INCHES * _SHARE * 72 / side
+    for order, stroke in enumerate(canvas.strokes(scene.road)):
+        width = max(stroke.width * scale, 0.5 * stroke.thinnest)
+        look = {"linewidths": width, "capstyle": "round" if width > 4 else "butt", "zorder": 1 + order / 100}
+        axes.add_collection(LineCollection(list(stroke.lines), colors=[_rgb(stroke.colour)], **look))
+    return figure, axes, scale
+
+
+def _draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, agent: int, *, hollow: bool = False) -> None:
+    """An oriented box with an arrowhead, as in the videos."""
+    colour = canvas.colour_of(agent)
+    box, arrow = canvas.car_shape(np.asarray(position), yaw, size)
+    fill, edge = ((255, 255, 255), colour) if hollow else (colour, canvas.blend(INK, colour, 0.5))
+    axes.add_patch(Polygon(box, facecolor=_rgb(fill), edgecolor=_rgb(edge), linewidth=0.9, zorder=4))
+    axes.add_patch(Polygon(arrow, facecolor=_rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
+
+
+def _draw_goal(axes: Axes, place: np.ndarray, agent: int, scale: float) -> None:
+    """A circle of the goal's radius with the agent's number, in its colour."""
+    x, y = (float(value) for value in place)
+    colour = _rgb(canvas.blend(canvas.colour_of(agent), INK, 0.8))
+    axes.add_patch(Circle((x, y), canvas.GOAL_RADIUS, fill=False, edgecolor=_rgb(canvas.colour_of(agent)), linewidth=1.3, zorder=3.5))
+    size = min(max(canvas.GOAL_RADIUS * scale * 0.9, 4.5), 9.0)
+    axes.text(x, y, str(agent), color=colour, fontsize=size, ha="center", va="center_baseline", zorder=3.6, clip_on=True)
+
+
+def _legend(figure: Figure, events: list[str], *, car: str, road: Road | None) -> None:
+    """What the shapes mean, below the axes."""
+    handles = [
+        Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(canvas.AGENTS[0]), markersize=7, label=f"car at its {car}"),
+        Line2D([], [], marker="o", linestyle="none", color=_rgb(canvas.AGENTS[0]), markerfacecolor="none", markersize=8, label="its goal"),
+    ]
+    if road is not None:
+        drawn = {stroke.colour for stroke in canvas.strokes(road)}
+        looks = (("lane", ASPHALT, 6), ("road edge", canvas.EDGE, 1.5), ("yellow line", canvas.YELLOW, 1.5))
+        handles += [Line2D([], [], color=_rgb(colour), linewidth=width, label=label) for label, colour, width in looks if colour in drawn]
+    for name in events:
+        mark = MARKS[name]
+        handles.append(Line2D([], [], marker=mark.marker, linestyle="none", color=_rgb(mark.colour), markersize=8, label=mark.label))
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), handletextpad=0.5, columnspacing=1.4)
+
+
+def _rgb(colour: Colour) -> tuple[float, float, float]:
+    red, green, blue = (channel / 255 for channel in colour)
+    return red, green, blue

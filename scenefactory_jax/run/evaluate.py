@@ -1,0 +1,185 @@
+"""`evaluate`: a run's policy on held-out scenes -> per-agent records, tables with intervals, a report and a video."""
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from scenefactory_jax import evaluation, world
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.report import tables
+from scenefactory_jax.report.canvas import Trajectory
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import sources
+from scenefactory_jax.run.train import make_policy
+from scenefactory_jax.types import SURFACES, Env
+
+PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
+
+
+class Result(NamedTuple):
+    """What `evaluate` hands back in Python: protocol -> records, protocol -> metric -> estimate, and the report's place."""
+
+    folder: Path
+    records: dict[str, dict[str, np.ndarray]]
+    summary: dict[str, dict[str, tables.Estimate]]
+    report: Path
+
+
+def evaluate(config: Mapping[str, Any]) -> Result:
+    """Evaluate a run as a config says (`load("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
+
+    Raises:
+        ConfigError: no such run, no checkpoint in it, a setting that the run does not have.
+        SceneError: scenes that cannot be read.
+    """
+    sources.use_compilation_cache()
+    run = Path(config["run"])
+    trained = configs.amend(configs.read(run), config["overrides"])
+    wanted = {True: "invincible", False: "strict"}.get(config["invincible"], config["invincible"])
+    if wanted not in PROTOCOLS:
+        raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
+    scenes = sources.heldout(trained["scenes"], path=config["scenes"]["path"])
+    out = Path(config["out"]) if config["out"] else run / "evaluation"
+    return judge(trained, run, scenes, out, settings=config, protocols=PROTOCOLS[wanted])
+
+
+def after_training(config: Mapping[str, Any], folder: Path) -> Result:
+    """The evaluation that ends `train`: held-out scenes, the run's own settings."""
+    settings = config["evaluation"]
+    scenes = sources.heldout(config["scenes"], path=None)
+    return judge(config, folder, scenes, folder, settings=settings, protocols=settings["protocols"])
+
+
+def judge(
+    config: Mapping[str, Any], run: Path, scenes: sources.Scenes, out: Path, *, settings: Mapping[str, Any], protocols: list[str]
+) -> Result:
+    """Play every protocol with the trained and, if asked for, the untrained policy; write records, report and video to `out`."""
+    from scenefactory_jax.run import reporting
+
+    out.mkdir(parents=True, exist_ok=True)
+    print(scenes.account, flush=True)
+    parameters = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
+    if settings["untrained"]:
+        parameters["untrained"] = checkpoint.restore_parameters(run / "untrained")
+    records, trajectories = {}, []
+    for protocol in protocols:
+        env = world.make({**config, "ends": configs.load("task", f"ends={protocol}")["ends"]})
+        for name, values in parameters.items():
+            label = protocol if name == "trained" else f"{protocol}, {name}"
+            film = settings["video"]["worlds"] if settings["video"]["enable"] and not trajectories and name == "trained" else 0
+            records[label], recorded = episodes(config, env, values, scenes, settings=settings, film=film)
+            trajectories = trajectories or recorded
+            tables.write_csv(out / f"agents-{label.replace(', ', '-')}.csv", records[label])
+    summary = {label: tables.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for label, rows in records.items()}
+    report = reporting.write(out, config=config, run=run, settings=settings, records=records, summary=summary, trajectories=trajectories)
+    print(tables.markdown(summary), f"\nreport {report}", sep="\n", flush=True)
+    return Result(out, records, summary, report)
+
+
+def episodes(
+    config: Mapping[str, Any], env: Env, parameters: Any, scenes: sources.Scenes, *, settings: Mapping[str, Any], film: int
+) -> tuple[dict[str, np.ndarray], list[Trajectory]]:
+    """One deterministic episode for every scene and repeat, all worlds at once.
+
+    Args:
+        film: how many worlds' trajectories to keep.
+
+    Returns:
+        Per-agent columns (`report.tables.COLUMNS`) and the kept trajectories.
+    """
+    policy = make_policy(config)
+    act = lambda values, observation: policy.apply(values, observation)[0]  # noqa: E731
+    index = np.tile(np.arange(len(scenes)), settings["repeats"])
+    batch = jax.tree.map(lambda leaf: leaf[index], scenes.scene)
+    keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
+    chunk, limit = settings["chunk_steps"], world.episode_steps(config["timing"])
+
+    @jax.jit
+    def begin(keys, batch):
+        return jax.vmap(functools.partial(evaluation.begin, env))(keys, batch)
+
+    @functools.partial(jax.jit, donate_argnums=2)
+    def play(parameters, batch, episode):
+        one = functools.partial(evaluation.play, env, act, parameters, steps=chunk, ttc_limit_s=settings["ttc_limit_s"])
+        episode, frames = jax.vmap(one)(batch, episode)
+        return episode, jax.tree.map(lambda leaf: leaf[:film], frames)
+
+    episode = begin(keys, batch)
+    present, started = jax.device_get((episode.state.agents.present, episode.tally.goal_distance))
+    kept, filmed = [], round(settings["video"]["seconds"] * config["timing"]["control_hz"])
+    for step in range(0, limit, chunk):
+        episode, frames = play(parameters, batch, episode)
+        if step < filmed:
+            kept.append(jax.device_get(frames))
+        if bool(episode.over.all()):
+            break
+    names = [scenes.names[i] for i in index]
+    records = _records(jax.device_get(episode), present, started, names, seed=settings["seed"], control_hz=config["timing"]["control_hz"])
+    return records, _trajectories(kept, episode, batch, names, filmed, config["timing"]["control_hz"]) if film else []
+
+
+def _records(episode, present, started, names: list[str], *, seed: int, control_hz: float) -> dict[str, np.ndarray]:
+    """One row for every spawned agent of every world."""
+    tally, state = episode.tally, episode.state
+    row_world, row_agent = np.nonzero(present)
+    of = lambda leaf: np.asarray(leaf)[row_world, row_agent]  # noqa: E731
+    events = {name: of(value) for name, value in vars(tally.happened).items()}
+    others = events["collided"] | events["crashed"] | events["touched_edge"] | events["fault"]
+    steps = np.maximum(of(tally.steps), 1)
+    seen = of(tally.ttc_steps)
+    return {
+        "scene": np.array(names)[row_world],
+        "world": row_world,
+        "seed": np.full(len(row_world), seed),
+        "agent": row_agent,
+        **events,
+        "clean": events["reached"] & ~others,
+        "time_s": of(tally.steps) / control_hz,
+        "route_m": of(state.agents.route),
+        "start_distance_m": of(started),
+        "end_distance_m": of(tally.goal_distance),
+        "max_drac": of(tally.drac_max),
+        "min_ttc_s": of(tally.ttc_min),
+        "mean_ttc_s": of(tally.ttc_sum) / np.maximum(seen, 1),
+        "has_ttc": seen > 0,
+        "mean_speed": of(tally.speed_sum) / steps,
+        "max_contact_force_n": of(tally.force_max),
+        "film_mm": np.asarray(state.weather.film_mm)[row_world],
+        "surface": np.array(SURFACES)[np.asarray(state.weather.surface)[row_world]],
+        "friction": of(tally.grip_sum) / steps,
+    }
+
+
+def _trajectories(kept: list, episode, batch, names: list[str], steps: int, control_hz: float) -> list[Trajectory]:
+    """The filmed worlds as a viewer wants them: cut where the last car finished."""
+    frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :steps], *kept)
+    found = []
+    for index in range(frames.active.shape[0]):
+        scene = jax.device_get(jax.tree.map(lambda leaf, i=index: leaf[i], batch))
+        live = np.flatnonzero(frames.active[index].any(axis=1))
+        end = min((live[-1] if len(live) else 0) + round(control_hz), frames.active.shape[1])
+        cut = lambda leaf, i=index, end=end: leaf[i, :end]  # noqa: E731
+        weather = jax.device_get(jax.tree.map(lambda leaf, i=index: leaf[i], episode.state.weather))
+        agents = jax.device_get(jax.tree.map(lambda leaf, i=index: leaf[i], episode.state.agents))
+        found.append(
+            Trajectory(
+                scene=scene,
+                position=cut(frames.position),
+                yaw=cut(frames.yaw),
+                speed=cut(frames.speed),
+                active=cut(frames.active),
+                events={name: cut(value) for name, value in vars(frames.events).items()},
+                size=agents.size,
+                goal=cut(frames.goal),
+                present=agents.present,
+                control_hz=control_hz,
+                title=names[index],
+                weather=f"{SURFACES[int(weather.surface)]}, {float(weather.film_mm):.1f} mm",
+            )
+        )
+    return found

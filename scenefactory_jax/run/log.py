@@ -1,0 +1,79 @@
+"""A training run's numbers on disk: metrics.csv, TensorBoard, and a progress bar on the terminal."""
+
+import contextlib
+import csv
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+FILE = "metrics.csv"
+
+
+class MetricsFile:
+    """metrics.csv, one row an iteration. On resume, rows after the checkpoint are dropped, so that the file tells one unbroken story."""
+
+    def __init__(self, folder: Path, *, resume_at: int | None = None):
+        self.path = Path(folder) / FILE
+        rows = [row for row in read(folder) if resume_at is not None and row["iteration"] <= resume_at] if self.path.exists() else []
+        self.columns = list(rows[0]) if rows else []
+        with open(self.path, "w", newline="") as file:
+            if rows:
+                writer = csv.DictWriter(file, self.columns)
+                writer.writeheader()
+                writer.writerows(rows)
+
+    def add(self, row: Mapping[str, float]) -> None:
+        new = not self.columns
+        self.columns = self.columns or list(row)
+        with open(self.path, "a", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, extrasaction="ignore")
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+
+def read(folder: Path) -> list[dict[str, float]]:
+    """Rows of a run's metrics.csv; none where there is no file yet."""
+    path = Path(folder) / FILE
+    if not path.is_file():
+        return []
+    with open(path, newline="") as file:
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+@contextlib.contextmanager
+def tensorboard(folder: Path, *, enable: bool) -> Iterator:
+    """A writer `add(row, iteration)` of TensorBoard scalars, or one that does nothing."""
+    if not enable:
+        yield lambda row, iteration: None
+        return
+    from tensorboardX import SummaryWriter
+
+    writer = SummaryWriter(str(Path(folder) / "tensorboard"))
+
+    def add(row: Mapping[str, float], iteration: int) -> None:
+        for name, value in row.items():
+            writer.add_scalar(name, value, iteration)
+
+    try:
+        yield add
+    finally:
+        writer.close()
+
+
+@contextlib.contextmanager
+def progress(total: int, *, enable: bool, start: int = 0) -> Iterator:
+    """A bar `show(iteration, text)` with the time left, or one that does nothing."""
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    ]
+    with Progress(*columns, disable=not enable, refresh_per_second=2) as bar:
+        task = bar.add_task("train", total=total, completed=start, text="compiling")
+        yield lambda iteration, text: bar.update(task, completed=iteration, text=text)

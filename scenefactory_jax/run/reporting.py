@@ -1,0 +1,74 @@
+"""Figures, video and report.md of an evaluation."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.report import document, pictures, plots, tables, video
+from scenefactory_jax.report.canvas import Trajectory
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import log
+
+
+def write(
+    out: Path,
+    *,
+    config: Mapping[str, Any],
+    run: Path,
+    settings: Mapping[str, Any],
+    records: Mapping[str, Mapping[str, np.ndarray]],
+    summary: Mapping[str, Mapping[str, tables.Estimate]],
+    trajectories: list[Trajectory],
+) -> Path:
+    """Write everything that a reader of the evaluation wants to see to `out`, and return the report's path."""
+    metrics = log.read(run)
+    baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
+    figures = _figures(out, metrics, records, summary, baselines, trajectories)
+    videos = _videos(out, trajectories, settings["video"])
+    files = {f"Agents, {name}": out / f"agents-{name.replace(', ', '-')}.csv" for name in records}
+    if metrics:
+        files["Metrics of the training"] = run / log.FILE
+    return document.write(
+        out,
+        title=f"{config['name']}: evaluation on scenes not seen in training",
+        summary=summary,
+        records=records,
+        config=config,
+        versions=configs.versions(),
+        bootstrap=settings["bootstrap"],
+        seed=settings["seed"],
+        baselines=baselines,
+        figures=figures,
+        videos=videos,
+        files=files,
+        commands=[f"python -m scenefactory_jax evaluate run={run}"],
+    )
+
+
+def _figures(out: Path, metrics, records, summary, baselines, trajectories) -> dict[str, Path]:
+    """Caption -> picture."""
+    found = {}
+    for name, baseline in baselines.items():
+        figure = plots.comparison_figure(summary[baseline], summary[name], names=("untrained", "trained"))
+        found[f"Untrained and trained, {name}"] = plots.save(figure, out / f"comparison-{name}.png")
+    if metrics:
+        found["Training"] = plots.save(plots.learning_figure(metrics), out / "learning.png")
+    first = next(iter(records))
+    found[f"How agents ended in each scene, {first}"] = plots.save(plots.outcome_figure(records[first]), out / "outcomes.png")
+    found["Surrogate safety"] = plots.save(plots.safety_figure(records), out / "safety.png")
+    if trajectories:
+        figure = pictures.trajectory_figure(trajectories[0])
+        found[f"Ways driven, {trajectories[0].title}"] = plots.save(figure, out / "trajectories.png")
+    return found
+
+
+def _videos(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any]) -> dict[str, Path]:
+    if not trajectories:
+        return {}
+    path = out / f"video{settings['suffix']}"
+    look = {key: settings[key] for key in ("fps", "stride", "columns", "panel", "trail_s")}
+    video.write(path, trajectories, **look)
+    speed = settings["fps"] * settings["stride"] / trajectories[0].control_hz
+    return {f"Deterministic policy on held-out scenes, {speed:g} x real time": path}

@@ -1,0 +1,130 @@
+"""Where a command's scenes come from: a bank, files in any known format, or the generator."""
+
+import itertools
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.scenes import bank, convert, source
+from scenefactory_jax.scenes.pack import Packed, prepare
+from scenefactory_jax.scenes.stack import describe, stack
+from scenefactory_jax.types import Scene
+
+CACHE = "SCENEFACTORY_CACHE"  # environment variable: folder of compiled programs; empty switches the cache off
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """Scenes stacked along the first axis, their names, and what was kept and dropped on the way."""
+
+    scene: Scene
+    names: tuple[str, ...]
+    account: str
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def training(config: Mapping[str, Any]) -> Scenes:
+    """The scenes to train on: `scenes.path`, or the generator's.
+
+    Raises:
+        ConfigError: neither is given.
+        SceneError: nothing usable at the path, with the reasons.
+    """
+    if config["path"] is not None:
+        return from_path(config, config["path"])
+    if config["generate"] is None:
+        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
+    return generated(config, seed=config["seed"], count=config["count"])
+
+
+def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
+    """Scenes that training never saw: those at `path`, or what the config's `scenes.heldout` names.
+
+    Raises:
+        ConfigError: the config names none.
+        SceneError: nothing usable at the path, with the reasons.
+    """
+    path = path if path is not None else config["heldout"]["path"]
+    if path is not None:
+        return from_path(config, path)
+    if config["path"] is not None or config["generate"] is None:
+        raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
+    if config["heldout"]["seed"] == config["seed"]:
+        raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
+    return generated(config, seed=config["heldout"]["seed"], count=config["heldout"]["count"])
+
+
+def has_heldout(config: Mapping[str, Any]) -> bool:
+    """Whether a config names held-out scenes."""
+    return config["heldout"]["path"] is not None or (config["path"] is None and config["generate"] is not None)
+
+
+def from_path(config: Mapping[str, Any], path: str | Path) -> Scenes:
+    """Scenes of a bank as it was packed, or of files, packed now."""
+    if bank.is_bank(path):
+        opened = bank.open(path)
+        scene, cuts = bank.load(opened, range(len(opened)), capacity=config["capacity"])
+        summary = convert.summarise(opened.reports, files=len(opened.reports), rejects=opened.rejects)
+        return Scenes(scene, opened.names, "\n".join([f"bank {path}", *convert.describe(summary), *describe(cuts)]))
+    parts = readers(config)
+    packed, rejects = convert.read(path, **parts, workers=config["workers"])
+    reports = [scene.report for scene in packed]
+    lines = convert.describe(convert.summarise(reports, files=len(source.find(path)), rejects=rejects))
+    if not packed:
+        raise ConfigError(f"scenes.path={path}: no usable scene\n" + "\n".join(lines))
+    return _stacked(packed, config, [f"scenes {path}", *lines])
+
+
+def generated(config: Mapping[str, Any], *, seed: int, count: int) -> Scenes:
+    """Scenes from the generator, checked and packed like any others."""
+    generate = build(config["generate"], builtins="scenefactory_jax.scenes.procedural.generate", where="scenes.generate")
+    parts = readers(config)
+    packed = [prepare(generate(seed, index), check=parts["check"], pack=parts["pack"]) for index in range(count)]
+    agents = sum(scene.report.agents_kept for scene in packed)
+    return _stacked(packed, config, [f"{count} generated scenes with {agents} agents, seed {seed}"])
+
+
+def readers(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Formats, check and pack of a scenes config, bound to their numbers."""
+    return {
+        "formats": source.make(config["formats"]),
+        "check": build(config["check"], builtins="scenefactory_jax.scenes.checks", where="scenes.check"),
+        "pack": build(config["pack"], builtins="scenefactory_jax.scenes.pack", where="scenes.pack"),
+    }
+
+
+def assign(scenes: Scenes, worlds: int, *, seed: int) -> tuple[Scene, str]:
+    """One scene for each world: the whole list shuffled, again and again (facts 4.5, random fill); on the device.
+
+    Returns:
+        Scenes along the first axis, and a line that says how often each is used.
+    """
+    generator = np.random.default_rng(seed)
+    order = itertools.chain.from_iterable(generator.permutation(len(scenes)) for _ in range(-(-worlds // len(scenes))))
+    chosen = np.fromiter(itertools.islice(order, worlds), int)
+    counts = np.bincount(chosen, minlength=len(scenes))
+    spawned = int(np.asarray(scenes.scene.agents.present)[chosen].sum())
+    unused = f"; {np.sum(counts == 0)} scenes are not used: raise worlds" if (counts == 0).any() else ""
+    text = f"{worlds} worlds of {len(scenes)} scenes, {counts.min()} to {counts.max()} worlds a scene, {spawned} logged agents{unused}"
+    return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)), text
+
+
+def use_compilation_cache() -> None:
+    """Keep compiled programs between processes, in the user's cache folder or where SCENEFACTORY_CACHE says."""
+    place = os.environ.get(CACHE, str(Path.home() / ".cache" / "scenefactory_jax"))
+    if place and jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", place)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+
+
+def _stacked(packed: Sequence[Packed], config: Mapping[str, Any], lines: list[str]) -> Scenes:
+    scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
+    return Scenes(scene, tuple(one.report.name for one in packed), "\n".join([*lines, *describe(cuts)]))

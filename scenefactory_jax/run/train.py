@@ -1,0 +1,135 @@
+"""`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
+
+import datetime
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from scenefactory_jax import world
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.ppo import train as ppo
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import log, sources
+from scenefactory_jax.types import Env, Policy
+
+OnIteration = Callable[[int, Mapping[str, float]], None]
+
+
+class Run(NamedTuple):
+    """What `train` hands back in Python."""
+
+    folder: Path
+    config: dict[str, Any]
+    env: Env
+    policy: Policy
+    state: ppo.TrainState
+    metrics: list[dict[str, float]]
+
+
+def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) -> Run:
+    """Train as a config says (`load("train", ...)`).
+
+    Args:
+        on_iteration: called on the host with (iteration, metrics) after each iteration, for notebooks and sweeps.
+
+    Raises:
+        ConfigError: a key that does not fit, a run folder that exists, nothing to resume.
+        SceneError: scenes that cannot be read.
+    """
+    sources.use_compilation_cache()
+    folder, resume = _folder(config)
+    env, policy = world.make(config), make_policy(config)
+    loaded = sources.training(config["scenes"])
+    worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"])
+    trainer = make_trainer(config, env, policy)
+    configs.write(folder, config)
+    print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
+
+    state = trainer.init(jax.random.key(config["seed"]), worlds)
+    if resume:
+        state = checkpoint.restore(folder / "checkpoints", state)
+        print(f"resumed at iteration {int(state.iteration)}", flush=True)
+    elif config["evaluation"]["enable"] and config["evaluation"]["untrained"]:
+        checkpoint.save(folder / "untrained", state, keep=1)  # the report compares with the policy before training
+    state = _loop(config, folder, trainer, worlds, state, resume=resume, on_iteration=on_iteration)
+    if config["evaluation"]["enable"]:
+        from scenefactory_jax.run.evaluate import after_training
+
+        after_training(config, folder)
+    return Run(folder, config, env, policy, state, log.read(folder))
+
+
+def make_policy(config: Mapping[str, Any]) -> Policy:
+    """The policy of a config's `policy` entry."""
+    return build(config["policy"], builtins=late_fusion, where="policy")()
+
+
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy) -> ppo.Trainer:
+    """PPO with a config's numbers."""
+    entry = {"_target_": "make", **config["ppo"]}
+    make = build(entry, builtins=ppo, where="ppo", episode_steps=world.episode_steps(config["timing"]))
+    return make(env, policy)
+
+
+def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: bool, on_iteration: OnIteration | None):
+    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts."""
+    first, total = int(state.iteration), config["iterations"]
+    file = log.MetricsFile(folder, resume_at=first if resume else None)
+    begun = time.monotonic()
+    with (
+        log.tensorboard(folder, enable=config["tensorboard"]) as board,
+        log.progress(total, enable=config["progress"], start=first) as show,
+    ):
+        for iteration in range(first + 1, total + 1):
+            before = time.monotonic()
+            state, metrics = trainer.iterate(state, worlds)
+            row = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            seconds = time.monotonic() - before
+            row = {"iteration": iteration, **row, "seconds": seconds, "casps": row["steps/spawned"] / seconds}
+            file.add(row)
+            board(row, iteration)
+            show(iteration, describe(row))
+            if on_iteration:
+                on_iteration(iteration, row)
+            spent = config["minutes"] is not None and time.monotonic() - begun >= 60 * config["minutes"]
+            if spent or iteration == total or iteration % config["checkpoint_every"] == 0:
+                checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"])
+            if spent:
+                break
+    return state
+
+
+def describe(row: Mapping[str, float]) -> str:
+    """One line on how training stands."""
+    names = {"reached": "goal", "collided": "collision", "touched_edge": "edge", "crashed": "crash"}
+    rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
+    return f"{rates} | {row['casps']:,.0f} steps/s"
+
+
+def _folder(config: Mapping[str, Any]) -> tuple[Path, bool]:
+    """The run's folder, and whether there is something in it to go on from."""
+    if config["out"] is None:
+        if config["resume"]:
+            raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        folder = Path("runs") / f"{config['name']}-{stamp}"
+        attempt = 1
+        while folder.exists():  # the jobs of a parallel sweep start in one second
+            attempt += 1
+            folder = folder.with_name(f"{config['name']}-{stamp}-{attempt}")
+        return folder, False
+    folder = Path(config["out"])
+    if checkpoint.latest(folder / "checkpoints") is None:
+        if config["resume"] and folder.exists() and (folder / "config.yaml").is_file():
+            return folder, False  # killed before its first checkpoint: start over
+        if config["resume"]:
+            raise ConfigError(f"out={folder}: no checkpoint to resume from; valid: a folder that `train` wrote")
+        return folder, False
+    if not config["resume"]:
+        raise ConfigError(f"out={folder}: holds a run already; add resume=true to go on with it, or choose another folder")
+    return folder, True

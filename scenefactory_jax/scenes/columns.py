@@ -1,0 +1,73 @@
+"""`Scene` as named numpy columns, and back: what packing, banks and stacking share.
+
+The columns, their axes and dtypes are read off the annotations in `types`, so a field added there needs no change here.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from scenefactory_jax.types import DRIVABLE, EDGES, Road, Scene
+
+T = TypeVar("T")
+
+ROADS = ("road", "lanes", "edges")
+DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
+
+
+class Column(NamedTuple):
+    """One leaf of a scene: dtype, and axes such as ("road", 2) or ("agents", "steps", 2)."""
+
+    dtype: np.dtype
+    axes: tuple[str | int, ...]
+
+
+def _describe(kind: type, prefix: str = "") -> dict[str, Column]:
+    """Dotted name of every leaf below a struct -> its column."""
+    found: dict[str, Column] = {}
+    for entry in dataclasses.fields(kind):
+        name = prefix + entry.name
+        if dataclasses.is_dataclass(entry.type):
+            found |= _describe(entry.type, f"{name}.")  # pyright: ignore[reportArgumentType]
+            continue
+        names = {"P": prefix.rstrip("."), "A": "agents", "L": "steps"}
+        axes = tuple(names.get(axis) or int(axis) for axis in entry.type.dim_str.split())  # pyright: ignore
+        dtype = next(dtype for name_, dtype in DTYPES.items() if entry.type.dtypes[0].startswith(name_))  # pyright: ignore
+        found[name] = Column(dtype, axes)
+    return found
+
+
+COLUMNS: dict[str, Column] = _describe(Scene)
+
+
+def assemble(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> T:
+    """The struct whose leaves have these dotted names.
+
+    Built past `__init__`: the annotations speak of device arrays, and these are numpy's until a program asks for them.
+    """
+    value = object.__new__(kind)
+    for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        name = prefix + entry.name
+        nested = dataclasses.is_dataclass(entry.type)
+        leaf = assemble(entry.type, columns, f"{name}.") if nested else columns[name]  # pyright: ignore[reportArgumentType]
+        object.__setattr__(value, entry.name, leaf)
+    return value
+
+
+def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """A struct's leaves as numpy arrays by their dotted names."""
+    found: dict[str, np.ndarray] = {}
+    for entry in dataclasses.fields(value):
+        leaf, name = getattr(value, entry.name), prefix + entry.name
+        found |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
+    return found
+
+
+def with_subsets(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Add `lanes` and `edges`, which repeat rows of `road`, to the columns of one scene."""
+    kinds = {"lanes": DRIVABLE, "edges": EDGES}
+    rows = {part: np.isin(columns["road.kind"], wanted) & columns["road.valid"] for part, wanted in kinds.items()}
+    fields = [entry.name for entry in dataclasses.fields(Road)]
+    return dict(columns) | {f"{part}.{name}": columns[f"road.{name}"][mask] for part, mask in rows.items() for name in fields}

@@ -1,0 +1,135 @@
+"""JSON documents: unpacking, and reading values out of them with messages that name the file and the key."""
+
+import gzip
+import json
+import lzma
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from scenefactory_jax.scenes.raw import OtherFormat, SceneError
+
+MAGIC = {b"\x1f\x8b": ("gzip", gzip.decompress), b"\xfd7zXZ\x00": ("xz", lzma.decompress)}
+NAMES = {dict: "an object", list: "a list", str: "a text", int: "an integer", float: "a number", bool: "true or false"}
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The JSON object in a file: plain, gzip or xz, told apart by their first bytes and not by the suffix.
+
+    Raises:
+        SceneError: unreadable, damaged or truncated.
+        OtherFormat: no JSON object at all.
+    """
+    text = unpack(path)
+    if not text.lstrip()[:1] == b"{":
+        raise OtherFormat(f"{path}: no JSON object (plain, gzip or xz); it begins with {text[:16]!r}")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path}: no valid JSON, damaged or cut short after {len(text)} bytes: {error}") from error
+
+
+def unpack(path: Path) -> bytes:
+    """What a file holds, without its compression.
+
+    Raises:
+        SceneError: no such file, or a compressed file that is damaged or truncated.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
+    for magic, (name, decompress) in MAGIC.items():
+        if content.startswith(magic):
+            try:
+                return decompress(content)
+            except (OSError, EOFError, lzma.LZMAError, ValueError) as error:
+                raise SceneError(f"{path}: begins as {name} but cannot be unpacked, damaged or cut short: {error}") from error
+    return content
+
+
+def is_number(value: Any) -> bool:
+    """A JSON number; true and false are none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def expect(value: Any, kind: type, where: str) -> Any:
+    """`value`, if it is of that JSON type; an integer passes for a number.
+
+    Raises:
+        SceneError: naming `where` and the value.
+    """
+    fits = is_number(value) if kind is float else isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    if not fits:
+        text = repr(value)
+        raise SceneError(f"{where}: {text if len(text) < 80 else text[:77] + '...'} is not {NAMES[kind]}")
+    return value
+
+
+def get(record: dict[str, Any], key: str, kind: type, where: str) -> Any:
+    """`record[key]`, if it is there and of that JSON type.
+
+    Raises:
+        SceneError: naming the key, and those that are there.
+    """
+    place = where + ("" if where.endswith(": ") else ".") + key
+    if key not in record:
+        raise SceneError(f"{place}: missing; there are: {', '.join(map(str, record)) or 'none'}")
+    return expect(record[key], kind, place)
+
+
+def numbers(values: Any, where: str, *, length: int | None = None) -> Float[np.ndarray, " N"]:
+    """A list of numbers as an array; whether they are finite is another question (`require_finite`).
+
+    Raises:
+        SceneError: no list, another length, or an entry that is no number, named.
+    """
+    expect(values, list, where)
+    if length is not None and len(values) != length:
+        raise SceneError(f"{where}: {len(values)} entries; there must be {length}, one for each step")
+    table = np.array(values) if all(map(is_number, values)) else None
+    if table is None:
+        place = next(i for i, value in enumerate(values) if not is_number(value))
+        expect(values[place], float, f"{where}[{place}]")
+    return np.asarray(table, np.float64)
+
+
+def points(rows: Any, keys: Sequence[str], where: str, *, length: int | None = None) -> Float[np.ndarray, "N D"]:
+    """A list of objects such as `{"x": 1.0, "y": 2.0}` as an array with a column for each key.
+
+    Raises:
+        SceneError: no list, another length, or a coordinate that is missing or no number, named as in `objects[3].position[10].x`.
+    """
+    expect(rows, list, where)
+    if length is not None and len(rows) != length:
+        raise SceneError(f"{where}: {len(rows)} entries; there must be {length}, one for each step")
+    try:
+        table = [[row[key] for key in keys] for row in rows]
+    except (KeyError, TypeError, IndexError):
+        table = None
+    if table is None or not all(is_number(value) for row in table for value in row):
+        for place, row in enumerate(rows):
+            expect(row, dict, f"{where}[{place}]")
+            for key in keys:
+                get(row, key, float, f"{where}[{place}]")
+    return np.asarray(table, np.float64).reshape(len(rows), len(keys))
+
+
+def require_finite(
+    table: Float[np.ndarray, "N ..."], where: str, *, rows: Bool[np.ndarray, " N"] | None = None, keys: Sequence[str] = ()
+) -> None:
+    """Refuse NaN and infinity in the given rows.
+
+    Raises:
+        SceneError: naming the first such number.
+    """
+    bad = ~np.isfinite(table)
+    if rows is not None:
+        bad &= rows.reshape((-1,) + (1,) * (table.ndim - 1))
+    if bad.any():
+        row, *column = np.argwhere(bad)[0]
+        key = f".{keys[column[0]]}" if keys and column else "".join(f"[{c}]" for c in column)
+        raise SceneError(f"{where}[{row}]{key}: {table[(row, *column)]} is not finite")

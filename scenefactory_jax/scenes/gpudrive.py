@@ -1,0 +1,152 @@
+"""GPUDrive's and Nocturne's scene JSON, from the Waymo Open Motion Dataset.
+
+`{name, scenario_id, objects[], roads[], tl_states{}, metadata{}}`. The old layout of Nocturne has neither ids nor map elements nor
+metadata nor heights, and its headings are in degrees.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from scenefactory_jax.scenes import documents
+from scenefactory_jax.scenes.raw import TRACK_KINDS, OtherFormat, Polyline, RawScene, SceneError, Track
+
+# the map element that a type's name stands for where `map_element_id` is missing
+ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crosswalk": 18, "speed_bump": 19, "driveway": 20}
+FULL_TURN = 2 * math.pi + 0.01  # rounding to a few digits may exceed the turn itself
+
+
+def read(
+    path: Path, *, step_s: float, current: int, headings: Literal["layout", "degrees", "radians"], height_m: float
+) -> Iterator[RawScene]:
+    """The one scene of a file.
+
+    Args:
+        path: JSON, plain, gzip or xz.
+        step_s: time between two steps; the format does not say it.
+        current: the step at which the simulation takes over; the format does not say it (10 in WOMD).
+        headings: their unit; `layout`: degrees in the old layout (no map elements, no metadata), else radians.
+        height_m: height of objects that have none (old layout).
+
+    Raises:
+        OtherFormat: the file has no `objects` and `roads`.
+        SceneError: it has, but a value is missing, of a wrong type or not finite, naming its key.
+    """
+    document = documents.load(path)
+    if missing := [key for key in ("objects", "roads") if key not in document]:
+        raise OtherFormat(f"{path}: no GPUDrive JSON: it has no {missing[0]!r}, but {', '.join(map(str, document)) or 'nothing'}")
+    where = f"{path}: "
+    objects = documents.expect(document["objects"], list, f"{where}objects")
+    roads = documents.expect(document["roads"], list, f"{where}roads")
+    records = [documents.expect(record, dict, f"{where}roads[{i}]") for i, record in enumerate(roads)]
+    old = "metadata" not in document and not any("map_element_id" in record for record in records)
+    degrees = old if headings == "layout" else headings == "degrees"
+    steps = _count_steps(objects, where)
+    if not 0 <= current < steps:
+        raise SceneError(f"{path}: {steps} steps, so no step {current}; set formats.gpudrive.current to a step of this log")
+    tracks = tuple(
+        _track(documents.expect(record, dict, f"{where}objects[{i}]"), i, steps, f"{where}objects[{i}]", degrees, height_m)
+        for i, record in enumerate(objects)
+    )
+    metadata, sdc = _metadata(document, tracks, where)
+    yield RawScene(
+        name=str(document.get("name") or Path(path).name),
+        source=str(path),
+        roads=tuple(_polyline(record, i, f"{where}roads[{i}]") for i, record in enumerate(records)),
+        tracks=tracks,
+        times=step_s * np.arange(steps, dtype=np.float64),
+        current=current,
+        sdc=sdc,
+        lights=dict(documents.expect(document.get("tl_states") or {}, dict, f"{where}tl_states")),
+        metadata=metadata | {"layout": "old" if old else "new"},
+    )
+
+
+def _count_steps(objects: list[Any], where: str) -> int:
+    """Length of the log: that of the first object's `valid`."""
+    if not objects:
+        raise SceneError(f"{where}objects: none; a scene needs at least one")
+    first = documents.expect(objects[0], dict, f"{where}objects[0]")
+    return len(documents.get(first, "valid", list, f"{where}objects[0]"))
+
+
+def _track(record: dict[str, Any], index: int, steps: int, where: str, degrees: bool, height_m: float) -> Track:
+    """One object. Invalid steps hold -10000 in the files and zero here."""
+    flags = documents.get(record, "valid", list, where)
+    if len(flags) != steps:
+        raise SceneError(f"{where}.valid: {len(flags)} entries; there must be {steps}, as objects[0] has")
+    for place, flag in enumerate(flags):
+        if flag is not True and flag is not False and flag not in (0, 1):
+            raise SceneError(f"{where}.valid[{place}]: {flag!r} is not true or false")
+    valid = np.array(flags, bool)
+    rows = documents.get(record, "position", list, where)
+    flat = bool(rows) and isinstance(rows[0], dict) and "z" not in rows[0]
+    axes = ("x", "y") if flat else ("x", "y", "z")
+    xyz = documents.points(rows, axes, f"{where}.position", length=steps)
+    velocity = documents.points(documents.get(record, "velocity", list, where), ("x", "y"), f"{where}.velocity", length=steps)
+    heading = documents.numbers(documents.get(record, "heading", list, where), f"{where}.heading", length=steps)
+    for name, table, keys in (("position", xyz, axes), ("velocity", velocity, axes), ("heading", heading, ())):
+        documents.require_finite(table, f"{where}.{name}", rows=valid, keys=keys)
+    if not degrees and valid.any() and np.abs(heading[valid]).max() > FULL_TURN:
+        place = int(np.argmax(np.where(valid, np.abs(heading), 0.0)))
+        raise SceneError(f"{where}.heading[{place}]: {heading[place]} is no angle in radians; for degrees set formats.gpudrive.headings")
+    yaw = np.deg2rad(heading) if degrees else heading
+    kind = documents.get(record, "type", str, where).lower()
+    mask = valid[:, None]
+    return Track(
+        id=documents.expect(record.get("id", index), int, f"{where}.id"),
+        kind=kind if kind in TRACK_KINDS else "other",  # pyright: ignore[reportArgumentType]
+        size=_size(record, where, height_m),
+        xyz=np.where(mask, np.pad(xyz, ((0, 0), (0, 1))) if flat else xyz, 0.0),
+        yaw=np.where(valid, np.remainder(yaw + np.pi, 2 * np.pi) - np.pi, 0.0),
+        velocity=np.where(mask, velocity, 0.0),
+        valid=valid,
+    )
+
+
+def _size(record: dict[str, Any], where: str, height_m: float) -> tuple[float, float, float]:
+    """Length, width, height; only the height may be missing."""
+    length, width = (float(documents.get(record, key, float, where)) for key in ("length", "width"))
+    return length, width, float(documents.get({"height": height_m} | record, "height", float, where))
+
+
+def _polyline(record: dict[str, Any], index: int, where: str) -> Polyline:
+    """One road feature; a stop sign's geometry may be a point outside any list."""
+    geometry = record.get("geometry")
+    rows = [geometry] if isinstance(geometry, dict) else documents.get(record, "geometry", list, where)
+    flat = bool(rows) and isinstance(rows[0], dict) and "z" not in rows[0]
+    axes = ("x", "y") if flat else ("x", "y", "z")
+    xyz = documents.points(rows, axes, f"{where}.geometry")
+    documents.require_finite(xyz, f"{where}.geometry", keys=axes)
+    if "map_element_id" in record:
+        kind = documents.get(record, "map_element_id", int, where)
+    else:
+        name = documents.get(record, "type", str, where)
+        if name not in ELEMENTS:
+            raise SceneError(f"{where}.type: {name!r} is no road feature and there is no map_element_id; valid: {', '.join(ELEMENTS)}")
+        kind = ELEMENTS[name]
+    identity = documents.expect(record.get("id", index), int, f"{where}.id")
+    return Polyline(kind=kind, xyz=np.pad(xyz, ((0, 0), (0, 1))) if flat else xyz, id=identity)
+
+
+def _metadata(document: Mapping[str, Any], tracks: tuple[Track, ...], where: str) -> tuple[dict[str, Any], int | None]:
+    """What the file says of itself, objects by their id (an index would not survive dropped tracks), and the SDC's index."""
+    where = f"{where}metadata"
+    source = documents.expect(document.get("metadata") or {}, dict, where)
+    found: dict[str, Any] = {"scenario_id": str(document["scenario_id"])} if "scenario_id" in document else {}
+    if "objects_of_interest" in source:
+        found["objects_of_interest"] = documents.get(source, "objects_of_interest", list, where)
+    if "tracks_to_predict" in source:
+        chosen = documents.get(source, "tracks_to_predict", list, where)
+        indices = [entry.get("track_index") if isinstance(entry, dict) else entry for entry in chosen]
+        found["tracks_to_predict"] = [tracks[i].id for i in indices if isinstance(i, int) and 0 <= i < len(tracks)]
+    sdc = source.get("sdc_track_index")
+    if sdc is None or sdc == -1:
+        return found, None
+    documents.expect(sdc, int, f"{where}.sdc_track_index")
+    if not 0 <= sdc < len(tracks):
+        raise SceneError(f"{where}.sdc_track_index: {sdc} is no object; valid: 0 to {len(tracks) - 1}")
+    return found, sdc

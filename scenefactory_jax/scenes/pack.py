@@ -1,0 +1,273 @@
+"""RawScene -> Scene: which part of the map and which cars, in float32 metres around the scene's centre.
+
+Nothing disappears silently: the report counts what was kept and what was dropped, by reason.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from scenefactory_jax.scenes import columns
+from scenefactory_jax.scenes.raw import RawScene, SceneError, Track
+from scenefactory_jax.types import DRIVABLE, Scene
+
+DEGENERATE_M = 1e-6  # shorter segments have no direction
+DROPS: tuple[str, ...] = ("not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity")
+CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
+
+
+@dataclass(frozen=True)
+class PackReport:
+    """The account of one packed scene, and what of its source the tensors do not hold."""
+
+    name: str
+    source: str
+    centre: tuple[float, float, float]  # of the scene, in the source's coordinates
+    centred_on: str  # "sdc", "mean", or "mean: ..." with the reason why not on the SDC
+    steps: int  # of the packed log
+    current: int  # index in the packed log of the step at which the cars start
+    track_ids: tuple[int, ...]  # of the agents, slot by slot
+    agents_kept: int
+    agents_dropped: dict[str, int]  # reason -> count, every reason of DROPS
+    segments_kept: int
+    segments_cut: dict[str, int]  # reason -> count, every reason of CUTS
+    relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
+    repairs: tuple[str, ...] = ()
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+class Packed(NamedTuple):
+    """A scene of its own size, and its account."""
+
+    scene: Scene
+    report: PackReport
+
+
+def prepare(raw: RawScene, *, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed:
+    """Check, then pack: both bound to their numbers. The report holds what the check repaired.
+
+    Raises:
+        SceneError: a scene that cannot be used, by name.
+    """
+    checked, repairs = check(raw)
+    scene, report = pack(checked)
+    return Packed(scene, replace(report, repairs=(*report.repairs, *repairs)))
+
+
+def pack(
+    raw: RawScene,
+    *,
+    box_m: float,
+    centre: Literal["sdc", "mean"],
+    gap_m: float,
+    agents: int,
+    min_travel_m: float,
+    car_size_m: list[float] | None,
+    start_speed: Literal["logged", "zero"],
+    log_from: Literal["start", "current"],
+    require_agents: bool,
+) -> tuple[Scene, PackReport]:
+    """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
+
+    Args:
+        raw: a checked scene.
+        box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
+        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (facts 4.3).
+        gap_m: longer steps between two points of a polyline are gaps, not segments (facts 4.4).
+        agents: slots. Cars are taken nearest to the centre first.
+        min_travel_m: a car whose goal is not farther than that from its start is no agent.
+        car_size_m: length and width of every car; null: as logged.
+        start_speed: "logged": along the heading, never backwards; "zero".
+        log_from: first step of the packed log: the recording's first, or the current one.
+        require_agents: refuse a scene in which no agent is left.
+
+    Raises:
+        SceneError: no lane segment in the box, or no agent where one is required.
+    """
+    origin, centred_on = _centre(raw, centre)
+    half = box_m / 2
+    road, cut, relief = _segments(raw, origin, half, gap_m)
+    if not np.isin(road["road.kind"], DRIVABLE).any():
+        place = f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on})"
+        raise SceneError(f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")
+    chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
+    if require_agents and not chosen:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
+        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
+    first = raw.current if log_from == "current" else 0
+    tracks = [raw.tracks[i] for i in chosen]
+    leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
+    leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
+    scene = columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
+    report = PackReport(
+        name=raw.name,
+        source=raw.source,
+        centre=(float(origin[0]), float(origin[1]), float(origin[2])),
+        centred_on=centred_on,
+        steps=len(raw.times) - first,
+        current=raw.current - first,
+        track_ids=tuple(track.id for track in tracks),
+        agents_kept=len(tracks),
+        agents_dropped=dropped,
+        segments_kept=len(road["road.kind"]),
+        segments_cut=cut,
+        relief_m=relief,
+        metadata=dict(raw.metadata),
+    )
+    return scene, report
+
+
+def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:
+    """Where the scene's zero lies, and what it was taken from."""
+    reason = ""
+    if wanted == "sdc":
+        if raw.sdc is None:
+            reason = ": the source names no sdc"
+        elif not raw.tracks[raw.sdc].valid[raw.current]:
+            reason = ": the sdc is absent at the current step"
+        else:
+            return raw.tracks[raw.sdc].xyz[raw.current].copy(), "sdc"
+    return np.concatenate([line.xyz for line in raw.roads if len(line.xyz) >= 2]).mean(axis=0), f"mean{reason}"
+
+
+def _segments(
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float
+) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
+    """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
+    order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("midpoint", "direction", "half_length", "arc", "kind", "polyline")}
+    cut, heights = dict.fromkeys(CUTS, 0), [np.zeros(0)]
+    for index in order:
+        line = raw.roads[index]
+        points = line.xyz[:, :2] - origin[:2]
+        delta = np.diff(points, axis=0)
+        length = np.linalg.norm(delta, axis=1)
+        within = np.abs(points).max(axis=1) <= half
+        inside = within[1:] & within[:-1]
+        degenerate, gap = length <= DEGENERATE_M, length > gap_m
+        kept = inside & ~degenerate & ~gap
+        for reason, mask in zip(CUTS, (~inside, inside & gap, inside & degenerate), strict=True):
+            cut[reason] += int(mask.sum())
+        rows["midpoint"].append(((points[1:] + points[:-1]) / 2)[kept])
+        rows["direction"].append(delta[kept] / length[kept, None])
+        rows["half_length"].append(length[kept] / 2)
+        rows["arc"].append((np.cumsum(length) - length / 2)[kept])
+        rows["kind"].append(np.full(kept.sum(), line.kind))
+        rows["polyline"].append(np.full(kept.sum(), index))
+        heights.append(line.xyz[1:][kept, 2])
+    road = {f"road.{name}": np.concatenate(parts) for name, parts in rows.items()}
+    road = {name: leaf.astype(columns.COLUMNS[name].dtype) for name, leaf in road.items()}
+    road["road.valid"] = np.ones(len(road["road.kind"]), bool)
+    height = np.concatenate(heights)
+    return road, cut, float(np.ptp(height)) if len(height) else 0.0
+
+
+def _choose(
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None
+) -> tuple[list[int], dict[str, int]]:
+    """Indices of the tracks that become agents, nearest to the centre first, and the others counted by reason."""
+    dropped, candidates = dict.fromkeys(DROPS, 0), []
+    for index, track in enumerate(raw.tracks):
+        if reason := _objection(track, raw.current, origin, half, min_travel_m):
+            dropped[reason] += 1
+        else:
+            start = track.xyz[raw.current, :2] - origin[:2]
+            candidates.append((float(np.hypot(*start)), index))
+    kept: list[int] = []
+    boxes = np.zeros((0, 4, 2))
+    for _, index in sorted(candidates):
+        track = raw.tracks[index]
+        length, width = car_size_m or track.size[:2]
+        box = corners(track.xyz[raw.current, :2] - origin[:2], track.yaw[raw.current], length, width)
+        if overlaps(box, boxes).any():
+            dropped["overlaps"] += 1
+        elif len(kept) == slots:
+            dropped["over_capacity"] += 1
+        else:
+            kept.append(index)
+            boxes = np.concatenate([boxes, box[None]])
+    return kept, dropped
+
+
+def _objection(track: Track, current: int, origin: Float[np.ndarray, "3"], half: float, min_travel_m: float) -> str | None:
+    """Why a track is no agent; None if it may be one."""
+    if track.kind != "vehicle":
+        return "not_a_vehicle"
+    if not track.valid[current]:
+        return "absent_at_start"
+    start, goal = track.xyz[current, :2] - origin[:2], track.xyz[_last(track), :2] - origin[:2]
+    if np.abs(start).max() > half:
+        return "start_outside_box"
+    if np.abs(goal).max() > half:
+        return "goal_outside_box"
+    return "too_short" if np.hypot(*(goal - start)) <= min_travel_m else None
+
+
+def _last(track: Track) -> int:
+    """The last valid step."""
+    return int(np.flatnonzero(track.valid)[-1])
+
+
+def corners(centre: Float[np.ndarray, "2"], yaw: float, length: float, width: float) -> Float[np.ndarray, "4 2"]:
+    """Corners of an oriented box, counter-clockwise."""
+    forward = np.array([np.cos(yaw), np.sin(yaw)])
+    along, across = forward * length / 2, np.array([-forward[1], forward[0]]) * width / 2
+    return centre + np.stack([along - across, along + across, -along + across, -along - across])
+
+
+def overlaps(box: Float[np.ndarray, "4 2"], others: Float[np.ndarray, "N 4 2"]) -> Bool[np.ndarray, " N"]:
+    """Whether a box shares area with each of the others: no side of either separates them (separating axis theorem)."""
+    separated = np.zeros(len(others), bool)
+    own = np.broadcast_to(box, others.shape)
+    for sides in (own, others):
+        axes = sides[:, 1:3] - sides[:, 0:2]  # two neighbouring sides: their directions are the normals of all four
+        first, second = np.einsum("nad,npd->nap", axes, own), np.einsum("nad,npd->nap", axes, others)
+        separated |= ((first.max(2) <= second.min(2)) | (second.max(2) <= first.min(2))).any(axis=1)
+    return ~separated
+
+
+def _agents(
+    tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, car_size_m: list[float] | None, start_speed: str
+) -> dict[str, np.ndarray]:
+    """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
+    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")} | {name: np.zeros(slots) for name in ("yaw", "speed", "route")}
+    sizes = np.array([car_size_m or track.size[:2] for track in tracks], float).reshape(-1, 2)
+    absent = car_size_m or (sizes.mean(axis=0) if len(sizes) else np.ones(2))
+    size = np.concatenate([sizes, np.tile(absent, (slots - len(tracks), 1))])
+    for slot, track in enumerate(tracks):
+        path = track.xyz[raw.current :][track.valid[raw.current :], :2] - origin[:2]
+        yaw = track.yaw[raw.current]
+        along = float(track.velocity[raw.current] @ np.array([np.cos(yaw), np.sin(yaw)]))
+        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], _wrap(yaw)
+        rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        rows["route"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
+    present = np.arange(slots) < len(tracks)
+    return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
+
+
+def _log(tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, first: int) -> dict[str, np.ndarray]:
+    """Columns of `log`: zeros where the recording has nothing."""
+    steps = len(raw.times) - first
+    rows = {
+        "log.position": np.zeros((slots, steps, 2)),
+        "log.yaw": np.zeros((slots, steps)),
+        "log.velocity": np.zeros((slots, steps, 2)),
+        "log.valid": np.zeros((slots, steps), bool),
+    }
+    for slot, track in enumerate(tracks):
+        valid = track.valid[first:]
+        rows["log.valid"][slot] = valid
+        rows["log.position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
+        rows["log.yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
+        rows["log.velocity"][slot][valid] = track.velocity[first:][valid]
+    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
+    return rows | {"log.dt": np.asarray(step)}
+
+
+def _wrap(angle: Any) -> Any:
+    """The same angle in [-pi, pi)."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi

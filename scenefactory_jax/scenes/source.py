@@ -1,0 +1,59 @@
+"""From a path to scenes: which files there are, and which reader reads each."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from scenefactory_jax.build import build
+from scenefactory_jax.scenes.raw import OtherFormat, RawScene, SceneError
+
+Reader = Callable[[Path], Iterator[RawScene]]
+
+
+def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
+    """Config entries -> readers, in the order in which they are tried.
+
+    Raises:
+        ConfigError: an entry that cannot be built, by name.
+    """
+    return {name: build(entry, builtins=__name__, where=f"formats.{name}") for name, entry in formats.items() if entry is not None}
+
+
+def find(path: Path | str) -> list[Path]:
+    """The file itself, or every file below a folder in sorted order, hidden ones left out.
+
+    Raises:
+        SceneError: no such path, or nothing in it.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise SceneError(f"{path}: no such file or folder; give a scene file or a folder of them")
+    hidden = lambda file: any(part.startswith(".") for part in file.relative_to(path).parts)  # noqa: E731
+    files = sorted(file for file in path.rglob("*") if file.is_file() and not hidden(file))
+    if not files:
+        raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
+    return files
+
+
+def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene]:
+    """The scenes of one file, by the first reader that knows its format.
+
+    Raises:
+        SceneError: no reader knows the format, each with its reason; or what the reader that knows it found wrong.
+    """
+    refusals = []
+    for name, reader in formats.items():
+        scenes = iter(reader(Path(path)))
+        try:
+            first = next(scenes, None)
+        except OtherFormat as refusal:
+            reason = str(refusal).removeprefix(f"{path}: ")
+            refusals.append(f"{name}: {reason}")
+            continue
+        if first is not None:
+            yield first
+        yield from scenes
+        return
+    raise SceneError(f"{path}: no reader knows this format ({'; '.join(refusals) or 'there are no readers'})")

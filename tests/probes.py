@@ -1,0 +1,118 @@
+"""Probe environments: the smallest tasks that each break on one fault of a learning algorithm.
+
+Each is an `Env` of one world whose body is one number an agent, the cue. The last of its three slots is never spawned, and pays poison.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import train
+from scenefactory_jax.types import Env, Events, Facts, Motion, Outcome, Scene, State, Weather
+
+AGENTS = 3
+SIZES = {"A": AGENTS, "P": 1, "L": 1}
+PRESENT = jnp.array([True, True, False])
+POISON = 1e6
+
+NUMBERS = dict(
+    horizon=16,
+    epochs=4,
+    minibatches=4,
+    sample_share=1.0,
+    permutation="each_epoch",
+    learning_rate=3e-3,
+    desired_kl=None,
+    learning_rate_min=1e-5,
+    learning_rate_max=1e-2,
+    gamma=0.9,
+    gae_lambda=0.95,
+    clip=0.2,
+    entropy=0.0,
+    value=1.0,
+    max_grad_norm=1.0,
+    normalise_advantage=True,
+    initial_phase=False,
+    episode_steps=1000,
+)
+
+SMALL = dict(
+    vector=[16], rows={}, rows_default=[16], trunk=[16], activation="tanh", log_std_init=-0.7, actor_head_scale=0.01, dtype="float32"
+)
+
+
+def blank(cls, **known):
+    """A struct of zeros wherever a probe has nothing to say."""
+
+    def zeros(kind):
+        if dataclasses.is_dataclass(kind):
+            return blank(kind)
+        shape = tuple(int(size) if size.isdigit() else SIZES[size] for size in kind.dim_str.split())
+        return jnp.zeros(shape, next((d for d in (jnp.float32, jnp.int32, bool) if jnp.dtype(d).name in kind.dtypes), bool))
+
+    return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
+
+
+def scenes(worlds: int) -> Scene:
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), blank(Scene))
+
+
+def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_steps: int = 1000) -> Env:
+    """Agents whose cue is -1 or +1, who live `life` steps and are paid reward(cue, action, age)."""
+    see = see or (lambda cue, age: cue)
+
+    def start(key, scene):
+        cue_key, key = jax.random.split(key)
+        return State(
+            body=jax.random.rademacher(cue_key, (AGENTS,), jnp.float32),
+            motion=blank(Motion),
+            agents=dataclasses.replace(scene.agents, present=PRESENT),
+            weather=blank(Weather),
+            active=PRESENT,
+            happened=blank(Events),
+            age=jnp.zeros(AGENTS, jnp.int32),
+            previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
+            step=jnp.int32(0),
+            key=key,
+        )
+
+    def transition(scene, state, action):
+        paid = jnp.where(state.active, reward(state.body, jnp.clip(action, -1.0, 1.0), state.age), POISON)
+        done = state.active & (state.age + 1 >= life)
+        after = dataclasses.replace(
+            state, active=state.active & ~done, age=state.age + 1, step=state.step + 1, previous_action=jnp.clip(action, -1.0, 1.0)
+        )
+        truncated = after.step >= episode_steps
+        over = truncated | ~jnp.any(after.active)
+        events = blank(Events, reached=done)
+        facts = blank(Facts, speed=jnp.where(state.active, 2.0, POISON))
+        return after, Outcome(None, paid, {"paid": paid}, events, done, truncated, over, facts)
+
+    def observe(scene, state):
+        return {"cue": jnp.where(state.active, see(state.body, state.age), 0.0)[:, None].astype(jnp.float32)}
+
+    def reset(key, scene):
+        state = start(key, scene)
+        return state, observe(scene, state)
+
+    def step(scene, state, action):
+        state, outcome = transition(scene, state, action)
+        return state, dataclasses.replace(outcome, observation=observe(scene, state))
+
+    return Env(reset, step, start, transition, observe)
+
+
+def trained(env: Env, *, iterations: int, worlds: int = 16, seed: int = 0, policy=None, **numbers):
+    """Policy, train state and the metrics of every iteration."""
+    policy = policy or late_fusion.make(**SMALL)
+    trainer = train.make(env, policy, **{**NUMBERS, **numbers})
+    stage = scenes(worlds)
+    train_state = trainer.init(jax.random.key(seed), stage)
+    history = []
+    for _ in range(iterations):
+        train_state, metrics = trainer.iterate(train_state, stage)
+        history.append(metrics)
+    return policy, train_state, history

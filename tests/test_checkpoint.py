@@ -1,0 +1,111 @@
+"""Checkpoints: going on from disk is going on, and what does not fit is named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import NUMBERS, SMALL, probe, scenes
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import checkpoint, train
+
+STAGE = 4
+
+
+def fresh(**sizes):
+    """A trainer of its own, as in a new process."""
+    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=3, episode_steps=20)
+    numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 20}
+    return train.make(env, late_fusion.make(**{**SMALL, **sizes}), **numbers)
+
+
+def begin(trainer, worlds=STAGE):
+    return trainer.init(jax.random.key(0), scenes(worlds))
+
+
+def assert_same(a, b):
+    def equal(x, y):
+        assert x.dtype == y.dtype
+        keys = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        np.testing.assert_array_equal(*((jax.random.key_data(x), jax.random.key_data(y)) if keys else (x, y)))
+
+    jax.tree.map(equal, a, b)
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    return fresh()
+
+
+@pytest.fixture(scope="module")
+def saved(trainer, tmp_path_factory):
+    """A folder with the checkpoints of iterations 1 to 3, of which two are kept, and the state after iteration 4."""
+    folder, train_state, stage = tmp_path_factory.mktemp("run") / "checkpoints", begin(trainer), scenes(STAGE)
+    assert checkpoint.latest(folder) is None
+    for _ in range(3):
+        train_state, _ = trainer.iterate(train_state, stage)
+        checkpoint.save(folder, train_state, keep=2)
+    third = jax.tree.map(jnp.copy, train_state)
+    return folder, third, trainer.iterate(train_state, stage)[0]
+
+
+def test_the_newest_are_kept(saved):
+    folder, third, _ = saved
+    assert checkpoint.latest(folder) == 3 and sorted(path.name for path in folder.iterdir()) == ["2", "3"]
+    checkpoint.save(folder, third, keep=2)  # again, under the same number
+    assert checkpoint.latest(folder) == 3
+
+
+def test_going_on_from_disk_is_going_on(saved):
+    folder, _, unbroken = saved
+    other = fresh()
+    train_state = checkpoint.restore(folder, begin(other), 2)
+    for _ in range(2):
+        train_state, _ = other.iterate(train_state, scenes(STAGE))
+    assert_same(train_state, unbroken)
+
+
+def test_restore_is_exact_in_every_array(saved, trainer):
+    folder, third, _ = saved
+    assert_same(checkpoint.restore(folder, begin(trainer)), third)
+
+
+def test_parameters_alone_drive_a_policy(saved):
+    folder, third, _ = saved
+    parameters = checkpoint.restore_parameters(folder)
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(parameters))
+    assert_same(parameters, third.parameters)
+    mean, _, _ = late_fusion.make(**SMALL).apply(parameters, third.observation)
+    assert mean.shape == (STAGE, 3, 3)
+
+
+def test_an_unfinished_checkpoint_is_not_there(saved):
+    folder, third, _ = saved
+    (folder / "9.orbax-checkpoint-tmp-1" / "parameters").mkdir(parents=True)
+    assert checkpoint.latest(folder) == 3
+    assert int(checkpoint.restore(folder, third).iteration) == 3
+
+
+def test_mistakes_are_named(saved, trainer, tmp_path):
+    folder, third, _ = saved
+    with pytest.raises(FileNotFoundError, match="nowhere: no checkpoint there"):
+        checkpoint.restore(tmp_path / "nowhere", third)
+    with pytest.raises(FileNotFoundError, match="no checkpoint there"):
+        checkpoint.restore_parameters(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no checkpoint of iteration 7; there are 2, 3"):
+        checkpoint.restore(folder, third, 7)
+    with pytest.raises(ConfigError, match="keep: 0"):
+        checkpoint.save(folder, third, keep=0)
+
+
+def test_a_checkpoint_of_another_config_is_refused_by_name(saved, trainer):
+    folder, _, _ = saved
+    wider = r"checkpoint has parameters/params/actor/vector/layer_0/kernel \(1, 16\), config wants \(1, 24\)"
+    with pytest.raises(ConfigError, match=wider) as caught:
+        checkpoint.restore(folder, begin(fresh(vector=[24])))
+    assert "optimiser" not in str(caught.value)
+    with pytest.raises(ConfigError, match="has no parameters/params/actor/vector/layer_1/bias, config wants one"):
+        checkpoint.restore(folder, begin(fresh(vector=[16, 16])))
+    with pytest.raises(ConfigError, match=r"checkpoint has worlds/active \(4, 3\), config wants \(6, 3\)"):
+        checkpoint.restore(folder, begin(trainer, worlds=6))

@@ -1,0 +1,274 @@
+"""PPO: advantages, loss and minibatches against plain arithmetic; then five probe environments."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.stats import norm
+from probes import NUMBERS, PRESENT, SMALL, probe, scenes, trained
+
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import gae, loss, train, update
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.types import Env
+
+T, W, A = 12, 2, 3
+WORLDS = 8
+
+
+def test_advantages_equal_a_plain_loop():
+    keys = jax.random.split(jax.random.key(0), 6)
+    reward, value = jax.random.normal(keys[0], (T, W, A)), jax.random.normal(keys[1], (T, W, A))
+    bootstrap = jax.random.normal(keys[2], (W, A))
+    active, done = jax.random.bernoulli(keys[3], 0.8, (T, W, A)), jax.random.bernoulli(keys[4], 0.2, (T, W, A))
+    truncated = jax.random.bernoulli(keys[5], 0.2, (T, W, A))
+    advantage, returns = gae.estimate(reward, value, bootstrap, active, done, truncated, gamma=0.9, gae_lambda=0.8)
+
+    wanted = np.zeros((T, W, A))
+    for index in np.ndindex(W, A):
+        following, carried = float(bootstrap[index]), 0.0
+        for t in reversed(range(T)):
+            at = (t, *index)
+            if done[at] or not active[at]:
+                carried = float(reward[at]) * bool(active[at]) - float(value[at])
+            elif truncated[at]:
+                carried = 0.0
+            else:
+                carried = float(reward[at]) + 0.9 * following - float(value[at]) + 0.9 * 0.8 * carried
+            following, wanted[at] = float(value[at]), carried
+    np.testing.assert_allclose(advantage, wanted, atol=1e-5)
+    np.testing.assert_allclose(returns, wanted + np.asarray(value), atol=1e-5)
+
+
+def test_gaussians_agree_with_their_definitions():
+    action, mean, other = jax.random.normal(jax.random.key(1), (3, 4, 3))
+    log_std, log_std_old = jnp.array([-0.5, 0.0, 0.4]), jnp.array([-0.2, 0.1, 0.3])
+    wanted = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
+    np.testing.assert_allclose(loss.log_probability(action, mean, log_std), wanted, rtol=1e-5)
+
+    draws = other[:, None] + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (4, 20_000, 3))
+    difference = loss.log_probability(draws, other[:, None], log_std_old) - loss.log_probability(draws, mean[:, None], log_std)
+    np.testing.assert_allclose(loss.kl(other, log_std_old, mean, log_std), difference.mean(1), rtol=0.05)
+    own = loss.log_probability(draws, other[:, None], log_std_old)
+    np.testing.assert_allclose(loss.gaussian_entropy(log_std_old), -own.mean(), rtol=0.01)
+    assert float(jnp.abs(loss.kl(mean, log_std, mean, log_std)).max()) == 0.0
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Policy, parameters and samples; every third one without weight."""
+    policy, keys, count = late_fusion.make(**SMALL), jax.random.split(jax.random.key(3), 8), 24
+    observation = {"cue": jax.random.normal(keys[0], (count, 1))}
+    parameters = policy.init(keys[1], observation)
+    mean, log_std, value = policy.apply(parameters, observation)
+    action = mean + jax.random.normal(keys[2], mean.shape)
+    old = mean + 0.3 * jax.random.normal(keys[3], mean.shape)
+    samples = loss.Batch(
+        observation=observation,
+        action=action,
+        mean=old,
+        log_probability=loss.log_probability(action, old, log_std),
+        value=value + 0.3 * jax.random.normal(keys[4], value.shape),
+        advantage=jax.random.normal(keys[5], value.shape),
+        returns=jax.random.normal(keys[6], value.shape),
+        weight=(jnp.arange(count) % 3 > 0).astype(jnp.float32),
+    )
+    return policy, parameters, samples, log_std
+
+
+def test_loss_equals_its_definition(batch):
+    policy, parameters, samples, log_std_old = batch
+    numbers = dict(clip=0.2, entropy=0.01, value=0.5)
+    total, facts = loss.ppo(parameters, samples, log_std_old, policy=policy, **numbers)
+    mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
+    surrogates, values = [], []
+    for i in np.flatnonzero(np.asarray(samples.weight)):
+        now = norm.logpdf(samples.action[i], mean[i], np.exp(log_std)).sum()
+        ratio, gain = np.exp(now - samples.log_probability[i]), float(samples.advantage[i])
+        surrogates.append(min(ratio * gain, np.clip(ratio, 0.8, 1.2) * gain))
+        old, target = float(samples.value[i]), float(samples.returns[i])
+        values.append(max((estimate[i] - target) ** 2, (old + np.clip(estimate[i] - old, -0.2, 0.2) - target) ** 2))
+    entropy = 3 * 0.5 * np.log(2 * np.pi * np.e) + log_std.sum()
+    np.testing.assert_allclose(total, -np.mean(surrogates) + 0.5 * np.mean(values) - 0.01 * entropy, rtol=1e-4)
+    assert 0.0 < float(facts["clip_fraction"]) < 1.0
+
+
+def test_samples_without_weight_change_nothing(batch):
+    policy, parameters, samples, log_std = batch
+    empty = samples.weight == 0
+    garbage = dataclasses.replace(
+        samples,
+        observation={"cue": jnp.where(empty[:, None], 9.0, samples.observation["cue"])},
+        action=jnp.where(empty[:, None], 50.0, samples.action),
+        advantage=jnp.where(empty, jnp.nan, samples.advantage),
+        returns=jnp.where(empty, 1e6, samples.returns),
+    )
+    gradient = jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)[0])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), gradient(parameters, garbage), gradient(parameters, samples))
+    normal = loss.normalise(garbage.advantage, samples.weight)
+    np.testing.assert_allclose([loss.weighted_mean(normal, samples.weight), loss.weighted_mean(normal**2, samples.weight)], [0, 1], atol=1e-5)
+    assert float(loss.weighted_mean(garbage.returns, jnp.zeros(24))) == 0.0
+    assert not loss.normalise(garbage.returns, jnp.zeros(24)).any()
+
+
+def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
+    weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
+    whole = update.split(jax.random.key(5), weight, minibatches=4, size=24)
+    assert sorted(whole.reshape(-1).tolist()) == list(range(96))
+    assert np.ptp(np.asarray(weight[whole].sum(1))) <= 1
+    part = update.split(jax.random.key(5), weight, minibatches=4, size=12)
+    assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
+
+
+def learn(batch, samples, **numbers):
+    policy, parameters, _, log_std = batch
+    numbers = {**dict(epochs=1, minibatches=2, size=12, permute_each_epoch=False, rate=update.AdaptiveRate(None, 1e-5, 1e-2)), **numbers}
+    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
+
+    def objective(parameters, part, log_std):
+        return loss.ppo(parameters, part, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)
+
+    return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), loss=objective, optimiser=adam, **numbers)
+
+
+def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
+    _, parameters, samples, _ = batch
+    broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # one of the two minibatches
+    after, state, facts = learn(batch, broken)
+    assert float(facts["skipped"]) == 1.0 and int(state[-1].count) == 1
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((after, facts)))
+    assert any(bool((a != b).any()) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parameters), strict=True))
+
+    after, _, facts = learn(batch, dataclasses.replace(samples, weight=jnp.zeros(24)))
+    jax.tree.map(np.testing.assert_array_equal, after, parameters)
+    assert float(facts["skipped"]) == 0.0
+
+
+def test_learning_rate_follows_the_divergence(batch):
+    samples, rates = batch[2], []
+    for desired in (1e-4, 0.1, 1e3):  # the samples' own divergence from the policy is about 0.27
+        rates.append(float(learn(batch, samples, minibatches=1, size=24, rate=update.AdaptiveRate(desired, 1e-5, 1e-2))[2]["learning_rate"]))
+    np.testing.assert_allclose(rates, [1e-3 / 1.5, 1e-3 / 1.5, 1e-3 * 1.5], rtol=1e-5)
+    held = learn(batch, samples, minibatches=1, size=24, rate=update.AdaptiveRate(1e-4, 9e-4, 1e-2))[2]["learning_rate"]
+    np.testing.assert_allclose(held, 9e-4, rtol=1e-5)
+
+
+def counted(env: Env):
+    """The environment, and how often its transition was traced."""
+    traces = []
+
+    def transition(scene, state, action):
+        traces.append(1)
+        return env.transition(scene, state, action)
+
+    return env._replace(transition=transition), traces
+
+
+@pytest.fixture(scope="module")
+def course():
+    """Lives of 3 steps in worlds of 7: the third life of a world runs out of time."""
+    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=5, episode_steps=4)
+    env, traces = counted(env)
+    return train.make(env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 4}), traces
+
+
+def run(trainer, stage, iterations, seed=0):
+    train_state, history = trainer.init(jax.random.key(seed), stage), []
+    for _ in range(iterations):
+        train_state, metrics = trainer.iterate(train_state, stage)
+        history.append(metrics)
+    return train_state, history
+
+
+def test_one_trace_same_seed_same_numbers_and_scenes_survive_donation(course):
+    trainer, traces = course
+    stage = scenes(WORLDS)
+    first, history = run(trainer, stage, 3)
+    second, _ = run(trainer, stage, 3)
+    other = jax.tree.map(lambda x: x + jnp.ones_like(x), stage)
+    trainer.iterate(second, other)
+    assert len(traces) <= 2  # the scan traces its body once, or twice to settle the carry; never again in later iterations
+    stage.agents.position.block_until_ready()
+    again, _ = run(trainer, stage, 3)
+    same = jax.tree.map(lambda a, b: bool((a == b).all()), (first.parameters, first.worlds), (again.parameters, again.worlds))
+    assert all(jax.tree.leaves(same))
+    assert all(bool(jnp.isfinite(value)) for metrics in history for value in metrics.values())
+    assert train.spawned_steps(first) == 3 * 16 * WORLDS * int(PRESENT.sum()) and int(first.iteration) == 3
+
+
+def test_metrics_count_what_happened(course):
+    trainer, _ = course
+    _, history = run(trainer, scenes(WORLDS), 2)
+    metrics = {name: float(value) for name, value in history[-1].items()}
+    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["share/active"] == 1.0
+    assert metrics["reward"] == pytest.approx(metrics["reward/paid"]) and -4.0 < metrics["reward"] < 0.0
+    assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
+    assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
+    assert metrics["events/reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
+
+
+def test_restart_keeps_what_was_learnt(course):
+    trainer, _ = course
+    stage = scenes(WORLDS)
+    train_state, _ = run(trainer, stage, 1)
+    learnt = jax.tree.map(np.asarray, train_state.parameters)
+    train_state = trainer.restart(train_state, stage)
+    jax.tree.map(np.testing.assert_array_equal, learnt, train_state.parameters)
+    assert len(set(train_state.worlds.step.tolist())) > 1 and not train_state.lives.steps.any()  # at random phases of 4 steps
+
+
+def test_mistakes_are_named():
+    env, policy = probe(lambda cue, action, age: cue, life=1), late_fusion.make(**SMALL)
+    with pytest.raises(ConfigError, match=r"16 x 8 worlds x 3 agents = 384 samples .* 7 minibatches"):
+        train.make(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
+    with pytest.raises(ConfigError, match=r"ppo\.gamma: 1\.5"):
+        train.make(env, policy, **{**NUMBERS, "gamma": 1.5})
+    with pytest.raises(ConfigError, match=r"ppo\.learning_rate: 1\.0 is outside"):
+        train.make(env, policy, **{**NUMBERS, "learning_rate": 1.0})
+
+
+@pytest.mark.parametrize("name", ["published", "demo", "quick", "smoke"])
+def test_configs_build(name):
+    entry = {"_target_": "make", **configs.load("train", f"ppo={name}")["ppo"]}
+    trainer = build(entry, builtins=train, where="ppo", episode_steps=100)(probe(lambda c, a, t: c, life=1), late_fusion.make(**SMALL))
+    assert trainer.iterate
+
+
+def look(policy, train_state, *cues):
+    """Action mean (throttle) and value for cues."""
+    mean, _, value = policy.apply(train_state.parameters, {"cue": jnp.array(cues, jnp.float32)[:, None]})
+    return mean[:, 0], value
+
+
+def test_probe_1_value():
+    env = probe(lambda cue, action, age: jnp.ones(3), life=1, see=lambda cue, age: 0.0 * cue)
+    policy, train_state, _ = trained(env, iterations=30)
+    np.testing.assert_allclose(look(policy, train_state, 0.0)[1], [1.0], atol=0.05)
+
+
+def test_probe_2_value_of_what_is_seen():
+    policy, train_state, history = trained(probe(lambda cue, action, age: cue, life=1), iterations=30)
+    np.testing.assert_allclose(look(policy, train_state, -1.0, 1.0)[1], [-1.0, 1.0], atol=0.05)
+    assert float(history[-1]["ppo/explained_variance"]) > 0.95
+
+
+def test_probe_3_value_of_what_comes_later():
+    env = probe(lambda cue, action, age: (age == 1).astype(jnp.float32), life=2, see=lambda cue, age: age)
+    policy, train_state, _ = trained(env, iterations=30)
+    np.testing.assert_allclose(look(policy, train_state, 0.0, 1.0)[1], [NUMBERS["gamma"], 1.0], atol=0.05)
+
+
+def test_probe_4_action():
+    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5) ** 2), life=1, see=lambda cue, age: 0.0 * cue)
+    policy, train_state, _ = trained(env, iterations=50)
+    np.testing.assert_allclose(look(policy, train_state, 0.0)[0], [0.5], atol=0.1)
+
+
+def test_probe_5_action_that_depends_on_what_is_seen():
+    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=1)
+    policy, train_state, history = trained(env, iterations=50, sample_share=0.75)  # two of three slots are spawned
+    np.testing.assert_allclose(look(policy, train_state, -1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
+    assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1 and float(history[-1]["ppo/left_out"]) == 0.0

@@ -1,0 +1,400 @@
+"""Laws of the report: intervals against known values, records that round-trip, pictures that show things where they are."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import road_of
+from PIL import Image
+
+from scenefactory_jax.report import canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax.types import Agents, Log, Scene, Weather
+
+BOOTSTRAP = {"bootstrap": 400, "seed": 0}
+FILM = {"fps": 10.0, "stride": 3, "columns": 2, "panel": 160, "trail_s": 2.0}
+
+
+def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: int = 0) -> dict[str, np.ndarray]:
+    rng, n = np.random.default_rng(seed), scenes * agents
+    scene = np.repeat(np.arange(scenes), agents)
+    share = np.clip(success + (0.15 * rng.normal(size=scenes) if 0 < success < 1 else 0.0), 0, 1)
+    reached = rng.random(n) < np.broadcast_to(share, scenes)[scene]
+    events = {name: (rng.random(n) < 0.15 * (1 - success)) for name in ("collided", "crashed", "touched_edge")}
+    ttc = np.where(rng.random(n) < 0.8, rng.gamma(3.0, 1.0, n), np.inf)
+    return {
+        "scene": np.array([f"scene, {i:03d}" for i in scene]), "world": scene, "seed": np.full(n, 7),
+        "agent": np.tile(np.arange(agents), scenes),
+        "reached": reached, **events, "fault": np.zeros(n, bool),
+        "clean": reached & ~events["collided"] & ~events["crashed"] & ~events["touched_edge"],
+        "time_s": rng.uniform(3, 50, n).astype(np.float32), "route_m": rng.uniform(10, 90, n), "start_distance_m": rng.uniform(10, 90, n),
+        "end_distance_m": np.where(reached, 2.5, 20.0), "max_drac": rng.gamma(1.0, 3.0, n), "min_ttc_s": ttc,
+        "mean_ttc_s": np.where(np.isfinite(ttc), np.minimum(ttc + 1, 10), 0.0), "has_ttc": np.isfinite(ttc),
+        "mean_speed": rng.uniform(1, 9, n), "max_contact_force_n": np.where(events["collided"], 900.0, 0.0),
+        "film_mm": np.array([0.0, 0.5])[scene % 2],
+        "surface": np.array(["AC", "SMA"])[scene % 2], "friction": np.array([0.86, 0.6])[scene % 2],
+    }  # fmt: skip
+
+
+def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and curve") -> canvas.Trajectory:
+    """A straight road with a quarter circle behind it; agent 0 arrives, agent 1 collides, the others drive on."""
+    angle = np.linspace(0, np.pi / 2, 40)
+    way = np.concatenate([np.stack([np.arange(-60.0, 0.0), np.zeros(60)], 1), 30 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)])
+    beside = np.array([0.0, 1.0])
+    road = road_of([(2, way), (6, way + 1.8 * beside), (15, way + 4.0 * beside), (16, way - 4.0 * beside)])
+    start = -55.0 + 14.0 * np.arange(agents)
+    run = start + 8.0 * np.arange(steps)[:, None] / 30
+    position = np.stack([run, np.zeros_like(run)], -1).astype(np.float32)
+    active = np.ones((steps, agents), bool)
+    events = {name: np.zeros((steps, agents), bool) for name in canvas.MARKS}
+    for agent, step, name in ((0, 30, "reached"), (1, 40, "collided")):
+        events[name][step, agent] = True
+        active[step + 1 :, agent] = False
+        position[step:, agent] = position[step, agent]
+    f = jnp.float32
+    goal = np.stack([position[30, 0], *np.tile([25.0, 20.0], (agents - 1, 1))]).astype(np.float32)
+    zero = jnp.zeros(agents, f)
+    size = jnp.tile(jnp.array([4.5, 2.0], f), (agents, 1))
+    cars = Agents(jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool))
+    row = jnp.zeros((agents, 1), f)
+    log = Log(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
+    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, Weather(f(0.5), jnp.int32(1))))
+    still = np.zeros((steps, agents), np.float32)
+    return canvas.Trajectory(
+        scene, position, still, still + 8, active, events, np.asarray(size), goal, np.ones(agents, bool), 30.0, title, "SMA, 0.5 mm"
+    )
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> canvas.Trajectory:
+    return make_trajectory()
+
+
+# Tables
+
+
+@pytest.mark.parametrize(
+    ("share", "count", "low", "high"),
+    [(0.5, 10, 0.2366, 0.7634), (0.0, 20, 0.0, 0.1611), (1.0, 20, 0.8389, 1.0), (81 / 263, 263, 0.2553, 0.3662)],
+)
+def test_wilson_matches_published_values(share, count, low, high):
+    """81 of 263: Newcombe 1998, table I, method 3; the others: closed form with z = 1.96."""
+    np.testing.assert_allclose(tables.wilson(share, count), (low, high), atol=1e-4)
+
+
+def test_bootstrap_matches_the_normal_interval_of_scene_means():
+    """With equal scenes the rate is a mean over scenes: its interval is about 1.96 standard errors of the scenes' means."""
+    records = make_records(scenes=200, agents=5, seed=3)
+    means = records["reached"].reshape(200, 5).mean(1)
+    estimate = tables.summarise(records, bootstrap=4000, seed=1)["success_rate"]
+    half = 1.96 * means.std() / np.sqrt(200)
+    assert estimate.method == tables.BOOTSTRAP
+    assert estimate.value == pytest.approx(means.mean())
+    np.testing.assert_allclose([estimate.low, estimate.high], [means.mean() - half, means.mean() + half], atol=0.1 * half)
+
+
+def test_agents_that_share_a_fate_widen_the_interval():
+    """Ten copies of each agent are no new evidence: the scene bootstrap must not narrow, as an interval over agents would."""
+    one = make_records(scenes=30, agents=1, seed=5)
+    ten = {name: np.repeat(column, 10) for name, column in one.items()}
+    first, second = (tables.summarise(r, **BOOTSTRAP)["success_rate"] for r in (one, ten))
+    assert (second.low, second.high) == pytest.approx((first.low, first.high))
+
+
+def test_resampling_is_reproducible_and_holds_the_value():
+    records = make_records()
+    first, again = (tables.summarise(records, **BOOTSTRAP) for _ in range(2))
+    assert first == again
+    for name, estimate in first.items():
+        assert estimate.low <= estimate.value <= estimate.high, name
+        assert estimate.unit != tables.SHARE or 0 <= estimate.low <= estimate.high <= 1
+
+
+def test_all_success_has_an_uncertain_lower_end():
+    estimate = tables.summarise(make_records(success=1.0), **BOOTSTRAP)["success_rate"]
+    assert (estimate.value, estimate.high, estimate.method) == (1.0, 1.0, tables.WILSON)
+    assert 0.9 < estimate.low < 1.0
+    assert tables.text(estimate).startswith("100.0 % [9")
+
+
+def test_one_scene_falls_back_and_says_so():
+    summary = tables.summarise(make_records(scenes=1, agents=16), **BOOTSTRAP)
+    assert summary["success_rate"].method == tables.WILSON
+    assert summary["mean_max_drac"].method == tables.AGENTS
+    assert "‡" in tables.text(summary["mean_max_drac"])
+
+
+def test_outcomes_are_exclusive_and_add_up():
+    records = make_records(seed=2)
+    summary = tables.summarise(records, **BOOTSTRAP)
+    assert summary["clean_success_rate"].value <= summary["success_rate"].value
+    names, counts = np.unique(plots.outcomes(records), return_counts=True)
+    assert set(names) <= set(plots.OUTCOMES) and counts.sum() == len(records["scene"])
+    arrived = counts[np.char.startswith(names, "reached")].sum()
+    assert arrived == records["reached"].sum()
+
+
+def test_published_means_weigh_worlds_equally():
+    records = make_records(scenes=2, agents=4)
+    records["max_drac"] = np.array([1.0, 1, 1, 1, 5, 5, 5, 5])
+    few = tables.select(records, np.array([0, 1, 2, 3, 4]))  # one agent is left in the second world
+    assert tables.summarise(few, **BOOTSTRAP)["mean_max_drac"].value == pytest.approx(3.0)
+    assert tables.summarise(few, **BOOTSTRAP)["high_drac_rate"].value == pytest.approx(0.2)
+
+
+def test_nobody_arrives_means_no_time_rather_than_nan():
+    estimate = tables.summarise(make_records(success=0.0), **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert estimate == tables.Estimate(None, None, None, 0, "s", tables.NONE)
+    assert tables.text(estimate) == "no data"
+
+
+def test_difference_is_paired_over_scenes():
+    before = make_records(success=0.5, seed=1)
+    after = {**before, "end_distance_m": before["end_distance_m"] - 2.0}
+    change = tables.difference(before, after, **BOOTSTRAP)
+    assert (change["mean_remaining_m"].low, change["mean_remaining_m"].high) == pytest.approx((-2.0, -2.0))
+    assert change["success_rate"].value == 0.0
+    assert change["success_rate"].method == tables.NEWCOMBE and change["success_rate"].low < 0 < change["success_rate"].high
+    with pytest.raises(tables.RecordsError, match="same scenes"):
+        tables.difference(before, make_records(scenes=11), **BOOTSTRAP)
+
+
+def test_breakdown_partitions_the_records():
+    records = make_records()
+    parts = tables.breakdown(records, "film_mm", **BOOTSTRAP)
+    assert list(parts) == ["0", "0.5"]
+    assert sum(part["success_rate"].count for part in parts.values()) == len(records["scene"])
+    with pytest.raises(tables.RecordsError, match=r"records\.wind.*surface"):
+        tables.breakdown(records, "wind", **BOOTSTRAP)
+
+
+def test_records_round_trip_through_csv(tmp_path):
+    records = {**make_records(), "kind": np.repeat(["junction", "straight"], 36), "lap": np.arange(72), "note": np.tile([0.1, np.inf], 36)}
+    tables.write_csv(tmp_path / "records.csv", records)
+    back = tables.read_csv(tmp_path / "records.csv")
+    assert list(back) == list(records)
+    for name, column in records.items():
+        np.testing.assert_array_equal(back[name], column, err_msg=name)
+        assert back[name].dtype.kind == np.asarray(column).dtype.kind, name
+
+
+def test_bad_records_are_refused_by_name(tmp_path):
+    records = make_records()
+    with pytest.raises(tables.RecordsError, match="no rows"):
+        tables.summarise({name: column[:0] for name, column in records.items()}, **BOOTSTRAP)
+    with pytest.raises(tables.RecordsError, match=r"records\.clean: column missing"):
+        tables.summarise({name: column for name, column in records.items() if name != "clean"}, **BOOTSTRAP)
+    with pytest.raises(tables.RecordsError, match=r"records\.agent: 71 rows"):
+        tables.summarise({**records, "agent": records["agent"][1:]}, **BOOTSTRAP)
+    with pytest.raises(tables.RecordsError, match=r"Mean max DRAC.*row 3"):
+        tables.summarise({**records, "max_drac": np.where(np.arange(72) == 3, np.nan, 1.0)}, **BOOTSTRAP)
+    with pytest.raises(tables.RecordsError, match=r"none\.csv: no such file"):
+        tables.read_csv(tmp_path / "none.csv")
+    tables.write_csv(tmp_path / "records.csv", records)
+    (tmp_path / "records.csv").write_text((tmp_path / "records.csv").read_text().replace("True", "perhaps", 1))
+    with pytest.raises(tables.RecordsError, match="no bool"):
+        tables.read_csv(tmp_path / "records.csv")
+
+
+# Pictures and videos
+
+
+def test_world_to_pixels():
+    view = canvas.View(left=-10.0, bottom=20.0, side=40.0, pixels=400)
+    corners = np.array([[-10.0, 60.0], [30.0, 20.0], [10.0, 40.0]])
+    np.testing.assert_allclose(canvas.to_pixels(view, corners), [[0, 0], [400, 400], [200, 200]])
+
+
+def test_view_holds_every_way_and_goal(trajectory):
+    left, bottom, side = canvas.around(canvas.places(trajectory), margin=5.0, smallest=10.0)
+    shown = np.concatenate([trajectory.position[trajectory.active], trajectory.goal])
+    assert (shown >= [left + 5 - 1e-3, bottom + 5 - 1e-3]).all() and (shown <= [left + side - 5 + 1e-3, bottom + side - 5 + 1e-3]).all()
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi / 2, 2.5])
+def test_car_shape_is_the_oriented_box(yaw):
+    box, arrow = canvas.car_shape(np.array([3.0, -2.0]), yaw, np.array([4.0, 2.0]))
+    np.testing.assert_allclose(box.mean(0), [3.0, -2.0], atol=1e-12)
+    front = (box[0] + box[1]) / 2 - [3.0, -2.0]
+    np.testing.assert_allclose(front, 2.0 * np.array([np.cos(yaw), np.sin(yaw)]), atol=1e-12)
+    assert (arrow[0] - [3.0, -2.0]) @ front > (arrow[1] - [3.0, -2.0]) @ front
+
+
+def test_dashes_run_on_across_segments():
+    """3 m on, 6 m off, counted along the polyline and not from each 1 m segment's start."""
+    stroke = canvas.strokes(road_of([(6, np.stack([np.arange(-10.0, 27.0), np.zeros(37)], 1))]))[0]
+    along = (np.arange(3600) + 0.5) / 100
+    covered = ((stroke.lines[:, :1, 0] + 10 <= along) & (along <= stroke.lines[:, 1:, 0] + 10)).any(axis=0)
+    np.testing.assert_array_equal(covered, along % 9 < 3)
+
+
+def test_a_car_is_drawn_where_it_is(trajectory):
+    """Law of the pixels: the box of agent 2's colour sits at its place, and moves as the car does."""
+    panel, centres = 640, []
+    settings = {**FILM, "columns": 1, "panel": panel, "trail_s": 0.0}
+    view = canvas.View(*canvas.around(canvas.places(trajectory), margin=9.0, smallest=50.0), panel)
+    shown = video.shown_steps(len(trajectory.active), 30)
+    for step, picture in zip(shown, video.frames([trajectory], **{**settings, "stride": 30}), strict=True):
+        body = picture[video._GAP + video._bar(panel) :][:panel, video._GAP : video._GAP + panel].astype(int)
+        match = np.abs(body - canvas.colour_of(2)).max(-1) < 40
+        column, row = canvas.to_pixels(view, trajectory.position[step, 2])
+        near = match[round(row) - 6 : round(row) + 7, round(column) - 24 : round(column) + 25]
+        assert match[round(row) - 2 : round(row) + 3, round(column) - 4 : round(column) - 1].all()
+        columns = np.nonzero(near)[1]
+        centres.append((columns.min() + columns.max()) / 2 + round(column) - 24 + 0.5 - column)
+    np.testing.assert_allclose(centres, 0.0, atol=1.5)
+
+
+def test_finished_cars_fade_and_events_are_marked(trajectory):
+    stage = video._prepare(trajectory, 240)
+    red = np.array(canvas.MARKS["collided"].colour)
+    early, late = (np.asarray(video._draw_world(stage, step, trail_s=1.0)).astype(int) for step in (39, 60))
+    assert not (np.abs(early - red).max(-1) < 12).any()
+    assert (np.abs(late - red).max(-1) < 12).sum() > 20
+    assert stage.counts["reached"][[29, 30, 60]].tolist() == [0, 1, 1]
+    blue = np.abs(late - canvas.colour_of(0)).max(-1) < 12  # arrived a second ago: car, goal and number are gone
+    assert not blue.any()
+
+
+@pytest.mark.parametrize("stride", [1, 3, 7])
+def test_gif_has_every_frame_and_the_right_speed(tmp_path, trajectory, stride):
+    path = video.write(tmp_path / "film.gif", [trajectory, make_trajectory(2, 45, "short")], **{**FILM, "stride": stride, "fps": 30.0})
+    expected = len(video.shown_steps(61, stride))
+    with Image.open(path) as film:
+        assert film.n_frames == expected
+        total = 0
+        for index in range(expected):
+            film.seek(index)
+            total += film.info["duration"]
+        assert total == pytest.approx(1000 * expected / 30, abs=10)
+        assert film.size == next(iter(video.frames([trajectory] * 2, **FILM))).shape[1::-1]
+
+
+def test_gif_shows_what_was_drawn(tmp_path, trajectory):
+    """Palette and frame differences must not add up to visible errors."""
+    path = video.write(tmp_path / "film.gif", [trajectory], **FILM)
+    pictures_drawn = list(video.frames([trajectory], **FILM))
+    with Image.open(path) as film:
+        for index in (0, 7, len(pictures_drawn) - 1):
+            film.seek(index)
+            error = np.abs(np.asarray(film.convert("RGB")).astype(int) - pictures_drawn[index])
+            assert error.mean() < 3.0
+            assert np.percentile(error, 99.5) < 40
+
+
+def test_gif_of_a_still_picture(tmp_path):
+    still = np.full((20, 30, 3), 200, np.uint8)
+    count = gif.write(tmp_path / "still.gif", [still] * 3, colours=gif.palette([still], keep=[]), fps=10.0)
+    with Image.open(tmp_path / "still.gif") as film:
+        assert (count, film.n_frames) == (3, 3)
+
+
+def test_mp4_has_every_frame(tmp_path, trajectory):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    import imageio_ffmpeg
+
+    path = video.write(tmp_path / "film.mp4", [trajectory], **FILM)
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert frames == len(video.shown_steps(61, 3)) and seconds == pytest.approx(frames / 10, abs=0.05)
+
+
+def test_bad_videos_are_refused_by_name(tmp_path, trajectory, monkeypatch):
+    with pytest.raises(video.VideoError, match=r"\.avi"):
+        video.write(tmp_path / "film.avi", [trajectory], **FILM)
+    with pytest.raises(video.VideoError, match="at least one"):
+        video.write(tmp_path / "film.gif", [], **FILM)
+    with pytest.raises(video.VideoError, match="stride: 0"):
+        video.frames([trajectory], **{**FILM, "stride": 0})
+    with pytest.raises(video.VideoError, match="fps"):
+        video.write(tmp_path / "film.gif", [trajectory], **{**FILM, "fps": 90.0})
+    with pytest.raises(canvas.TrajectoryError, match=r"trajectory\.yaw"):
+        video.frames([trajectory._replace(yaw=trajectory.yaw[1:])], **FILM)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(video.VideoError, match=r"pip install scenefactory_jax\[video\]"):
+        video.write(tmp_path / "film.mp4", [trajectory], **FILM)
+
+
+def test_a_fault_leaves_the_car_where_it_was(trajectory):
+    position = trajectory.position.copy()
+    position[50:, 2] = np.nan
+    settled = canvas.settle(trajectory._replace(position=position))
+    np.testing.assert_array_equal(settled.position[60, 2], position[49, 2])
+    assert not settled.active[50:, 2].any() and settled.active[:50, 2].all()
+    assert len(list(video.frames([trajectory._replace(position=position)], **FILM))) == 21
+
+
+def test_a_respawn_draws_no_line_across_the_map(trajectory):
+    position = trajectory.position.copy()
+    position[30:, 2] += 50.0
+    driven = canvas.moves(trajectory._replace(position=position))
+    assert not driven[30, 2] and driven[29, 2] and driven[31, 2]
+
+
+# Figures and the document
+
+
+def test_every_figure_is_drawn(tmp_path, trajectory):
+    first, second = make_records(success=0.3), make_records()
+    summary = [tables.summarise(r, **BOOTSTRAP) for r in (first, second)]
+    row = {"iteration": 0, "steps/spawned": 1e4, "reward/goal": 1.0, "reward/edge": -0.5, "loss/kl": 0.01}
+    rows = [{**row, "ended/reached": i / 9} for i in range(9)]
+    figures = {
+        "learning": plots.learning_figure([*rows, {"steps/spawned": 1e4, "casps": 5.0}]),
+        "rates": plots.rates_figure({"a": summary[0], "b": summary[1]}),
+        "comparison": plots.comparison_figure(*summary),
+        "outcomes": plots.outcome_figure(second, most=5),
+        "safety": plots.safety_figure({"a": first, "b": second}),
+        "scene": pictures.scene_figure(trajectory.scene, whole=True),
+        "ways": pictures.trajectory_figure(trajectory),
+    }
+    for name, figure in figures.items():
+        picture = np.asarray(Image.open(plots.save(figure, tmp_path / f"{name}.png")).convert("L"))
+        assert picture.std() > 5, name
+    assert [axes.get_title(loc="left") for axes in figures["learning"].axes] == [
+        "How agents end", "Reward a step, by term", "KL divergence of an update", "Training speed",
+    ]  # fmt: skip
+
+
+def test_plots_refuse_what_they_cannot_show():
+    with pytest.raises(plots.PlotError, match="steps/spawned"):
+        plots.learning_figure([{"loss": 1.0}])
+    with pytest.raises(plots.PlotError, match="no column to plot"):
+        plots.learning_figure({"steps/spawned": [1, 2], "wind": [1, 2]})
+    with pytest.raises(plots.PlotError, match="no summary"):
+        plots.rates_figure({})
+
+
+def test_report_says_what_happened(tmp_path):
+    records = {"strict": make_records(), "strict, untrained": make_records(success=0.1, seed=9)}
+    summary = {name: tables.summarise(r, **BOOTSTRAP) for name, r in records.items()}
+    (tmp_path / "a film.gif").write_bytes(b"GIF89a")
+    path = document.write(
+        tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip": 0.15}},
+        versions={"GPU": "none"}, baselines={"strict": "strict, untrained"}, videos={"Four worlds": tmp_path / "a film.gif"},
+        commands=["python -m scenefactory_jax evaluate run=X"], **BOOTSTRAP,
+    )  # fmt: skip
+    text = path.read_text()
+    assert f"**{records['strict']['reached'].sum()} of 72 cars reached their goal" in text
+    assert "![Four worlds](../a%20film.gif)" in text
+    for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip` | 0.15 |", "evaluate run=X", "scene, 00"):
+        assert part in text, part
+    assert "nan" not in text.lower() and "None" not in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert all(line.endswith("|") for line in lines)
+
+
+def test_report_refuses_what_does_not_fit(tmp_path):
+    records = {"strict": make_records()}
+    summary = {"strict": tables.summarise(records["strict"], **BOOTSTRAP)}
+    rest = {"title": "", "config": {}, "versions": {}, **BOOTSTRAP}
+    with pytest.raises(document.DocumentError, match="nothing to report"):
+        document.write(tmp_path, summary={}, records={}, **rest)
+    with pytest.raises(document.DocumentError, match="no 'strict'"):
+        document.write(tmp_path, summary=summary, records={}, **rest)
+    with pytest.raises(document.DocumentError, match="'strict' -> 'random'"):
+        document.write(tmp_path, summary=summary, records=records, baselines={"strict": "random"}, **rest)
+    with pytest.raises(document.DocumentError, match="no such file"):
+        document.write(tmp_path, summary=summary, records=records, figures={"x": Path("nowhere.png")}, **rest)
+    assert not (tmp_path / "report.md").exists()
