@@ -4,13 +4,10 @@ Each is an `Env` of one world whose body is one number an agent, the cue. The la
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.policy import late_fusion
-from scenefactory_jax.ppo import train
 from scenefactory_jax.types import Env, Events, Facts, Motion, Outcome, Scene, State, Weather
 
 AGENTS = 3
@@ -56,13 +53,30 @@ def blank(cls, **known):
     return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
 
 
-def scenes(worlds: int) -> Scene:
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), blank(Scene))
+def scenes(worlds: int, task: int = 5) -> Scene:
+    """Scenes that hold nothing but the number of a probe."""
+    scene = blank(Scene, weather=Weather(film_mm=jnp.float32(0.0), surface=jnp.int32(task)))
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), scene)
 
 
-def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_steps: int = 1000) -> Env:
-    """Agents whose cue is -1 or +1, who live `life` steps and are paid reward(cue, action, age)."""
-    see = see or (lambda cue, age: cue)
+def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
+    """Agents whose cue is -1 or +1. Which of the five probes it is stands in the scene, so that all share one compilation.
+
+    | task | sees | lives | is paid | what it proves |
+    | 1 | 0 | 1 step | 1 | value |
+    | 2 | cue | 1 step | cue | value of what is seen |
+    | 3 | age | 2 steps | 1 in the second | discounting |
+    | 4 | 0 | 1 step | -(throttle - 0.5)^2 | action |
+    | 5 | cue | 1 step | -(throttle - 0.5 cue)^2 | action that depends on what is seen |
+    """
+
+    def pay(task, cue, action, age):
+        one, later = jnp.ones(AGENTS), (age == 1).astype(jnp.float32)
+        throttle = action[:, 0]
+        return jnp.select([task == 1, task == 2, task == 3, task == 4], [one, cue, later, -((throttle - 0.5) ** 2)], -((throttle - 0.5 * cue) ** 2))
+
+    def see(task, cue, age):
+        return jnp.select([task == 2, task == 3, task == 5], [cue, age.astype(jnp.float32), cue], 0.0)
 
     def start(key, scene):
         cue_key, key = jax.random.split(key)
@@ -70,7 +84,7 @@ def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_s
             body=jax.random.rademacher(cue_key, (AGENTS,), jnp.float32),
             motion=blank(Motion),
             agents=dataclasses.replace(scene.agents, present=PRESENT),
-            weather=blank(Weather),
+            weather=scene.weather,
             active=PRESENT,
             happened=blank(Events),
             age=jnp.zeros(AGENTS, jnp.int32),
@@ -80,8 +94,9 @@ def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_s
         )
 
     def transition(scene, state, action):
-        paid = jnp.where(state.active, reward(state.body, jnp.clip(action, -1.0, 1.0), state.age), POISON)
-        done = state.active & (state.age + 1 >= life)
+        task = scene.weather.surface
+        paid = jnp.where(state.active, pay(task, state.body, jnp.clip(action, -1.0, 1.0), state.age), POISON)
+        done = state.active & (state.age + 1 >= (life or jnp.where(task == 3, 2, 1)))
         after = dataclasses.replace(
             state, active=state.active & ~done, age=state.age + 1, step=state.step + 1, previous_action=jnp.clip(action, -1.0, 1.0)
         )
@@ -92,7 +107,7 @@ def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_s
         return after, Outcome(None, paid, {"paid": paid}, events, done, truncated, over, facts)
 
     def observe(scene, state):
-        return {"cue": jnp.where(state.active, see(state.body, state.age), 0.0)[:, None].astype(jnp.float32)}
+        return {"cue": jnp.where(state.active, see(scene.weather.surface, state.body, state.age), 0.0)[:, None]}
 
     def reset(key, scene):
         state = start(key, scene)
@@ -103,16 +118,3 @@ def probe(reward: Callable, *, life: int, see: Callable | None = None, episode_s
         return state, dataclasses.replace(outcome, observation=observe(scene, state))
 
     return Env(reset, step, start, transition, observe)
-
-
-def trained(env: Env, *, iterations: int, worlds: int = 16, seed: int = 0, policy=None, **numbers):
-    """Policy, train state and the metrics of every iteration."""
-    policy = policy or late_fusion.make(**SMALL)
-    trainer = train.make(env, policy, **{**NUMBERS, **numbers})
-    stage = scenes(worlds)
-    train_state = trainer.init(jax.random.key(seed), stage)
-    history = []
-    for _ in range(iterations):
-        train_state, metrics = trainer.iterate(train_state, stage)
-        history.append(metrics)
-    return policy, train_state, history

@@ -15,7 +15,7 @@ STAGE = 4
 
 def fresh(**sizes):
     """A trainer of its own, as in a new process."""
-    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=3, episode_steps=20)
+    env = probe(life=3, episode_steps=20)
     numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 20}
     return train.make(env, late_fusion.make(**{**SMALL, **sizes}), **numbers)
 

@@ -1,13 +1,14 @@
 """PPO: advantages, loss and minibatches against plain arithmetic; then five probe environments."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.scipy.stats import norm
-from probes import NUMBERS, PRESENT, SMALL, probe, scenes, trained
+from probes import NUMBERS, PRESENT, SMALL, probe, scenes
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.policy import late_fusion
@@ -49,10 +50,10 @@ def test_gaussians_agree_with_their_definitions():
     wanted = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
     np.testing.assert_allclose(loss.log_probability(action, mean, log_std), wanted, rtol=1e-5)
 
-    draws = other[:, None] + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (4, 20_000, 3))
-    difference = loss.log_probability(draws, other[:, None], log_std_old) - loss.log_probability(draws, mean[:, None], log_std)
-    np.testing.assert_allclose(loss.kl(other, log_std_old, mean, log_std), difference.mean(1), rtol=0.05)
-    own = loss.log_probability(draws, other[:, None], log_std_old)
+    draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
+    own = loss.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
+    difference = own - loss.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
+    np.testing.assert_allclose(loss.kl(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
     np.testing.assert_allclose(loss.gaussian_entropy(log_std_old), -own.mean(), rtol=0.01)
     assert float(jnp.abs(loss.kl(mean, log_std, mean, log_std)).max()) == 0.0
 
@@ -62,10 +63,10 @@ def batch():
     """Policy, parameters and samples; every third one without weight."""
     policy, keys, count = late_fusion.make(**SMALL), jax.random.split(jax.random.key(3), 8), 24
     observation = {"cue": jax.random.normal(keys[0], (count, 1))}
-    parameters = policy.init(keys[1], observation)
+    parameters = jax.jit(policy.init)(keys[1], observation)
     mean, log_std, value = policy.apply(parameters, observation)
-    action = mean + jax.random.normal(keys[2], mean.shape)
-    old = mean + 0.3 * jax.random.normal(keys[3], mean.shape)
+    action = mean + jnp.exp(log_std) * jax.random.normal(keys[2], mean.shape)
+    old = mean + 0.1 * jax.random.normal(keys[3], mean.shape)
     samples = loss.Batch(
         observation=observation,
         action=action,
@@ -106,10 +107,10 @@ def test_samples_without_weight_change_nothing(batch):
         advantage=jnp.where(empty, jnp.nan, samples.advantage),
         returns=jnp.where(empty, 1e6, samples.returns),
     )
-    gradient = jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)[0])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), gradient(parameters, garbage), gradient(parameters, samples))
-    normal = loss.normalise(garbage.advantage, samples.weight)
-    np.testing.assert_allclose([loss.weighted_mean(normal, samples.weight), loss.weighted_mean(normal**2, samples.weight)], [0, 1], atol=1e-5)
+    gradient = jax.jit(jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)[0]))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
+    normal, weight = loss.normalise(garbage.advantage, samples.weight), samples.weight
+    np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
     assert float(loss.weighted_mean(garbage.returns, jnp.zeros(24))) == 0.0
     assert not loss.normalise(garbage.returns, jnp.zeros(24)).any()
 
@@ -131,7 +132,8 @@ def learn(batch, samples, **numbers):
     def objective(parameters, part, log_std):
         return loss.ppo(parameters, part, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)
 
-    return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), loss=objective, optimiser=adam, **numbers)
+    run = jax.jit(functools.partial(update.learn, loss=objective, optimiser=adam, **numbers))
+    return run(parameters, adam.init(parameters), samples, log_std, jax.random.key(6))
 
 
 def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
@@ -148,12 +150,16 @@ def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
 
 
 def test_learning_rate_follows_the_divergence(batch):
-    samples, rates = batch[2], []
-    for desired in (1e-4, 0.1, 1e3):  # the samples' own divergence from the policy is about 0.27
-        rates.append(float(learn(batch, samples, minibatches=1, size=24, rate=update.AdaptiveRate(desired, 1e-5, 1e-2))[2]["learning_rate"]))
-    np.testing.assert_allclose(rates, [1e-3 / 1.5, 1e-3 / 1.5, 1e-3 * 1.5], rtol=1e-5)
-    held = learn(batch, samples, minibatches=1, size=24, rate=update.AdaptiveRate(1e-4, 9e-4, 1e-2))[2]["learning_rate"]
-    np.testing.assert_allclose(held, 9e-4, rtol=1e-5)
+    def rate(*numbers):
+        facts = learn(batch, batch[2], minibatches=1, size=24, rate=update.AdaptiveRate(*numbers))[2]
+        return float(facts["learning_rate"])
+
+    divergence = float(learn(batch, batch[2], minibatches=1, size=24)[2]["kl"])
+    np.testing.assert_allclose(rate(divergence / 3, 1e-5, 1e-2), 1e-3 / 1.5, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence, 1e-5, 1e-2), 1e-3, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence * 3, 1e-5, 1e-2), 1e-3 * 1.5, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence / 3, 9e-4, 1e-2), 9e-4, rtol=1e-5)
+    np.testing.assert_allclose(rate(None, 1e-5, 1e-2), 1e-3, rtol=1e-5)
 
 
 def counted(env: Env):
@@ -169,9 +175,8 @@ def counted(env: Env):
 
 @pytest.fixture(scope="module")
 def course():
-    """Lives of 3 steps in worlds of 7: the third life of a world runs out of time."""
-    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=5, episode_steps=4)
-    env, traces = counted(env)
+    """Agents who would live 5 steps in worlds of 4: all run out of time."""
+    env, traces = counted(probe(life=5, episode_steps=4))
     return train.make(env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 4}), traces
 
 
@@ -221,7 +226,7 @@ def test_restart_keeps_what_was_learnt(course):
 
 
 def test_mistakes_are_named():
-    env, policy = probe(lambda cue, action, age: cue, life=1), late_fusion.make(**SMALL)
+    env, policy = probe(), late_fusion.make(**SMALL)
     with pytest.raises(ConfigError, match=r"16 x 8 worlds x 3 agents = 384 samples .* 7 minibatches"):
         train.make(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
     with pytest.raises(ConfigError, match=r"ppo\.gamma: 1\.5"):
@@ -233,42 +238,52 @@ def test_mistakes_are_named():
 @pytest.mark.parametrize("name", ["published", "demo", "quick", "smoke"])
 def test_configs_build(name):
     entry = {"_target_": "make", **configs.load("train", f"ppo={name}")["ppo"]}
-    trainer = build(entry, builtins=train, where="ppo", episode_steps=100)(probe(lambda c, a, t: c, life=1), late_fusion.make(**SMALL))
+    trainer = build(entry, builtins=train, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
     assert trainer.iterate
 
 
-def look(policy, train_state, *cues):
-    """Action mean (throttle) and value for cues."""
-    mean, _, value = policy.apply(train_state.parameters, {"cue": jnp.array(cues, jnp.float32)[:, None]})
-    return mean[:, 0], value
+@pytest.fixture(scope="module")
+def probes():
+    """One compiled trainer for all probes: task -> (action mean and value for cues, metrics of every iteration)."""
+    policy = late_fusion.make(**SMALL)
+    trainer = train.make(probe(), policy, **{**NUMBERS, "sample_share": 0.75})  # two of three slots are spawned
+    apply = jax.jit(policy.apply)
+
+    def train_on(task, iterations):
+        train_state, history = run(trainer, scenes(2 * WORLDS, task), iterations)
+
+        def look(*cues):
+            mean, _, value = apply(train_state.parameters, {"cue": jnp.array(cues, jnp.float32)[:, None]})
+            return mean[:, 0], value
+
+        return look, history
+
+    return train_on
 
 
-def test_probe_1_value():
-    env = probe(lambda cue, action, age: jnp.ones(3), life=1, see=lambda cue, age: 0.0 * cue)
-    policy, train_state, _ = trained(env, iterations=30)
-    np.testing.assert_allclose(look(policy, train_state, 0.0)[1], [1.0], atol=0.05)
+def test_probe_1_value(probes):
+    look, _ = probes(1, 25)
+    np.testing.assert_allclose(look(0.0)[1], [1.0], atol=0.05)
 
 
-def test_probe_2_value_of_what_is_seen():
-    policy, train_state, history = trained(probe(lambda cue, action, age: cue, life=1), iterations=30)
-    np.testing.assert_allclose(look(policy, train_state, -1.0, 1.0)[1], [-1.0, 1.0], atol=0.05)
+def test_probe_2_value_of_what_is_seen(probes):
+    look, history = probes(2, 25)
+    np.testing.assert_allclose(look(-1.0, 1.0)[1], [-1.0, 1.0], atol=0.05)
     assert float(history[-1]["ppo/explained_variance"]) > 0.95
 
 
-def test_probe_3_value_of_what_comes_later():
-    env = probe(lambda cue, action, age: (age == 1).astype(jnp.float32), life=2, see=lambda cue, age: age)
-    policy, train_state, _ = trained(env, iterations=30)
-    np.testing.assert_allclose(look(policy, train_state, 0.0, 1.0)[1], [NUMBERS["gamma"], 1.0], atol=0.05)
+def test_probe_3_value_of_what_comes_later(probes):
+    look, _ = probes(3, 25)
+    np.testing.assert_allclose(look(0.0, 1.0)[1], [NUMBERS["gamma"], 1.0], atol=0.05)
 
 
-def test_probe_4_action():
-    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5) ** 2), life=1, see=lambda cue, age: 0.0 * cue)
-    policy, train_state, _ = trained(env, iterations=50)
-    np.testing.assert_allclose(look(policy, train_state, 0.0)[0], [0.5], atol=0.1)
+def test_probe_4_action(probes):
+    look, _ = probes(4, 40)
+    np.testing.assert_allclose(look(0.0)[0], [0.5], atol=0.1)
 
 
-def test_probe_5_action_that_depends_on_what_is_seen():
-    env = probe(lambda cue, action, age: -((action[:, 0] - 0.5 * cue) ** 2), life=1)
-    policy, train_state, history = trained(env, iterations=50, sample_share=0.75)  # two of three slots are spawned
-    np.testing.assert_allclose(look(policy, train_state, -1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
-    assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1 and float(history[-1]["ppo/left_out"]) == 0.0
+def test_probe_5_action_that_depends_on_what_is_seen(probes):
+    look, history = probes(5, 40)
+    np.testing.assert_allclose(look(-1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
+    assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1
+    assert float(history[-1]["ppo/left_out"]) == 0.0

@@ -184,7 +184,7 @@ def test_nobody_starts_or_drives_into_another(scenes):
         for i, own in enumerate(scene.tracks):
             for other in scene.tracks[:i]:
                 now = scene.current
-                assert not box(own, now, grow=2.4).intersects(box(other, now)), scene.name  # more than 8.8 m between centres on one lane
+                assert not box(own, now, grow=2.45).intersects(box(other, now, grow=2.45)), scene.name  # 8.9 m along a lane
                 assert np.linalg.norm(own.xyz[-1] - other.xyz[-1]) >= TRAFFIC["goal_gap_m"]
                 near = np.flatnonzero(np.linalg.norm(own.xyz - other.xyz, axis=1) < 5.0)
                 assert not any(box(own, step).intersects(box(other, step)) for step in near), scene.name

@@ -339,7 +339,7 @@ def test_every_figure_is_drawn(tmp_path, trajectory):
     first, second = make_records(success=0.3), make_records()
     summary = [tables.summarise(r, **BOOTSTRAP) for r in (first, second)]
     row = {"iteration": 0, "steps/spawned": 1e4, "reward/goal": 1.0, "reward/edge": -0.5, "loss/kl": 0.01}
-    rows = [{**row, "ended/reached": i / 9} for i in range(9)]
+    rows = [{**row, "events/reached": i / 9} for i in range(9)]
     figures = {
         "learning": plots.learning_figure([*rows, {"steps/spawned": 1e4, "casps": 5.0}]),
         "rates": plots.rates_figure({"a": summary[0], "b": summary[1]}),

@@ -1,85 +1,38 @@
-"""Scenes on the host: readers, checks, packing, banks, conversion, MJCF."""
+"""Scenes on the host: readers, checks, packing."""
 
 import copy
 import gzip
 import json
 import lzma
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import shapely
-import yaml
+from scene_documents import (
+    FORMATS,
+    STEPS,
+    checker,
+    curve,
+    document,
+    packer,
+    parsed,
+    prepared,
+    scenefactory_document,
+    straight,
+    thing,
+    written,
+)  # fmt: skip
 
-from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.scenes import bank, checks, columns, convert, mjcf, pack, source, stack
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.scenes import checks, columns, pack, source
 from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
-from scenefactory_jax.types import EDGES, Scene
-
-CONF = Path(__file__).resolve().parent.parent / "conf"
-FORMATS = yaml.safe_load((CONF / "formats.yaml").read_text())
-WOMD = yaml.safe_load((CONF / "scenes" / "womd.yaml").read_text())
-STEPS = 12
-NONE = dict.fromkeys(stack.AXES)
+from scenefactory_jax.types import EDGES
 
 
 @pytest.fixture(scope="module")
 def readers():
     return source.make(FORMATS)
-
-
-def checker(**numbers):
-    return build(WOMD["check"] | numbers, builtins=checks, where="scenes.check")
-
-
-def packer(**numbers):
-    return build(WOMD["pack"] | numbers, builtins=pack, where="scenes.pack")
-
-
-def prepared(raw, **numbers):
-    return pack.prepare(raw, check=checker(), pack=packer(**numbers))
-
-
-def straight(x0, x1, y, step=1.0):
-    return [{"x": float(x), "y": float(y), "z": 0.0} for x in np.arange(x0, x1 + 1e-9, step)]
-
-
-def thing(x, y=0.0, *, speed=5.0, kind="vehicle", valid=None, id=0, yaw=0.0):
-    """An object that drives along +x."""
-    valid = [True] * STEPS if valid is None else valid
-    times = 0.1 * np.arange(STEPS)
-    position = [{"x": float(x + speed * t), "y": float(y), "z": 0.0} if v else {"x": -1e4, "y": -1e4, "z": -1e4} for t, v in zip(times, valid)]
-    velocity = [{"x": float(speed), "y": 0.0} if v else {"x": -1e4, "y": -1e4} for v in valid]
-    heading = [float(yaw) if v else -1e4 for v in valid]
-    size = {"width": 1.9, "length": 4.5, "height": 1.5}
-    return {"position": position, "velocity": velocity, "heading": heading, "valid": valid, "type": kind, "id": id, **size}
-
-
-def document(*, objects=None, **changes):
-    """A street along x of 80 m with edges, in GPUDrive's layout."""
-    roads = [
-        {"geometry": straight(-40, 40, 6), "type": "road_edge", "map_element_id": 15, "id": 3},
-        {"geometry": straight(-40, 40, 0), "type": "lane", "map_element_id": 2, "id": 1},
-        {"geometry": [{"x": 9.0, "y": 4.0, "z": 0.0}], "type": "stop_sign", "map_element_id": 17, "id": 4},
-    ]
-    objects = [thing(0, id=7, speed=40), thing(-30, id=8, speed=40)] if objects is None else objects
-    metadata = {"sdc_track_index": 0, "tracks_to_predict": [{"track_index": 1, "difficulty": 0}], "objects_of_interest": []}
-    whole = {"name": "street", "scenario_id": "abc", "objects": objects, "roads": roads, "tl_states": {}, "metadata": metadata}
-    return whole | changes
-
-
-def written(folder, content, name="scene.json", opener=open):
-    path = folder / name
-    with opener(path, "wt") as file:
-        file.write(content if isinstance(content, str) else json.dumps(content))
-    return path
-
-
-def parsed(folder, content, readers):
-    return next(source.read(written(folder, content), readers))
 
 
 @pytest.fixture
@@ -121,16 +74,6 @@ def test_old_layout_has_degrees_and_type_names(tmp_path, readers):
     np.testing.assert_allclose(raw.tracks[0].yaw, np.pi / 2)
     _, report = prepared(raw, require_agents=False)
     assert report.centred_on.startswith("mean: the source names no sdc")
-
-
-def scenefactory_document():
-    pose = {"x": 1.0, "y": 2.0, "z": 0.0, "yaw": 0.5}
-    items = [
-        {"agent_id": 5, "agent_type": 1, "start": pose, "end": {"x": 21.0, "y": 2.0, "z": 0.0, "yaw": 0.6, "t_idx": 79}},
-        {"agent_id": 6, "agent_type": 2, "start": pose | {"x": 11.0}, "end": None},
-    ]
-    polylines = [{"type": 2, "id": 9, "n": 41, "xyz": [[float(x), 0.0] for x in range(-20, 21)]}]
-    return {"meta": {"scene_index_global": 4}, "road": {"polylines": polylines}, "agents": {"items": items, "sdc": None}}
 
 
 def test_scenefactory_json(tmp_path, readers):
@@ -212,7 +155,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, readers):
     binary = tmp_path / "scene.bin"
     binary.write_bytes(bytes(range(200)))
     other = written(tmp_path, {"lanes": []}, "other.json")
-    cases = {cut: "damaged or cut short", squeezed: "begins as xz", fake: "begins as gzip", binary: "no reader", other: "'objects'.*road.pol"}
+    cases = {cut: "cut short", squeezed: "begins as xz", fake: "begins as gzip", binary: "no reader", other: "'objects'.*road.pol"}
     for path, message in cases.items():
         with pytest.raises(SceneError, match=message) as caught:
             list(source.read(path, readers))
@@ -222,6 +165,10 @@ def test_damaged_and_foreign_files_are_named(tmp_path, readers):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SceneError, match="empty folder"):
         source.find(tmp_path / "empty")
+    (tmp_path / "empty" / "bank.json").write_text("{}")
+    with pytest.raises(SceneError, match="a bank already"):
+        source.find(tmp_path / "empty")
+    assert {path.name for path in source.find(tmp_path)} == {path.name for path in cases}
 
 
 def test_a_converter_is_one_file_and_one_entry(tmp_path, monkeypatch, readers):
@@ -289,11 +236,6 @@ def test_refusals_name_the_element(street):
 # ---- packing
 
 
-def curve(kind, radius, points, id=0):
-    angle = np.linspace(0, 2, points)
-    return Polyline(kind=kind, xyz=np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1), id=id)
-
-
 def test_segments_keep_length_direction_and_order(street):
     roads = (curve(16, 30, 60), curve(2, 20, 50), curve(1, 25, 40), curve(2, 22, 30))
     scene, report = prepared(replace(street, roads=roads), centre="mean", require_agents=False)
@@ -314,14 +256,17 @@ def test_segments_keep_length_direction_and_order(street):
 
 
 def test_cut_segments_are_counted_by_reason(street):
-    points = np.array([[-99.0, 0, 0], [-98.0, 0, 0], [-94.0, 0, 0], [-93.0, 0, 0], [99.5, 0, 0], [100.0, 0, 0], [100.5, 0, 0]])
+    x = [-99.0, -98.0, -94.0, -93.0, 99.5, 100.0, 100.5]
+    points = np.stack([x, np.zeros(7), np.zeros(7)], axis=1) + street.tracks[0].xyz[street.current]
     raw = replace(street, roads=(Polyline(kind=2, xyz=points, id=0),))
     scene, report = prepared(raw, require_agents=False)
-    assert report.segments_cut == {"outside_box": 2, "gap": 2, "degenerate": 0} and report.segments_kept == 2
-    np.testing.assert_allclose(2 * scene.road.half_length, 1.0, rtol=1e-6)
-    np.testing.assert_allclose(scene.road.arc, [0.5, 5.5])
+    assert report.segments_cut == {"outside_box": 1, "gap": 2, "degenerate": 0} and report.segments_kept == 3
+    np.testing.assert_allclose(2 * scene.road.half_length, [1.0, 1.0, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(scene.road.arc, [0.5, 5.5, 198.75])
     with pytest.raises(SceneError, match="no driving lane within 20 m"):
         prepared(raw, box_m=40.0)
+    doubled = replace(raw, roads=(replace(raw.roads[0], xyz=np.repeat(points, 2, axis=0)),))  # and not repaired by the checks
+    assert packer(require_agents=False)(doubled)[1].segments_cut == {"outside_box": 2, "gap": 2, "degenerate": 6}
 
 
 def test_agents_are_dropped_by_reason_and_ordered_from_the_centre(tmp_path, readers):
@@ -388,226 +333,6 @@ def test_box_overlap_agrees_with_shapely():
     for box, polygon in zip(boxes, polygons, strict=True):
         wanted = [polygon.intersection(other).area > 1e-9 for other in polygons]
         assert pack.overlaps(box, np.array(boxes)).tolist() == wanted
-
-
-# ---- stacks and banks
-
-
-def test_stack_pads_with_masked_rows(street):
-    small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
-    stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS} and not report.cuts
-    assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
-    for world, scene in enumerate((small, large)):
-        for name, leaf in columns.flatten(scene).items():
-            whole = columns.flatten(stacked)[name][world]
-            np.testing.assert_array_equal(whole[tuple(map(slice, leaf.shape))], leaf)
-            if name.endswith((".valid", ".present")):
-                assert whole.sum() == leaf.sum()
-    assert (stacked.agents.size > 0).all()
-    again, _ = stack.stack([columns.assemble(Scene, {n: a[0] for n, a in columns.flatten(stacked).items()})], capacity=NONE)
-    np.testing.assert_array_equal(again.road.midpoint[0, :256], stacked.road.midpoint[0, :256])
-
-
-def test_a_capacity_cuts_what_is_farthest_and_says_so(street):
-    scene = prepared(street).scene
-    stacked, report = stack.stack([scene], capacity=NONE | {"road": 40, "agents": 1, "steps": 11})
-    account = "\n".join(stack.describe(report))
-    assert {cut.axis: (cut.had, cut.kept) for cut in report.cuts} == {"road": (160, 40), "agents": (2, 1), "steps": (12, 11)}
-    assert "cut to capacity road=40: 120 of 160 in 1 worlds, the nearest" in account and "agents=1" in account and "steps=11" in account
-    used = np.concatenate([scene.agents.position[:1], scene.agents.goal[:1], scene.log.position[0, :11]])
-    distance = np.linalg.norm(scene.road.midpoint[:, None] - used, axis=2).min(1)
-    kept = {tuple(point) for point in stacked.road.midpoint[0].tolist()}
-    inside = np.array([tuple(point) in kept for point in scene.road.midpoint.tolist()])
-    assert inside.sum() == 40 and distance[inside].max() <= distance[~inside].min() + 1e-5
-    assert stacked.road.kind[0].tolist() == sorted(stacked.road.kind[0].tolist())
-    for wrong, message in (({"road": 0}, "capacity.road: 0"), ({"lane": 3}, "capacity.lane: unknown; valid: road, lanes")):
-        with pytest.raises(SceneError, match=message):
-            stack.stack([scene], capacity=wrong)
-    with pytest.raises(SceneError, match="no scenes"):
-        stack.stack([], capacity=NONE)
-
-
-@pytest.fixture
-def made(tmp_path, street):
-    """Two scenes of different sizes, and the bank of them."""
-    scenes = [prepared(street, agents=3), prepared(replace(street, name="other", roads=street.roads[1:]), agents=2, log_from="current")]
-    written = bank.write(tmp_path / "bank", scenes, settings={"box_m": 200.0}, rejects=[{"source": "x", "scene": None, "reason": "bad"}])
-    return scenes, written
-
-
-def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
-    scenes, opened = made
-    shutil.move(tmp_path / "bank", tmp_path / "elsewhere")
-    moved = bank.open(tmp_path / "elsewhere")
-    assert moved.names == ("street", "other") and moved.settings == {"box_m": 200.0} and moved.rejects[0]["reason"] == "bad"
-    assert isinstance(moved.leaves["road.midpoint"], np.memmap) and len(opened) == 2
-    for index, packed in enumerate(scenes):
-        found = bank.scene(moved, index)
-        assert found.report == packed.report
-        for name, leaf in columns.flatten(packed.scene).items():
-            back = columns.flatten(found.scene)[name]
-            assert back.dtype == leaf.dtype
-            np.testing.assert_array_equal(back, leaf)
-    stacked, report = bank.load(moved, [1, 0, 1], capacity=NONE | {"road": 79})
-    wanted, _ = stack.stack([scenes[i].scene for i in (1, 0, 1)], capacity=NONE | {"road": 79})
-    for name, leaf in columns.flatten(wanted).items():
-        np.testing.assert_array_equal(columns.flatten(stacked)[name], leaf)
-    assert sorted(cut.world for cut in report.cuts) == [0, 1, 2]
-    with pytest.raises(SceneError, match="no scene 7; valid: 0 to 1"):
-        bank.load(moved, [7], capacity=NONE)
-
-
-def test_a_bank_replaces_a_bank_and_nothing_else(tmp_path, made):
-    scenes, opened = made
-    again = bank.write(opened.path, (bank.scene(opened, i) for i in (1,)), settings={})  # filtered onto itself
-    assert again.names == ("other",)
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "thesis.tex").write_text("years of work")
-    with pytest.raises(SceneError, match="exists and is no bank"):
-        bank.write(tmp_path / "home", scenes, settings={})
-
-    def breaks():
-        yield scenes[0]
-        raise RuntimeError("disk on fire")
-
-    with pytest.raises(RuntimeError):
-        bank.write(opened.path, breaks(), settings={})
-    assert bank.open(opened.path).names == ("other",)
-    with pytest.raises(SceneError, match="no scene to write"):
-        bank.write(tmp_path / "empty", [], settings={})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bank", "home", "scene.json"]  # no leftovers
-
-
-def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
-    _, opened = made
-    path = opened.path
-    with pytest.raises(SceneError, match="no such folder"):
-        bank.open(tmp_path / "nowhere")
-    with pytest.raises(SceneError, match="no bank: it has no bank.json"):
-        bank.open(tmp_path)
-    column = path / "road.arc.npy"
-    whole = column.read_bytes()
-    column.write_bytes(whole[:-8])
-    with pytest.raises(SceneError, match="road.arc.npy: damaged or cut short"):
-        bank.open(path)
-    np.save(column, np.zeros(3, np.float32))
-    with pytest.raises(SceneError, match="road.arc.npy: 3 rows"):
-        bank.open(path)
-    np.save(column, np.zeros(3))
-    with pytest.raises(SceneError, match="road.arc.npy: float64"):
-        bank.open(path)
-    column.unlink()
-    with pytest.raises(SceneError, match="road.arc.npy: missing column"):
-        bank.open(path)
-    index = json.loads((path / bank.INDEX).read_text())
-    (path / bank.INDEX).write_text(json.dumps(index | {"schema": 99}))
-    with pytest.raises(SceneError, match="a bank of schema 99; this version reads 1"):
-        bank.open(path)
-
-
-# ---- conversion
-
-
-def options(**changes):
-    return {"formats": source.make(FORMATS), "check": checker(), "pack": packer(), "settings": WOMD, "workers": 1} | changes
-
-
-def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
-    folder = tmp_path / "in"
-    (folder / "deep").mkdir(parents=True)
-    written(folder, document(), "a.json")
-    written(folder, json.dumps(document())[:500], "b.json")
-    written(folder, document(objects=[thing(0, speed=0)]), "c.json")
-    written(folder / "deep", scenefactory_document(), "d.json.gz", gzip.open)
-    written(folder, "hidden", ".note")
-    seen = []
-    summary = convert.convert(folder, tmp_path / "bank", **options(on_file=lambda done, total: seen.append((done, total))))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert (summary.files, summary.scenes, summary.agents_kept) == (4, 2, 3)
-    reasons = {Path(reject["source"]).name: reject["reason"] for reject in summary.rejects}
-    assert set(reasons) == {"b.json", "c.json"} and "cut short" in reasons["b.json"] and "1 too_short" in reasons["c.json"]
-    opened = bank.open(tmp_path / "bank")
-    assert list(opened.rejects) == list(summary.rejects) and opened.settings["pack"]["box_m"] == 200.0
-    lines = convert.describe(summary)
-    assert lines[-1] == "2 scenes with 3 agents from 4 files, 2 rejected" and any("rejected" in line and "b.json" in line for line in lines)
-
-
-def broken_reader(path):
-    raise KeyError("x")
-    yield
-
-
-def test_nothing_usable_writes_no_bank(tmp_path):
-    path = written(tmp_path, document())
-    with pytest.raises(SceneError, match=r"1 were rejected: KeyError: 'x'"):
-        convert.convert(path, tmp_path / "bank", **options(formats={"broken": broken_reader}))
-    assert not (tmp_path / "bank").exists()
-
-
-# ---- real data
-
-
-def test_real_scenes_convert_alike_in_one_process_and_in_two(tmp_path, shared_data):
-    for path in [*sorted((shared_data / "womd" / "train").iterdir())[:3], *(shared_data / "formats" / "nocturne_old").iterdir()]:
-        (tmp_path / path.name).symlink_to(path)
-    alone = convert.convert(tmp_path, tmp_path / "banks" / "one", **options())
-    summary = convert.convert(tmp_path, tmp_path / "banks" / "two", **options(workers=2))
-    assert alone.scenes == 4 and not alone.rejects and alone.agents_kept > 15
-    one, two = bank.open(tmp_path / "banks" / "one"), bank.open(tmp_path / "banks" / "two")
-    assert summary.scenes == 4 and [r.track_ids for r in one.reports] == [r.track_ids for r in two.reports]
-    for name, leaf in one.leaves.items():
-        np.testing.assert_array_equal(leaf, two.leaves[name])
-    stacked, report = bank.load(one, range(4), capacity=NONE)
-    assert not report.cuts and all(np.isfinite(leaf).all() for leaf in columns.flatten(stacked).values())
-    assert np.abs(stacked.road.midpoint).max() <= 100 and np.abs(stacked.agents.goal).max() <= 100
-    near = np.linalg.norm(stacked.lanes.midpoint[:, None] - stacked.agents.position[:, :, None], axis=-1)
-    near = np.where(stacked.lanes.valid[:, None], near, np.inf).min(axis=2)[stacked.agents.present]
-    assert np.median(near) < 1.5  # cars drive on lanes: centre, units and axes agree
-    along = np.einsum("wad,wad->wa", stacked.agents.goal - stacked.agents.position, np.stack([np.cos(stacked.agents.yaw), np.sin(stacked.agents.yaw)], -1))
-    assert (along[stacked.agents.present] > 0).mean() > 0.8  # goals lie ahead: headings are right, in degrees or radians
-
-
-# ---- MJCF
-
-
-def stand_in_car():
-    car = mujoco.MjSpec()
-    chassis = car.worldbody.add_body(name="chassis", pos=[0, 0, 0.6])
-    chassis.add_freejoint(name="root")
-    chassis.add_geom(name="box", type=mujoco.mjtGeom.mjGEOM_BOX, size=[2, 1, 0.5], mass=1800)
-    return car
-
-
-LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "box_m": 200.0}
-
-
-def test_a_scene_becomes_one_model(street):
-    scene = prepared(replace(street, roads=(*street.roads, curve(2, 20, 50))), agents=4).scene
-    model = mjcf.world(scene, stand_in_car(), merge_tolerance_m=None, **LOOKS)
-    compiled = model.compile()
-    assert compiled.ngeom == 1 + len(scene.road.kind) + 2 * 2 and compiled.nv == 2 * 6
-    data = mujoco.MjData(compiled)
-    mujoco.mj_forward(compiled, data)
-    for slot in (0, 1):
-        np.testing.assert_allclose(data.body(f"agent{slot}/chassis").xpos, [*scene.agents.position[slot], 0.6], atol=1e-6)
-        np.testing.assert_allclose(data.geom(f"goal{slot}").xpos[:2], scene.agents.goal[slot], atol=1e-6)
-    for _ in range(200):
-        mujoco.mj_step(compiled, data)
-    assert {data.contact[i].geom1 for i in range(data.ncon)} == {compiled.geom("ground").id}  # road and goals touch nobody
-    np.testing.assert_allclose(data.qpos[2], 0.5, atol=0.01)
-    mujoco.MjModel.from_xml_string(model.to_xml())
-    with pytest.raises(ValueError, match="free joint"):
-        mjcf.world(scene, mujoco.MjSpec(), merge_tolerance_m=None, **LOOKS)
-
-
-def test_merged_segments_stay_within_the_tolerance(street):
-    scene = prepared(replace(street, roads=(*street.roads, curve(2, 20, 50))), require_agents=False).scene
-    single, merged = (list(mjcf.chains(scene.road, tolerance)) for tolerance in (None, 0.05))
-    assert [len(points) for points, _ in single] == [81, 50, 81] and [kind for _, kind in merged] == [2, 2, 15]
-    assert sum(len(points) - 1 for points, _ in merged) < 20
-    for (fine, _), (coarse, _) in zip(single, merged, strict=True):
-        assert shapely.LineString(coarse).hausdorff_distance(shapely.LineString(fine)) <= 0.05
 
 
 def test_raw_scene_types_are_plain():

@@ -40,14 +40,15 @@ def ppo(
     """
     mean, log_std, estimate = policy.apply(parameters, batch.observation)
     weight = batch.weight
+    # what an empty slot holds must not reach a gradient, not even as 0 x inf
+    change = log_probability(batch.action, mean, log_std) - batch.log_probability
+    change, advantage, old, target = (jnp.where(weight > 0.0, x, 0.0) for x in (change, batch.advantage, batch.value, batch.returns))
 
-    log_ratio = log_probability(batch.action, mean, log_std) - batch.log_probability
-    ratio = jnp.exp(log_ratio)
-    surrogate = jnp.minimum(ratio * batch.advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * batch.advantage)
-    policy_loss = -weighted_mean(surrogate, weight)
+    ratio = jnp.exp(change)
+    policy_loss = -weighted_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage), weight)
 
-    near = batch.value + jnp.clip(estimate - batch.value, -clip, clip)
-    value_loss = weighted_mean(jnp.maximum((estimate - batch.returns) ** 2, (near - batch.returns) ** 2), weight)
+    near = old + jnp.clip(estimate - old, -clip, clip)
+    value_loss = weighted_mean(jnp.maximum((estimate - target) ** 2, (near - target) ** 2), weight)
 
     bonus = weighted_mean(jnp.broadcast_to(gaussian_entropy(log_std), weight.shape), weight)
     loss = policy_loss + value * value_loss - entropy * bonus

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
 
-COMMANDS = ("train", "evaluate", "convert", "scenes", "render")
+COMMANDS = ("train", "evaluate", "convert", "scenes", "render", "bench")
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 
 

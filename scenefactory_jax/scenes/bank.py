@@ -19,12 +19,12 @@ from jaxtyping import Int
 from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.pack import Packed, PackReport
 from scenefactory_jax.scenes.raw import SceneError
+from scenefactory_jax.scenes.source import BANK_INDEX as INDEX
 from scenefactory_jax.scenes.stack import CutReport, stack
 from scenefactory_jax.types import Scene
 
 FORMAT = "scenefactory_jax bank"
 SCHEMA = 1  # rises whenever a bank of before can no longer be read
-INDEX = "bank.json"
 SIZES = ("road", "agents", "steps")  # the columns of sizes.npy
 STORED = {n: c for n, c in columns.COLUMNS.items() if not n.startswith(("lanes.", "edges.")) and n != "road.valid"}
 
@@ -213,7 +213,7 @@ def scene(bank: Bank, index: int) -> Packed:
     index = index % count
     road, agents, steps = (int(size) for size in bank.sizes[index])
     shapes = {"road": (road,), "agents": (agents,), "log": (agents, steps), "one": ()}
-    leaves = {"road.valid": np.ones(road, bool)}
+    leaves: dict[str, np.ndarray] = {"road.valid": np.ones(road, bool)}
     for name, column in STORED.items():
         layout = _layout(column)
         begin, end = bank.starts[layout][index : index + 2]

@@ -123,7 +123,7 @@ def _run(work: Callable[[Path], Result], files: Sequence[Path], workers: int) ->
         yield from map(work, files)
         return
     with ProcessPoolExecutor(min(workers, len(files)), mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(work, files, chunksize=4)
+        yield from pool.map(work, files)
 
 
 def summarise(reports: Sequence[PackReport], *, files: int, rejects: Sequence[Mapping[str, Any]]) -> Summary:

@@ -24,7 +24,7 @@ def load(path: Path) -> dict[str, Any]:
         OtherFormat: no JSON object at all.
     """
     text = unpack(path)
-    if not text.lstrip()[:1] == b"{":
+    if not text.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         raise OtherFormat(f"{path}: no JSON object (plain, gzip or xz); it begins with {text[:16]!r}")
     try:
         return json.loads(text)

@@ -15,7 +15,9 @@ from scenefactory_jax.scenes.raw import RawScene, SceneError, Track
 from scenefactory_jax.types import DRIVABLE, Scene
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
-DROPS: tuple[str, ...] = ("not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity")
+DROPS: tuple[str, ...] = (
+    "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
+)  # fmt: skip
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 

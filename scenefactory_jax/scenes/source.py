@@ -7,6 +7,7 @@ from typing import Any
 from scenefactory_jax.build import build
 from scenefactory_jax.scenes.raw import OtherFormat, RawScene, SceneError
 
+BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 Reader = Callable[[Path], Iterator[RawScene]]
 
 
@@ -20,18 +21,21 @@ def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
 
 
 def find(path: Path | str) -> list[Path]:
-    """The file itself, or every file below a folder in sorted order, hidden ones left out.
+    """The file itself, or every file below a folder in sorted order; hidden ones, and banks that lie among them, are left out.
 
     Raises:
-        SceneError: no such path, or nothing in it.
+        SceneError: no such path, a bank, or nothing in it.
     """
     path = Path(path)
     if path.is_file():
         return [path]
     if not path.is_dir():
         raise SceneError(f"{path}: no such file or folder; give a scene file or a folder of them")
+    if (path / BANK_INDEX).is_file():
+        raise SceneError(f"{path}: a bank already; give the files that it was made from")
     hidden = lambda file: any(part.startswith(".") for part in file.relative_to(path).parts)  # noqa: E731
-    files = sorted(file for file in path.rglob("*") if file.is_file() and not hidden(file))
+    found = (file for file in path.rglob("*") if file.is_file() and not hidden(file))
+    files = sorted(file for file in found if not (file.parent / BANK_INDEX).is_file())
     if not files:
         raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
     return files
@@ -52,8 +56,9 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene]:
             reason = str(refusal).removeprefix(f"{path}: ")
             refusals.append(f"{name}: {reason}")
             continue
-        if first is not None:
-            yield first
+        if first is None:
+            raise SceneError(f"{path}: no scene in it, says the reader {name!r}")
+        yield first
         yield from scenes
         return
     raise SceneError(f"{path}: no reader knows this format ({'; '.join(refusals) or 'there are no readers'})")

@@ -82,7 +82,7 @@ def generate(
             break
     else:
         raise SceneError(f"generate.traffic.cars: {REDRAWS} layouts of kind {kind!r} held fewer than {least} cars; ask for fewer")
-    features = _features(layout, *find_edges(layout.lanes), lane_spacing_m, line_spacing_m)
+    features = _features(layout, find_edges(layout.lanes), lane_spacing_m, line_spacing_m)
     origin = np.concatenate([points for _, points, *_ in features]).mean(axis=0)
     return RawScene(
         name=f"procedural-{kind}-{index:06d}",
@@ -124,14 +124,14 @@ def _draw_style(rng: np.random.Generator, lanes: list[int], width: list[float], 
 Feature = tuple[int, Points, tuple[int, ...], tuple[int, ...], float | None]
 
 
-def _features(layout: Layout, outer: list[Points], islands: list[Points], lane_spacing: float, line_spacing: float) -> list[Feature]:
+def _features(layout: Layout, edges: tuple[list[Points], list[Points]], lane_spacing: float, line_spacing: float) -> list[Feature]:
     """Kind, points, entries, exits and speed limit of every polyline: lanes first, so that a lane's place is its id."""
     found: list[Feature] = [
         (LANE_STREET, resample(lane.points, lane_spacing), entry, lane.exits, lane.limit)
         for lane, entry in zip(layout.lanes, entries(layout.lanes), strict=True)
     ]
     found += [(line.kind, resample(line.points, line_spacing), (), (), None) for line in layout.lines]
-    found += [(kind, points, (), (), None) for kind, group in ((EDGE_BOUNDARY, outer), (EDGE_MEDIAN, islands)) for points in group]
+    found += [(kind, points, (), (), None) for kind, group in zip((EDGE_BOUNDARY, EDGE_MEDIAN), edges, strict=True) for points in group]
     return found
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.scenes.pack import corners, overlaps
 from scenefactory_jax.scenes.procedural.curves import arc_length, heading
 from scenefactory_jax.scenes.procedural.layout import Lane, check_positive, check_range, entries
 from scenefactory_jax.scenes.procedural.motion import Drive, Limits, Route, comfortable, drive, make_route
@@ -198,16 +199,14 @@ def _fits(own: Drive, current: int, placed: list[Car], numbers: Numbers) -> bool
     travel = own.place[-1] - own.place[current]
     if not numbers.travel[0] <= travel <= numbers.travel[1]:
         return False
-    for car in placed:
-        if np.linalg.norm(own.position[-1] - car.drive.position[-1]) < numbers.goal_gap:
-            return False
-        offset = own.position[current] - car.drive.position[current]
-        for yaw in (own.yaw[current], car.drive.yaw[current]):
-            ahead = heading(yaw)
-            along, across = abs(offset @ ahead), abs(ahead[0] * offset[1] - ahead[1] * offset[0])
-            if along < numbers.start_gap and across < numbers.size[1] + SIDE_GAP_M:
-                return False
-    return True
+    if not placed:
+        return True
+    goals = np.stack([car.drive.position[-1] for car in placed])
+    if np.min(np.linalg.norm(own.position[-1] - goals, axis=1)) < numbers.goal_gap:
+        return False
+    room = numbers.start_gap, numbers.size[1] + SIDE_GAP_M  # each car's own half of the gap to the next
+    rooms = [corners(drive.position[current], float(drive.yaw[current]), *room) for drive in (own, *(car.drive for car in placed))]
+    return not overlaps(rooms[0], np.stack(rooms[1:])).any()
 
 
 def _cross(route: Route, own: Drive, other: Car) -> bool:
@@ -229,8 +228,6 @@ def _touches(own: Drive, placed: list[Car], size: tuple[float, float]) -> int | 
 
 
 def _circles(own: Drive, size: tuple[float, float]) -> tuple[float, Float[np.ndarray, "L 3 2"]]:
-    """Three circles along the axis that cover nearly all of the box, as `geometry.car_circles` lays them."""
-    radius = 0.55 * size[1]
-    spacing = max(0.0, size[0] / 2 - 0.8 * radius)
-    along = spacing * np.array([1.0, 0.0, -1.0])
-    return radius, own.position[:, None] + along[:, None] * heading(own.yaw)[:, None]
+    """Three circles along the axis that cover the box, the smallest that do: one on the middle of each third."""
+    along = size[0] / 3 * np.array([1.0, 0.0, -1.0])
+    return float(np.hypot(size[0] / 6, size[1] / 2)), own.position[:, None] + along[:, None] * heading(own.yaw)[:, None]

@@ -1,0 +1,38 @@
+"""`convert`: scene files in any known format -> a bank, with an account of what was kept, dropped and refused."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.progress import Progress
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import sources
+from scenefactory_jax.scenes.convert import Summary
+from scenefactory_jax.scenes.convert import convert as to_bank
+from scenefactory_jax.scenes.convert import describe
+
+
+def convert(config: Mapping[str, Any]) -> Summary:
+    """Convert as a config says (`load("convert", "source=...", "out=...")`). A bad file is listed and the rest goes on.
+
+    Raises:
+        ConfigError: source or out is missing.
+        SceneError: no files, `out` is something else than a bank, or not one usable scene.
+    """
+    for key in ("source", "out"):
+        if config[key] is None:
+            raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")
+    scenes = config["scenes"]
+    settings = {key: scenes[key] for key in ("check", "pack")}
+    with Progress(disable=not config["progress"]) as bar:
+        task = bar.add_task("convert")
+        summary = to_bank(
+            config["source"],
+            config["out"],
+            **sources.readers(scenes),
+            settings=settings,
+            workers=scenes["workers"],
+            on_file=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print("\n".join(describe(summary)), flush=True)
+    return summary

@@ -1,0 +1,76 @@
+"""`render`: one scene as a MuJoCo model with all its cars, as XML, and as pictures."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import jax
+import mujoco
+import numpy as np
+
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.run import sources
+from scenefactory_jax.run.scenes import draw
+from scenefactory_jax.scenes import mjcf
+from scenefactory_jax.types import Scene
+
+
+def render(config: Mapping[str, Any]) -> Path:
+    """Write `scene.xml` (open it with `python -m mujoco.viewer --mjcf=...`), a bird's-eye picture and MuJoCo's own view to `out`.
+
+    Raises:
+        ConfigError: no such scene, or a dynamics without a car to show.
+        SceneError: nothing usable at the path.
+    """
+    loaded = sources.training(config["scenes"])
+    index, count = config["index"], len(loaded)
+    if not 0 <= index < count:
+        raise ConfigError(f"index: {index}; valid: 0 to {count - 1}")
+    scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), loaded.scene)
+    spec = world(config, scene)
+    out = Path(config["out"])
+    out.mkdir(parents=True, exist_ok=True)
+    xml = out / "scene.xml"
+    xml.write_text(spec.to_xml())
+    print(f"{loaded.names[index]}: {xml}", flush=True)
+    one = sources.Scenes(jax.tree.map(lambda leaf: leaf[None], scene), (loaded.names[index],), loaded.account)
+    print(draw(one, out, limit=1)[0], flush=True)
+    try:
+        imageio.imwrite(out / "mujoco.png", photograph(spec.compile(), **config["image"]))
+        print(out / "mujoco.png", flush=True)
+    except Exception as error:  # whatever the platform's OpenGL raises: the files above are there all the same
+        print(f"no OpenGL for mujoco.Renderer here ({error}); set MUJOCO_GL=egl or osmesa", flush=True)
+    return xml
+
+
+def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
+    """The whole scene with its cars and their tyre contacts, as a spec that compiles and steps.
+
+    Raises:
+        ConfigError: the configured dynamics has no articulated car.
+    """
+    dynamics = config["dynamics"]
+    if "car" not in dynamics or "solver" not in dynamics:
+        raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: mjx_car, mjx_published")
+    make = lambda name, key: build({**dynamics[key], "_target_": name}, builtins=cars.__name__, where=f"dynamics.{key}")()  # noqa: E731
+    parameters, solver = make("CarParameters", "car"), make("Solver", "solver")
+    car = cars.spec(parameters, visual=True, brake_rows=False)
+    spec = mjcf.world(scene, car, box_m=config["scenes"]["pack"]["box_m"], **config["world"])
+    for slot in np.flatnonzero(np.asarray(scene.agents.present)):
+        cars.add_ground_pairs(spec, parameters, ground="ground", prefix=f"agent{slot}/")
+    cars.set_options(spec, solver, physics_dt=1.0 / config["timing"]["physics_hz"])
+    return spec
+
+
+def photograph(model: mujoco.MjModel, *, width: int, height: int) -> np.ndarray:
+    """The world from above and behind, by `mujoco.Renderer`."""
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = model.stat.center, 1.1 * model.stat.extent, 90.0, -50.0
+    with mujoco.Renderer(model, height, width) as renderer:
+        renderer.update_scene(data, camera)
+        return renderer.render()
