@@ -4,15 +4,22 @@
 
     config = sf.load("train", "experiment=demo")    # the same config as on the command line
     env = sf.make(config)                           # pure functions for one world: env.reset, env.step
-    scenes = sf.scenes(config)                      # worlds stacked along the first axis
+    scenes = sf.scenes(config["scenes"])            # worlds stacked along the first axis
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
 
 Everything under `run/` (`train`, `evaluate`, `convert`, `render`) takes such a config too.
 """
 
+import contextlib
+import io
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
+    from mujoco import mjx as _mjx  # noqa: F401
+
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run.config import load
+from scenefactory_jax.run.sources import training as scenes
 from scenefactory_jax.world import assemble, make
 
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "__version__", "assemble", "load", "make"]
+__all__ = ["ConfigError", "__version__", "assemble", "load", "make", "scenes"]

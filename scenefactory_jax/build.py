@@ -1,8 +1,8 @@
 """A config entry -> a function with its numbers bound.
 
-The one extension mechanism. An entry is a mapping with `_target_` and numbers: `{_target_: my_terms.jerk, limit: 3.0}`. A target without a dot
-is looked up among the built-ins of a module, a dotted one is imported. The numbers must be the function's keyword-only parameters,
-all of them, with the annotated types: a misspelt, missing or mistyped key fails here, by name, with what would be valid.
+The one extension mechanism. An entry is a mapping with `_target_` and numbers: `{_target_: my_terms.jerk, limit: 3.0}`. A target without a
+dot is looked up among the built-ins of a module, a dotted one is imported. The numbers must be the function's keyword-only parameters, all
+of them, with the annotated types: a misspelt, missing or mistyped key fails here, by name, with what would be valid.
 """
 
 import functools

@@ -14,8 +14,9 @@ EVENTS = tuple(field.name for field in dataclasses.fields(Events))
 def judge(facts: Facts, happened: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
     """New events of this step and the agents that they end.
 
-    An event is new once in an agent's life. If several are new in one step, the first in the order of `EVENTS` counts (the paper's events are
-    mutually exclusive). `ending` names the events after which an agent leaves the stage; the others are only noted (an "invincible" agent).
+    An event is new once in an agent's life. If several are new in one step, the first in the order of `EVENTS` counts (the paper's events
+    are mutually exclusive). `ending` names the events after which an agent leaves the stage; the others are only noted (an "invincible"
+    agent).
     """
     taken = jnp.zeros_like(active)
     new = {}

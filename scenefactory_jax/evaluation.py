@@ -95,7 +95,8 @@ def play(
         tally = _note(episode.tally, before.active, outcome, ttc_limit_s=ttc_limit_s)
         motion = state.motion
         frame = Frame(
-            motion.position[:, :2], motion.yaw, jnp.linalg.norm(motion.velocity[:, :2], axis=1), before.active, state.agents.goal, outcome.events
+            motion.position[:, :2], motion.yaw, jnp.linalg.norm(motion.velocity[:, :2], axis=1), before.active, state.agents.goal,
+            outcome.events
         )
         return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
 

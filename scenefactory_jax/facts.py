@@ -37,8 +37,8 @@ def measure(
 ) -> Facts:
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
-    Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its tangent
-    turned towards the goal; TTC and DRAC among active cars; edges touched by the bounding circles.
+    Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
+    tangent turned towards the goal; TTC and DRAC among active cars; edges touched by the bounding circles.
     """
     motion, active = after.motion, before.active
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
@@ -47,7 +47,8 @@ def measure(
     speed = norm(velocity)
     to_goal = after.agents.goal - position
     lane = _measure_lane(scene, before, position, motion, to_goal)
-    edge_gap = jnp.min(distance_to_segments(centres, scene.edges, half_width_m=edge_half_width_m), axis=(1, 2), initial=jnp.inf) - edge_radius_m
+    to_edges = distance_to_segments(centres, scene.edges, half_width_m=edge_half_width_m)
+    edge_gap = jnp.min(to_edges, axis=(1, 2), initial=jnp.inf) - edge_radius_m
     edge_ttc = conflict.with_points(centres, radius, velocity, motion.yaw, scene.edges, range_m=edge_range_m)
     strayed = norm(position - after.agents.position)
 

@@ -1,7 +1,8 @@
 """Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent.
 
-A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them and the dictionary of their results is the observation. One's own group
-is the same with a dotted target. The policy encodes vectors and sets by their type, so a new group needs no change anywhere else.
+A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them and the dictionary of their results is the observation.
+One's own group is the same with a dotted target. The policy encodes vectors and sets by their type, so a new group needs no change
+anywhere else.
 """
 
 from collections.abc import Callable, Mapping
@@ -54,7 +55,8 @@ def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale:
 
 
 def neighbours(
-    scene: Scene, state: State, *, count: int, distance_scale_m: float, speed_scale_mps: float, ttc_scale_s: float, circles: dict[str, float]
+    scene: Scene, state: State, *, count: int, distance_scale_m: float, speed_scale_mps: float, ttc_scale_s: float, circles: dict[str,
+    float]
 ) -> Rows:
     """The nearest other active cars: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
     motion, agents = state.motion, state.agents

@@ -1,7 +1,7 @@
 """Reward terms: functions of one Step that give a number for each agent; `weigh` sums them.
 
-A term is a config entry `{_target_: progress, weight: 2.0, limit_m: 2.0}`: `weight` multiplies the term, the other keys are its numbers. One's own
-term is the same with a dotted target: `{_target_: my_terms.jerk, weight: -0.1}`.
+A term is a config entry `{_target_: progress, weight: 2.0, limit_m: 2.0}`: `weight` multiplies the term, the other keys are its numbers.
+One's own term is the same with a dotted target: `{_target_: my_terms.jerk, weight: -0.1}`.
 """
 
 from collections.abc import Callable, Mapping

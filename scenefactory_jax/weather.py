@@ -78,8 +78,8 @@ def spacing(
 ) -> Float[Array, "*shape"]:
     """Y_R: the share of the contact patch in which water is squeezed out to the minimum spacing.
 
-    The published bracket 1/(h_m^2 + 2 T h_m) - 1/(h0^2 + 2 T h0) turns negative for h0 < h_m, where the clip gives one: holding h0 at h_m or
-    above says the same without a division by zero on a dry road. The difference is written as one fraction for float32's sake.
+    The published bracket 1/(h_m^2 + 2 T h_m) - 1/(h0^2 + 2 T h0) turns negative for h0 < h_m, where the clip gives one: holding h0
+    at h_m or above says the same without a division by zero on a dry road. The difference is one fraction for float32's sake.
     """
     texture = texture_mm * 1e-3
     least, first = tyre.minimum_spacing, jnp.maximum(tyre.spacing_ratio * film_mm * 1e-3, tyre.minimum_spacing)
@@ -126,21 +126,21 @@ def grip(
         ConfigError: an unknown mode, tyre constant or surface, by name.
     """
     constants = build({**tyre, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
-    theta, texture = _surfaces(surfaces)
     if mode not in ("static", "dynamic", "speed"):
         raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
     place = jnp.broadcast_to(weather.film_mm, position.shape[:-1])
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
-    at = lambda table: jnp.broadcast_to(jnp.asarray(table, jnp.float32)[weather.surface], speed.shape)
-    return jnp.maximum(friction(v, place, at(theta), at(texture), s, tyre=constants), floor)
+    theta, texture = (jnp.broadcast_to(table[weather.surface], speed.shape) for table in _surfaces(surfaces))
+    return jnp.maximum(friction(v, place, theta, texture, s, tyre=constants), floor)
 
 
-def _surfaces(surfaces: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
     rows = [build({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
-    return [row.theta for row in rows], [row.texture_mm for row in rows]
+    return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Env for ONE world, made of dynamics, spawn, weather, facts, ends, rewards and observations.
 
-`make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both give
-pure functions to put under one's own `jit`, `vmap` and `scan`.
+`make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both
+give pure functions to put under one's own `jit`, `vmap` and `scan`.
 """
 
 import functools
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax import ends, facts, observations, rewards, spawn
+from scenefactory_jax import ends, observations, rewards, spawn
 from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Agents, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather

@@ -37,7 +37,15 @@ NUMBERS = dict(
 )
 
 SMALL = dict(
-    vector=[16], rows={}, rows_default=[16], trunk=[16], activation="tanh", log_std_init=-0.7, actor_head_scale=0.01, dtype="float32"
+    vector=[16],
+    rows={},
+    rows_default=[16],
+    trunk=[16],
+    activation="tanh",
+    mean_init=[0.0, 0.0, 0.0],
+    log_std_init=-0.7,
+    actor_head_scale=0.01,
+    dtype="float32",
 )
 
 
@@ -71,9 +79,9 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
     """
 
     def pay(task, cue, action, age):
-        one, later = jnp.ones(AGENTS), (age == 1).astype(jnp.float32)
-        throttle = action[:, 0]
-        return jnp.select([task == 1, task == 2, task == 3, task == 4], [one, cue, later, -((throttle - 0.5) ** 2)], -((throttle - 0.5 * cue) ** 2))
+        throttle, later = action[:, 0], (age == 1).astype(jnp.float32)
+        paid = [jnp.ones(AGENTS), cue, later, -((throttle - 0.5) ** 2), -((throttle - 0.5 * cue) ** 2)]
+        return jnp.stack(paid)[task - 1]
 
     def see(task, cue, age):
         return jnp.select([task == 2, task == 3, task == 5], [cue, age.astype(jnp.float32), cue], 0.0)

@@ -26,8 +26,10 @@ def test_advantages_equal_a_plain_loop():
     bootstrap = jax.random.normal(keys[2], (W, A))
     active, done = jax.random.bernoulli(keys[3], 0.8, (T, W, A)), jax.random.bernoulli(keys[4], 0.2, (T, W, A))
     truncated = jax.random.bernoulli(keys[5], 0.2, (T, W, A))
-    advantage, returns = gae.estimate(reward, value, bootstrap, active, done, truncated, gamma=0.9, gae_lambda=0.8)
+    estimate = jax.jit(functools.partial(gae.estimate, gamma=0.9, gae_lambda=0.8))
+    advantage, returns = estimate(reward, value, bootstrap, active, done, truncated)
 
+    reward, value, bootstrap, active, done, truncated = map(np.asarray, (reward, value, bootstrap, active, done, truncated))
     wanted = np.zeros((T, W, A))
     for index in np.ndindex(W, A):
         following, carried = float(bootstrap[index]), 0.0
@@ -124,42 +126,43 @@ def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
-def learn(batch, samples, **numbers):
+@pytest.fixture(scope="module")
+def learn(batch):
+    """Two minibatches of 12: (samples, rate) -> (parameters, optimiser state, facts)."""
     policy, parameters, _, log_std = batch
-    numbers = {**dict(epochs=1, minibatches=2, size=12, permute_each_epoch=False, rate=update.AdaptiveRate(None, 1e-5, 1e-2)), **numbers}
     adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, entropy=0.01, value=1.0)
+    numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
 
-    def objective(parameters, part, log_std):
-        return loss.ppo(parameters, part, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)
+    @jax.jit
+    def run(samples, rate):
+        return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), rate=rate, **numbers)
 
-    run = jax.jit(functools.partial(update.learn, loss=objective, optimiser=adam, **numbers))
-    return run(parameters, adam.init(parameters), samples, log_std, jax.random.key(6))
+    return lambda samples, *rate: run(samples, update.AdaptiveRate(*rate))
 
 
-def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
+def test_what_is_not_finite_moves_nothing_and_is_counted(batch, learn):
     _, parameters, samples, _ = batch
-    broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # one of the two minibatches
-    after, state, facts = learn(batch, broken)
+    broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # in one of the two minibatches
+    after, state, facts = learn(broken, 0.01, 1e-5, 1e-2)
     assert float(facts["skipped"]) == 1.0 and int(state[-1].count) == 1
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((after, facts)))
-    assert any(bool((a != b).any()) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parameters), strict=True))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, facts)))
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parameters), strict=True))
 
-    after, _, facts = learn(batch, dataclasses.replace(samples, weight=jnp.zeros(24)))
+    after, _, facts = learn(dataclasses.replace(samples, weight=jnp.zeros(24)), 0.01, 1e-5, 1e-2)
     jax.tree.map(np.testing.assert_array_equal, after, parameters)
     assert float(facts["skipped"]) == 0.0
 
 
-def test_learning_rate_follows_the_divergence(batch):
+def test_learning_rate_follows_the_divergence(batch, learn):
     def rate(*numbers):
-        facts = learn(batch, batch[2], minibatches=1, size=24, rate=update.AdaptiveRate(*numbers))[2]
-        return float(facts["learning_rate"])
+        return float(learn(batch[2], *numbers)[2]["learning_rate"])
 
-    divergence = float(learn(batch, batch[2], minibatches=1, size=24)[2]["kl"])
-    np.testing.assert_allclose(rate(divergence / 3, 1e-5, 1e-2), 1e-3 / 1.5, rtol=1e-5)
+    divergence = float(learn(batch[2], 1.0, 1e-5, 1e-2)[2]["kl"])
+    np.testing.assert_allclose(rate(divergence / 9, 1e-5, 1e-2), 1e-3 / 1.5**2, rtol=1e-5)  # once in each minibatch
     np.testing.assert_allclose(rate(divergence, 1e-5, 1e-2), 1e-3, rtol=1e-5)
-    np.testing.assert_allclose(rate(divergence * 3, 1e-5, 1e-2), 1e-3 * 1.5, rtol=1e-5)
-    np.testing.assert_allclose(rate(divergence / 3, 9e-4, 1e-2), 9e-4, rtol=1e-5)
-    np.testing.assert_allclose(rate(None, 1e-5, 1e-2), 1e-3, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence * 9, 1e-5, 1e-2), 1e-3 * 1.5**2, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence / 9, 9e-4, 1e-2), 9e-4, rtol=1e-5)
 
 
 def counted(env: Env):

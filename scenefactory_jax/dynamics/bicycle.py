@@ -4,17 +4,18 @@ The same wheelbase, steering limit and longitudinal capability as the articulate
 else. Contact is reported with the articulated cars' contact model, as the force that would act, and moves nobody.
 """
 
+import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.build import build
-from scenefactory_jax.geometry import heading
-from scenefactory_jax.struct import struct
+from scenefactory_jax.dynamics.contact import choose
+from scenefactory_jax.geometry import heading, norm, wrap_angle
+from scenefactory_jax.struct import replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
 
 GRAVITY = 9.81
@@ -69,59 +70,75 @@ def make(
     """
     entry = {**contact, "_target_": "forces"}
     meet = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)
-
-    def init(scene: Scene) -> Body:
-        agents = scene.agents
-        zero = jnp.zeros(agents.yaw.shape, jnp.float32)
-        return Body(agents.position, agents.yaw, agents.speed, zero, zero, zero, zero, zero, zero)
+    limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
-        action = jnp.clip(action, -1.0, 1.0)
-        push = acceleration * jnp.maximum(action[:, 0], 0.0) - deceleration * jnp.maximum(action[:, 2], 0.0) - drag * body.speed
-        speed = jnp.clip(body.speed + push * control_dt, 0.0, speed_limit)
-        mean = 0.5 * (body.speed + speed)
-        steer = steering_limit * action[:, 1]
-        slip_angle = jnp.arctan(rear_length / wheelbase * jnp.tan(steer))
-        yaw_rate = mean * jnp.cos(slip_angle) * jnp.tan(steer) / wheelbase
-        # the chord of an arc points along the heading half way
-        along = heading(body.yaw + 0.5 * yaw_rate * control_dt + slip_angle)
-        position = body.position + mean[:, None] * control_dt * along
+        moved = roll(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
         mu = grip(scene.weather, body.position, body.speed)
-        wanted = jnp.sqrt(jnp.maximum(((speed - body.speed) / control_dt) ** 2 + (mean * yaw_rate) ** 2, 1e-12))
-        moved = Body(
-            position=position,
-            yaw=body.yaw + yaw_rate * control_dt,
-            speed=speed,
-            steer=steer,
-            slip_angle=slip_angle,
-            yaw_rate=yaw_rate,
-            contact_force=jnp.zeros_like(speed),
-            grip=mu,
-            grip_use=wanted / (mu * GRAVITY),
-        )
-        motion = read(moved)
+        motion = read(moved, height=centre_height)
         _, _, force = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
-        zero = jnp.zeros_like(speed)
-        held = Body(
-            body.position, body.yaw, body.speed, body.steer, body.slip_angle, body.yaw_rate, contact_force=zero, grip=body.grip, grip_use=zero
-        )
-        keep = lambda new, old: jnp.where(active.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-        return jax.tree.map(keep, Body(**{**vars(moved), "contact_force": force}), held)
+        along, across = (moved.speed - body.speed) / control_dt, moved.yaw_rate * moved.speed
+        wanted = norm(jnp.stack([along, across], axis=-1))
+        moved = replace(moved, contact_force=force, grip=mu, grip_use=wanted / (mu * GRAVITY))
+        held = replace(body, contact_force=jnp.zeros_like(force), grip_use=jnp.zeros_like(force))
+        return choose(active, moved, held)
 
-    def read(body: Body) -> Motion:
-        flat = body.speed[:, None] * heading(body.yaw + body.slip_angle)
-        zero = jnp.zeros_like(body.speed)
-        return Motion(
-            position=jnp.concatenate([body.position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
-            velocity=jnp.concatenate([flat, zero[:, None]], axis=-1),
-            yaw=jnp.arctan2(jnp.sin(body.yaw), jnp.cos(body.yaw)),
-            yaw_rate=body.yaw_rate,
-            upright=jnp.ones_like(zero),
-            steer=body.steer,
-            contact_force=body.contact_force,
-            grip=body.grip,
-            grip_use=body.grip_use,
-            slip=zero,
-        )
+    return Dynamics(init=init, advance=advance, read=functools.partial(read, height=centre_height))
 
-    return Dynamics(init=init, advance=advance, read=read)
+
+class Limits(NamedTuple):
+    """The numbers of `make` that decide how a car moves."""
+
+    wheelbase: float
+    rear_length: float
+    steering: float
+    acceleration: float
+    deceleration: float
+    drag: float
+    speed: float
+
+
+def init(scene: Scene) -> Body:
+    """Cars at their starts."""
+    agents = scene.agents
+    zero = jnp.zeros(agents.yaw.shape, jnp.float32)
+    return Body(agents.position, agents.yaw, agents.speed, zero, zero, zero, zero, zero, zero)
+
+
+def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:
+    """One integration of throttle, steer and brake over `dt` seconds."""
+    throttle, brake = jnp.maximum(action[:, 0], 0.0), jnp.maximum(action[:, 2], 0.0)
+    push = limits.acceleration * throttle - limits.deceleration * brake - limits.drag * body.speed
+    speed = jnp.clip(body.speed + push * dt, 0.0, limits.speed)
+    mean = 0.5 * (body.speed + speed)
+    steer = limits.steering * action[:, 1]
+    slip_angle = jnp.arctan(limits.rear_length / limits.wheelbase * jnp.tan(steer))
+    yaw_rate = mean * jnp.cos(slip_angle) * jnp.tan(steer) / limits.wheelbase
+    chord = heading(body.yaw + slip_angle + 0.5 * yaw_rate * dt)  # the chord of an arc points along the heading half way
+    return replace(
+        body,
+        position=body.position + (mean * dt)[:, None] * chord,
+        yaw=wrap_angle(body.yaw + yaw_rate * dt),
+        speed=speed,
+        steer=steer,
+        slip_angle=slip_angle,
+        yaw_rate=yaw_rate,
+    )
+
+
+def read(body: Body, *, height: float) -> Motion:
+    """What the rest of the system may know of the cars."""
+    flat = body.speed[:, None] * heading(body.yaw + body.slip_angle)
+    zero = jnp.zeros_like(body.speed)
+    return Motion(
+        position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),
+        velocity=jnp.concatenate([flat, zero[:, None]], axis=-1),
+        yaw=body.yaw,
+        yaw_rate=body.yaw_rate,
+        upright=jnp.ones_like(zero),
+        steer=body.steer,
+        contact_force=body.contact_force,
+        grip=body.grip,
+        grip_use=body.grip_use,
+        slip=zero,
+    )

@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
 """The car as a MuJoCo model: one box chassis on four sprung wheels, 6 + 10 degrees of freedom.
 
 Each wheel is one body with its joints in a row (suspension slide, steering hinge in front, spin hinge), instead of a carrier, a knuckle and

@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
 """Articulated cars on MJX: one car is one MJX model, `vmap` runs the cars of a world, `contact` lets them meet.
 
 What changes per car and per step is written into the model inside `advance`: the friction of each tyre's contact pair and the brakes, which
@@ -5,6 +7,7 @@ are friction losses of the wheels' joints. Everything else that acts on a car is
 carried: positions, velocities and the solver's warm start, not MJX's whole `Data`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -12,12 +15,14 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics.car import CarParameters, Solver
+from scenefactory_jax.dynamics.contact import choose
+from scenefactory_jax.geometry import norm
 from scenefactory_jax.struct import replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
 
@@ -56,6 +61,15 @@ class Plant(NamedTuple):
     latched: bool
 
 
+class Single(NamedTuple):
+    """What MJX carries of one car from step to step."""
+
+    qpos: Float[Array, "17"]
+    qvel: Float[Array, "16"]
+    qacc_warmstart: Float[Array, "16"]
+    spin_sign: Float[Array, "4"]
+
+
 class Command(NamedTuple):
     """What one car is told for a control step, and what the road gives it."""
 
@@ -83,8 +97,8 @@ def make(
         car: numbers of `car.CarParameters`.
         solver: numbers of `car.Solver`.
         contact: stiffness, damping and friction of `contact.forces`; its height is the car's.
-        brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a remembered
-            spin direction, which flips every substep once a wheel locks.
+        brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a
+            remembered spin direction, which flips every substep once a wheel locks.
         grip: (weather, position, speed) -> friction coefficient, asked for every wheel at the start of every control step.
         physics_dt: s; `control_dt` must be a whole multiple of it.
 
@@ -121,7 +135,10 @@ def make(
 
 def places(model: mujoco.MjModel) -> Places:
     """Addresses of the joints in a compiled car."""
-    at = lambda kind, wheels, address: np.array([getattr(model.joint(f"{kind}_{w}"), address)[0] for w in wheels])
+
+    def at(kind: str, wheels: tuple[str, ...], address: str) -> np.ndarray:
+        return np.array([getattr(model.joint(f"{kind}_{wheel}"), address)[0] for wheel in wheels])
+
     return Places(
         suspension_q=at("suspension", cars.WHEELS, "qposadr"),
         suspension_v=at("suspension", cars.WHEELS, "dofadr"),
@@ -168,7 +185,7 @@ def _advance(
     """One control step of all cars."""
     car = plant.car
     before = read(plant, body)
-    speed = jnp.sqrt((before.velocity[:, :2] ** 2).sum(-1))
+    speed = norm(before.velocity[:, :2])
     wheels = wheel_positions(car, before.position[:, :2], before.yaw)
     mu = grip(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
     action = jnp.clip(action, -1.0, 1.0)
@@ -180,44 +197,30 @@ def _advance(
         motion = read(plant, now)
         force, torque, strength = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
         command = Command(steer, drive, brake, mu, force, torque)
-        moved = jax.vmap(lambda b, c: move(plant, b, c))(now, command)
-        return replace(moved, contact_force=jnp.maximum(now.contact_force, strength)), None
+        car_of = Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign)
+        moved, use, slip = jax.vmap(functools.partial(move, plant))(car_of, command)
+        strongest = jnp.maximum(now.contact_force, strength)
+        return replace(now, **moved._asdict(), contact_force=strongest, grip_use=use, slip=slip), None
 
     quiet = replace(body, contact_force=jnp.zeros_like(body.contact_force), grip=mu.mean(-1))
     after, _ = jax.lax.scan(substep, quiet, length=substeps)
-    held = replace(
-        body,
-        contact_force=jnp.zeros_like(body.contact_force),
-        grip_use=jnp.zeros_like(body.grip_use),
-        slip=jnp.zeros_like(body.slip),
-    )
-    keep = lambda new, old: jnp.where(active.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-    return jax.tree.map(keep, after, held)
+    zero = jnp.zeros_like(body.slip)
+    return choose(active, after, replace(body, contact_force=zero, grip_use=zero, slip=zero))
 
 
-def move(plant: Plant, body: Any, command: Command) -> Any:
-    """One physics step of one car (a `Body` without the agent axis)."""
-    places = plant.places
-    applied, sign = _generalised_force(plant, body, command)
-    friction = plant.model.pair_friction.at[:, :2].set(command.mu[:, None])
-    model = plant.model.replace(pair_friction=friction)
+def move(plant: Plant, car: Single, command: Command) -> tuple[Single, Float[Array, ""], Float[Array, ""]]:
+    """One physics step of one car; also the largest share of grip that a tyre used, and the fastest sliding of a tyre, m/s."""
+    applied, sign = _generalised_force(plant, car, command)
+    model = plant.model.replace(pair_friction=plant.model.pair_friction.at[:, :2].set(command.mu[:, None]))
     if not plant.latched:
-        model = model.replace(dof_frictionloss=model.dof_frictionloss.at[places.spin_v].set(command.brake + cars.LATENT_FRICTION))
-    data = plant.data.replace(qpos=body.qpos, qvel=body.qvel, qacc_warmstart=body.qacc_warmstart, qfrc_applied=applied)
+        loss = model.dof_frictionloss.at[plant.places.spin_v].set(command.brake + cars.LATENT_FRICTION)
+        model = model.replace(dof_frictionloss=loss)
+    data = plant.data.replace(qpos=car.qpos, qvel=car.qvel, qacc_warmstart=car.qacc_warmstart, qfrc_applied=applied)
     data = mjx.step(model, data)
-    use, slip = _tyres(data, command.mu)
-    return replace(
-        body,
-        qpos=data.qpos,
-        qvel=data.qvel,
-        qacc_warmstart=data.qacc_warmstart,
-        spin_sign=sign,
-        grip_use=use,
-        slip=slip,
-    )
+    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), *_tyres(data, command.mu)
 
 
-def _generalised_force(plant: Plant, body: Any, command: Command) -> tuple[Float[Array, "16"], Float[Array, "4"]]:
+def _generalised_force(plant: Plant, body: Single, command: Command) -> tuple[Float[Array, "16"], Float[Array, "4"]]:
     """Servo, engine, bump stops, dampings, other cars, and latched brakes, as joint forces; and the wheels' spin signs."""
     car, at = plant.car, plant.places
     angle, rate = body.qpos[at.steer_q], body.qvel[at.steer_v]
@@ -247,10 +250,9 @@ def _tyres(data: mjx.Data, mu: Float[Array, "4"]) -> tuple[Float[Array, ""], Flo
     rows = np.asarray(data._impl.contact.efc_address)[:, None] + np.arange(3)
     force = data._impl.efc_force[rows]
     slide = (data._impl.efc_J @ data.qvel)[rows][:, 1:]
-    length = lambda v: jnp.sqrt(jnp.maximum((v**2).sum(-1), 1e-12))
     loaded = force[:, 0] > 1.0  # N
-    use = length(force[:, 1:]) / (mu * jnp.where(loaded, force[:, 0], 1.0))
-    return jnp.where(loaded, use, 0.0).max(), jnp.where(loaded, length(slide), 0.0).max()
+    use = norm(force[:, 1:]) / (mu * jnp.where(loaded, force[:, 0], 1.0))
+    return jnp.where(loaded, use, 0.0).max(), jnp.where(loaded, norm(slide), 0.0).max()
 
 
 def matrix(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -1,4 +1,6 @@
-"""The same car and the same controls in MuJoCo's C engine, in double precision and with the solver run to convergence: what MJX is tested against."""
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
+"""The same car and controls in MuJoCo's C engine, in double precision and with the solver run to convergence: MJX is tested against it."""
 
 import dataclasses
 from typing import NamedTuple

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.build import build
-from scenefactory_jax.geometry import wrap_angle
-from scenefactory_jax.struct import struct
+from scenefactory_jax.dynamics.contact import choose
+from scenefactory_jax.geometry import norm, wrap_angle
+from scenefactory_jax.struct import replace, struct
 from scenefactory_jax.types import Dynamics, Log, Motion, Scene
 
 
@@ -22,9 +23,7 @@ class Body:
     motion: Motion
 
 
-def make(
-    *, start_row: int, centre_height: float, contact: dict[str, Any], grip: Callable[..., Any], control_dt: float
-) -> Dynamics:
+def make(*, start_row: int, centre_height: float, contact: dict[str, Any], grip: Callable[..., Any], control_dt: float) -> Dynamics:
     """Cars on the tracks of `scene.log`, linear in time between valid rows, at rest before the first and after the last.
 
     Args:
@@ -51,7 +50,7 @@ def make(
             upright=jnp.ones_like(zero),
             steer=zero,
             contact_force=zero,
-            grip=grip(scene.weather, position, jnp.sqrt((velocity**2).sum(-1))),
+            grip=grip(scene.weather, position, norm(velocity)),
             grip_use=zero,
             slip=zero,
         )
@@ -61,13 +60,10 @@ def make(
         return Body(steps=steps, motion=at(scene, steps))
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
-        steps = body.steps + 1
-        motion = at(scene, steps)
+        motion = at(scene, body.steps + 1)
         _, _, force = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
-        moved = Body(steps=steps, motion=Motion(**{**vars(motion), "contact_force": force}))
-        held = Body(steps=body.steps, motion=Motion(**{**vars(body.motion), "contact_force": jnp.zeros_like(force)}))
-        keep = lambda new, old: jnp.where(active.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
-        return jax.tree.map(keep, moved, held)
+        moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
+        return choose(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 
     return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
 
@@ -99,7 +95,8 @@ def sample(
     before_row, after_row = jnp.clip(before_row, 0, length - 1), jnp.clip(after_row, 0, length - 1)
     gap = (after_row - before_row).astype(jnp.float32)
     share = jnp.where(moving & (gap > 0), (row - before_row) / jnp.maximum(gap, 1.0), 0.0)
-    mix = lambda values: values[before_row] + share * (values[after_row] - values[before_row])
     turn = wrap_angle(yaw[after_row] - yaw[before_row])
-    still = lambda x: jnp.where(moving, x, 0.0)
-    return mix(position), still(mix(velocity)), wrap_angle(yaw[before_row] + share * turn), still(turn / jnp.maximum(gap, 1.0) / dt)
+    moved = position[before_row] + share * (position[after_row] - position[before_row])
+    speed = velocity[before_row] + share * (velocity[after_row] - velocity[before_row])
+    yaw_rate = turn / (jnp.maximum(gap, 1.0) * dt)
+    return moved, jnp.where(moving, speed, 0.0), wrap_angle(yaw[before_row] + share * turn), jnp.where(moving, yaw_rate, 0.0)

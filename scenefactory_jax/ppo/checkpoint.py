@@ -72,7 +72,7 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
 
 
 def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
-    """Only what the policy learnt, as nested dicts of numpy arrays: for evaluation, on whatever device.
+    """Only what the policy learnt, as nested dicts of arrays on the default device: for evaluation, wherever training ran.
 
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
@@ -81,7 +81,7 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
         step = _find(manager, Path(folder), iteration)
         plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), manager.item_metadata(step)[LEARNT], is_leaf=_is_metadata)
         found = manager.restore(step, args=ocp.args.Composite(parameters=ocp.args.StandardRestore(plain)))
-    return jax.tree.map(np.asarray, found[LEARNT])
+    return jax.tree.map(jnp.asarray, found[LEARNT])
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """`bench`: how fast a training configuration runs, and where the time of a control step goes.
 
-CASPS, controlled-agent steps per second, counts the steps of spawned slots (30 Hz ticks) with PPO in the loop, after warm-up. Phases are measured
-one by one as scans over the rollout's horizon, so fusion across phases is lost and their sum need not be the whole: both are printed.
+CASPS, controlled-agent steps per second, counts the steps of spawned slots (30 Hz ticks) with PPO in the loop, after warm-up. Phases are
+measured one by one as scans over the rollout's horizon, so fusion across phases is lost and their sum need not be the whole: both are
+printed.
 """
 
 import json
@@ -137,7 +138,8 @@ def _nudged(states, key):
 def describe(result: Mapping[str, Any]) -> str:
     """The figures as text; the headline last."""
     phases = result["phase_ms_a_control_step"]
-    rows = [[name, f"{value:.2f}"] for name, value in phases.items()] + [["whole iteration", f"{1e3 * result['iteration_s'] / result['horizon']:.2f}"]]
+    whole = 1e3 * result["iteration_s"] / result["horizon"]
+    rows = [[name, f"{value:.2f}"] for name, value in {**phases, "whole iteration": whole}.items()]
     low, high = result["casps_range"]
     size = " x ".join(map(str, result["slots"]))
     return "\n".join(

@@ -109,11 +109,13 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
             result[last] = load("task", override)[last]
             continue
         node: Any = result
-        for key in [*parents, last]:
-            if not isinstance(node, Mapping) or key not in node:
-                raise ConfigError(f"overrides: {path}: the run has no {key!r} there; valid: {', '.join(sorted(map(str, node)))}")
-            node, holder = node[key], node
-        holder[last] = yaml.safe_load(value)
+        for depth, key in enumerate([*parents, last]):
+            if not isinstance(node, dict) or key not in node:
+                valid = ", ".join(sorted(map(str, node))) if isinstance(node, dict) else "nothing: it is a value"
+                raise ConfigError(f"overrides: {path}: the run has no {key!r} there; valid: {valid}")
+            if depth == len(parents):
+                node[key] = yaml.safe_load(value)
+            node = node[key]
     return result
 
 

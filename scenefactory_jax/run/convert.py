@@ -7,9 +7,8 @@ from rich.progress import Progress
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import sources
-from scenefactory_jax.scenes.convert import Summary
+from scenefactory_jax.scenes.convert import Summary, describe
 from scenefactory_jax.scenes.convert import convert as to_bank
-from scenefactory_jax.scenes.convert import describe
 
 
 def convert(config: Mapping[str, Any]) -> Summary:

@@ -1,7 +1,8 @@
 """`evaluate`: a run's policy on held-out scenes -> per-agent records, tables with intervals, a report and a video."""
 
 import functools
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +15,9 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import sources
+from scenefactory_jax.run import log, sources
 from scenefactory_jax.run.train import make_policy
-from scenefactory_jax.types import SURFACES, Env
+from scenefactory_jax.types import SURFACES
 
 PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
@@ -55,6 +56,28 @@ def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     return judge(config, folder, scenes, folder, settings=settings, protocols=settings["protocols"])
 
 
+def make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> Callable[[Any, Mapping[str, float]], None]:
+    """A function (parameters, metrics row) that adds one row of held-out estimates to `evaluations.csv`: rates against steps."""
+    settings = {**config["evaluation"], "repeats": 1}
+    scenes = sources.heldout(config["scenes"], path=None)
+    examiners = {
+        protocol: make_examiner(config, scenes, protocol=protocol, settings=settings, film=0) for protocol in settings["protocols"]
+    }
+    file = log.MetricsFile(folder, name=log.EVALUATIONS, resume_at=resume_at)
+
+    def watch(parameters: Any, row: Mapping[str, float]) -> None:
+        begun = time.monotonic()
+        found = {key: row[key] for key in ("iteration", "steps/total", "minutes")}
+        for protocol, examine in examiners.items():
+            summary = tables.summarise(examine(parameters)[0], bootstrap=settings["bootstrap"], seed=settings["seed"])
+            for name, estimate in summary.items():
+                for key in ("value", "low", "high"):
+                    found[f"{protocol}/{name}/{key}"] = np.nan if (number := getattr(estimate, key)) is None else number
+        file.add({**found, "seconds": time.monotonic() - begun})
+
+    return watch
+
+
 def judge(
     config: Mapping[str, Any], run: Path, scenes: sources.Scenes, out: Path, *, settings: Mapping[str, Any], protocols: list[str]
 ) -> Result:
@@ -67,12 +90,12 @@ def judge(
     if settings["untrained"]:
         parameters["untrained"] = checkpoint.restore_parameters(run / "untrained")
     records, trajectories = {}, []
-    for protocol in protocols:
-        env = world.make({**config, "ends": configs.load("task", f"ends={protocol}")["ends"]})
+    for number, protocol in enumerate(protocols):
+        film = settings["video"]["worlds"] if settings["video"]["enable"] and number == 0 else 0
+        examine = make_examiner(config, scenes, protocol=protocol, settings=settings, film=film)
         for name, values in parameters.items():
             label = protocol if name == "trained" else f"{protocol}, {name}"
-            film = settings["video"]["worlds"] if settings["video"]["enable"] and not trajectories and name == "trained" else 0
-            records[label], recorded = episodes(config, env, values, scenes, settings=settings, film=film)
+            records[label], recorded = examine(values)
             trajectories = trajectories or recorded
             tables.write_csv(out / f"agents-{label.replace(', ', '-')}.csv", records[label])
     summary = {label: tables.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for label, rows in records.items()}
@@ -81,23 +104,27 @@ def judge(
     return Result(out, records, summary, report)
 
 
-def episodes(
-    config: Mapping[str, Any], env: Env, parameters: Any, scenes: sources.Scenes, *, settings: Mapping[str, Any], film: int
-) -> tuple[dict[str, np.ndarray], list[Trajectory]]:
-    """One deterministic episode for every scene and repeat, all worlds at once.
+def make_examiner(
+    config: Mapping[str, Any], scenes: sources.Scenes, *, protocol: str, settings: Mapping[str, Any], film: int
+) -> Callable[[Any], tuple[dict[str, np.ndarray], list[Trajectory]]]:
+    """A function parameters -> (records, trajectories) that plays one deterministic episode for every scene and repeat, all at once.
+
+    It compiles when it is first called, and not again for other parameters.
 
     Args:
+        protocol: an option of the `ends` group.
         film: how many worlds' trajectories to keep.
-
-    Returns:
-        Per-agent columns (`report.tables.COLUMNS`) and the kept trajectories.
     """
-    policy = make_policy(config)
-    act = lambda values, observation: policy.apply(values, observation)[0]  # noqa: E731
+    env, policy = world.make({**config, "ends": configs.load("task", f"ends={protocol}")["ends"]}), make_policy(config)
     index = np.tile(np.arange(len(scenes)), settings["repeats"])
-    batch = jax.tree.map(lambda leaf: leaf[index], scenes.scene)
+    names = [scenes.names[i] for i in index]
+    batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
-    chunk, limit = settings["chunk_steps"], world.episode_steps(config["timing"])
+    control_hz, chunk = config["timing"]["control_hz"], settings["chunk_steps"]
+    limit, filmed = world.episode_steps(config["timing"]), round(settings["video"]["seconds"] * control_hz)
+
+    def act(parameters, observation):
+        return policy.apply(parameters, observation)[0]
 
     @jax.jit
     def begin(keys, batch):
@@ -109,18 +136,20 @@ def episodes(
         episode, frames = jax.vmap(one)(batch, episode)
         return episode, jax.tree.map(lambda leaf: leaf[:film], frames)
 
-    episode = begin(keys, batch)
-    present, started = jax.device_get((episode.state.agents.present, episode.tally.goal_distance))
-    kept, filmed = [], round(settings["video"]["seconds"] * config["timing"]["control_hz"])
-    for step in range(0, limit, chunk):
-        episode, frames = play(parameters, batch, episode)
-        if step < filmed:
-            kept.append(jax.device_get(frames))
-        if bool(episode.over.all()):
-            break
-    names = [scenes.names[i] for i in index]
-    records = _records(jax.device_get(episode), present, started, names, seed=settings["seed"], control_hz=config["timing"]["control_hz"])
-    return records, _trajectories(kept, episode, batch, names, filmed, config["timing"]["control_hz"]) if film else []
+    def examine(parameters):
+        episode = begin(keys, batch)
+        present, started = jax.device_get((episode.state.agents.present, episode.tally.goal_distance))
+        kept = []
+        for step in range(0, limit, chunk):
+            episode, frames = play(parameters, batch, episode)
+            if step < filmed:
+                kept.append(jax.device_get(frames))
+            if bool(episode.over.all()):
+                break
+        records = _records(jax.device_get(episode), present, started, names, seed=settings["seed"], control_hz=control_hz)
+        return records, _trajectories(kept, episode, batch, names, filmed, control_hz) if film else []
+
+    return examine
 
 
 def _records(episode, present, started, names: list[str], *, seed: int, control_hz: float) -> dict[str, np.ndarray]:

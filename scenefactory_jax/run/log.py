@@ -7,15 +7,16 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-FILE = "metrics.csv"
+FILE, EVALUATIONS = "metrics.csv", "evaluations.csv"
 
 
 class MetricsFile:
-    """metrics.csv, one row an iteration. On resume, rows after the checkpoint are dropped, so that the file tells one unbroken story."""
+    """A CSV file with one row an iteration. On resume, rows after the checkpoint are dropped, so that it tells one unbroken story."""
 
-    def __init__(self, folder: Path, *, resume_at: int | None = None):
-        self.path = Path(folder) / FILE
-        rows = [row for row in read(folder) if resume_at is not None and row["iteration"] <= resume_at] if self.path.exists() else []
+    def __init__(self, folder: Path, *, name: str = FILE, resume_at: int | None = None):
+        self.path = Path(folder) / name
+        rows = [row for row in read(folder, name) if resume_at is not None and row["iteration"] <= resume_at]
+        self.rows = rows
         self.columns = list(rows[0]) if rows else []
         with open(self.path, "w", newline="") as file:
             if rows:
@@ -33,9 +34,9 @@ class MetricsFile:
             writer.writerow(row)
 
 
-def read(folder: Path) -> list[dict[str, float]]:
-    """Rows of a run's metrics.csv; none where there is no file yet."""
-    path = Path(folder) / FILE
+def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
+    """Rows of a run's metrics; none where there is no file yet."""
+    path = Path(folder) / name
     if not path.is_file():
         return []
     with open(path, newline="") as file:

@@ -1,4 +1,6 @@
 """`render`: one scene as a MuJoCo model with all its cars, as XML, and as pictures."""
+# pyright: reportAttributeAccessIssue=false
+# mujoco is an extension module without stubs
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -17,7 +17,7 @@ from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import log, sources
 from scenefactory_jax.types import Env, Policy
 
-OnIteration = Callable[[int, Mapping[str, float]], None]
+OnIteration = Callable[[ppo.TrainState, Mapping[str, float]], None]
 
 
 class Run(NamedTuple):
@@ -35,7 +35,9 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
     """Train as a config says (`load("train", ...)`).
 
     Args:
-        on_iteration: called on the host with (iteration, metrics) after each iteration, for notebooks and sweeps.
+        on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
+        donated
+            to the next iteration: copy what is to outlive the call.
 
     Raises:
         ConfigError: a key that does not fit, a run folder that exists, nothing to resume.
@@ -56,11 +58,15 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
         print(f"resumed at iteration {int(state.iteration)}", flush=True)
     elif config["evaluation"]["enable"] and config["evaluation"]["untrained"]:
         checkpoint.save(folder / "untrained", state, keep=1)  # the report compares with the policy before training
-    state = _loop(config, folder, trainer, worlds, state, resume=resume, on_iteration=on_iteration)
+    watch = _make_watch(config, folder, resume_at=int(state.iteration) if resume else None)
+    state = _loop(config, folder, trainer, worlds, state, resume=resume, callbacks=[c for c in (watch, on_iteration) if c])
     if config["evaluation"]["enable"]:
-        from scenefactory_jax.run.evaluate import after_training
+        if sources.has_heldout(config["scenes"]):
+            from scenefactory_jax.run.evaluate import after_training
 
-        after_training(config, folder)
+            after_training(config, folder)
+        else:
+            print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
     return Run(folder, config, env, policy, state, log.read(folder))
 
 
@@ -76,11 +82,25 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy) -> ppo.Tra
     return make(env, policy)
 
 
-def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: bool, on_iteration: OnIteration | None):
-    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts."""
+def _make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> OnIteration | None:
+    """Held-out evaluation every so many iterations, if the config asks for it."""
+    every = config["evaluation"]["every"]
+    if not every or not config["evaluation"]["enable"]:
+        return None
+    from scenefactory_jax.run.evaluate import make_watch
+
+    watch = make_watch(config, folder, resume_at=resume_at)
+    return lambda state, row: watch(state.parameters, row) if row["iteration"] % every == 0 else None
+
+
+def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: bool, callbacks: list[OnIteration]):
+    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
+
+    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them.
+    """
     first, total = int(state.iteration), config["iterations"]
     file = log.MetricsFile(folder, resume_at=first if resume else None)
-    begun = time.monotonic()
+    spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
         log.tensorboard(folder, enable=config["tensorboard"]) as board,
         log.progress(total, enable=config["progress"], start=first) as show,
@@ -90,16 +110,18 @@ def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: 
             state, metrics = trainer.iterate(state, worlds)
             row = {name: float(value) for name, value in jax.device_get(metrics).items()}
             seconds = time.monotonic() - before
-            row = {"iteration": iteration, **row, "seconds": seconds, "casps": row["steps/spawned"] / seconds}
+            spent += seconds / 60
+            row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
+            row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
             board(row, iteration)
             show(iteration, describe(row))
-            if on_iteration:
-                on_iteration(iteration, row)
-            spent = config["minutes"] is not None and time.monotonic() - begun >= 60 * config["minutes"]
-            if spent or iteration == total or iteration % config["checkpoint_every"] == 0:
+            for callback in callbacks:
+                callback(state, row)
+            late = config["minutes"] is not None and spent >= config["minutes"]
+            if late or iteration == total or iteration % config["checkpoint_every"] == 0:
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"])
-            if spent:
+            if late:
                 break
     return state
 

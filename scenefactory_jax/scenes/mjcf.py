@@ -1,4 +1,6 @@
 """A whole scene as one MuJoCo model: ground, road, cars and goals, to look at and to check against the C engine."""
+# pyright: reportAttributeAccessIssue=false
+# mujoco is an extension module without stubs
 
 import itertools
 from collections.abc import Iterator

@@ -1,0 +1,157 @@
+"""Friction against the reference table, the published cells and the model's own differential equation; laws; drawing; config errors."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from conftest import ROOT, SHARED, scene_of
+
+from scenefactory_jax import weather
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.types import SURFACES, Weather
+
+CONF = ROOT / "conf" / "weather"
+BASE = yaml.safe_load((CONF / "base.yaml").read_text())
+TYRE = weather.Tyre(**BASE["grip"]["tyre"])
+SURFACE = BASE["grip"]["surfaces"]
+FILMS = (0.0, 0.3, 0.5, 1.0, 2.0)
+PUBLISHED = {"AC": (1.105, 0.959, 0.859, 0, 0), "SMA": (1.204, 1.046, 0.937, 0, 0), "OGFC": (1.337, 1.162, 1.041, 0, 0)}
+
+
+@jax.jit
+def mu_of(speed, film, theta, texture, slip):
+    return weather.friction(speed, film, theta, texture, slip, tyre=TYRE)
+
+
+def grip_of(**numbers):
+    return build({**BASE["grip"], **numbers}, builtins=weather, where="weather.grip")
+
+
+@pytest.mark.parametrize(("column", "slip"), [("mu_static_ss", 0.15), ("mu_dynamic_ss", 0.80)])
+def test_friction_matches_the_reference_table(column, slip):
+    table = SHARED.parent / "reference" / "friction_golden.csv"
+    if not table.is_file():
+        pytest.skip(f"needs the reference table {table}")
+    rows = list(csv.DictReader(table.open()))
+    speed, film, theta, texture, wanted = (
+        jnp.array([float(row[name]) for row in rows], jnp.float32) for name in ("speed_mps", "film_mm", "theta", "texture_mm", column)
+    )
+    assert len(rows) == 2280
+    np.testing.assert_allclose(mu_of(speed, film, theta, texture, jnp.full_like(speed, slip)), wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_friction_matches_the_published_cells_to_the_printed_digit(name):
+    film = jnp.array(FILMS)
+    full = lambda x: jnp.full_like(film, x)  # noqa: E731
+    mu = mu_of(full(13.89), film, full(SURFACE[name]["theta"]), full(SURFACE[name]["texture_mm"]), full(0.15))
+    np.testing.assert_allclose(mu, PUBLISHED[name], atol=5e-4)
+
+
+@pytest.mark.parametrize(("film", "slip"), [(0.0, 0.15), (0.3, 0.15), (0.5, 0.8), (0.8, 0.05)])
+def test_closed_form_is_where_the_bristle_comes_to_rest(film, slip):
+    speed, dt, z = 13.89, 1e-4, 0.0
+    theta, texture = SURFACE["SMA"]["theta"], SURFACE["SMA"]["texture_mm"]
+    args = (jnp.float32(speed), jnp.float32(film))
+    y_r = float(weather.spacing(*args, jnp.float32(texture), tyre=TYRE))
+    contact = theta * y_r - float(weather.lift(*args, tyre=TYRE))
+    b1, b2, b3, b4 = TYRE.stribeck_velocity
+    stribeck = b1 * np.exp(b2 * film + b3) + b4
+    g = TYRE.coulomb + (TYRE.static - TYRE.coulomb) * np.exp(-np.sqrt(slip * speed / stribeck))
+    pull = TYRE.bristle_stiffness * slip * speed / g + 7 / (6 * TYRE.patch_length) * (1 + slip) * speed
+    for _ in range(5000):  # 0.5 s of dz/dt = v_r - theta Y_R (sigma0 v_r / g + K w_r) z
+        z += dt * (slip * speed - theta * y_r * pull * z)
+    wanted = contact * theta * y_r * TYRE.bristle_stiffness * z
+    got = mu_of(*(jnp.float32(x) for x in (speed, film, theta, texture, slip)))
+    assert float(got) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_friction_falls_with_water_and_speed():
+    film, speed = jnp.linspace(0.0, 3.0, 61), jnp.linspace(1.0, 40.0, 40)
+    one = jnp.ones
+    by_film = mu_of(13.89 * one(61), film, one(61), 0.65 * one(61), 0.15 * one(61))
+    by_speed = mu_of(speed, 0.5 * one(40), one(40), 0.65 * one(40), 0.15 * one(40))
+    assert (np.diff(by_film) <= 1e-6).all() and (np.diff(by_speed) < 0).all()
+    assert ((by_film >= 0) & (by_film < 1.5)).all()
+
+
+def test_gradients_are_finite_at_rest_on_dry_roads_and_beyond_the_cliff():
+    slope = jax.jit(jax.vmap(jax.grad(lambda v, h, s: mu_of(v, h, jnp.float32(1.0), jnp.float32(0.65), s), argnums=(0, 1, 2))))
+    speed, film = jnp.meshgrid(jnp.array([0.0, 1e-12, 1e-3, 13.89, 60.0]), jnp.array([0.0, 1e-20, 1e-6, 0.3, 0.8, 0.805, 1.0, 1e3]))
+    for slip in (0.0, 0.15):
+        for part in slope(speed.ravel(), film.ravel(), jnp.full(speed.size, slip)):
+            assert jnp.isfinite(part).all()
+
+
+@pytest.mark.parametrize("mode", ["static", "dynamic", "speed"])
+def test_grip_modes(mode):
+    condition = Weather(film_mm=jnp.float32(0.3), surface=jnp.int32(1))
+    speed = jnp.array([[0.0, 5.0, 13.89, 30.0]] * 2)
+    mu = jax.jit(grip_of(mode=mode))(condition, jnp.zeros((2, 4, 2)), speed)
+    assert mu.shape == (2, 4) and mu.dtype == jnp.float32
+    if mode == "speed":
+        assert (np.diff(mu) < 0).all() and mu[0, 0] < 1.6
+        assert mu[0, 2] == pytest.approx(1.046, abs=1e-3)
+    else:
+        np.testing.assert_allclose(mu, {"static": 1.046, "dynamic": 0.905}[mode], atol=1e-3)
+
+
+def test_the_floor_holds_where_the_tyre_floats():
+    mu = grip_of()(Weather(film_mm=jnp.float32(2.0), surface=jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
+    np.testing.assert_allclose(mu, 1e-3)
+
+
+def test_draw_follows_the_weights_and_keep_keeps():
+    cases = [
+        {"surface": "AC", "film_mm": 0.0, "weight": 3.0},
+        {"surface": "OGFC", "film_mm": 0.5, "weight": 1.0},
+        {"surface": "SMA", "film_mm": 9.0, "weight": 0.0},
+    ]
+    scene = scene_of([[0, 0]], [[1, 0]])
+    drawn = jax.vmap(lambda key: weather.draw(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
+    assert set(np.unique(drawn.surface)) == {0, 2}
+    assert float((drawn.surface == 0).mean()) == pytest.approx(0.75, abs=0.03)
+    np.testing.assert_array_equal(drawn.film_mm == 0.5, drawn.surface == 2)
+    assert weather.keep(jax.random.key(0), scene) is scene.weather
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"mode": "wet"}, "weather.grip.mode"),
+        ({"tyre": {**BASE["grip"]["tyre"], "wdith": 1.0}}, "tyre.wdith"),
+        ({"tyre": {k: v for k, v in BASE["grip"]["tyre"].items() if k != "load"}}, "tyre.load"),
+        ({"surfaces": {"AC": SURFACE["AC"]}}, "SMA"),
+        ({"surfaces": {**SURFACE, "AC": {"theta": 1.0}}}, "surfaces.AC.texture_mm"),
+    ],
+)
+def test_grip_refuses_by_name(change, named):
+    with pytest.raises(ConfigError, match=named):
+        grip_of(**change)(Weather(film_mm=jnp.float32(0.0), surface=jnp.int32(0)), jnp.zeros((1, 2)), jnp.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("case", "named"),
+    [
+        ({"surface": "ICE", "film_mm": 0.0, "weight": 1.0}, "AC, SMA, OGFC"),
+        ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
+        ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
+        ({"surface": "AC", "weight": 1.0}, "film_mm"),
+    ],
+)
+def test_draw_refuses_by_name(case, named):
+    with pytest.raises(ConfigError, match=named):
+        weather.draw(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
+
+
+@pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
+def test_every_shipped_weather_draws_a_drivable_road(name):
+    config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    draw = build({**BASE["draw"], **config["draw"]}, builtins=weather, where="weather.draw")
+    scene = scene_of([[0, 0]], [[1, 0]])
+    drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
+    mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
+    assert mu.min() > 0.5 and mu.max() < 1.4
