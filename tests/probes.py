@@ -28,6 +28,7 @@ NUMBERS = dict(
     gamma=0.9,
     gae_lambda=0.95,
     clip=0.2,
+    value_clip=0.2,
     entropy=0.0,
     value=1.0,
     max_grad_norm=1.0,

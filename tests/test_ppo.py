@@ -84,7 +84,7 @@ def batch():
 
 def test_loss_equals_its_definition(batch):
     policy, parameters, samples, log_std_old = batch
-    numbers = dict(clip=0.2, entropy=0.01, value=0.5)
+    numbers = dict(clip=0.2, value_clip=0.2, entropy=0.01, value=0.5)
     total, facts = loss.ppo(parameters, samples, log_std_old, policy=policy, **numbers)
     mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
     surrogates, values = [], []
@@ -109,7 +109,7 @@ def test_samples_without_weight_change_nothing(batch):
         advantage=jnp.where(empty, jnp.nan, samples.advantage),
         returns=jnp.where(empty, 1e6, samples.returns),
     )
-    gradient = jax.jit(jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, entropy=0.01, value=1.0)[0]))
+    gradient = jax.jit(jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)[0]))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
     normal, weight = loss.normalise(garbage.advantage, samples.weight), samples.weight
     np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
@@ -131,7 +131,7 @@ def learn(batch):
     """Two minibatches of 12: (samples, rate) -> (parameters, optimiser state, facts)."""
     policy, parameters, _, log_std = batch
     adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
-    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, entropy=0.01, value=1.0)
+    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
     numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
 
     @jax.jit

@@ -8,6 +8,7 @@ faster. What does not spin adds to the wheel body's mass, and to its inertia abo
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import mujoco
@@ -17,6 +18,7 @@ from scenefactory_jax.build import ConfigError
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
 FRONT = WHEELS[:2]
+PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
 LATENT_FRICTION = 1e-3  # N m; the brakes' solver rows exist only if the model is compiled with a positive friction loss
 
 
@@ -86,8 +88,8 @@ def spec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec
     model.compiler.autolimits = False
     chassis = model.worldbody.add_body(name="chassis", pos=[0, 0, car.wheel_radius - car.wheel_height])
     chassis.add_freejoint(name="root")
-    _inertial(chassis, car.mass, car.inertia, at=[0, 0, car.mass_height])
-    _solid(chassis, "box", mujoco.mjtGeom.mjGEOM_BOX, [car.length / 2, car.width / 2, car.height / 2], rgba=[0.2, 0.4, 0.8, 1])
+    _inertial(chassis, car.mass, car.inertia, at=[0.0, 0.0, car.mass_height])
+    _solid(chassis, "box", mujoco.mjtGeom.mjGEOM_BOX, [car.length / 2, car.width / 2, car.height / 2], rgba=PAINT)
     for name in WHEELS:
         _add_wheel(chassis, name, car, visual=visual, brake_rows=brake_rows)
     if visual:
@@ -113,16 +115,16 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
     about, across = car.wheel_inertia
     still = car.carrier_inertia + (car.knuckle_inertia if front else 0.0)
     mass = car.wheel_mass + car.carrier_mass + (car.knuckle_mass if front else 0.0)
-    _inertial(wheel, mass, [across + still, about, across + still], at=[0, 0, 0])
+    _inertial(wheel, mass, [across + still, about, across + still], at=[0.0, 0.0, 0.0])
     radii = [car.wheel_radius, car.wheel_width / 2, car.wheel_radius]
-    tyre = _solid(wheel, f"tyre_{name}", mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, rgba=[0.1, 0.1, 0.1, 1])
+    tyre = _solid(wheel, f"tyre_{name}", mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, rgba=RUBBER)
     if visual:
         tyre.rgba = [0, 0, 0, 0]
-        lie = [0.5**0.5, 0.5**0.5, 0, 0]
-        size = [car.wheel_radius, car.wheel_width / 2, 0]
-        _solid(wheel, f"rim_{name}", mujoco.mjtGeom.mjGEOM_CYLINDER, size, rgba=[0.1, 0.1, 0.1, 1], quat=lie)
+        lie = [0.5**0.5, 0.5**0.5, 0.0, 0.0]
+        size = [car.wheel_radius, car.wheel_width / 2, 0.0]
+        _solid(wheel, f"rim_{name}", mujoco.mjtGeom.mjGEOM_CYLINDER, size, rgba=RUBBER, quat=lie)
         spoke = [0.9 * car.wheel_radius, car.wheel_width / 2 + 0.005, 0.04]
-        _solid(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1])
+        _solid(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1.0])
 
 
 def _linear(coefficient: float) -> list[float]:
@@ -136,24 +138,24 @@ def _decorate(chassis: mujoco.MjsBody, car: CarParameters) -> None:
     for geom in chassis.geoms:
         geom.rgba = [*geom.rgba[:3], 0.0]
     box = mujoco.mjtGeom.mjGEOM_BOX
-    _solid(chassis, "hull", box, [length, 0.9 * width, 0.5 * height], rgba=[0.2, 0.4, 0.8, 1], pos=[0, 0, -0.5 * height])
+    _solid(chassis, "hull", box, [length, 0.9 * width, 0.5 * height], rgba=PAINT, pos=[0.0, 0.0, -0.5 * height])
     glass = [0.5 * length, 0.8 * width, 0.5 * height]
-    _solid(chassis, "cabin", box, glass, rgba=[0.15, 0.2, 0.3, 1], pos=[-0.12 * length, 0, 0.5 * height])
+    _solid(chassis, "cabin", box, glass, rgba=[0.15, 0.2, 0.3, 1.0], pos=[-0.12 * length, 0.0, 0.5 * height])
     for side in (-1, 1):
         y = 0.6 * side * width
         lamp = [0.02, 0.15 * width, 0.08 * height]
-        _solid(chassis, f"head_{side}", box, lamp, rgba=[1, 1, 0.8, 1], pos=[length, y, -0.25 * height])
-        _solid(chassis, f"tail_{side}", box, lamp, rgba=[0.8, 0.1, 0.1, 1], pos=[-length, y, -0.25 * height])
+        _solid(chassis, f"head_{side}", box, lamp, rgba=[1.0, 1.0, 0.8, 1.0], pos=[length, y, -0.25 * height])
+        _solid(chassis, f"tail_{side}", box, lamp, rgba=[0.8, 0.1, 0.1, 1.0], pos=[-length, y, -0.25 * height])
 
 
-def _inertial(body: mujoco.MjsBody, mass: float, inertia: tuple[float, ...] | list[float], at: list[float]) -> None:
+def _inertial(body: mujoco.MjsBody, mass: float, inertia: Sequence[float], at: Sequence[float]) -> None:
     body.explicitinertial = True
-    body.mass, body.inertia, body.ipos = mass, list(inertia), at
+    body.mass, body.inertia, body.ipos = mass, list(inertia), list(at)
 
 
-def _solid(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: list[float], **options: list[float]) -> mujoco.MjsGeom:
+def _solid(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Sequence[float], **options: Sequence[float]) -> mujoco.MjsGeom:
     """A geom without mass that collides with nothing: contacts are explicit pairs."""
-    return body.add_geom(name=name, type=kind, size=size, mass=0, contype=0, conaffinity=0, **options)
+    return body.add_geom(name=name, type=kind, size=list(size), mass=0, contype=0, conaffinity=0, **options)
 
 
 def add_ground_pairs(model: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "") -> None:

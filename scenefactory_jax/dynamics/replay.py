@@ -88,9 +88,7 @@ def sample(
     following = jax.lax.cummin(jnp.where(valid, rows, length), reverse=True)  # valid row at or after
     here = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, length - 1)
     before, after = last[here], following[jnp.minimum(here + 1, length - 1)]
-    exact = (row <= here) & valid[here]
-    after = jnp.where(exact, here, after)
-    moving = (before >= 0) & (after < length) & (row < length)
+    moving = (before >= 0) & (before < after) & (after < length)
     before_row, after_row = jnp.where(before >= 0, before, after), jnp.where(after < length, after, before)
     before_row, after_row = jnp.clip(before_row, 0, length - 1), jnp.clip(after_row, 0, length - 1)
     gap = (after_row - before_row).astype(jnp.float32)

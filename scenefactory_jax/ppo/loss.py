@@ -28,13 +28,23 @@ class Batch:
 
 
 def ppo(
-    parameters: Any, batch: Batch, log_std_old: Float[Array, " 3"], *, policy: Policy, clip: float, entropy: float, value: float
+    parameters: Any,
+    batch: Batch,
+    log_std_old: Float[Array, " 3"],
+    *,
+    policy: Policy,
+    clip: float,
+    value_clip: float | None,
+    entropy: float,
+    value: float,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Clipped surrogate + value loss - entropy bonus, and what is worth watching.
 
     Args:
         log_std_old: of the policy that acted.
-        clip: epsilon of both the probability ratio and the value's distance from the value at acting time.
+        clip: epsilon of the probability ratio.
+        value_clip: largest distance from the value at acting time that a gradient may ask for; None does not bound it. The published code
+            takes `clip`, which lets the critic move 0.15 an iteration where returns are tens.
         entropy: weight of the entropy bonus.
         value: weight of the value loss.
     """
@@ -47,8 +57,11 @@ def ppo(
     ratio = jnp.exp(change)
     policy_loss = -weighted_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage), weight)
 
-    near = old + jnp.clip(estimate - old, -clip, clip)
-    value_loss = weighted_mean(jnp.maximum((estimate - target) ** 2, (near - target) ** 2), weight)
+    errors = (estimate - target) ** 2
+    if value_clip is not None:
+        near = old + jnp.clip(estimate - old, -value_clip, value_clip)
+        errors = jnp.maximum(errors, (near - target) ** 2)
+    value_loss = weighted_mean(errors, weight)
 
     bonus = weighted_mean(jnp.broadcast_to(gaussian_entropy(log_std), weight.shape), weight)
     loss = policy_loss + value * value_loss - entropy * bonus

@@ -63,6 +63,7 @@ def make(
     gamma: float,
     gae_lambda: float,
     clip: float,
+    value_clip: float | None,
     entropy: float,
     value: float,
     max_grad_norm: float,
@@ -81,7 +82,8 @@ def make(
         learning_rate: of Adam; the first one if `desired_kl` is a number.
         desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
         gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
-        clip: of the probability ratio and of the value loss.
+        clip: of the probability ratio.
+        value_clip: of the value loss; None leaves it unclipped.
         entropy, value: weights of entropy bonus and value loss.
         normalise_advantage: over the active samples of the whole rollout.
         initial_phase: worlds start at a random time of their episode, so that they do not all run out of time together.
@@ -92,7 +94,7 @@ def make(
     """
     _check(locals())
     adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
-    objective = functools.partial(loss.ppo, policy=policy, clip=clip, entropy=entropy, value=value)
+    objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value)
     rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max)
     each = permutation == "each_epoch"
     learn = functools.partial(

@@ -120,7 +120,7 @@ def assign(scenes: Scenes, worlds: int, *, seed: int) -> tuple[Scene, str]:
 def use_compilation_cache() -> None:
     """Keep compiled programs between processes, in the user's cache folder or where SCENEFACTORY_CACHE says."""
     place = os.environ.get(CACHE, str(Path.home() / ".cache" / "scenefactory_jax"))
-    if place and jax.config.read("jax_compilation_cache_dir") is None:
+    if place and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
         jax.config.update("jax_compilation_cache_dir", place)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
 
