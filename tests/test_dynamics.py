@@ -1,6 +1,6 @@
 """The backends against laws of motion, the C engine and their own contracts.
 
-All articulated runs share two compiled functions: eight cars on eight "lanes" 500 m apart, each lane with its own friction. Tests that want
+All articulated runs share one compiled function: eight cars on eight "lanes" 500 m apart, each lane with its own friction. Tests that want
 other numbers of cars put them on the same eight slots.
 """
 
@@ -11,15 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
-from conftest import ROOT, scene_of
+from conftest import scene_of
 from omegaconf import OmegaConf
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import oracle, replay
+from scenefactory_jax.dynamics import oracle
+from scenefactory_jax.run.config import load
 from scenefactory_jax.struct import replace
-from scenefactory_jax.types import Log
 
 G, WHEELBASE = 9.81, 2.6
 MU = np.array([0.86, 0.05, 0.1, 0.3, 0.5, 0.7, 1.0, 1.1], np.float32)
@@ -29,10 +28,13 @@ CHUNK = 30  # control steps in one compiled run: a second
 BACKENDS = ("mjx_car", "bicycle", "replay")
 
 
+@functools.cache
 def config(name):
-    own = yaml.safe_load((ROOT / "conf" / "dynamics" / f"{name}.yaml").read_text())
-    parents = [config(parent) for parent in own.pop("defaults", []) if parent != "_self_"]
-    return OmegaConf.to_container(OmegaConf.merge(*parents, own))
+    return load("task", f"dynamics={name}")["dynamics"]
+
+
+def numbers_of(name):
+    return cars.CarParameters(**config(name)["car"]), cars.Solver(**config(name)["solver"])
 
 
 def grip(weather, position, speed):
@@ -152,8 +154,7 @@ def test_trajectories_agree_with_the_c_engine():
     MJX runs in float32 with Newton 2/4, the C engine in float64 to convergence. Measured: 4 cm after 3 s where cars slide, 1 mm where
     they grip; the bounds leave a factor of three, for other platforms' rounding.
     """
-    numbers = config("mjx_car")
-    car, solver = cars.CarParameters(**numbers["car"]), cars.Solver(**numbers["solver"])
+    car, solver = numbers_of("mjx_car")
     speed, action = np.linspace(4, 16, 8), random_controls(0, 3, 15)
     _, (body, _) = drive("mjx_car", scene_for(speed=speed), action)
     for i in range(8):
@@ -169,8 +170,7 @@ def test_trajectories_agree_with_the_c_engine():
 
 def test_locked_stops_reach_the_tyre_limit_in_the_c_engine():
     """With brakes four times as strong, so that wheels lock at any friction: from 15 m/s, within a percent of v^2 / (2 mu g)."""
-    numbers = config("mjx_car")
-    car, solver = cars.CarParameters(**numbers["car"]), cars.Solver(**numbers["solver"])
+    car, solver = numbers_of("mjx_car")
     strong = dataclasses.replace(car, brake_torque_front=4 * car.brake_torque_front, brake_torque_rear=4 * car.brake_torque_rear)
     for mu in (0.3, 0.86, 1.1):
         action = np.tile(np.array([0.0, 0.0, 1.0]), (240, 1))
@@ -260,19 +260,14 @@ def test_permuting_agents_permutes_results(name):
 def test_contract_of_a_backend(name):
     """Compiles once, vmaps over worlds, is deterministic, and keeps shapes and dtypes."""
     dynamics, _, init = backend(name)
-    scene, traces = scene_for(speed=5.0), []
-
-    def step(scene, body, action, active):
-        traces.append(1)
-        return dynamics.advance(scene, body, action, active)
-
+    scene = scene_for(speed=5.0)
     start = init(scene)
-    shapes = jax.eval_shape(step, scene, start, jnp.zeros((8, 3)), EVERYONE)
+    shapes = jax.eval_shape(dynamics.advance, scene, start, jnp.zeros((8, 3)), EVERYONE)
     for got, wanted in zip(jax.tree.leaves(shapes), jax.tree.leaves(start), strict=True):
         assert got.shape == wanted.shape and got.dtype == wanted.dtype
         assert not got.weak_type and not wanted.weak_type and wanted.shape[0] == 8
     worlds = jax.tree.map(lambda x: jnp.stack([x, x]), (scene, start))
-    both = jax.eval_shape(jax.vmap(step), *worlds, jnp.zeros((2, 8, 3)), jnp.ones((2, 8), bool))
+    both = jax.eval_shape(jax.vmap(dynamics.advance), *worlds, jnp.zeros((2, 8, 3)), jnp.ones((2, 8), bool))
     assert all(x.shape[:2] == (2, 8) for x in jax.tree.leaves(both))
     second = backend(name)[1]
     before = second._cache_size()
@@ -331,45 +326,9 @@ def test_bicycle_reports_contact_and_keeps_going():
     assert motion.velocity[-1, 0, 0] > 9.0 and motion.velocity[-1, 1, 0] == 0.0
 
 
-def logged(valid):
-    """Cars that run at 10 m/s along x and turn at 0.5 rad/s through the wrap of the angle, every 0.1 s."""
-    t = 0.1 * np.arange(len(valid))
-    position = np.stack([np.stack([10 * t, np.full_like(t, y)], -1) for y in LANES])
-    yaw = np.tile((3.0 + 0.5 * t + np.pi) % (2 * np.pi) - np.pi, (8, 1))
-    velocity = np.tile(np.array([10.0, 0.0]), (8, len(t), 1))
-    position, yaw, velocity = (jnp.asarray(x, jnp.float32) for x in (position, yaw, velocity))
-    return Log(position=position, yaw=yaw, velocity=velocity, valid=jnp.tile(jnp.asarray(valid, bool), (8, 1)), dt=jnp.float32(0.1))
-
-
-def test_replay_follows_the_log_whatever_the_action():
-    scene = replace(scene_for(), log=logged([True] * 11))
-    _, (_, motion) = drive("replay", scene, random_controls(0, 2, 1))
-    t = np.arange(1, 61) / 30
-    moving = t < 1.0 - 1e-6
-    np.testing.assert_allclose(motion.position[:, 0, 0], np.minimum(10 * t, 10.0), atol=1e-4)
-    np.testing.assert_allclose(motion.velocity[moving, 0, 0], 10.0, rtol=1e-5)
-    np.testing.assert_allclose(motion.yaw_rate[moving, 0], 0.5, rtol=1e-3)
-    assert not motion.velocity[t > 1.01].any()
-    np.testing.assert_allclose(np.unwrap(motion.yaw[:, 0])[moving], 3.0 + 0.5 * t[moving], atol=1e-3)
-    assert np.abs(motion.yaw).max() <= np.pi + 1e-5
-
-
-def test_replay_bridges_gaps_and_stands_where_nothing_was_seen():
-    log = logged([False, True, True, False, False, True, False, False])
-    at = lambda row: replay.sample(jnp.float32(row), log.position[0], log.yaw[0], log.velocity[0], log.valid[0], dt=log.dt)  # noqa: E731
-    cases = ((0.0, 1, 0), (0.5, 1, 0), (1.5, 1.5, 10), (3.0, 3, 10), (4.5, 4.5, 10), (5.0, 5, 0), (6.5, 5, 0), (99.0, 5, 0))
-    for row, x, speed in cases:
-        position, velocity, _, yaw_rate = at(row)
-        assert float(position[0]) == pytest.approx(x, abs=1e-4), row
-        assert float(velocity[0]) == pytest.approx(speed, abs=1e-4) and float(yaw_rate) == pytest.approx(0.05 * speed, abs=1e-3), row
-    nothing = replay.sample(jnp.float32(2.0), log.position[0], log.yaw[0], log.velocity[0], log.valid[0] & False, dt=log.dt)
-    assert all(np.isfinite(x).all() for x in nothing) and not nothing[1].any()
-
-
 @pytest.mark.parametrize("name", ["mjx_car", "mjx_published"])
 def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
-    numbers = config(name)
-    car, solver = cars.CarParameters(**numbers["car"]), cars.Solver(**numbers["solver"])
+    car, solver = numbers_of(name)
     plain = cars.standalone(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
     seen = cars.standalone(car, solver, physics_dt=1 / 120, visual=True, brake_rows=True)
     assert (plain.nq, plain.nv, plain.npair) == (17, 16, 4) and seen.ngeom > plain.ngeom
@@ -399,9 +358,9 @@ def test_refuses_by_name(changes, named):
 
 
 def test_refuses_a_control_step_that_is_no_multiple():
+    context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 50}
     with pytest.raises(ConfigError, match="whole multiple"):
-        entry = config("mjx_car")
-        build(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, physics_dt=1 / 120, control_dt=1 / 50)()
+        build(config("mjx_car"), builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 @pytest.mark.slow
