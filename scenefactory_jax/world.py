@@ -6,7 +6,7 @@ give pure functions to put under one's own `jit`, `vmap` and `scan`.
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +35,8 @@ def make(config: Mapping[str, Any]) -> Env:
     dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
     bound = functools.partial(build, builtins="scenefactory_jax.facts")
     ends.check(config["ends"].get("ending", []), where="ends")
-    return assemble(
-        dynamics,
+    parts = Parts(
+        dynamics=dynamics,
         draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
         draw_weather=build(config["weather"]["draw"], builtins="scenefactory_jax.weather", where="weather.draw"),
         measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
@@ -46,6 +46,7 @@ def make(config: Mapping[str, Any]) -> Env:
         episode_steps=episode_steps(timing),
         respawn_clear_m=config["spawn"]["respawn_clear_m"],
     )
+    return assemble(parts)
 
 
 def episode_steps(timing: Mapping[str, float]) -> int:
@@ -53,75 +54,80 @@ def episode_steps(timing: Mapping[str, float]) -> int:
     return round(timing["episode_s"] * timing["control_hz"])
 
 
-def assemble(
-    dynamics: Dynamics,
-    *,
-    draw_agents: Callable[[PRNGKeyArray, Scene], Agents],
-    draw_weather: Callable[[PRNGKeyArray, Scene], Weather],
-    measure: Callable[[Scene, State, State], Facts],
-    judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]],
-    terms: Mapping[str, tuple[float, rewards.Term]],
-    groups: Mapping[str, observations.Group],
-    episode_steps: int,
-    respawn_clear_m: float | None,
-) -> Env:
-    """Join bound parts into an environment.
+class Parts(NamedTuple):
+    """What an environment is made of, every part bound to its numbers."""
 
-    Args:
-        episode_steps: control steps after which a world is truncated.
-        respawn_clear_m: None parks finished agents until the world ends (the paper's rule); a number starts them again at a fresh draw once
-            no active car stands within that distance.
-    """
+    dynamics: Dynamics
+    draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
+    draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
+    measure: Callable[[Scene, State, State], Facts]
+    judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
+    terms: Mapping[str, tuple[float, rewards.Term]]
+    groups: Mapping[str, observations.Group]
+    episode_steps: int  # control steps after which a world is truncated
+    # None parks finished agents until the world ends (the paper's rule); a number of metres starts them again at a fresh draw
+    # once no active car stands within that distance
+    respawn_clear_m: float | None
 
-    def start(key: PRNGKeyArray, scene: Scene) -> State:
-        agents_key, weather_key, key = jax.random.split(key, 3)
-        agents, weather = draw_agents(agents_key, scene), draw_weather(weather_key, scene)
-        body = dynamics.init(replace(scene, agents=agents, weather=weather))
-        count = agents.present.shape[0]
-        state = State(
-            body=body,
-            motion=dynamics.read(body),
-            agents=agents,
-            weather=weather,
-            active=agents.present,
-            happened=ends.none(count),
-            age=jnp.zeros(count, jnp.int32),
-            previous_action=jnp.zeros((count, 3), jnp.float32),
-            step=jnp.int32(0),
-            key=key,
-        )
-        return _strong(state)
 
-    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
-        scene = replace(scene, agents=state.agents, weather=state.weather)
-        action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
-        after = _advance(dynamics, scene, state, action)
-        measured = measure(scene, state, after)
-        measured, after = _quarantine(measured, state, after)
-        events, done = judge(measured, state.happened, state.active)
-        after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
-        reward, parts = rewards.weigh(Step(scene, state, action, after, measured, events), terms)
-        truncated = after.step >= episode_steps
-        if respawn_clear_m is None:
-            over = truncated | ~jnp.any(after.active)
-        else:
-            over = truncated
-            after = _respawn(dynamics, draw_agents, scene, after, clear_m=respawn_clear_m)
-        outcome = Outcome(None, reward, parts, events, done, truncated, over, measured)
-        return _strong(after), outcome
-
-    def observe(scene: Scene, state: State) -> Observation:
-        return observations.observe(replace(scene, agents=state.agents, weather=state.weather), state, groups)
+def assemble(parts: Parts) -> Env:
+    """Join bound parts into an environment."""
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
-        state = start(key, scene)
-        return state, observe(scene, state)
+        state = _start(parts, key, scene)
+        return state, _observe(parts, scene, state)
 
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
-        state, outcome = transition(scene, state, action)
-        return state, replace(outcome, observation=observe(scene, state))
+        state, outcome = _transition(parts, scene, state, action)
+        return state, replace(outcome, observation=_observe(parts, scene, state))
 
-    return Env(reset, step, start, transition, observe)
+    def bind(function: Callable) -> Callable:
+        return functools.partial(function, parts)
+
+    return Env(reset, step, bind(_start), bind(_transition), bind(_observe))
+
+
+def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
+    """A fresh episode."""
+    agents_key, weather_key, key = jax.random.split(key, 3)
+    agents, weather = parts.draw_agents(agents_key, scene), parts.draw_weather(weather_key, scene)
+    body = parts.dynamics.init(replace(scene, agents=agents, weather=weather))
+    count = agents.present.shape[0]
+    state = State(
+        body=body,
+        motion=parts.dynamics.read(body),
+        agents=agents,
+        weather=weather,
+        active=agents.present,
+        happened=ends.none(count),
+        age=jnp.zeros(count, jnp.int32),
+        previous_action=jnp.zeros((count, 3), jnp.float32),
+        step=jnp.int32(0),
+        key=key,
+    )
+    return _strong(state)
+
+
+def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+    """One control step, without the observation."""
+    scene = replace(scene, agents=state.agents, weather=state.weather)
+    action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
+    after = _advance(parts.dynamics, scene, state, action)
+    measured, after = _quarantine(parts.measure(scene, state, after), state, after)
+    events, done = parts.judge(measured, state.happened, state.active)
+    after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
+    reward, terms = rewards.weigh(Step(scene, state, action, after, measured, events), parts.terms)
+    truncated = after.step >= parts.episode_steps
+    if parts.respawn_clear_m is None:
+        over = truncated | ~jnp.any(after.active)
+    else:
+        over = truncated
+        after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clear_m)
+    return _strong(after), Outcome(None, reward, terms, events, done, truncated, over, measured)
+
+
+def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
+    return observations.observe(replace(scene, agents=state.agents, weather=state.weather), state, parts.groups)
 
 
 def choose(condition: Bool[Array, " A"], chosen: Any, other: Any) -> Any:

@@ -19,7 +19,7 @@ def checker(**numbers):
 
 
 def packer(**numbers):
-    return build(WOMD["pack"] | numbers, builtins=pack, where="scenes.pack")
+    return build(WOMD["pack"] | {"log_from": "start"} | numbers, builtins=pack, where="scenes.pack")
 
 
 def prepared(raw, **numbers):
