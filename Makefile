@@ -20,7 +20,7 @@ $(STAMP): pyproject.toml constraints.txt
 comma := ,
 
 demo: $(STAMP) ## train cars on generated roads, evaluate them on unseen ones, write a report and a video
-	$(BIN)/python -m scenefactory_jax train experiment=demo out=runs/demo
+	$(BIN)/python -m scenefactory_jax train experiment=demo
 
 test: $(STAMP) ## the fast tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile

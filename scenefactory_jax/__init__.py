@@ -6,12 +6,15 @@
     env = sf.make(config)                           # pure functions for one world: env.reset, env.step
     scenes = sf.load_scenes(config["scenes"])       # worlds stacked along the first axis
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
+    run = sf.train(config)                          # and sf.evaluate(sf.load("evaluate", f"run={run.folder}"))
 
-Everything under `run/` (`train`, `evaluate`, `convert`, `render`) takes such a config too.
+Everything under `run/` (`train`, `evaluate`, `convert`, `render`) takes such a config.
 """
 
 import contextlib
+import importlib
 import io
+from typing import TYPE_CHECKING, Any
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
     from mujoco import mjx as _mjx  # noqa: F401
@@ -21,5 +24,16 @@ from scenefactory_jax.run.config import load
 from scenefactory_jax.run.sources import training as load_scenes
 from scenefactory_jax.world import Parts, assemble, make
 
+if TYPE_CHECKING:
+    from scenefactory_jax.run.evaluate import evaluate
+    from scenefactory_jax.run.train import train
+
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "Parts", "__version__", "assemble", "load", "load_scenes", "make"]
+__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_scenes", "make", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    """`train` and `evaluate` are imported when they are first used: checkpoints and reports take a second to load."""
+    if name not in ("train", "evaluate"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"scenefactory_jax.run.{name}"), name)

@@ -36,7 +36,7 @@ def main() -> None:
     try:
         if not any(flag in overrides for flag in ("-m", "--multirun", "--help", "-h")):
             configs.load(command, *configs.as_overrides(overrides))  # a wrong key is explained here, with the valid ones
-        sys.argv = [f"{sys.argv[0]} {command}", *overrides]
+        sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, overrides)]
         hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=command)(_job(command))()
     except (ConfigError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -53,6 +53,9 @@ def _job(command: str):
         except ValueError as error:  # ConfigError and SceneError; a bug's own ValueError keeps its traceback
             if type(error) is ValueError:
                 raise
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
 

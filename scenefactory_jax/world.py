@@ -30,6 +30,9 @@ def make(config: Mapping[str, Any]) -> Env:
         if key not in timing:
             raise ConfigError(f"timing.{key}: missing; timing needs physics_hz, control_hz, episode_s")
         check_type(timing[key], float, where=f"timing.{key}")
+        if not timing[key] > 0:
+            raise ConfigError(f"timing.{key}: {timing[key]}; wanted is a number above 0")
+    check_type(config["spawn"]["respawn_clear_m"], float | None, where="spawn.respawn_clear_m")
     context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
     grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
     dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()

@@ -20,7 +20,7 @@ from scenefactory_jax.build import build
 from scenefactory_jax.ppo import rollout
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import sources
+from scenefactory_jax.run import keys, sources
 from scenefactory_jax.run.train import make_policy, make_trainer
 from scenefactory_jax.struct import replace
 
@@ -31,6 +31,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     Returns:
         The figures, which are also printed and, with `out`, written as JSON.
     """
+    keys.check(config, keys.BENCH)
     sources.use_compilation_cache()
     loaded = sources.training(config["scenes"])
     worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"])

@@ -52,7 +52,7 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
 def _compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(folder()), version_base="1.3"):
-        return plain(hydra_compose(name, overrides=list(overrides)))
+        return plain(hydra_compose(name, overrides=[quoted(override) for override in overrides]))
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -130,7 +130,9 @@ def versions() -> dict[str, str]:
     """Versions of this package and of what its numbers depend on, and the device."""
     import jax
 
-    found = {"scenefactory_jax": _version("scenefactory_jax")} | {name: _version(name) for name in PACKAGES}
+    import scenefactory_jax
+
+    found = {"scenefactory_jax": scenefactory_jax.__version__} | {name: _version(name) for name in PACKAGES}
     device = jax.devices()[0]
     return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
 
@@ -140,6 +142,14 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "not installed"
+
+
+def quoted(override: str) -> str:
+    """`overrides=[dynamics=bicycle,weather=wet]` with its entries quoted: Hydra's grammar takes no bare `=` inside a list."""
+    match = re.fullmatch(r"overrides=\[([^\[\]{}()'\"\\]+)\]", override)
+    if not match:
+        return override
+    return f"overrides=[{','.join(repr(entry.strip()) for entry in match.group(1).split(','))}]"
 
 
 def as_overrides(arguments: Sequence[str]) -> list[str]:

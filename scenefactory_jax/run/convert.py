@@ -6,7 +6,7 @@ from typing import Any
 from rich.progress import Progress
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import sources
+from scenefactory_jax.run import keys, sources
 from scenefactory_jax.scenes.convert import Summary, describe
 from scenefactory_jax.scenes.convert import convert as to_bank
 
@@ -18,6 +18,7 @@ def convert(config: Mapping[str, Any]) -> Summary:
         ConfigError: source or out is missing.
         SceneError: no files, `out` is something else than a bank, or not one usable scene.
     """
+    keys.check(config, keys.CONVERT)
     for key in ("source", "out"):
         if config[key] is None:
             raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")

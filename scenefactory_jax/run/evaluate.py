@@ -15,7 +15,7 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import log, sources
+from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.run.train import make_policy
 from scenefactory_jax.types import SURFACES
 
@@ -38,6 +38,7 @@ def evaluate(config: Mapping[str, Any]) -> Result:
         ConfigError: no such run, no checkpoint in it, a setting that the run does not have.
         SceneError: scenes that cannot be read.
     """
+    keys.check_evaluate(config)
     sources.use_compilation_cache()
     run = Path(config["run"])
     trained = configs.amend(configs.read(run), config["overrides"])

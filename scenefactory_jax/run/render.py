@@ -13,7 +13,7 @@ import numpy as np
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.run import sources
+from scenefactory_jax.run import keys, sources
 from scenefactory_jax.run.scenes import draw
 from scenefactory_jax.scenes import mjcf
 from scenefactory_jax.types import Scene
@@ -26,6 +26,7 @@ def render(config: Mapping[str, Any]) -> Path:
         ConfigError: no such scene, or a dynamics without a car to show.
         SceneError: nothing usable at the path.
     """
+    keys.check(config, keys.RENDER)
     loaded = sources.training(config["scenes"])
     index, count = config["index"], len(loaded)
     if not 0 <= index < count:

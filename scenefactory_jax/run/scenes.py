@@ -9,7 +9,7 @@ import numpy as np
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import pictures, plots, tables
-from scenefactory_jax.run import sources
+from scenefactory_jax.run import keys, sources
 
 
 def scenes(config: Mapping[str, Any]) -> sources.Scenes:
@@ -19,6 +19,7 @@ def scenes(config: Mapping[str, Any]) -> sources.Scenes:
         ConfigError: an unknown op.
         SceneError: nothing usable at the path.
     """
+    keys.check(config, keys.SCENES)
     if config["op"] not in ("check", "sheet"):
         raise ConfigError(f"op: {config['op']!r}; valid: check, sheet")
     loaded = sources.training(config["scenes"])

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.run import keys
 from scenefactory_jax.scenes import bank, convert, source
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.stack import describe, stack
@@ -30,6 +31,9 @@ class Scenes:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __getitem__(self, index: int) -> Scene:
+        return jax.tree.map(lambda leaf: leaf[index], self.scene)
+
 
 def training(config: Mapping[str, Any]) -> Scenes:
     """The scenes to train on: `scenes.path`, or the generator's.
@@ -38,9 +42,10 @@ def training(config: Mapping[str, Any]) -> Scenes:
         ConfigError: neither is given.
         SceneError: nothing usable at the path, with the reasons.
     """
+    keys.check_scenes(config)
     if config["path"] is not None:
         return from_path(config, config["path"])
-    if config["generate"] is None:
+    if not _has_generator(config):
         raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
     return generated(config, seed=config["seed"], count=config["count"])
 
@@ -52,10 +57,11 @@ def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
         ConfigError: the config names none.
         SceneError: nothing usable at the path, with the reasons.
     """
+    keys.check_scenes(config)
     path = path if path is not None else config["heldout"]["path"]
     if path is not None:
         return from_path(config, path)
-    if config["path"] is not None or config["generate"] is None:
+    if config["path"] is not None or not _has_generator(config):
         raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
     if config["heldout"]["seed"] == config["seed"]:
         raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
@@ -64,7 +70,12 @@ def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
 
 def has_heldout(config: Mapping[str, Any]) -> bool:
     """Whether a config names held-out scenes."""
-    return config["heldout"]["path"] is not None or (config["path"] is None and config["generate"] is not None)
+    return config["heldout"]["path"] is not None or (config["path"] is None and _has_generator(config))
+
+
+def _has_generator(config: Mapping[str, Any]) -> bool:
+    """An experiment may set numbers of a generator that `scenes=womd` does not have."""
+    return "_target_" in (config["generate"] or {})
 
 
 def from_path(config: Mapping[str, Any], path: str | Path) -> Scenes:

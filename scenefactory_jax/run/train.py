@@ -14,7 +14,7 @@ from scenefactory_jax.policy import late_fusion
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.ppo import train as ppo
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import log, sources
+from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.types import Env, Policy
 
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float]], None]
@@ -43,6 +43,7 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
         ConfigError: a key that does not fit, a run folder that exists, nothing to resume.
         SceneError: scenes that cannot be read.
     """
+    keys.check_train(config)
     sources.use_compilation_cache()
     folder, resume = _folder(config)
     env, policy = world.make(config), make_policy(config)
@@ -56,8 +57,8 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
     if resume:
         state = checkpoint.restore(folder / "checkpoints", state)
         print(f"resumed at iteration {int(state.iteration)}", flush=True)
-    elif config["evaluation"]["enable"] and config["evaluation"]["untrained"]:
-        checkpoint.save(folder / "untrained", state, keep=1)  # the report compares with the policy before training
+    elif config["evaluation"]["untrained"]:
+        checkpoint.save(folder / "untrained", state, keep=1)  # evaluations compare with the policy before training
     watch = _make_watch(config, folder, resume_at=int(state.iteration) if resume else None)
     state = _loop(config, folder, trainer, worlds, state, resume=resume, callbacks=[c for c in (watch, on_iteration) if c])
     if config["evaluation"]["enable"]:

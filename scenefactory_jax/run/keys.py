@@ -1,0 +1,85 @@
+"""What a command's own keys must be, checked at the door: before scenes are read, and long before anything compiles.
+
+The groups (dynamics, reward, ppo, ...) are checked against the functions that they configure, by `build`. These keys configure commands.
+"""
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from scenefactory_jax.build import ConfigError, check_type
+from scenefactory_jax.run import config as configs
+
+
+class Key(NamedTuple):
+    """A key's type, and the least value that makes sense."""
+
+    hint: Any
+    least: float | None = None
+
+
+COUNT, SEED, FLAG, PLACE = Key(int, 1), Key(int, 0), Key(bool), Key(str | None)
+VIDEO = {"enable": FLAG, "worlds": SEED, "seconds": Key(float, 0), "stride": COUNT, "fps": Key(float, 0), "columns": COUNT}
+VIDEO |= {"panel": COUNT, "trail_s": Key(float, 0), "suffix": Key(str)}
+JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
+EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list[str]), **JUDGE}
+TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
+TRAIN |= {"minutes": Key(float | None, 0), "checkpoint_every": COUNT, "checkpoints_kept": COUNT, "tensorboard": FLAG, "progress": FLAG}
+BENCH = {"seed": SEED, "worlds": COUNT, "warmup": SEED, "repeats": COUNT, "out": PLACE}
+RENDER = {"index": SEED, "out": Key(str)}
+SCENES = {"op": Key(str), "out": Key(str), "limit": SEED}
+CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG}
+SOURCE = {"path": PLACE, "seed": SEED, "count": COUNT, "workers": COUNT}
+HELDOUT = {"path": PLACE, "seed": SEED, "count": COUNT}
+
+
+def check(config: Mapping[str, Any], keys: Mapping[str, Key], *, where: str = "") -> None:
+    """Refuse a key that is missing, of another type, or too small.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    for name, (hint, least) in keys.items():
+        place = f"{where}.{name}" if where else name
+        if name not in config:
+            raise ConfigError(f"{place}: missing; {where or 'the command'} needs {', '.join(keys)}")
+        value = os.fspath(config[name]) if isinstance(config[name], os.PathLike) else config[name]
+        check_type(value, hint, where=place)
+        if least is not None and value is not None and not value >= least:
+            raise ConfigError(f"{place}: {value}; wanted is at least {least}")
+
+
+def check_train(config: Mapping[str, Any]) -> None:
+    """Every key of `train`, also those of the evaluation that comes hours later.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(config, TRAIN)
+    evaluation = config["evaluation"]
+    check(evaluation, EVALUATION, where="evaluation")
+    check(evaluation["video"], VIDEO, where="evaluation.video")
+    known = sorted(path.stem for path in (configs.folder() / "ends").glob("*.yaml"))
+    for protocol in evaluation["protocols"] or [None]:
+        if protocol not in known:
+            raise ConfigError(f"evaluation.protocols: {evaluation['protocols']}; valid: one or more of {', '.join(known)}")
+
+
+def check_evaluate(config: Mapping[str, Any]) -> None:
+    """Every key of `evaluate`.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(config, {"run": Key(str), "out": PLACE, "overrides": Key(list[str]), **JUDGE})
+    check(config["video"], VIDEO, where="video")
+
+
+def check_scenes(config: Mapping[str, Any]) -> None:
+    """Every key of a scenes config that is no function's own.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(config, SOURCE, where="scenes")
+    check(config["heldout"], HELDOUT, where="scenes.heldout")
