@@ -52,7 +52,7 @@ def make(config: Mapping[str, Any]) -> Env:
     return assemble(parts)
 
 
-def episode_steps(timing: Mapping[str, float]) -> int:
+def episode_steps(timing: Mapping[str, float | int]) -> int:
     """Control steps in an episode."""
     return round(timing["episode_s"] * timing["control_hz"])
 

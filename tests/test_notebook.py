@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 NOTEBOOK = Path(__file__).resolve().parent.parent / "notebooks" / "01_quickstart.ipynb"
-ITERATIONS = '"iterations=30"'
+ITERATIONS = '"iterations=25"'
 
 nbformat = pytest.importorskip("nbformat", reason="needs nbformat: pip install scenefactory_jax[dev]")
 

@@ -146,6 +146,7 @@ def describe(result: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             tables.grid(["phase", "ms a control step"], rows),
+            "",
             f"compile {result['compile_s']:.1f} s, peak memory {result['peak_memory_gib']:.1f} GiB, {result['versions']['device']}",
             f"{result['casps']:,.0f} CASPS ({low:,.0f} to {high:,.0f}, {result['repeats']} repeats) at {size} slots, "
             f"{result['slots_per_s']:,.0f} slots/s, {100 * result['active_share']:.0f} % of spawned steps active",

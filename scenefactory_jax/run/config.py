@@ -47,6 +47,8 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
         return _compose(name, overrides)
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(name, error)) from None
+    except ValueError as error:  # what Hydra says of `timing=null`
+        raise ConfigError(f"{' '.join(overrides)}: {error}") from None
 
 
 def _compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
@@ -78,7 +80,7 @@ def _explain(name: str, error: Exception) -> str:
             valid = ", ".join(sorted(map(str, node))) if isinstance(node, Mapping) else "nothing: it is a value"
             return f"{match.group(1)}: unknown key {key!r}; {where} has: {valid}"
         node = node[key]
-    return text
+    return f"{text}; to replace all of {match.group(1)}: ~{match.group(1)} +{match.group(1)}={{...}}"
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -153,5 +155,5 @@ def quoted(override: str) -> str:
 
 
 def as_overrides(arguments: Sequence[str]) -> list[str]:
-    """Command-line arguments that are overrides, without Hydra's own flags."""
-    return [argument for argument in arguments if not argument.startswith("-") and not argument.startswith("hydra")]
+    """Command-line arguments that are overrides, without Hydra's own flags; `hydra.searchpath` says where options of one's own lie."""
+    return [a for a in arguments if not a.startswith("-") and (not a.startswith("hydra") or a.startswith("hydra.searchpath="))]

@@ -57,7 +57,7 @@ def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     return judge(config, folder, scenes, folder, settings=settings, protocols=settings["protocols"])
 
 
-def make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> Callable[[Any, Mapping[str, float]], None]:
+def make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> Callable[[Any, Mapping[str, float | int]], None]:
     """A function (parameters, metrics row) that adds one row of held-out estimates to `evaluations.csv`: rates against steps."""
     settings = {**config["evaluation"], "repeats": 1}
     scenes = sources.heldout(config["scenes"], path=None)
@@ -66,7 +66,7 @@ def make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None
     }
     file = log.MetricsFile(folder, name=log.EVALUATIONS, resume_at=resume_at)
 
-    def watch(parameters: Any, row: Mapping[str, float]) -> None:
+    def watch(parameters: Any, row: Mapping[str, float | int]) -> None:
         begun = time.monotonic()
         found = {key: row[key] for key in ("iteration", "steps/total", "minutes")}
         for protocol, examine in examiners.items():
@@ -121,7 +121,7 @@ def make_examiner(
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
-    control_hz, chunk = config["timing"]["control_hz"], settings["chunk_steps"]
+    control_hz, chunk = float(config["timing"]["control_hz"]), settings["chunk_steps"]
     limit, filmed = world.episode_steps(config["timing"]), round(settings["video"]["seconds"] * control_hz)
 
     def act(parameters, observation):

@@ -5,7 +5,7 @@ The groups (dynamics, reward, ppo, ...) are checked against the functions that t
 
 import os
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from scenefactory_jax.build import ConfigError, check_type
 from scenefactory_jax.run import config as configs
@@ -19,8 +19,8 @@ class Key(NamedTuple):
 
 
 COUNT, SEED, FLAG, PLACE = Key(int, 1), Key(int, 0), Key(bool), Key(str | None)
-VIDEO = {"enable": FLAG, "worlds": SEED, "seconds": Key(float, 0), "stride": COUNT, "fps": Key(float, 0), "columns": COUNT}
-VIDEO |= {"panel": COUNT, "trail_s": Key(float, 0), "suffix": Key(str)}
+VIDEO = {"enable": FLAG, "worlds": SEED, "seconds": Key(float, 0.1), "stride": COUNT, "fps": Key(float, 0.1), "columns": COUNT}
+VIDEO |= {"panel": Key(int, 120), "trail_s": Key(float, 0), "suffix": Key(Literal[".gif", ".mp4"])}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
 EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}

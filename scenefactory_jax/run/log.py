@@ -24,7 +24,7 @@ class MetricsFile:
                 writer.writeheader()
                 writer.writerows(rows)
 
-    def add(self, row: Mapping[str, float]) -> None:
+    def add(self, row: Mapping[str, float | int]) -> None:
         new = not self.columns
         self.columns = self.columns or list(row)
         with open(self.path, "a", newline="") as file:
@@ -53,7 +53,7 @@ def tensorboard(folder: Path, *, enable: bool) -> Iterator:
 
     writer = SummaryWriter(str(Path(folder) / "tensorboard"))
 
-    def add(row: Mapping[str, float], iteration: int) -> None:
+    def add(row: Mapping[str, float | int], iteration: int) -> None:
         for name, value in row.items():
             writer.add_scalar(name, value, iteration)
 

@@ -17,7 +17,7 @@ from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.types import Env, Policy
 
-OnIteration = Callable[[ppo.TrainState, Mapping[str, float]], None]
+OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
 
 
 class Run(NamedTuple):
@@ -127,7 +127,7 @@ def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: 
     return state
 
 
-def describe(row: Mapping[str, float]) -> str:
+def describe(row: Mapping[str, float | int]) -> str:
     """One line on how training stands."""
     names = {"reached": "goal", "collided": "collision", "touched_edge": "edge", "crashed": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)

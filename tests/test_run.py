@@ -1,0 +1,315 @@
+"""The whole, from a config to a report: training, going on after a stop, evaluation, conversion, and the other commands."""
+
+import csv
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import jax
+import numpy as np
+import pytest
+import yaml
+from conftest import ROOT
+from omegaconf import OmegaConf
+from running import quick_compilation, smoke
+from scene_documents import document, thing, written
+
+from scenefactory_jax import __main__ as command_line
+from scenefactory_jax import world
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.report import tables
+from scenefactory_jax.run import config, log, sources
+from scenefactory_jax.run import render as rendering
+from scenefactory_jax.run.bench import bench
+from scenefactory_jax.run.convert import convert
+from scenefactory_jax.run.evaluate import evaluate
+from scenefactory_jax.run.render import render
+from scenefactory_jax.run.scenes import scenes
+from scenefactory_jax.run.train import make_policy, make_trainer, train
+from scenefactory_jax.scenes import bank
+
+CLOCK = {"seconds", "casps", "minutes"}  # columns that no two runs share
+# the smoke run's own shapes, so that what is trained on other scenes is compiled already
+CAPACITY = [f"scenes.capacity.{name}={size}" for name, size in dict(road=1024, lanes=768, edges=256, agents=4, steps=81).items()]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled(tmp_path_factory):
+    """Programs compiled once for the whole module."""
+    with quick_compilation(tmp_path_factory.mktemp("cache")):
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Four unbroken iterations and the report."""
+    return train(smoke(tmp_path_factory.mktemp("runs") / "whole", "iterations=4", "checkpoint_every=2", "evaluation.every=2"))
+
+
+def same_numbers(folder: Path, other: Path) -> None:
+    rows, others = log.read(folder), log.read(other)
+    assert len(rows) == len(others) and list(rows[0]) == list(others[0])
+    for row, expected in zip(rows, others, strict=True):
+        assert {name: row[name] for name in row if name not in CLOCK} == {name: expected[name] for name in row if name not in CLOCK}
+
+
+# ---- train
+
+
+def test_a_run_folder_holds_what_it_promises(whole):
+    kept = config.read(whole.folder)
+    assert kept == whole.config and kept["name"] == "smoke" and kept["iterations"] == 4
+    versions = yaml.safe_load((whole.folder / "versions.yaml").read_text())
+    assert versions["jax"] == jax.__version__ and versions["platform"] == "cpu"
+    assert checkpoint.latest(whole.folder / "checkpoints") == 4 and checkpoint.latest(whole.folder / "untrained") == 0
+    for trained, stored in zip(
+        jax.tree.leaves(whole.state.parameters), jax.tree.leaves(checkpoint.restore_parameters(whole.folder / "checkpoints")), strict=True
+    ):
+        np.testing.assert_array_equal(trained, stored)
+
+
+def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
+    with open(whole.folder / "metrics.csv", newline="") as file:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    assert rows == whole.metrics and [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    terms = {f"reward/{name}" for name in whole.config["reward"]}
+    assert terms == {name for name in rows[0] if name.startswith("reward/")} and len(terms) == 10
+    for row in rows:
+        assert row["reward"] == pytest.approx(sum(row[name] for name in terms), abs=1e-5)
+        assert row["casps"] == pytest.approx(row["steps/spawned"] / row["seconds"])
+    spawned = int(np.asarray(whole.state.worlds.agents.present).sum()) * whole.config["ppo"]["horizon"]
+    assert [row["steps/total"] for row in rows] == [spawned * n for n in (1, 2, 3, 4)]
+    judged = log.read(whole.folder, log.EVALUATIONS)
+    assert [row["iteration"] for row in judged] == [2, 4] and all(0 <= row["strict/success/value"] <= 1 for row in judged)
+
+
+def test_the_report_compares_and_its_files_are_there(whole):
+    text = (whole.folder / "report.md").read_text()
+    assert "| Metric | strict, untrained | strict | difference |" in text
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert {"video.gif", "learning.png", "comparison-strict.png", "agents-strict.csv", "metrics.csv"} <= set(links)
+    assert all((whole.folder / link).is_file() for link in links if "://" not in link and not link.startswith("#"))
+    assert imageio.imread(whole.folder / "video.gif").ndim >= 3 and imageio.improps(whole.folder / "video.gif").n_images > 1
+
+
+def test_every_spawned_agent_has_a_record(whole):
+    heldout = sources.heldout(whole.config["scenes"], path=None)
+    present = np.asarray(heldout.scene.agents.present)
+    for name in ("strict", "strict-untrained"):
+        records = tables.read_csv(whole.folder / f"agents-{name}.csv")
+        assert len(records["scene"]) == present.sum()
+        assert list(zip(records["world"], records["agent"], strict=True)) == list(zip(*np.nonzero(present), strict=True))
+        assert set(records["scene"]) == set(heldout.names) and not set(heldout.names) & set(sources.training(whole.config["scenes"]).names)
+
+
+def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, tmp_path):
+    again = lambda *changes: smoke(tmp_path / "run", "checkpoint_every=2", "evaluation.enable=false", *changes)  # noqa: E731
+    train(again("iterations=2"))
+    with pytest.raises(ConfigError, match="holds a run already; add resume=true"):
+        train(again("iterations=4"))
+
+    def killed(state, row):
+        if row["iteration"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(again("iterations=4", "resume=true"), on_iteration=killed)
+    assert len(log.read(tmp_path / "run")) == 3 and checkpoint.latest(tmp_path / "run" / "checkpoints") == 2  # a row past the checkpoint
+    seen = []
+    resumed = train(again("iterations=4", "resume=true"), on_iteration=lambda state, row: seen.append(row["iteration"]))
+    assert seen == [3, 4]
+    same_numbers(resumed.folder, whole.folder)
+    jax.tree.map(np.testing.assert_array_equal, resumed.state.parameters, whole.state.parameters)
+
+
+# ---- evaluate
+
+
+def judged(run, out, *overrides):
+    return evaluate(config.load("evaluate", f"run={run.folder}", f"out={out}", "chunk_steps=30", "bootstrap=100", *overrides))
+
+
+def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
+    first, second = (judged(whole, tmp_path / name, "video.enable=false", "invincible=both") for name in ("a", "b"))
+    assert set(first.records) == {"strict", "invincible"} and first.report.is_file()
+    for protocol, records in first.records.items():
+        assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (second.folder / f"agents-{protocol}.csv").read_bytes()
+        assert all(len(column) == len(records["scene"]) for column in records.values())
+    assert (first.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()  # what training wrote
+    strict, invincible = (first.records[name] for name in ("strict", "invincible"))
+    ended = strict["collided"] | strict["crashed"] | strict["touched_edge"]
+    assert ended.any() and (invincible["time_s"] >= strict["time_s"]).all()
+
+
+def test_other_settings_of_a_run(whole, tmp_path):
+    short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
+    changed = judged(whole, tmp_path / "short", "video.seconds=0.5", "video.panel=120", "video.worlds=1", "invincible=true", short)
+    assert set(changed.records) == {"invincible"} and changed.records["invincible"]["time_s"].max() <= 1.0
+    assert (tmp_path / "short" / "video.gif").is_file()
+    assert config.read(whole.folder)["timing"]["episode_s"] == 2
+    for override, message in {
+        "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
+        "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
+        "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base dry mixed wet",
+        "invincible=perhaps": "invincible: 'perhaps'; valid: true, false, both",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            judged(whole, tmp_path / "bad", override)
+    with pytest.raises(ConfigError, match="is no run: it has no config.yaml"):
+        evaluate(config.load("evaluate", f"run={tmp_path}"))
+
+
+# ---- convert -> bank -> train
+
+
+def trained_on_bank(source, folder):
+    """Convert, train on the bank, and hand back the conversion's summary and the run."""
+    summary = convert(config.load("convert", f"source={source}", f"out={folder / 'bank'}", "progress=false", "scenes.pack.agents=4"))
+    run = train(smoke(folder / "run", "scenes=womd", f"scenes.path={folder / 'bank'}", *CAPACITY))
+    assert len(bank.open(folder / "bank")) == summary.scenes == 2
+    assert len(run.metrics) == 2 and all(np.isfinite(value) for row in run.metrics for value in row.values())
+    return summary, run
+
+
+def test_files_become_a_bank_and_a_policy(tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    for name, offset in (("one", 0), ("two", 8)):
+        objects = [thing(0, id=7, speed=40), thing(-30 + offset, id=8, speed=40)]
+        written(tmp_path / "in", document(name=name, objects=objects), f"{name}.json")
+    summary, run = trained_on_bank(tmp_path / "in", tmp_path)
+    assert summary.agents_kept == 4 and run.metrics[0]["steps/spawned"] == 4 / 2 * 4 * run.config["ppo"]["horizon"]
+    printed = capsys.readouterr().out
+    assert "2 scenes with 4 agents from 2 files, 0 rejected" in printed and "4 worlds of 2 scenes, 2 to 2 worlds a scene" in printed
+    assert "no report: scenes.heldout.path is null" in printed and not (run.folder / "report.md").exists()
+
+
+def test_real_scenes_become_a_bank_and_a_policy(tmp_path, shared_data):
+    (tmp_path / "in").mkdir()
+    for path in sorted((shared_data / "womd" / "train").iterdir())[:2]:
+        (tmp_path / "in" / path.name).symlink_to(path)
+    summary, run = trained_on_bank(tmp_path / "in", tmp_path)
+    assert summary.agents_kept > 2 and run.metrics[0]["steps/active"] > 0
+
+
+# ---- the other commands
+
+
+def test_scenes_lists_and_draws(tmp_path, capsys):
+    loaded = scenes(config.load("scenes", "op=sheet", "scenes.count=3", "limit=2", f"out={tmp_path}"))
+    printed = capsys.readouterr().out
+    assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "3 generated scenes" in printed
+    assert sorted(path.stem for path in tmp_path.glob("*.png")) == sorted(loaded.names[:2])
+    with pytest.raises(ConfigError, match="op: 'draw'; valid: check, sheet"):
+        scenes(config.load("scenes", "op=draw"))
+
+
+def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
+    import mujoco
+
+    settings = config.load("render", "scenes.count=1", f"out={tmp_path}")
+    monkeypatch.setattr(rendering, "photograph", lambda model, **size: np.zeros((4, 6, 3), np.uint8))
+    xml = render(settings)
+    assert {str(xml), str(tmp_path / "mujoco.png")} <= set(capsys.readouterr().out.replace(": ", "\n").split("\n"))
+    model = mujoco.MjModel.from_xml_path(str(xml))  # pyright: ignore[reportAttributeAccessIssue]
+    assert model.nu >= 0 and model.nbody > 10 and len(list(tmp_path.glob("*.png"))) == 2
+
+    def blind(model, **size):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(rendering, "photograph", blind)
+    assert render(settings) == xml and "no OpenGL for mujoco.Renderer here (no display)" in capsys.readouterr().out
+    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: mjx_car"}.items():
+        with pytest.raises(ConfigError, match=message):
+            render(config.load("render", "scenes.count=1", f"out={tmp_path}", override))
+
+
+def test_bench_measures_phases(tmp_path, capsys):
+    result = bench(config.load("bench", "experiment=smoke", "worlds=4", "warmup=0", "repeats=1", f"out={tmp_path / 'bench.json'}"))
+    printed = capsys.readouterr().out
+    assert "CASPS" in printed and all(name in printed for name in result["phase_ms_a_control_step"])
+    assert result["slots"] == [4, 4] and result["casps"] > 0 and yaml.safe_load((tmp_path / "bench.json").read_text())["casps"] > 0
+
+
+# ---- command line
+
+
+def shell(*arguments):
+    command = [sys.executable, "-m", "scenefactory_jax", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"JAX_PLATFORMS": "cpu"})
+
+
+def test_help_lists_the_commands(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "--help"])
+    with pytest.raises(SystemExit) as stopped:
+        command_line.main()
+    assert stopped.value.code == 0 and all(f"\n  {name} " in capsys.readouterr().out for name in config.COMMANDS)
+
+
+def test_a_wrong_key_ends_as_one_line():
+    done = shell("train", "ppo.horizn=3")
+    assert done.returncode == 2 and not done.stdout and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("error: ppo.horizn: unknown key 'horizn'; ppo has: clip, ") and "horizon" in done.stderr
+
+
+def test_a_wrong_value_ends_as_one_line():
+    done = shell("evaluate", "run=/nowhere", "overrides=[dynamics=bicycle,weather=wet]")  # a list that Hydra alone would not read
+    assert done.returncode == 2 and not done.stdout and "Traceback" not in done.stderr
+    assert done.stderr == "error: /nowhere is no run: it has no config.yaml; give the folder that `train` wrote\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "worlds=many"], "error: worlds: 'many' is of type str, wanted int"),
+        (["train", "scenes.path=/nowhere", "experiment=smoke"], "error: /nowhere: no such file or folder"),
+        (["evaluate"], "error: Missing mandatory value: run"),
+        (["evaluate", "run=/nowhere"], "error: /nowhere is no run"),
+        (["convert", "source=/nowhere"], "error: out: missing"),
+        (["convert", "source=/nowhere", "out=/tmp/x"], "error: /nowhere: no such file or folder"),
+        (["drive-away"], "unknown command 'drive-away'; valid: train, evaluate"),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
+    monkeypatch.chdir(tmp_path)
+
+    def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
+        return lambda job: lambda: job(OmegaConf.create(config.load(config_name, *arguments[1:])))
+
+    monkeypatch.setattr("hydra.main", composing)
+    with pytest.raises(SystemExit) as stopped:
+        command_line.main()
+    text = capsys.readouterr().err or str(stopped.value)
+    assert message in text and len(text.splitlines()) == 1 and stopped.value.code not in (0, None)
+    assert not list(tmp_path.iterdir())
+
+
+# ---- every option composes and builds
+
+
+def options():
+    groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name != "experiment"]
+    return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
+
+
+def builds(whole_config):
+    env, policy = world.make(whole_config), make_policy(whole_config)
+    assert make_trainer(whole_config, env, policy).iterate
+    assert list(sources.readers(whole_config["scenes"])["formats"]) == ["gpudrive", "scenefactory"]
+    if sources.has_heldout(whole_config["scenes"]):
+        build(whole_config["scenes"]["generate"], builtins="scenefactory_jax.scenes.procedural.generate", where="scenes.generate")
+
+
+@pytest.mark.parametrize("option", options())
+def test_every_option_builds(option):
+    builds(config.load("train", option))
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (config.folder() / "experiment").glob("*.yaml")))
+def test_every_experiment_builds(name):
+    builds(config.load("train", f"experiment={name}"))
+    assert config.load("bench", f"experiment={name}")["ppo"] == config.load("train", f"experiment={name}")["ppo"]
