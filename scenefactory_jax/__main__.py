@@ -20,6 +20,7 @@ commands: {", ".join(configs.COMMANDS)}
   convert   scenes -> a bank          source=FILE_OR_FOLDER out=BANK
   scenes    look at scenes            scenes.path=FOLDER_OR_BANK out=FOLDER
   render    scenes as MJCF and images scenes.path=FOLDER_OR_BANK out=FOLDER
+  bench     measure training speed    experiment=published scenes.path=FOLDER_OR_BANK out=FILE
 
 `COMMAND --help` shows the config of a command, `COMMAND --cfg job` the one that your overrides give."""
 

@@ -89,7 +89,8 @@ READER = """
         yield RawScene(path.stem, str(path), (Polyline(2, lane, 1),), (track,), step_s * np.arange(steps), 0)
     """
 
-TERM = ["+reward.haste={_target_: my_terms.haste, weight: 0.25, unit_mps: 10.0}", "+reward.jerk={_target_: my_terms.jerkiness, weight: -1.0}"]
+TERM = ["+reward.haste={_target_: my_terms.haste, weight: 0.25, unit_mps: 10.0}"]
+TERM += ["+reward.jerk={_target_: my_terms.jerkiness, weight: -1.0}"]
 GROUP = ["+observe.clock={_target_: my_groups.clock, period_s: 2.0}", "+observe.mates={_target_: my_groups.mates, scale_m: 50.0}"]
 DYNAMICS = ["~dynamics", "+dynamics={_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}"]
 FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"

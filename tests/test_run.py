@@ -84,7 +84,7 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
     spawned = int(np.asarray(whole.state.worlds.agents.present).sum()) * whole.config["ppo"]["horizon"]
     assert [row["steps/total"] for row in rows] == [spawned * n for n in (1, 2, 3, 4)]
     judged = log.read(whole.folder, log.EVALUATIONS)
-    assert [row["iteration"] for row in judged] == [2, 4] and all(0 <= row["strict/success/value"] <= 1 for row in judged)
+    assert [row["iteration"] for row in judged] == [2, 4] and all(0 <= row["strict/success_rate/value"] <= 1 for row in judged)
 
 
 def test_the_report_compares_and_its_files_are_there(whole):
@@ -93,7 +93,7 @@ def test_the_report_compares_and_its_files_are_there(whole):
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert {"video.gif", "learning.png", "comparison-strict.png", "agents-strict.csv", "metrics.csv"} <= set(links)
     assert all((whole.folder / link).is_file() for link in links if "://" not in link and not link.startswith("#"))
-    assert imageio.imread(whole.folder / "video.gif").ndim >= 3 and imageio.improps(whole.folder / "video.gif").n_images > 1
+    assert len(list(imageio.imiter(whole.folder / "video.gif"))) > 1
 
 
 def test_every_spawned_agent_has_a_record(whole):
@@ -103,7 +103,9 @@ def test_every_spawned_agent_has_a_record(whole):
         records = tables.read_csv(whole.folder / f"agents-{name}.csv")
         assert len(records["scene"]) == present.sum()
         assert list(zip(records["world"], records["agent"], strict=True)) == list(zip(*np.nonzero(present), strict=True))
-        assert set(records["scene"]) == set(heldout.names) and not set(heldout.names) & set(sources.training(whole.config["scenes"]).names)
+        assert set(records["scene"]) == set(heldout.names)
+    seen = sources.training(whole.config["scenes"]).scene.agents.position
+    assert not any(np.array_equal(one, other) for one in seen for other in heldout.scene.agents.position)
 
 
 def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, tmp_path):
@@ -134,12 +136,10 @@ def judged(run, out, *overrides):
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
-    first, second = (judged(whole, tmp_path / name, "video.enable=false", "invincible=both") for name in ("a", "b"))
-    assert set(first.records) == {"strict", "invincible"} and first.report.is_file()
-    for protocol, records in first.records.items():
-        assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (second.folder / f"agents-{protocol}.csv").read_bytes()
-        assert all(len(column) == len(records["scene"]) for column in records.values())
-    assert (first.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()  # what training wrote
+    first, second = (judged(whole, tmp_path / kind, "video.enable=false", f"invincible={kind}") for kind in ("both", "true"))
+    assert set(first.records) == {"strict", "invincible"} and set(second.records) == {"invincible"} and first.report.is_file()
+    for again, protocol in ((second, "invincible"), (whole, "strict")):  # strict: what training itself wrote
+        assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
     strict, invincible = (first.records[name] for name in ("strict", "invincible"))
     ended = strict["collided"] | strict["crashed"] | strict["touched_edge"]
     assert ended.any() and (invincible["time_s"] >= strict["time_s"]).all()
@@ -159,7 +159,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
     }.items():
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
-    with pytest.raises(ConfigError, match="is no run: it has no config.yaml"):
+    with pytest.raises(ConfigError, match=r"is no run: it has no config\.yaml"):
         evaluate(config.load("evaluate", f"run={tmp_path}"))
 
 
@@ -246,7 +246,8 @@ def test_help_lists_the_commands(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "--help"])
     with pytest.raises(SystemExit) as stopped:
         command_line.main()
-    assert stopped.value.code == 0 and all(f"\n  {name} " in capsys.readouterr().out for name in config.COMMANDS)
+    printed = capsys.readouterr().out
+    assert stopped.value.code == 0 and all(f"\n  {name} " in printed for name in config.COMMANDS)
 
 
 def test_a_wrong_key_ends_as_one_line():
@@ -306,7 +307,8 @@ def builds(whole_config):
 
 @pytest.mark.parametrize("option", options())
 def test_every_option_builds(option):
-    builds(config.load("train", option))
+    lean = [] if option.startswith("dynamics=") else ["dynamics=bicycle"]
+    builds(config.load("train", option, *lean))
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (config.folder() / "experiment").glob("*.yaml")))
