@@ -75,7 +75,7 @@ def test_same_seed_same_scene_whatever_came_before(scenes):
 
 def test_kinds_take_turns(scenes):
     assert [scene.metadata["kind"] for scene in scenes] == KINDS * 8
-    assert scenes[4].name == "procedural-roundabout-000004"
+    assert scenes[4].name == f"procedural-roundabout-{scenes[4].metadata['seed']}-000004"
     assert len({scene.name for scene in scenes}) == len(scenes)
 
 

@@ -85,7 +85,7 @@ def generate(
     features = _features(layout, find_edges(layout.lanes), lane_spacing_m, line_spacing_m)
     origin = np.concatenate([points for _, points, *_ in features]).mean(axis=0)
     return RawScene(
-        name=f"procedural-{kind}-{index:06d}",
+        name=f"procedural-{kind}-{seed}-{index:06d}",
         source=f"generator, seed {seed}, index {index}",
         roads=tuple(_polyline(i, origin, *feature) for i, feature in enumerate(features)),
         tracks=tuple(_track(i, origin, car, traffic["car_size_m"]) for i, car in enumerate(cars)),
