@@ -105,7 +105,7 @@ def shown_steps(length: int, stride: int) -> list[int]:
 
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], *, fps: float | int) -> None:
     """Pipe raw pictures to the ffmpeg of imageio-ffmpeg; H.264 in 4:2:0, which every player shows."""
-    from imageio_ffmpeg import get_ffmpeg_exe  # an optional dependency
+    from imageio_ffmpeg import get_ffmpeg_exe  # an optional dependency  # pyright: ignore[reportMissingImports]
 
     first = next(pictures)
     height, width, _ = first.shape
