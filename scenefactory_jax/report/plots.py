@@ -51,7 +51,7 @@ class Panel(NamedTuple):
 LEARNING: tuple[Panel, ...] = (
     Panel("How agents end", "share of agents", ("events/", *RATES), "shares"),
     Panel("Reward a step, by term", "reward", ("reward/", "terms/"), "stack"),
-    Panel("Losses", "loss", ("policy", "value"), "lines"),
+    Panel("Losses", "loss", ("policy_loss", "value_loss"), "lines"),
     Panel("Entropy of the policy", "nats", ("entropy",), "lines"),
     Panel("Critic", "explained variance", ("explained_variance",), "lines"),
     Panel("KL divergence of an update", "nats", ("kl",), "lines"),

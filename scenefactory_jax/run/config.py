@@ -155,5 +155,7 @@ def quoted(override: str) -> str:
 
 
 def as_overrides(arguments: Sequence[str]) -> list[str]:
-    """Command-line arguments that are overrides, without Hydra's own flags; `hydra.searchpath` says where options of one's own lie."""
-    return [a for a in arguments if not a.startswith("-") and (not a.startswith("hydra") or a.startswith("hydra.searchpath="))]
+    """Command-line arguments that are overrides, without Hydra's own flags and their values (`--cfg job`); `hydra.searchpath` says where
+    options of one's own lie."""
+    settings = [a for a in arguments if a.startswith("~") or ("=" in a and not a.startswith("-"))]
+    return [a for a in settings if not a.startswith("hydra") or a.startswith("hydra.searchpath=")]
