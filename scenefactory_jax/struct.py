@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are JAX pytrees.
+"""Frozen dataclasses that are JAX pytrees, and what one does with pytrees.
 
 `flax.struct` rebuilds a dataclass through `__init__` when a pytree is unflattened, so a shape check on the fields would see
 the tracers, `None`s and batched arrays that `vmap`, `scan` and `eval_shape` put there. Here unflattening bypasses `__init__`:
@@ -10,10 +10,26 @@ from collections.abc import Iterable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 T = TypeVar("T")
 
 replace = dataclasses.replace
+
+
+def choose(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
+    """Row by row of two pytrees whose leaves all start with the axis of `condition`: agents, or worlds."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, chosen, other)
+
+
+def strong(tree: T) -> T:
+    """Cast away weak types: a carried state with one traces its function a second time."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
 
 def static(**options: Any) -> Any:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax import ends, observations, rewards, spawn
 from scenefactory_jax.build import ConfigError, build, check_type
-from scenefactory_jax.struct import replace
+from scenefactory_jax.struct import choose, replace, strong
 from scenefactory_jax.types import Agents, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
 
@@ -108,7 +108,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
         step=jnp.int32(0),
         key=key,
     )
-    return _strong(state)
+    return strong(state)
 
 
 def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
@@ -126,20 +126,11 @@ def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "
     else:
         over = truncated
         after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clear_m)
-    return _strong(after), Outcome(None, reward, terms, events, done, truncated, over, measured)
+    return strong(after), Outcome(None, reward, terms, events, done, truncated, over, measured)
 
 
 def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
     return observations.observe(replace(scene, agents=state.agents, weather=state.weather), state, parts.groups)
-
-
-def choose(condition: Bool[Array, " A"], chosen: Any, other: Any) -> Any:
-    """Row by row of two pytrees whose leaves all start with the agent axis."""
-
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(pick, chosen, other)
 
 
 def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
@@ -188,11 +179,6 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
         previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
         key=key,
     )
-
-
-def _strong(tree: Any) -> Any:
-    """Cast away weak types, so that a second step does not trace again."""
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
 
 def _require(config: Mapping[str, Any], groups: tuple[str, ...]) -> None:

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.build import build
-from scenefactory_jax.dynamics.contact import choose
 from scenefactory_jax.geometry import heading, norm, wrap_angle
-from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
 
 GRAVITY = 9.81

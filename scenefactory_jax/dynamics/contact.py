@@ -6,7 +6,7 @@ other box's nearest face, which leaves two contact points, each with half the st
 """
 
 import functools
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.geometry import cross, dot, norm
-
-T = TypeVar("T")
 
 
 class Touch(NamedTuple):
@@ -83,11 +81,6 @@ def forces(
     strength = norm(total)
     largest = jnp.zeros((count,), position.dtype).at[first].max(strength).at[second].max(strength)
     return sum_force, sum_torque, largest
-
-
-def choose(active: Bool[Array, " A"], moved: T, held: T) -> T:
-    """Row by row of two pytrees whose leaves start with the agent axis: bodies of inactive cars are held."""
-    return jax.tree.map(lambda new, old: jnp.where(_rows(active, new), new, old), moved, held)
 
 
 def _rows(mask: Bool[Array, " A"], like: Array) -> Array:

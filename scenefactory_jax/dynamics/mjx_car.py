@@ -21,9 +21,8 @@ from mujoco import mjx
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics.car import CarParameters, Solver
-from scenefactory_jax.dynamics.contact import choose
 from scenefactory_jax.geometry import norm
-from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
 
 

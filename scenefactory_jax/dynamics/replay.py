@@ -9,9 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.build import build
-from scenefactory_jax.dynamics.contact import choose
 from scenefactory_jax.geometry import norm, wrap_angle
-from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Log, Motion, Scene
 
 

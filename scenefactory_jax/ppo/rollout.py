@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.ppo.loss import log_probability
-from scenefactory_jax.struct import struct
+from scenefactory_jax.struct import choose, struct
 from scenefactory_jax.types import Env, Observation, Outcome, Policy, Scene, State
 
 
@@ -76,20 +76,11 @@ def collect(
         )
         lives, counts = _tally(worlds, outcome, sample, lives)
         fresh = jax.vmap(env.start)(jax.random.split(start_key, outcome.over.shape[0]), scenes)
-        worlds = choose_worlds(outcome.over, fresh, after)
+        worlds = choose(outcome.over, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
     return worlds, observation, lives, samples, jax.tree.map(lambda x: jnp.sum(x, axis=0), counts)
-
-
-def choose_worlds(condition: Bool[Array, " W"], chosen: State, other: State) -> State:
-    """World by world, one of two states."""
-
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(pick, chosen, other)
 
 
 def no_lives(worlds: State) -> Lives:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import gae, loss, rollout, update
-from scenefactory_jax.struct import replace, struct
+from scenefactory_jax.struct import replace, strong, struct
 from scenefactory_jax.types import Env, Observation, Policy, Scene, State
 
 Metrics = dict[str, Float[Array, ""]]
@@ -170,7 +170,7 @@ def _iterate(
         iteration=train_state.iteration + 1,
         steps=_add(train_state.steps, tally["spawned"]),
     )
-    return _strong(following), measure(tally, facts)
+    return strong(following), measure(tally, facts)
 
 
 def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float) -> int:
@@ -249,14 +249,9 @@ def _add(steps: Array, more: Array) -> Array:
     return jnp.stack([steps[0] + rest // MILLION, rest % MILLION])
 
 
-def _strong(tree: Any) -> Any:
-    """Cast away weak types, so that a second iteration does not trace again."""
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
-
-
 def _own(tree: Any) -> Any:
     """Buffers of its own: `jit` may hand an argument (a scene's spawn points) straight through, and donating it would delete the scene."""
-    return jax.tree.map(jnp.copy, _strong(tree))
+    return jax.tree.map(jnp.copy, strong(tree))
 
 
 def _check(numbers: dict[str, Any]) -> None:
