@@ -61,11 +61,53 @@ class Log:
 
 
 @struct
-class Weather:
-    """Uniform road condition of one world; `surface` indexes SURFACES."""
+class Patches:
+    """Places of the road with a condition of their own; where they overlap the last one counts.
 
-    film_mm: Float[Array, ""]
-    surface: Int[Array, ""]
+    One shape stands for all: the points within `radius` of a line of vertices and, if it is `closed`, the points inside it. A circle is one
+    vertex repeated, a strip an open line with half its width, a polygon a closed line with radius 0.
+    """
+
+    vertices: Float[Array, "N V 2"]
+    closed: Bool[Array, " N"]
+    radius: Float[Array, " N"]
+    surface: Int[Array, " N"]  # index into SURFACES
+    film_mm: Float[Array, " N"]
+    follows: Float[Array, " N"]  # share of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
+    present: Bool[Array, " N"]
+
+
+@struct
+class Rain:
+    """Water film of the open road over an episode: linear between knots, constant beyond them; it stays as it is without any."""
+
+    now_s: Float[Array, ""]  # since the episode began
+    time_s: Float[Array, " K"]  # of the knots, ascending
+    film_mm: Float[Array, " K"]
+
+
+@struct
+class Weather:
+    """Road condition of one world, over the plane and over time; `surface` indexes SURFACES."""
+
+    film_mm: Float[Array, ""]  # on the open road, now
+    surface: Int[Array, ""]  # of the open road
+    patches: Patches
+    rain: Rain
+
+
+@struct
+class Boxes:
+    """Oriented boxes on the road at one moment: cars, and what else they can hit."""
+
+    position: Float[Array, "B 2"]
+    elevation: Float[Array, " B"]  # of the boxes' centres
+    yaw: Float[Array, " B"]
+    velocity: Float[Array, "B 2"]
+    yaw_rate: Float[Array, " B"]
+    size: Float[Array, "B 2"]  # length, width
+    mass: Float[Array, " B"]  # inf: whatever hits it, it stays on its way
+    present: Bool[Array, " B"]
 
 
 @struct

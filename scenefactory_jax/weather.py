@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.types import SURFACES, Scene, Weather
+from scenefactory_jax.types import SURFACES, Patches, Rain, Scene, Weather
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -163,7 +163,7 @@ def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Wea
     index = jax.random.choice(key, len(chosen), p=weights / weights.sum())
     film = jnp.asarray([case.film_mm for case in chosen], jnp.float32)
     surface = jnp.asarray([SURFACES.index(case.surface) for case in chosen], jnp.int32)
-    return Weather(film_mm=film[index], surface=surface[index])
+    return uniform(film[index], surface[index])
 
 
 def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
@@ -181,6 +181,13 @@ def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
     if sum(case.weight for case in chosen) <= 0:
         raise ConfigError("weather.draw.cases: no case with a positive weight")
     return chosen
+
+
+def uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:
+    """One condition everywhere and for ever: no patches, no rain."""
+    none, nothing = jnp.zeros(0, jnp.float32), jnp.zeros(0, bool)
+    patches = Patches(jnp.zeros((0, 1, 2), jnp.float32), nothing, none, jnp.zeros(0, jnp.int32), none, none, nothing)
+    return Weather(film_mm, surface, patches, Rain(now_s=jnp.float32(0.0), time_s=none, film_mm=none))
 
 
 def keep(key: PRNGKeyArray, scene: Scene) -> Weather:

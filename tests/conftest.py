@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from scenefactory_jax.types import Agents, Log, Road, Scene, Weather
+from scenefactory_jax.types import Agents, Log, Road, Scene
+from scenefactory_jax.weather import uniform
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "data"
@@ -79,5 +80,5 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     )
     return Scene(
         road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
-        weather=Weather(film_mm=jnp.float32(0.0), surface=jnp.int32(0)),
+        weather=uniform(jnp.float32(0.0), jnp.int32(0)),
     )

@@ -8,7 +8,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.types import Env, Events, Facts, Motion, Outcome, Scene, State, Weather
+from scenefactory_jax.types import Env, Events, Facts, Motion, Outcome, Scene, State
+from scenefactory_jax.weather import uniform
 
 AGENTS = 3
 SIZES = {"A": AGENTS, "P": 1, "L": 1}
@@ -64,7 +65,7 @@ def blank(cls, **known):
 
 def scenes(worlds: int, task: int = 5) -> Scene:
     """Scenes that hold nothing but the number of a probe."""
-    scene = blank(Scene, weather=Weather(film_mm=jnp.float32(0.0), surface=jnp.int32(task)))
+    scene = blank(Scene, weather=uniform(jnp.float32(0.0), jnp.int32(task)))
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), scene)
 
 

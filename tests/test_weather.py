@@ -11,7 +11,8 @@ from conftest import ROOT, SHARED, scene_of
 
 from scenefactory_jax import weather
 from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.types import SURFACES, Weather
+from scenefactory_jax.types import SURFACES
+from scenefactory_jax.weather import uniform
 
 CONF = ROOT / "conf" / "weather"
 BASE = yaml.safe_load((CONF / "base.yaml").read_text())
@@ -88,7 +89,7 @@ def test_gradients_are_finite_at_rest_on_dry_roads_and_beyond_the_cliff():
 
 @pytest.mark.parametrize("mode", ["static", "dynamic", "speed"])
 def test_grip_modes(mode):
-    condition = Weather(film_mm=jnp.float32(0.3), surface=jnp.int32(1))
+    condition = uniform(jnp.float32(0.3), jnp.int32(1))
     speed = jnp.array([[0.0, 5.0, 13.89, 30.0]] * 2)
     mu = jax.jit(grip_of(mode=mode))(condition, jnp.zeros((2, 4, 2)), speed)
     assert mu.shape == (2, 4) and mu.dtype == jnp.float32
@@ -100,7 +101,7 @@ def test_grip_modes(mode):
 
 
 def test_the_floor_holds_where_the_tyre_floats():
-    mu = grip_of()(Weather(film_mm=jnp.float32(2.0), surface=jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
+    mu = grip_of()(uniform(jnp.float32(2.0), jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
     np.testing.assert_allclose(mu, 1e-3)
 
 
@@ -130,7 +131,7 @@ def test_draw_follows_the_weights_and_keep_keeps():
 )
 def test_grip_refuses_by_name(change, named):
     with pytest.raises(ConfigError, match=named):
-        grip_of(**change)(Weather(film_mm=jnp.float32(0.0), surface=jnp.int32(0)), jnp.zeros((1, 2)), jnp.zeros(1))
+        grip_of(**change)(uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 2)), jnp.zeros(1))
 
 
 @pytest.mark.parametrize(

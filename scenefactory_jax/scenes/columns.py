@@ -9,11 +9,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from scenefactory_jax.types import DRIVABLE, EDGES, Road, Scene
+from scenefactory_jax.types import DRIVABLE, EDGES, Boxes, Patches, Rain, Road, Scene
 
 T = TypeVar("T")
 
 ROADS = ("road", "lanes", "edges")
+DRAWN = (Patches, Rain, Boxes)  # parts of a scene that resets make: no file holds them, packed scenes have none of them
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 
 
@@ -29,14 +30,19 @@ def _describe(kind: type, prefix: str = "") -> dict[str, Column]:
     found: dict[str, Column] = {}
     for entry in dataclasses.fields(kind):
         name = prefix + entry.name
+        if entry.type in DRAWN:
+            continue
         if dataclasses.is_dataclass(entry.type):
             found |= _describe(entry.type, f"{name}.")  # pyright: ignore[reportArgumentType]
             continue
         names = {"P": prefix.rstrip("."), "A": "agents", "L": "steps"}
         axes = tuple(names.get(axis) or int(axis) for axis in entry.type.dim_str.split())  # pyright: ignore
-        dtype = next(dtype for name_, dtype in DTYPES.items() if entry.type.dtypes[0].startswith(name_))  # pyright: ignore
-        found[name] = Column(dtype, axes)
+        found[name] = Column(_dtype(entry.type), axes)
     return found
+
+
+def _dtype(annotation: Any) -> np.dtype:
+    return next(dtype for name, dtype in DTYPES.items() if annotation.dtypes[0].startswith(name))
 
 
 COLUMNS: dict[str, Column] = _describe(Scene)
@@ -50,17 +56,32 @@ def assemble(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "")
     value = object.__new__(kind)
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         name = prefix + entry.name
-        nested = dataclasses.is_dataclass(entry.type)
-        leaf = assemble(entry.type, columns, f"{name}.") if nested else columns[name]  # pyright: ignore[reportArgumentType]
+        if entry.type in DRAWN:
+            leaf = _nothing(entry.type, columns["log.dt"].shape)
+        elif dataclasses.is_dataclass(entry.type):
+            leaf = assemble(entry.type, columns, f"{name}.")  # pyright: ignore[reportArgumentType]
+        else:
+            leaf = columns[name]
         object.__setattr__(value, entry.name, leaf)
     return value
 
 
+def _nothing(kind: type[T], worlds: tuple[int, ...]) -> T:
+    """A drawn part without rows, for one scene (`worlds` is empty) or a stack of them."""
+    value = object.__new__(kind)
+    for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        shape = tuple(int(axis) if axis.isdigit() else 0 for axis in entry.type.dim_str.split())  # pyright: ignore
+        object.__setattr__(value, entry.name, np.zeros((*worlds, *shape), _dtype(entry.type)))
+    return value
+
+
 def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """A struct's leaves as numpy arrays by their dotted names."""
+    """A struct's leaves as numpy arrays by their dotted names, without the drawn parts."""
     found: dict[str, np.ndarray] = {}
     for entry in dataclasses.fields(value):
         leaf, name = getattr(value, entry.name), prefix + entry.name
+        if isinstance(leaf, DRAWN):
+            continue
         found |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
     return found
 
