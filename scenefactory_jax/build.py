@@ -86,7 +86,7 @@ def check_type(value: Any, hint: Any, *, where: str) -> None:
         raise ConfigError(f"{where}: {value!r} is of type {type(value).__name__}, wanted {wanted or hint}")
 
 
-def check_range(span: Sequence[float], *, where: str, least: float | None = 0.0) -> tuple[float, float]:
+def check_range(span: Sequence[float | int], *, where: str, least: float | None = 0.0) -> tuple[float | int, float | int]:
     """The ends of a range of the config, [least, most].
 
     Raises:

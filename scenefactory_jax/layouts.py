@@ -4,7 +4,7 @@ A layout is a function (key, scene, weather) -> Patches, named by an entry of `w
 road's. It may leave patches out (`present`) but their number is constant: shapes of arrays are static.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -225,13 +225,15 @@ def _surface(weather: Weather, surface: str | None, *, name: str) -> Int[Array, 
     return jnp.int32(SURFACES.index(surface))
 
 
-def _uniform(key: PRNGKeyArray, span: list[float], shape: tuple[int, ...], *, name: str, least: float | None = 0.0) -> Float[Array, "..."]:
+def _uniform(
+    key: PRNGKeyArray, span: Sequence[float | int], shape: tuple[int, ...], *, name: str, least: float | None = 0.0
+) -> Float[Array, "..."]:
     """Numbers from a range of the config."""
     low, high = check_range(span, where=name, least=least)
     return jax.random.uniform(key, shape, jnp.float32, low, high)
 
 
-def _check(**numbers: tuple[float, float]) -> None:
+def _check(**numbers: tuple[float | int, float | int]) -> None:
     """Refuse numbers below their least, by name."""
     for name, (value, least) in numbers.items():
         if value < least:

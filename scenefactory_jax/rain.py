@@ -5,6 +5,7 @@ can start from its film. Films between knots are linear.
 """
 
 import itertools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +106,6 @@ def _course(time_s: Float[Array, " K"], film_mm: Float[Array, " K"]) -> Rain:
     return Rain(now_s=jnp.float32(0.0), time_s=time_s, film_mm=film_mm)
 
 
-def _uniform(key: PRNGKeyArray, span: list[float], *, name: str) -> Float[Array, ""]:
+def _uniform(key: PRNGKeyArray, span: Sequence[float | int], *, name: str) -> Float[Array, ""]:
     low, high = check_range(span, where=name)
     return jax.random.uniform(key, (), jnp.float32, low, high)
