@@ -1,4 +1,4 @@
-"""RawScene -> Scene: which part of the map and which cars, in float32 metres around the scene's centre.
+"""RawScene -> Scene: which part of the map, which cars and who else, in float32 metres around the scene's centre.
 
 Nothing disappears silently: the report counts what was kept and what was dropped, by reason.
 """
@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.raw import RawScene, SceneError, Track
-from scenefactory_jax.types import DRIVABLE, Scene
+from scenefactory_jax.types import DRIVABLE, ROAD_USERS, Scene
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
 )  # fmt: skip
+OTHER_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 
@@ -34,6 +35,8 @@ class PackReport:
     track_ids: tuple[int, ...]  # of the agents, slot by slot
     agents_kept: int
     agents_dropped: dict[str, int]  # reason -> count, every reason of DROPS
+    others_kept: int  # everybody who is no agent is counted here or in the next
+    others_dropped: dict[str, int]  # reason -> count, every reason of OTHER_DROPS
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count, every reason of CUTS
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -71,8 +74,13 @@ def pack(
     start_speed: Literal["logged", "zero"],
     log_from: Literal["start", "current"],
     require_agents: bool,
+    others: int,
+    others_least_m: float,
 ) -> tuple[Scene, PackReport]:
     """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
+
+    The `others` are those who are no agents and in the box at some step from the current one on, as large as logged. Whose box overlaps an
+    agent's at the start is left out.
 
     Args:
         raw: a checked scene.
@@ -85,6 +93,8 @@ def pack(
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
         require_agents: refuse a scene in which no agent is left.
+        others: at most so many, those first that come nearest to the start of an agent (to the centre, without agents).
+        others_least_m: shortest and narrowest that they may be.
 
     Raises:
         SceneError: no lane segment in the box, or no agent where one is required.
@@ -103,6 +113,8 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
+    rest, others_dropped = _choose_others(raw, chosen, leaves, origin, half, others, others_least_m)
+    leaves |= _others([raw.tracks[i] for i in rest], raw, origin, first, others_least_m)
     scene = columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
     report = PackReport(
         name=raw.name,
@@ -114,6 +126,8 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
+        others_kept=len(rest),
+        others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
@@ -253,21 +267,61 @@ def _agents(
 
 def _log(tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, first: int) -> dict[str, np.ndarray]:
     """Columns of `log`: zeros where the recording has nothing."""
+    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
+    rows = _recording(tracks, raw, origin, slots, first)
+    return {f"log.{name}": leaf for name, leaf in rows.items()} | {"log.dt": np.asarray(step)}
+
+
+def _recording(
+    tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, first: int
+) -> dict[str, np.ndarray]:
+    """What tracks did from a step on, in so many slots: zeros where the recording has nothing."""
     steps = len(raw.times) - first
-    rows = {
-        "log.position": np.zeros((slots, steps, 2)),
-        "log.yaw": np.zeros((slots, steps)),
-        "log.velocity": np.zeros((slots, steps, 2)),
-        "log.valid": np.zeros((slots, steps), bool),
-    }
+    rows = {name: np.zeros((slots, steps, 2)) for name in ("position", "velocity")}
+    rows |= {"yaw": np.zeros((slots, steps)), "valid": np.zeros((slots, steps), bool)}
     for slot, track in enumerate(tracks):
         valid = track.valid[first:]
-        rows["log.valid"][slot] = valid
-        rows["log.position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
-        rows["log.yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
-        rows["log.velocity"][slot][valid] = track.velocity[first:][valid]
-    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
-    return rows | {"log.dt": np.asarray(step)}
+        rows["valid"][slot] = valid
+        rows["position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
+        rows["yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
+        rows["velocity"][slot][valid] = track.velocity[first:][valid]
+    return rows
+
+
+def _choose_others(
+    raw: RawScene, agents: list[int], leaves: dict[str, np.ndarray], origin: Float[np.ndarray, "3"], half: float, limit: int, least: float
+) -> tuple[list[int], dict[str, int]]:
+    """Indices of the tracks that become others, nearest to an agent's start first, and the rest counted by reason."""
+    rows = [leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")]
+    boxes = np.array([corners(place, float(yaw), *size) for place, yaw, size in zip(*rows, strict=True)]).reshape(-1, 4, 2)
+    starts = rows[0] if len(rows[0]) else np.zeros((1, 2))
+    dropped, candidates = dict.fromkeys(OTHER_DROPS, 0), []
+    for index in sorted(set(range(len(raw.tracks))) - set(agents)):
+        track = raw.tracks[index]
+        now = track.valid[raw.current :]
+        path = track.xyz[raw.current :, :2] - origin[:2]
+        inside = now & (np.abs(path).max(axis=1) <= half)
+        length, width = np.maximum(track.size[:2], least)
+        if not now.any():
+            dropped["absent_from_start_on"] += 1
+        elif not inside.any():
+            dropped["outside_box"] += 1
+        elif now[0] and overlaps(corners(path[0], track.yaw[raw.current], length, width), boxes).any():
+            dropped["overlaps_agent"] += 1
+        else:
+            near = np.linalg.norm(path[inside][:, None] - starts, axis=2).min()
+            candidates.append((float(near), index))
+    kept = [index for _, index in sorted(candidates)]
+    dropped["over_capacity"] = max(len(kept) - limit, 0)
+    return kept[:limit], dropped
+
+
+def _others(tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], first: int, least: float) -> dict[str, np.ndarray]:
+    """Columns of `others`."""
+    rows = _recording(tracks, raw, origin, len(tracks), first)
+    rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
+    rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
+    return {f"others.{name}": leaf for name, leaf in rows.items()}
 
 
 def _wrap(angle: Any) -> Any:
