@@ -38,12 +38,14 @@ def measure(
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
     Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
-    tangent turned towards the goal; TTC and DRAC among active cars; edges touched by the bounding circles.
+    tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
     """
     motion, active = after.motion, before.active
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    centres, radius = car_circles(position, motion.yaw, after.agents.size, **circles)
-    ttc, drac = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    everyone = conflict.bodies(motion, after.agents.size, active, scene.boxes)
+    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    centres, radius = centres[: len(active)], radius[: len(active)]
     speed = norm(velocity)
     to_goal = after.agents.goal - position
     lane = _measure_lane(scene, before, position, motion, to_goal)
@@ -66,10 +68,10 @@ def measure(
         speed=speed,
         goal_distance=norm(to_goal),
         **lane,
-        ttc=conflict.least(ttc, active),
+        ttc=conflict.least(ttc, everyone.present),
         edge_ttc=edge_ttc,
         edge_gap=edge_gap,
-        drac=jnp.max(jnp.where(active[None], drac, 0.0), axis=1),
+        drac=jnp.max(jnp.where(everyone.present[None], drac, 0.0), axis=1),
         strayed=strayed,
         contact_force=motion.contact_force,
         grip=motion.grip,

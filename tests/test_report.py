@@ -11,6 +11,7 @@ from conftest import road_of
 from PIL import Image
 
 from scenefactory_jax.report import canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Scene
 from scenefactory_jax.weather import uniform
 
@@ -61,7 +62,7 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
     cars = Agents(jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool))
     row = jnp.zeros((agents, 1), f)
     log = Log(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
-    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, uniform(f(0.5), jnp.int32(1))))
+    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, uniform(f(0.5), jnp.int32(1)), unrecorded(1), nobody()))
     still = np.zeros((steps, agents), np.float32)
     return canvas.Trajectory(
         scene, position, still, still + 8, active, events, np.asarray(size), goal, np.ones(agents, bool), 30.0, title, "SMA, 0.5 mm"

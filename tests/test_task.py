@@ -9,7 +9,7 @@ import pytest
 from conftest import road_of, scene_of
 
 import scenefactory_jax
-from scenefactory_jax import conflict, ends, facts, geometry, observations, rewards, spawn, world
+from scenefactory_jax import conflict, ends, facts, geometry, observations, others, rewards, spawn, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Dynamics, Motion
@@ -51,6 +51,7 @@ def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=Non
         dynamics=glide(),
         draw_agents=draw,
         draw_weather=keep,
+        others=others.ignore,
         measure=functools.partial(facts.measure, **config["facts"]),
         judge=functools.partial(ends.judge, ending=ending or config["ends"]["ending"]),
         terms=rewards.make(config["reward"]),

@@ -21,6 +21,7 @@ from mujoco import mjx
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics.car import CarParameters, Solver
+from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.geometry import norm
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
@@ -95,7 +96,7 @@ def make(
     Args:
         car: numbers of `car.CarParameters`.
         solver: numbers of `car.Solver`.
-        contact: stiffness, damping and friction of `contact.forces`; its height is the car's.
+        contact: numbers of `contact.make`; its height is the car's.
         brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a
             remembered spin direction, which flips every substep once a wheel locks.
         grip: (weather, position, speed) -> friction coefficient, asked for every wheel at the start of every control step.
@@ -106,8 +107,8 @@ def make(
     """
     parameters: CarParameters = build({**car, "_target_": "CarParameters"}, builtins=cars.__name__, where="dynamics.car")()
     settings: Solver = build({**solver, "_target_": "Solver"}, builtins=cars.__name__, where="dynamics.solver")()
-    entry = {**contact, "_target_": "forces"}
-    meet = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)
+    entry = {**contact, "_target_": "make"}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
     cars.stable_limits(parameters, physics_dt=physics_dt)
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
@@ -173,7 +174,7 @@ def start(plant: Plant, still: np.ndarray, scene: Scene) -> Body:
 
 def _advance(
     plant: Plant,
-    meet: Callable[..., Any],
+    meet: Contact,
     grip: Callable[..., Any],
     substeps: int,
     scene: Scene,
@@ -192,9 +193,12 @@ def _advance(
     steer, drive = car.steering_limit * action[:, 1], car.drive_torque * jnp.maximum(action[:, 0], 0.0)
     brake = jnp.maximum(action[:, 2], 0.0)[:, None] * full
 
-    def substep(now: Body, _: None) -> tuple[Body, None]:
-        motion = read(plant, now)
-        force, torque, strength = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
+    mass = plant.model.body_mass.sum()
+    near = meet.neighbours(boxes_of(before, scene.agents.size, active, mass), scene.boxes)
+
+    def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
+        touching = boxes_of(read(plant, now), scene.agents.size, active, mass)
+        force, torque, strength = meet.forces(touching, later(near, time))
         command = Command(steer, drive, brake, mu, force, torque)
         car_of = Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign)
         moved, use, slip = jax.vmap(functools.partial(move, plant))(car_of, command)
@@ -202,7 +206,7 @@ def _advance(
         return replace(now, **moved._asdict(), contact_force=strongest, grip_use=use, slip=slip), None
 
     quiet = replace(body, contact_force=jnp.zeros_like(body.contact_force), grip=mu.mean(-1))
-    after, _ = jax.lax.scan(substep, quiet, length=substeps)
+    after, _ = jax.lax.scan(substep, quiet, plant.model.opt.timestep * jnp.arange(substeps))
     zero = jnp.zeros_like(body.slip)
     return choose(active, after, replace(body, contact_force=zero, grip_use=zero, slip=zero))
 
