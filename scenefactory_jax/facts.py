@@ -40,18 +40,16 @@ def measure(
     Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
     tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
     """
-    motion, active = after.motion, before.active
+    motion, active, cars = after.motion, before.active, len(before.active)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
     everyone = conflict.bodies(motion, after.agents.size, active, scene.boxes)
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
-    centres, radius = centres[: len(active)], radius[: len(active)]
-    speed = norm(velocity)
-    to_goal = after.agents.goal - position
+    speed, to_goal = norm(velocity), after.agents.goal - position
     lane = _measure_lane(scene, before, position, motion, to_goal)
-    to_edges = distance_to_segments(centres, scene.edges, half_width_m=edge_half_width_m)
+    to_edges = distance_to_segments(centres[:cars], scene.edges, half_width_m=edge_half_width_m)
     edge_gap = jnp.min(to_edges, axis=(1, 2), initial=jnp.inf) - edge_radius_m
-    edge_ttc = conflict.with_points(centres, radius, velocity, motion.yaw, scene.edges, range_m=edge_range_m)
+    edge_ttc = conflict.with_points(centres[:cars], radius[:cars], velocity, motion.yaw, scene.edges, range_m=edge_range_m)
     strayed = norm(position - after.agents.position)
 
     outside = jnp.max(jnp.abs(position), axis=1) > 0.5 * box_m

@@ -35,9 +35,9 @@ def random_pairs(
 ) -> Agents:
     """Random start-goal pairs on the lanes, every slot filled where there is room (facts 4.7).
 
-    Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to
-    length; starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot none of whose candidates
-    fits stays absent. Speed at the start is zero.
+    Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to length;
+    starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot none of
+    whose candidates fits stays absent. Speed at the start is zero.
     """
     slots = scene.agents.present.shape[0]
     place_key, travel_key = jax.random.split(key)

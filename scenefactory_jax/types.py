@@ -1,8 +1,8 @@
 """Every type that crosses a module border.
 
-Axes: `A` agent slots, `O` others on the road, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written for one world and
-`jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from world x; anything
-else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
+Axes: `A` agent slots, `O` others on the road, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written
+for one world and `jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from
+world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
 """
 
 from collections.abc import Callable
@@ -259,7 +259,8 @@ class Dynamics(NamedTuple):
 
 class Env(NamedTuple):
     """One world as pure functions. `reset` and `step` are the public pair; the next three are their parts, so that a training loop can
-    reset finished worlds before it pays for the observation. `now` gives the scene as it is at a state's moment, for dynamics and viewers."""
+    reset finished worlds before it pays for the observation. `now` gives the scene as it is at a state's moment, for dynamics and
+    viewers."""
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]

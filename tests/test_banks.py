@@ -35,7 +35,7 @@ def street(tmp_path, readers):
 def test_stack_pads_with_masked_rows(street):
     small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
     stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS} and not report.cuts
+    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "others": 0} and not report.cuts
     assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
     for world, scene in enumerate((small, large)):
         for name, leaf in columns.flatten(scene).items():
@@ -141,7 +141,7 @@ def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
         bank.open(path)
     index = json.loads((path / bank.INDEX).read_text())
     (path / bank.INDEX).write_text(json.dumps(index | {"schema": 99}))
-    with pytest.raises(SceneError, match="a bank of schema 99; this version reads 1"):
+    with pytest.raises(SceneError, match="a bank of schema 99; this version reads 2"):
         bank.open(path)
 
 
@@ -219,7 +219,7 @@ def stand_in_car():
     return car
 
 
-LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "box_m": 200.0}
+LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "other_height_m": 1.5, "box_m": 200.0}
 
 
 def test_a_scene_becomes_one_model(street):

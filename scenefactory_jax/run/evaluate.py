@@ -13,7 +13,7 @@ from scenefactory_jax import evaluation, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
-from scenefactory_jax.report.canvas import Trajectory
+from scenefactory_jax.report.canvas import Others, Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.run.train import make_policy
@@ -210,6 +210,7 @@ def _trajectories(kept: list, episode, batch, names: list[str], steps: int, cont
                 control_hz=control_hz,
                 title=names[index],
                 weather=f"{SURFACES[int(weather.surface)]}, {float(weather.film_mm):.1f} mm",
+                others=Others(*(cut(getattr(frames.others, name)) for name in Others._fields)),
             )
         )
     return found

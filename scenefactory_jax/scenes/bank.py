@@ -1,7 +1,8 @@
 """Packed scenes on disk: a folder with `bank.json` and one .npy a column, memory-mapped when it is read.
 
 Ragged columns lie end to end, scene after scene; `sizes.npy` holds each scene's segments, agent slots, steps and others. `lanes` and
-`edges` repeat rows of `road` and are not stored. A bank can be moved; it is written beside its place and renamed, so that nobody ever meets half of one.
+`edges` repeat rows of `road` and are not stored. A bank can be moved; it is written beside its place and renamed, so that nobody ever meets
+half of one.
 """
 
 import json

@@ -93,7 +93,7 @@ def pack(
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
         require_agents: refuse a scene in which no agent is left.
-        others: at most so many, those first that come nearest to the start of an agent (to the centre, without agents).
+        others: at most so many, those that come nearest to an agent's start (to the centre, without agents).
         others_least_m: shortest and narrowest that they may be.
 
     Raises:
@@ -107,15 +107,13 @@ def pack(
         raise SceneError(f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
-        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
+        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped) or 'no tracks'}")
     first = raw.current if log_from == "current" else 0
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     rest, others_dropped = _choose_others(raw, chosen, leaves, origin, half, others, others_least_m)
     leaves |= _others([raw.tracks[i] for i in rest], raw, origin, first, others_least_m)
-    scene = columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -133,7 +131,11 @@ def pack(
         relief_m=relief,
         metadata=dict(raw.metadata),
     )
-    return scene, report
+    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _reasons(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
 def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:

@@ -40,7 +40,8 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     """Worlds along a new first axis, padded with masked rows: numpy leaves `[W, ...]`.
 
     A segment capacity that is too small cuts the segments farthest from every start, goal and logged position of the world's agents (from
-    the centre, if it has none); one of agents or others the last rows, one of steps the last steps. `lanes` and `edges` are cut on their own.
+    the centre, if it has none); one of agents or others the last rows, one of steps the last steps. `lanes` and `edges` are cut on their
+    own.
 
     Args:
         scenes: single worlds, of any sizes.
