@@ -14,7 +14,7 @@ from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, pack
 
 from scenefactory_jax.scenes import bank, columns, convert, mjcf, source, stack
 from scenefactory_jax.scenes.raw import SceneError
-from scenefactory_jax.types import Scene
+from scenefactory_jax.types import Boxes, Scene
 
 NONE = dict.fromkeys(stack.AXES)
 
@@ -239,6 +239,17 @@ def test_a_scene_becomes_one_model(street):
     mujoco.MjModel.from_xml_string(model.to_xml())
     with pytest.raises(ValueError, match="free joint"):
         mjcf.world(scene, mujoco.MjSpec(), merge_tolerance_m=None, **LOOKS)
+
+
+def test_others_stand_in_the_model_and_can_be_hit(street):
+    scene = prepared(street, agents=2).scene
+    f = np.float32
+    boxes = Boxes(f([[9, 3], [0, 0]]), f([0.7, 0]), f([0.5, 0]), f([[0, 0]] * 2), f([0, 0]), f([[4, 2]] * 2), f([np.inf] * 2),
+                  np.array([True, False]))  # fmt: skip
+    model = mjcf.world(replace(scene, boxes=boxes), stand_in_car(), merge_tolerance_m=None, **LOOKS).compile()
+    assert model.geom("other0").size.tolist() == [2.0, 1.0, 0.75] and model.geom("other0").contype == 1
+    with pytest.raises(KeyError):
+        model.geom("other1")
 
 
 def test_merged_segments_stay_within_the_tolerance(street):

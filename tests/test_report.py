@@ -11,6 +11,7 @@ from conftest import road_of
 from PIL import Image
 
 from scenefactory_jax.report import canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax.report import others as shapes
 from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Scene
 from scenefactory_jax.weather import uniform
@@ -72,6 +73,33 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
 @pytest.fixture(scope="module")
 def trajectory() -> canvas.Trajectory:
     return make_trajectory()
+
+
+def beside(trajectory: canvas.Trajectory) -> canvas.Trajectory:
+    """With a parked lorry, a cyclist that rides along, and a person who leaves half way."""
+    steps = len(trajectory.active)
+    place = np.stack([np.tile([-30.0, 3.0], (steps, 1)), np.stack([-50 + 0.1 * np.arange(steps), np.full(steps, -2.0)], 1),
+                      np.tile([-20.0, -3.0], (steps, 1))], axis=1)  # fmt: skip
+    size = np.tile([[9.0, 2.5], [1.8, 0.7], [0.8, 0.8]], (steps, 1, 1))
+    present = np.ones((steps, 3), bool)
+    present[steps // 2 :, 2] = False
+    return trajectory._replace(others=canvas.Others(place, np.zeros((steps, 3)), size, present))
+
+
+def test_others_are_drawn_where_they_are(trajectory):
+    film = {**FILM, "columns": 1, "panel": 400}
+    empty, full = (list(video.frames([t], **film)) for t in (trajectory, beside(trajectory)))
+    changed = [(a != b).any(-1) for a, b in zip(empty, full, strict=True)]
+    assert changed[0].sum() > changed[-1].sum() > 50, "the person has left"
+    drawn = shapes.shapes(beside(trajectory).others, 0, np.array([True, False, True]))
+    for shape, (x, y), kind in zip(drawn, ((-30, 3), (-50, -2), (-20, -3)), ("hollow", "lens", "disc"), strict=True):
+        np.testing.assert_allclose(shape.points.mean(0), [x, y], atol=0.2)
+        assert (shape.fill == shapes.MOVING) == (kind != "hollow") and (len(shape.points) > 6) == (kind == "disc")
+    assert shapes.parked(beside(trajectory).others).tolist() == [True, False, True]
+    pictures.trajectory_figure(beside(trajectory))
+    wrong = beside(trajectory)
+    with pytest.raises(canvas.TrajectoryError, match=r"others\.yaw: shape \(61, 2\)"):
+        canvas.check(wrong._replace(others=wrong.others._replace(yaw=np.zeros((61, 2)))))
 
 
 # Tables

@@ -46,12 +46,12 @@ def config():
     return scenefactory_jax.load("task")
 
 
-def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None):
+def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None, beside=others.ignore):
     parts = world.Parts(
         dynamics=glide(),
         draw_agents=draw,
         draw_weather=keep,
-        others=others.ignore,
+        others=beside,
         measure=functools.partial(facts.measure, **config["facts"]),
         judge=functools.partial(ends.judge, ending=ending or config["ends"]["ending"]),
         terms=rewards.make(config["reward"]),

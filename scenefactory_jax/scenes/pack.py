@@ -79,9 +79,6 @@ def pack(
 ) -> tuple[Scene, PackReport]:
     """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
 
-    The `others` are those who are no agents and in the box at some step from the current one on, as large as logged. Whose box overlaps an
-    agent's at the start is left out.
-
     Args:
         raw: a checked scene.
         box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
@@ -93,7 +90,7 @@ def pack(
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
         require_agents: refuse a scene in which no agent is left.
-        others: at most so many, those that come nearest to an agent's start (to the centre, without agents).
+        others: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
         others_least_m: shortest and narrowest that they may be.
 
     Raises:
@@ -102,9 +99,7 @@ def pack(
     origin, centred_on = _centre(raw, centre)
     half = box_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m)
-    if not np.isin(road["road.kind"], DRIVABLE).any():
-        place = f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on})"
-        raise SceneError(f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")
+    _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
         raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped) or 'no tracks'}")
@@ -112,8 +107,8 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    rest, others_dropped = _choose_others(raw, chosen, leaves, origin, half, others, others_least_m)
-    leaves |= _others([raw.tracks[i] for i in rest], raw, origin, first, others_least_m)
+    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, others, others_least_m)
+    leaves |= beside
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -124,7 +119,7 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
-        others_kept=len(rest),
+        others_kept=len(beside["others.kind"]),
         others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
@@ -132,6 +127,11 @@ def pack(
         metadata=dict(raw.metadata),
     )
     return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _require_lane(raw: RawScene, road: dict[str, np.ndarray], place: str) -> None:
+    if not np.isin(road["road.kind"], DRIVABLE).any():
+        raise SceneError(f"{raw.source}: roads: no driving lane within {place}")
 
 
 def _reasons(dropped: dict[str, int]) -> str:
@@ -293,7 +293,10 @@ def _recording(
 def _choose_others(
     raw: RawScene, agents: list[int], leaves: dict[str, np.ndarray], origin: Float[np.ndarray, "3"], half: float, limit: int, least: float
 ) -> tuple[list[int], dict[str, int]]:
-    """Indices of the tracks that become others, nearest to an agent's start first, and the rest counted by reason."""
+    """Indices of the tracks that become others, nearest to an agent's start (without agents: to the centre) first, and the rest by reason.
+
+    Whose box overlaps an agent's at the start is left out: the two would burst apart.
+    """
     rows = [leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")]
     boxes = np.array([corners(place, float(yaw), *size) for place, yaw, size in zip(*rows, strict=True)]).reshape(-1, 4, 2)
     starts = rows[0] if len(rows[0]) else np.zeros((1, 2))
@@ -318,12 +321,23 @@ def _choose_others(
     return kept[:limit], dropped
 
 
-def _others(tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], first: int, least: float) -> dict[str, np.ndarray]:
-    """Columns of `others`."""
+def _others(
+    raw: RawScene,
+    agents: list[int],
+    leaves: dict[str, np.ndarray],
+    origin: Float[np.ndarray, "3"],
+    half: float,
+    first: int,
+    limit: int,
+    least: float,
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Columns of `others`, and who was left out, by reason."""
+    chosen, dropped = _choose_others(raw, agents, leaves, origin, half, limit, least)
+    tracks = [raw.tracks[i] for i in chosen]
     rows = _recording(tracks, raw, origin, len(tracks), first)
     rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
     rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
-    return {f"others.{name}": leaf for name, leaf in rows.items()}
+    return {f"others.{name}": leaf for name, leaf in rows.items()}, dropped
 
 
 def _wrap(angle: Any) -> Any:
