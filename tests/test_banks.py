@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -243,9 +244,9 @@ def test_a_scene_becomes_one_model(street):
 
 def test_others_stand_in_the_model_and_can_be_hit(street):
     scene = prepared(street, agents=2).scene
-    f = np.float32
-    boxes = Boxes(f([[9, 3], [0, 0]]), f([0.7, 0]), f([0.5, 0]), f([[0, 0]] * 2), f([0, 0]), f([[4, 2]] * 2), f([np.inf] * 2),
-                  np.array([True, False]))  # fmt: skip
+    f = lambda *rows: jnp.array(rows, jnp.float32)  # noqa: E731
+    still, size = f([0, 0], [0, 0]), f([4, 2], [4, 2])
+    boxes = Boxes(f([9, 3], [0, 0]), f(0.7, 0), f(0.5, 0), still, f(0, 0), size, f(np.inf, np.inf), jnp.array([True, False]))
     model = mjcf.world(replace(scene, boxes=boxes), stand_in_car(), merge_tolerance_m=None, **LOOKS).compile()
     assert model.geom("other0").size.tolist() == [2.0, 1.0, 0.75] and model.geom("other0").contype == 1
     with pytest.raises(KeyError):

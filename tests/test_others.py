@@ -28,8 +28,8 @@ def numbers_of(name, **changes):
     return {key: value for key, value in load("task", f"others={name}")["others"].items() if key != "_target_"} | changes
 
 
-def bound(name, **changes):
-    timing = {"control_dt": CONTROL} if name == "replay" else {}
+def bound(name, *, control_dt=CONTROL, **changes):
+    timing = {"control_dt": control_dt} if name == "replay" else {}
     return functools.partial(getattr(others, name), **numbers_of(name, **changes), **timing)
 
 
@@ -93,6 +93,10 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
             np.testing.assert_array_equal(getattr(boxes, name)[seen], getattr(log, name)[seen, row])
         np.testing.assert_allclose(boxes.yaw[seen], log.yaw[seen, row], atol=1e-6)
         assert boxes.present[seen].all()
+    # 25 Hz meets every second row at 1.9999999, 3.9999998, ...: the last row too must be met
+    others_at = jax.jit(jax.vmap(lambda step: bound("replay", control_dt=0.04)(street, step)))(5 * jnp.arange(11))
+    np.testing.assert_array_equal(others_at.position[:, 1], log.position[1, ::2])
+    assert others_at.present[:, 1].all()
     third = jax.tree.map(lambda leaf: leaf[31], trace)
     np.testing.assert_allclose(third.position[1], [-10 + 8 * 31 / 30, 3.5], atol=1e-4)
     np.testing.assert_allclose(third.yaw_rate[:2], [0.0, 0.2], atol=1e-4)
