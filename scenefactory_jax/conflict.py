@@ -1,31 +1,51 @@
 """Surrogate safety measures between moving circles: time to collision (TTC) and deceleration rate to avoid a crash (DRAC)."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.geometry import dot, heading, norm
-from scenefactory_jax.types import Road
+from scenefactory_jax.types import Boxes, Motion, Road
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
 
 
+class Bodies(NamedTuple):
+    """Everybody on the road: the cars, and the boxes after them."""
+
+    position: Float[Array, "B 2"]
+    yaw: Float[Array, " B"]
+    velocity: Float[Array, "B 2"]
+    size: Float[Array, "B 2"]
+    present: Bool[Array, " B"]
+
+
+def bodies(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> Bodies:
+    """Cars and boxes as one list; its first rows are the cars."""
+    cars = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], size, active)
+    beside = (boxes.position, boxes.yaw, boxes.velocity, boxes.size, boxes.present)
+    return Bodies(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
+
+
 def pairwise(
-    centres: Float[Array, "A 3 2"],
-    radius: Float[Array, " A"],
-    velocity: Float[Array, "A 2"],
+    centres: Float[Array, "B 3 2"],
+    radius: Float[Array, " B"],
+    velocity: Float[Array, "B 2"],
     yaw: Float[Array, " A"],
     *,
     drac_gap_floor_m: float,
-) -> tuple[Float[Array, "A A"], Float[Array, "A A"]]:
-    """TTC (s) and DRAC (m/s^2) of each car (row) with each other car (column), both moving on with their present velocities.
+) -> tuple[Float[Array, "A B"], Float[Array, "A B"]]:
+    """TTC (s) and DRAC (m/s^2) of each car (row) with each other body (column), both moving on with their present velocities.
 
-    TTC: first time at which a circle of the column car, ahead of the row car's own circle, touches it; 0 when they overlap, inf when their
-    paths never meet. DRAC = closing^2 / (2 gap), largest over the circle pairs in any direction, gap not below a floor (the published
-    evaluation uses 1 m). The diagonal holds inf and 0.
+    TTC: first time at which a circle of the column's body, ahead of the row car's own circle, touches it; 0 when they overlap, inf when
+    their paths never meet. DRAC = closing^2 / (2 gap), largest over the circle pairs in any direction, gap not below a floor (the published
+    evaluation uses 1 m). The first rows of the bodies are the cars, as many as there are in `yaw`: the diagonal holds inf and 0.
     """
-    apart = centres[None, :, None, :, :] - centres[:, None, :, None, :]  # [row, column, own circle, other circle, xy]
-    relative = (velocity[None] - velocity[:, None])[:, :, None, None, :]
-    reach = (radius[:, None] + radius[None])[:, :, None, None]
+    cars = len(yaw)
+    apart = centres[None, :, None, :, :] - centres[:cars, None, :, None, :]  # [row, column, own circle, other circle, xy]
+    relative = (velocity[None] - velocity[:cars, None])[:, :, None, None, :]
+    reach = (radius[:cars, None] + radius[None])[:, :, None, None]
     distance = norm(apart)
     ahead = dot(apart, heading(yaw)[:, None, None, None, :]) > 0
 
@@ -43,7 +63,7 @@ def pairwise(
     gap = jnp.maximum(distance - reach, drac_gap_floor_m)
     drac = jnp.max(closing**2 / (2 * gap), axis=(2, 3))
 
-    self_pair = jnp.eye(len(radius), dtype=bool)
+    self_pair = jnp.eye(cars, len(radius), dtype=bool)
     return jnp.where(self_pair, jnp.inf, ttc), jnp.where(self_pair, 0.0, drac)
 
 
@@ -68,6 +88,6 @@ def with_points(
     return jnp.min(jnp.where(seen & (gap <= 0), 0.0, time), axis=(1, 2), initial=jnp.inf)
 
 
-def least(ttc: Float[Array, "A A"], other: Bool[Array, " A"]) -> Float[Array, " A"]:
+def least(ttc: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
     """Smallest TTC over the columns that count as present."""
     return jnp.min(jnp.where(other[None], ttc, jnp.inf), axis=1)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax import ends
 from scenefactory_jax.struct import replace, struct
-from scenefactory_jax.types import Env, Events, Outcome, Scene, State
+from scenefactory_jax.types import Boxes, Env, Events, Outcome, Scene, State
 
 Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 
@@ -45,6 +45,7 @@ class Frame:
     active: Bool[Array, " A"]
     goal: Float[Array, "A 2"]
     events: Events
+    others: Boxes
 
 
 @struct
@@ -96,7 +97,7 @@ def play(
         motion = state.motion
         frame = Frame(
             motion.position[:, :2], motion.yaw, jnp.linalg.norm(motion.velocity[:, :2], axis=1), before.active, state.agents.goal,
-            outcome.events
+            outcome.events, env.now(scene, state).boxes
         )
         return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
 

@@ -38,18 +38,18 @@ def measure(
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
     Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
-    tangent turned towards the goal; TTC and DRAC among active cars; edges touched by the bounding circles.
+    tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
     """
-    motion, active = after.motion, before.active
+    motion, active, cars = after.motion, before.active, len(before.active)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    centres, radius = car_circles(position, motion.yaw, after.agents.size, **circles)
-    ttc, drac = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
-    speed = norm(velocity)
-    to_goal = after.agents.goal - position
+    everyone = conflict.bodies(motion, after.agents.size, active, scene.boxes)
+    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    speed, to_goal = norm(velocity), after.agents.goal - position
     lane = _measure_lane(scene, before, position, motion, to_goal)
-    to_edges = distance_to_segments(centres, scene.edges, half_width_m=edge_half_width_m)
+    to_edges = distance_to_segments(centres[:cars], scene.edges, half_width_m=edge_half_width_m)
     edge_gap = jnp.min(to_edges, axis=(1, 2), initial=jnp.inf) - edge_radius_m
-    edge_ttc = conflict.with_points(centres, radius, velocity, motion.yaw, scene.edges, range_m=edge_range_m)
+    edge_ttc = conflict.with_points(centres[:cars], radius[:cars], velocity, motion.yaw, scene.edges, range_m=edge_range_m)
     strayed = norm(position - after.agents.position)
 
     outside = jnp.max(jnp.abs(position), axis=1) > 0.5 * box_m
@@ -66,10 +66,10 @@ def measure(
         speed=speed,
         goal_distance=norm(to_goal),
         **lane,
-        ttc=conflict.least(ttc, active),
+        ttc=conflict.least(ttc, everyone.present),
         edge_ttc=edge_ttc,
         edge_gap=edge_gap,
-        drac=jnp.max(jnp.where(active[None], drac, 0.0), axis=1),
+        drac=jnp.max(jnp.where(everyone.present[None], drac, 0.0), axis=1),
         strayed=strayed,
         contact_force=motion.contact_force,
         grip=motion.grip,

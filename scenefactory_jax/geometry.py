@@ -69,6 +69,14 @@ def car_circles(
     return centres, radius
 
 
+def distance_to_boxes(
+    point: Float[Array, "*n 2"], position: Float[Array, "B 2"], yaw: Float[Array, " B"], size: Float[Array, "B 2"]
+) -> Float[Array, "*n B"]:
+    """Distance from points to the outlines of oriented boxes; 0 inside."""
+    beyond = jnp.abs(to_frame(point[..., None, :] - position, yaw)) - size / 2
+    return norm(jnp.maximum(beyond, 0.0))
+
+
 def nearest_segment(position: Float[Array, "A 2"], road: Road) -> tuple[Int[Array, " A"], Bool[Array, ""]]:
     """Row of the valid segment whose midpoint is nearest, and whether there is any. Ties go to the first in storage order."""
     offset = position[:, None, :] - road.midpoint

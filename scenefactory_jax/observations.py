@@ -70,23 +70,23 @@ def neighbours(
     scene: Scene, state: State, *, count: int, distance_scale_m: float, speed_scale_mps: float, ttc_scale_s: float, circles: dict[str,
     float]
 ) -> Rows:
-    """The nearest other active cars: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
-    motion, agents = state.motion, state.agents
-    position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    others = state.active[None] & ~jnp.eye(len(state.active), dtype=bool)
-    apart = position[None] - position[:, None]
+    """The nearest other active cars and boxes: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
+    motion, cars = state.motion, len(state.active)
+    position, yaws, velocity, size, present = conflict.bodies(motion, state.agents.size, state.active, scene.boxes)
+    others = present[None] & ~jnp.eye(cars, len(present), dtype=bool)
+    apart = position[None] - position[:cars, None]
     squared = jnp.where(others, dot(apart, apart), jnp.inf)
-    rows = min(count, len(state.active))
+    rows = min(count, len(present))
     order = jnp.argsort(squared, axis=1)[:, :rows]
     mask = jnp.take_along_axis(others, order, axis=1)
 
-    centres, radius = car_circles(position, motion.yaw, agents.size, **circles)
+    centres, radius = car_circles(position, yaws, size, **circles)
     ttc, _ = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=1.0)
     time = jnp.minimum(jnp.take_along_axis(ttc, order, axis=1) / ttc_scale_s, 1.0)
-    place = to_frame(position[order] - position[:, None], motion.yaw[:, None]) / distance_scale_m
-    yaw = wrap_angle(motion.yaw[order] - motion.yaw[:, None]) / jnp.pi
+    place = to_frame(position[order] - position[:cars, None], motion.yaw[:, None]) / distance_scale_m
+    yaw = wrap_angle(yaws[order] - motion.yaw[:, None]) / jnp.pi
     speed = norm(velocity)[order] / speed_scale_mps
-    columns = [place, agents.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
+    columns = [place, size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
     features = jnp.where(mask[..., None], jnp.concatenate(columns, axis=-1), 0.0)
     padding = count - rows
     return Rows(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.geometry import CONTIGUOUS_M, heading, locate, norm, running_length
+from scenefactory_jax.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
 from scenefactory_jax.struct import replace
-from scenefactory_jax.types import Agents, Scene
+from scenefactory_jax.types import Agents, Boxes, Scene
 
 
 def logged(key: PRNGKeyArray, scene: Scene) -> Agents:
@@ -33,9 +33,9 @@ def random_pairs(
 ) -> Agents:
     """Random start-goal pairs on the lanes, every slot filled where there is room (facts 4.7).
 
-    Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to
-    length; starts keep `start_gap` from other starts and goals `goal_gap` from other goals. A slot none of whose candidates
-    fits stays absent. Speed at the start is zero.
+    Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to length;
+    starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot none of
+    whose candidates fits stays absent. Speed at the start is zero.
     """
     slots = scene.agents.present.shape[0]
     place_key, travel_key = jax.random.split(key)
@@ -53,6 +53,7 @@ def random_pairs(
         & (jnp.abs(goal_arc - start_arc - travel) < CONTIGUOUS_M)
         & (jnp.abs(last_arc - first_arc - travel - 2 * margin_m) < 2 * CONTIGUOUS_M)
     )
+    unbroken &= ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
     chosen, present = _choose(start, goal, unbroken, start_gap_m=start_gap_m, goal_gap_m=goal_gap_m)
     pick = lambda rows: jnp.take_along_axis(rows, chosen.reshape((-1, 1) + (1,) * (rows.ndim - 2)), axis=1)[:, 0]  # noqa: E731
     hide = lambda rows: jnp.where(present.reshape((-1,) + (1,) * (rows.ndim - 1)), rows, 0.0).astype(jnp.float32)  # noqa: E731
@@ -92,10 +93,18 @@ def _choose(
     return chosen, present
 
 
-def is_clear(agents: Agents, position: Float[Array, "A 2"], active: Bool[Array, " A"], *, clear_m: float) -> Bool[Array, " A"]:
-    """Whether no active car stands within `clear_m` of each agent's start."""
+def is_clear(
+    agents: Agents, position: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes, *, clear_m: float
+) -> Bool[Array, " A"]:
+    """Whether no active car stands within `clear_m` of each agent's start, nor the outline of a box within half of it."""
     near = norm(agents.position[:, None] - position[None]) < clear_m
-    return ~jnp.any(near & active[None] & ~jnp.eye(len(active), dtype=bool), axis=1)
+    taken = jnp.any(near & active[None] & ~jnp.eye(len(active), dtype=bool), axis=1)
+    return ~taken & ~_beside(agents.position, boxes, within_m=0.5 * clear_m)
+
+
+def _beside(point: Float[Array, "*n 2"], boxes: Boxes, *, within_m: float) -> Bool[Array, "*n"]:
+    """Whether a point is nearer than that to the outline of a box that is present."""
+    return jnp.any((distance_to_boxes(point, boxes.position, boxes.yaw, boxes.size) < within_m) & boxes.present, axis=-1)
 
 
 def forward(agents: Agents) -> Float[Array, "A 2"]:

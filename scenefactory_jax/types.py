@@ -1,18 +1,21 @@
 """Every type that crosses a module border.
 
-Axes: `A` agent slots, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written for one world and
-`jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from world x; anything
-else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
+Axes: `A` agent slots, `O` others on the road, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written
+for one world and `jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from
+world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from scenefactory_jax.struct import struct
 
 SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
+
+RoadUser = Literal["vehicle", "pedestrian", "cyclist", "other"]
+ROAD_USERS: tuple[RoadUser, ...] = get_args(RoadUser)  # the order of `Tracks.kind`
 
 # WOMD map element ids: the `kind` of a road segment (Waymo Open Motion Dataset, map.proto and GPUDrive's MapElementIds)
 LANE_FREEWAY, LANE_STREET, LANE_BIKE = 1, 2, 3
@@ -58,6 +61,18 @@ class Log:
     velocity: Float[Array, "A L 2"]
     valid: Bool[Array, "A L"]
     dt: Float[Array, ""]
+
+
+@struct
+class Tracks:
+    """What everybody else on the road did in the recording: who was there and is no agent, at the steps of `Log`."""
+
+    position: Float[Array, "O L 2"]
+    yaw: Float[Array, "O L"]
+    velocity: Float[Array, "O L 2"]
+    valid: Bool[Array, "O L"]
+    size: Float[Array, "O 2"]  # length, width
+    kind: Int[Array, " O"]  # index into ROAD_USERS
 
 
 @struct
@@ -112,7 +127,7 @@ class Boxes:
 
 @struct
 class Scene:
-    """One world as the graph sees it: constant in an episode, except that a reset may redraw agents and weather.
+    """One world as the graph sees it: constant in an episode, except for agents and weather, which a reset may redraw, and the boxes.
 
     `lanes` (kinds DRIVABLE) and `edges` (kinds EDGES) repeat rows of `road`, so that looking for the nearest lane or edge does not walk
     over everything else. Coordinates are metres around the scene's centre.
@@ -124,6 +139,8 @@ class Scene:
     agents: Agents
     log: Log
     weather: Weather
+    others: Tracks
+    boxes: Boxes  # where the others are now; nobody is there until an environment says so
 
 
 @struct
@@ -136,7 +153,7 @@ class Motion:
     yaw_rate: Float[Array, " A"]
     upright: Float[Array, " A"]  # cosine between the car's and the world's up
     steer: Float[Array, " A"]  # mean angle of the front wheels
-    contact_force: Float[Array, " A"]  # largest car-to-car force of the last control step, N
+    contact_force: Float[Array, " A"]  # largest force of another car or box in the last control step, N
     grip: Float[Array, " A"]  # friction coefficient, mean over the wheels
     grip_use: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
     slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
@@ -164,7 +181,7 @@ class Facts:
     lane_distance: Float[Array, " A"]  # distance from its midpoint
     lane_alignment: Float[Array, " A"]  # cosine between the car and the lane, towards the goal
     has_lane: Bool[Array, " A"]
-    ttc: Float[Array, " A"]  # time to collision with the nearest other car, inf if none
+    ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
     edge_ttc: Float[Array, " A"]
     edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2
@@ -241,14 +258,16 @@ class Dynamics(NamedTuple):
 
 
 class Env(NamedTuple):
-    """One world as pure functions. `reset` and `step` are the public pair; the other three are their parts, so that a training loop can
-    reset finished worlds before it pays for the observation."""
+    """One world as pure functions. `reset` and `step` are the public pair; the next three are their parts, so that a training loop can
+    reset finished worlds before it pays for the observation. `now` gives the scene as it is at a state's moment, for dynamics and
+    viewers."""
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
     start: Callable[[PRNGKeyArray, Scene], State]
     transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
     observe: Callable[[Scene, State], Observation]
+    now: Callable[[Scene, State], Scene]
 
 
 class Policy(NamedTuple):

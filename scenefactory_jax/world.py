@@ -1,4 +1,4 @@
-"""Env for ONE world, made of dynamics, spawn, weather, facts, ends, rewards and observations.
+"""Env for ONE world, made of dynamics, spawn, weather, others, facts, ends, rewards and observations.
 
 `make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both
 give pure functions to put under one's own `jit`, `vmap` and `scan`.
@@ -10,21 +10,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax import conditions, ends, observations, rain, rewards, spawn
 from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.struct import choose, replace, strong
-from scenefactory_jax.types import Agents, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
+from scenefactory_jax.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
 
 def make(config: Mapping[str, Any]) -> Env:
-    """The environment of a config with the groups timing, dynamics, weather, spawn, facts, ends, reward and observe.
+    """The environment of a config with the groups timing, dynamics, weather, spawn, others, facts, ends, reward and observe.
 
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
-    _require(config, ("timing", "dynamics", "weather", "spawn", "facts", "ends", "reward", "observe"))
+    _require(config, ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
     timing = config["timing"]
     for key in ("physics_hz", "control_hz", "episode_s"):
         if key not in timing:
@@ -42,6 +42,7 @@ def make(config: Mapping[str, Any]) -> Env:
         dynamics=dynamics,
         draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
         draw_weather=conditions.make(config["weather"]),
+        others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
         measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
         judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.ends", where="ends"),
         terms=rewards.make(config["reward"], **context),
@@ -64,6 +65,7 @@ class Parts(NamedTuple):
     dynamics: Dynamics
     draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
     draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
+    others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
     measure: Callable[[Scene, State, State], Facts]
     judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
     terms: Mapping[str, tuple[float, rewards.Term]]
@@ -89,12 +91,18 @@ def assemble(parts: Parts) -> Env:
     def bind(function: Callable) -> Callable:
         return functools.partial(function, parts)
 
-    return Env(reset, step, bind(_start), bind(_transition), bind(_observe))
+    return Env(reset, step, bind(_start), bind(_transition), bind(_observe), bind(_now))
+
+
+def _now(parts: Parts, scene: Scene, state: State) -> Scene:
+    """The scene as it is at a state's moment: this episode's agents and weather, and the others where they are."""
+    return replace(scene, agents=state.agents, weather=state.weather, boxes=parts.others(scene, state.step))
 
 
 def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
     """A fresh episode."""
     agents_key, weather_key, key = jax.random.split(key, 3)
+    scene = replace(scene, boxes=parts.others(scene, jnp.int32(0)))
     agents, weather = parts.draw_agents(agents_key, scene), parts.draw_weather(weather_key, scene)
     body = parts.dynamics.init(jax.random.fold_in(key, 0), replace(scene, agents=agents, weather=weather))
     count = agents.present.shape[0]
@@ -115,9 +123,10 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
 
 def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
     """One control step, without the observation."""
-    scene = replace(scene, agents=state.agents, weather=rain.pass_time(state.weather, dt=parts.control_dt))
+    scene = _now(parts, scene, replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt)))
     action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
+    scene = _now(parts, scene, after)
     measured, after = _quarantine(parts.measure(scene, state, after), state, after)
     events, done = parts.judge(measured, state.happened, state.active)
     after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
@@ -132,7 +141,7 @@ def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "
 
 
 def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
-    return observations.observe(replace(scene, agents=state.agents, weather=state.weather), state, parts.groups)
+    return observations.observe(_now(parts, scene, state), state, parts.groups)
 
 
 def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
@@ -167,7 +176,7 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
     body_key = jax.random.fold_in(draw_key, 0)
     fresh = draw_agents(draw_key, scene)
     waiting = ~state.active & fresh.present
-    clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, clear_m=clear_m)
+    clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
     begins = waiting & clear
     agents = choose(begins, fresh, state.agents)
     body = choose(begins, dynamics.init(body_key, replace(scene, agents=agents)), state.body)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Road, Scene
 from scenefactory_jax.weather import uniform
 
@@ -80,5 +81,5 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     )
     return Scene(
         road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
-        weather=uniform(jnp.float32(0.0), jnp.int32(0)),
+        weather=uniform(jnp.float32(0.0), jnp.int32(0)), others=unrecorded(steps), boxes=nobody(),
     )

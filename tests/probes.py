@@ -12,7 +12,7 @@ from scenefactory_jax.types import Env, Events, Facts, Motion, Outcome, Scene, S
 from scenefactory_jax.weather import uniform
 
 AGENTS = 3
-SIZES = {"A": AGENTS, "P": 1, "L": 1}
+SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0}
 PRESENT = jnp.array([True, True, False])
 POISON = 1e6
 
@@ -127,4 +127,4 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
         state, outcome = transition(scene, state, action)
         return state, dataclasses.replace(outcome, observation=observe(scene, state))
 
-    return Env(reset, step, start, transition, observe)
+    return Env(reset, step, start, transition, observe, lambda scene, state: scene)

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, pack
 
 from scenefactory_jax.scenes import bank, columns, convert, mjcf, source, stack
 from scenefactory_jax.scenes.raw import SceneError
-from scenefactory_jax.types import Scene
+from scenefactory_jax.types import Boxes, Scene
 
 NONE = dict.fromkeys(stack.AXES)
 
@@ -35,7 +36,7 @@ def street(tmp_path, readers):
 def test_stack_pads_with_masked_rows(street):
     small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
     stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS} and not report.cuts
+    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "others": 0} and not report.cuts
     assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
     for world, scene in enumerate((small, large)):
         for name, leaf in columns.flatten(scene).items():
@@ -141,7 +142,7 @@ def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
         bank.open(path)
     index = json.loads((path / bank.INDEX).read_text())
     (path / bank.INDEX).write_text(json.dumps(index | {"schema": 99}))
-    with pytest.raises(SceneError, match="a bank of schema 99; this version reads 1"):
+    with pytest.raises(SceneError, match="a bank of schema 99; this version reads 2"):
         bank.open(path)
 
 
@@ -219,7 +220,7 @@ def stand_in_car():
     return car
 
 
-LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "box_m": 200.0}
+LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "other_height_m": 1.5, "box_m": 200.0}
 
 
 def test_a_scene_becomes_one_model(street):
@@ -239,6 +240,17 @@ def test_a_scene_becomes_one_model(street):
     mujoco.MjModel.from_xml_string(model.to_xml())
     with pytest.raises(ValueError, match="free joint"):
         mjcf.world(scene, mujoco.MjSpec(), merge_tolerance_m=None, **LOOKS)
+
+
+def test_others_stand_in_the_model_and_can_be_hit(street):
+    scene = prepared(street, agents=2).scene
+    f = lambda *rows: jnp.array(rows, jnp.float32)  # noqa: E731
+    still, size = f([0, 0], [0, 0]), f([4, 2], [4, 2])
+    boxes = Boxes(f([9, 3], [0, 0]), f(0.7, 0), f(0.5, 0), still, f(0, 0), size, f(np.inf, np.inf), jnp.array([True, False]))
+    model = mjcf.world(replace(scene, boxes=boxes), stand_in_car(), merge_tolerance_m=None, **LOOKS).compile()
+    assert model.geom("other0").size.tolist() == [2.0, 1.0, 0.75] and model.geom("other0").contype == 1
+    with pytest.raises(KeyError):
+        model.geom("other1")
 
 
 def test_merged_segments_stay_within_the_tolerance(street):

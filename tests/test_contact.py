@@ -1,6 +1,4 @@
-"""Forces between boxes: brute-force SAT, conservation laws, symmetry, and what must not touch."""
-
-import functools
+"""Forces between boxes: brute-force SAT, conservation laws, symmetry, masses from 80 kg to a wall, and what must not touch."""
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +8,40 @@ import yaml
 from conftest import ROOT
 
 from scenefactory_jax.dynamics import contact
+from scenefactory_jax.struct import replace
+from scenefactory_jax.tracks import nobody
+from scenefactory_jax.types import Boxes
 
 NUMBERS = yaml.safe_load((ROOT / "conf" / "dynamics" / "base.yaml").read_text())["contact"]
-forces = jax.jit(functools.partial(contact.forces, **NUMBERS, height=1.0))
+MASS = NUMBERS["mass"]
 touch = jax.jit(jax.vmap(contact.touch))
 
 
-def crowd(seed, count=8, spread=6.0):
+def with_numbers(**changes):
+    model = contact.make(**{**NUMBERS, "height": 1.0, **changes})
+    return lambda cars, others: model.forces(cars, model.neighbours(cars, others))
+
+
+both = jax.jit(with_numbers())
+
+
+def forces(cars):
+    return both(cars, nobody())
+
+
+def boxes(position, *, z=0.75, yaw=0.0, velocity=0.0, yaw_rate=0.0, size=(4.0, 2.0), mass=MASS, present=True) -> Boxes:
+    position = jnp.asarray(position, jnp.float32)
+    full = lambda value, *tail: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (len(position), *tail))  # noqa: E731
+    there = jnp.broadcast_to(jnp.asarray(present), (len(position),))
+    return Boxes(position, full(z), full(yaw), full(velocity, 2), full(yaw_rate), full(size, 2), full(mass), there)
+
+
+def crowd(seed, count=8, spread=6.0, mass=MASS):
     """Cars of several sizes in a heap, so that many pairs overlap."""
     rng = np.random.default_rng(seed)
-    position = np.concatenate([rng.uniform(-spread, spread, (count, 2)), np.full((count, 1), 0.75)], axis=1)
-    state = (position, rng.uniform(-4, 4, count), rng.normal(0, 8, (count, 2)), rng.normal(0, 2, count))
-    size = rng.uniform([3.0, 1.5], [6.0, 2.5], (count, 2))
-    return (*(jnp.asarray(x, jnp.float32) for x in (*state, size)), jnp.ones(count, bool))
+    state = dict(position=rng.uniform(-spread, spread, (count, 2)), yaw=rng.uniform(-4, 4, count))
+    state |= dict(velocity=rng.normal(0, 8, (count, 2)), yaw_rate=rng.normal(0, 2, count))
+    return boxes(**state, size=rng.uniform([3.0, 1.5], [6.0, 2.5], (count, 2)), mass=mass)
 
 
 def corners(centre, yaw, half):
@@ -79,11 +98,13 @@ def test_contact_points_of_shallow_touches_lie_in_both_boxes():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_momentum_is_kept(seed):
-    position, yaw, velocity, yaw_rate, size, active = crowd(seed)
-    force, torque, largest = (np.asarray(x, np.float64) for x in forces(position, yaw, velocity, yaw_rate, size, active))
+    masses = np.array([80.0, MASS, 1e4, 500.0, MASS, 80.0, 3e4, 900.0]) if seed % 2 else MASS
+    cars = crowd(seed, mass=masses)
+    force, torque, largest = (np.asarray(x, np.float64) for x in forces(cars))
     scale = np.abs(force).sum()
     assert scale > 1e5 and largest.max() > 1e4
     np.testing.assert_allclose(force.sum(0) / scale, 0, atol=1e-6)
+    position = np.asarray(cars.position, np.float64)
     about_origin = torque + position[:, 0] * force[:, 1] - position[:, 1] * force[:, 0]
     assert abs(about_origin.sum()) / (scale * 6) < 1e-6
 
@@ -91,81 +112,179 @@ def test_momentum_is_kept(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_friction_and_damping_never_add_energy(seed):
     """With springs away (depths tiny compared to speeds), contact power is not positive."""
-    position, yaw, velocity, yaw_rate, size, active = crowd(seed)
-    soft = jax.jit(functools.partial(contact.forces, **{**NUMBERS, "stiffness": 0.0}, height=1.0))
-    force, torque, _ = soft(position, yaw, velocity, yaw_rate, size, active)
-    assert float((force * velocity).sum() + (torque * yaw_rate).sum()) < 0
+    cars = crowd(seed)
+    force, torque, _ = jax.jit(with_numbers(stiffness=0.0))(cars, nobody())
+    assert float((force * cars.velocity).sum() + (torque * cars.yaw_rate).sum()) < 0
 
 
 def test_permuting_cars_permutes_forces():
-    state = crowd(7)
+    cars = crowd(7)
     order = np.random.default_rng(0).permutation(8)
-    straight = forces(*state)
-    shuffled = forces(*(x[order] for x in state))
-    for a, b in zip(straight, shuffled, strict=True):
+    shuffled = forces(jax.tree.map(lambda leaf: leaf[order], cars))
+    for a, b in zip(forces(cars), shuffled, strict=True):
         np.testing.assert_allclose(a[order], b, rtol=2e-4, atol=50.0)
 
 
 def test_turning_the_world_turns_the_forces():
-    position, yaw, velocity, yaw_rate, size, active = crowd(8)
+    cars = crowd(8)
     angle = 0.7
     turn = jnp.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], jnp.float32)
-    turned = position.at[:, :2].set(position[:, :2] @ turn + jnp.array([10.0, -5.0]))
-    force, torque, largest = forces(position, yaw, velocity, yaw_rate, size, active)
-    other = forces(turned, yaw + angle, velocity @ turn, yaw_rate, size, active)
+    place = cars.position @ turn + jnp.array([10.0, -5.0])
+    force, torque, largest = forces(cars)
+    other = forces(replace(cars, position=place, yaw=cars.yaw + angle, velocity=cars.velocity @ turn))
     for a, b in zip((force @ turn, torque, largest), other, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=100.0)
 
 
-def two(gap, *, closing=0.0, lateral=0.0, z=0.0, shift=0.0):
-    position = jnp.array([[0.0, 0.0, 0.75], [4.0 + gap, shift, 0.75 + z]])
-    velocity = jnp.array([[closing, lateral], [0.0, 0.0]])
-    return position, jnp.zeros(2), velocity, jnp.zeros(2), jnp.array([[4.0, 2.0]] * 2), jnp.ones(2, bool)
+def two(gap, *, closing=0.0, lateral=0.0, z=0.0, shift=0.0, **changes):
+    return boxes([[0.0, 0.0], [4.0 + gap, shift]], z=[0.75, 0.75 + z], velocity=[[closing, lateral], [0.0, 0.0]], **changes)
+
+
+def split(pair):
+    """The first box as the only car, the second as somebody else."""
+    row = lambda i: jax.tree.map(lambda leaf: leaf[i : i + 1], pair)  # noqa: E731
+    return row(0), row(1)
 
 
 def test_pushes_apart_brakes_sliding_and_never_pulls():
-    force, torque, largest = forces(*two(-0.01, closing=1.0))
+    force, torque, largest = forces(two(-0.01, closing=1.0))
     assert force[0, 0] < -9e3 and force[1, 0] == -force[0, 0] and largest[0] == largest[1] == force[1, 0]
     np.testing.assert_allclose(torque, 0, atol=1.0)
-    force, _, _ = forces(*two(-0.01, closing=-10.0))
+    force, _, _ = forces(two(-0.01, closing=-10.0))
     np.testing.assert_array_equal(force, 0)
-    force, _, _ = forces(*two(-0.01, lateral=2.0))
+    force, _, _ = forces(two(-0.01, lateral=2.0))
     assert float(force[0, 1]) == pytest.approx(NUMBERS["friction"] * float(force[0, 0]), rel=1e-3)
-    force, torque, _ = forces(*two(-0.01, closing=1.0, shift=1.0))
+    force, torque, _ = forces(two(-0.01, closing=1.0, shift=1.0))
     assert torque[0] > 1e3 and torque[1] > 1e3  # pushed back on the left, and forward on the right: both turn left
 
 
 def test_what_does_not_touch_feels_nothing():
-    for state in (two(0.01, closing=20.0), two(-1.0, z=1.01)):
-        assert all(not np.asarray(x).any() for x in forces(*state))
-    assert all(not np.asarray(x).any() for x in forces(*two(-1.0)[:-1], jnp.array([True, False])))
-    assert all(not np.asarray(x).any() for x in contact.forces(*(x[:1] for x in two(-1.0)), **NUMBERS, height=1.0))
+    for state in (two(0.01, closing=20.0), two(-1.0, z=1.01), two(-1.0, present=[True, False])):
+        assert all(not np.asarray(x).any() for x in (*forces(state), *both(*split(state))))
+    alone = jax.tree.map(lambda leaf: leaf[:1], two(-1.0))
+    assert all(not np.asarray(x).any() for x in with_numbers()(alone, nobody()))
 
 
 def test_a_touch_is_felt_within_a_tenth_of_a_millimetre():
-    _, _, largest = forces(*two(-1e-4))
+    _, _, largest = forces(two(-1e-4))
     assert largest.min() > 25.0
 
 
-@pytest.mark.parametrize("leaf", range(4))
+@pytest.mark.parametrize("leaf", ["position", "velocity", "yaw", "yaw_rate", "elevation"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_broken_car_touches_nobody(leaf, bad):
-    state = list(crowd(2))
-    state[leaf] = state[leaf].at[3].set(bad)
-    got = forces(*state)
-    state[leaf] = state[leaf].at[3].set(0.0)
-    state[5] = state[5].at[3].set(False)
-    for a, b in zip(got, forces(*state), strict=True):
+    cars = crowd(2)
+    broken = replace(cars, **{leaf: getattr(cars, leaf).at[3].set(bad)})
+    absent = replace(cars, present=cars.present.at[3].set(False))
+    for a, b in zip(forces(broken), forces(absent), strict=True):
         np.testing.assert_array_equal(a, b)
         assert np.isfinite(a).all()
 
 
 def test_gradients_are_finite_in_a_heap_apart_and_exactly_aligned():
-    def total(position, yaw, velocity, yaw_rate, size, active):
-        force, torque, largest = contact.forces(position, yaw, velocity, yaw_rate, size, active, **NUMBERS, height=1.0)
+    def total(position, yaw, velocity, yaw_rate, cars, others):
+        force, torque, largest = with_numbers()(replace(cars, position=position, yaw=yaw, velocity=velocity, yaw_rate=yaw_rate), others)
         return (force**2).sum() + (torque**2).sum() + largest.sum()
 
     slope = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))
-    aligned = (jnp.zeros((8, 3)), jnp.zeros(8), jnp.zeros((8, 2)), jnp.zeros(8), jnp.ones((8, 2)), jnp.ones(8, bool))
-    for state in (crowd(1), crowd(1, spread=500.0), aligned):
-        assert all(np.isfinite(g).all() for g in slope(*state))
+    walls = crowd(2, count=6, mass=[np.inf, 80.0, np.inf, 100.0, np.inf, 80.0])
+    for cars in (crowd(1), crowd(1, spread=500.0), boxes(np.zeros((8, 2)), z=0.0, size=1.0)):
+        assert all(np.isfinite(g).all() for g in slope(cars.position, cars.yaw, cars.velocity, cars.yaw_rate, cars, walls))
+
+
+# ---- others: walls, people, and what is too far away
+
+
+def test_stiffness_follows_the_reduced_mass():
+    equal = float(forces(two(-0.01, closing=1.0))[2][0])
+    for mass, factor in ((MASS, 1.0), (80.0, 2 * 80 / (MASS + 80)), (3 * MASS, 1.5)):
+        _, _, largest = forces(two(-0.01, closing=1.0, mass=[MASS, mass]))
+        assert float(largest[0]) == pytest.approx(factor * equal, rel=1e-4)
+    assert float(both(*split(two(-0.01, closing=1.0, mass=[MASS, np.inf])))[2][0]) == pytest.approx(2 * equal, rel=1e-4)
+
+
+def test_boxes_are_felt_as_cars_are():
+    """A wall is twice a parked car's equal: same place, same direction, same torque."""
+    pair = two(-0.05, closing=3.0, lateral=1.0, shift=0.7)
+    force, torque, _ = forces(pair)
+    against, twist, _ = both(*split(replace(pair, mass=jnp.array([MASS, np.inf], jnp.float32))))
+    np.testing.assert_allclose(against[0], 2 * force[0], rtol=1e-4)
+    np.testing.assert_allclose(twist[0], 2 * torque[0], rtol=1e-4)
+
+
+def test_far_absent_and_broken_boxes_change_nothing():
+    cars, wall = split(two(-0.05, closing=3.0, shift=0.5, mass=[MASS, np.inf]))
+    alone = both(cars, wall)
+    assert float(alone[2][0]) > 1e4
+    extra = boxes(
+        [[0.0, 0.5], [500.0, 0.0], [1.0, 0.0], [np.nan, 0.0], [0.0, 0.0], [0.5, 0.1], [60.0, 1.0]],
+        present=[False, True, True, True, True, True, True], z=[0.75, 0.75, 5.0, 0.75, 0.75, 0.75, 0.75],
+        velocity=[[0.0, 0.0]] * 4 + [[np.inf, 0.0]] + [[0.0, 0.0]] * 2, yaw=[0, 0, 0, 0, 0, np.nan, 0], mass=np.inf,
+    )  # fmt: skip
+    crowd_of = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wall, extra)
+    for order in (np.arange(8), np.arange(8)[::-1], np.random.default_rng(0).permutation(8)):
+        for a, b in zip(alone, both(cars, jax.tree.map(lambda leaf, order=order: leaf[order], crowd_of)), strict=True):
+            np.testing.assert_array_equal(a, b)
+    for a, b in zip(forces(cars), both(cars, extra), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_neighbours_are_the_nearest_by_their_outlines():
+    cars = boxes([[0.0, 0.0], [100.0, 0.0]])
+    others = boxes([[9.0, 0.0], [6.0, 0.0], [101.0, 0.0], [0.0, 5.0]], size=[[18.0, 2.5], [0.8, 0.8], [4.0, 2.0], [4.0, 2.0]],
+                   present=[True, True, True, False])  # fmt: skip
+    near = contact.neighbours(cars, others, nearest=2)
+    np.testing.assert_array_equal(near.position[:, :, 0], [[9.0, 6.0], [101.0, 9.0]])  # the long one's front is nearer than the person
+    assert contact.neighbours(cars, others, nearest=9).position.shape == (2, 4, 2)
+    assert contact.neighbours(cars, nobody(), nearest=4).position.shape == (2, 0, 2)
+
+
+def collide(masses, speed, *, offset=0.0, steps=240, dt=1 / 120, driven=False):
+    """Two boxes, the first at `speed` towards the second, which is free or stays; semi-implicit Euler as the substeps do it."""
+    size = jnp.array([[4.0, 2.0], [4.0, 2.0] if masses[1] > 500 else [0.8, 0.8]])
+    pair = boxes([[0.0, 0.0], [2.2 + float(size[1, 0]) / 2, offset]], velocity=[[speed, 0.0], [0.0, 0.0]], size=size, mass=masses)
+    inertia = pair.mass * (size**2).sum(-1) / 12
+
+    def step(state, _):
+        if driven:
+            cars, others = split(state)
+            force, torque, largest = with_numbers()(cars, others)
+            force, torque = (jnp.concatenate([x, jnp.zeros_like(x)]) for x in (force, torque))
+            largest = jnp.concatenate([largest, largest])
+        else:
+            force, torque, largest = with_numbers()(state, nobody())
+        velocity = state.velocity + dt * force / state.mass[:, None]
+        rate = state.yaw_rate + dt * torque / inertia
+        moved = replace(state, position=state.position + dt * velocity, yaw=state.yaw + dt * rate, velocity=velocity, yaw_rate=rate)
+        return moved, (moved, largest)
+
+    _, (trace, largest) = jax.lax.scan(step, pair, length=steps)
+    spin, run = inertia * trace.yaw_rate**2, pair.mass * (trace.velocity**2).sum(-1)
+    energy = jnp.where(jnp.isfinite(pair.mass), 0.5 * (spin + run), 0.0).sum(-1)
+    return trace, np.asarray(energy), np.asarray(largest)
+
+
+@pytest.mark.parametrize("masses", [(80.0, 80.0), (MASS, 80.0), (MASS, MASS), (MASS, 4e4), (80.0, 4e4), (MASS, np.inf)], ids=str)
+@pytest.mark.parametrize("offset", [0.0, 0.8])
+def test_collisions_of_any_masses_are_stable_and_lose_energy(masses, offset):
+    walled = not np.isfinite(masses[1])
+    trace, energy, largest = collide(masses, 12.0, offset=offset, driven=walled)
+    start = 0.5 * masses[0] * 12.0**2
+    assert largest.max() > 1e3 and np.isfinite(trace.position).all()
+    assert energy[-1] < start and energy.max() < 1.02 * start
+    relative = np.asarray(trace.velocity[-1, 1, 0] - trace.velocity[-1, 0, 0])
+    assert 0.0 < relative < 12.0, "they part, slower than they met"
+    if not walled:
+        momentum = (np.asarray(masses)[:, None] * np.asarray(trace.velocity[-1], np.float64)).sum(0)
+        np.testing.assert_allclose(momentum, [masses[0] * 12.0, 0.0], atol=1e-3 * masses[0] * 12.0)
+
+
+@pytest.mark.parametrize("speed", [3.0, 10.0, 20.0])
+def test_a_person_hardly_slows_a_car_but_is_felt(speed):
+    trace, _, largest = collide((MASS, 80.0), speed, driven=True)
+    lost = speed - float(trace.velocity[-1, 0, 0])
+    assert largest.max() > 100.0, "far above the 25 N of a collision"
+    assert 0.05 < lost < 0.8, "a free body of 80 kg costs a car 4 % of its speed"
+    assert float(trace.position[-1, 0, 0]) > 4.0, "and the car drives on"
+    trace, _, _ = collide((MASS, np.inf), speed, driven=True)
+    assert float(trace.velocity[-1, 0, 0]) < 0.0, "a wall throws it back"

@@ -93,7 +93,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
         ("wrlds=3", r"wrlds: unknown key 'wrlds'; the top level has: checkpoint_every, .*worlds"),
         ("facts.circles.radius=1", r"facts\.circles\.radius: unknown key 'radius'; facts\.circles has: radius_floor_m, "),
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
-        ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, road, steps"),
+        ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, others, road, steps"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': base bicycle mjx_car mjx_published replay"),
         ("experiment=smok", r"Could not find 'experiment/smok' Available options in 'experiment': demo published quick smoke"),
         ("dynamics={_target_: mine.make, gain: 1.0}", r"to replace all of dynamics: ~dynamics \+dynamics=\{\.\.\.\}"),

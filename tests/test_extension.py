@@ -54,7 +54,7 @@ BACKEND = """
     def make(*, gain_mps2: float, height_m: float, control_dt: float):
         '''Points that throttle pushes along x and steering along y.'''
 
-        def init(scene):
+        def init(key, scene):
             return Body(scene.agents.position, jnp.zeros_like(scene.agents.position))
 
         def advance(scene, body, action, active):

@@ -38,7 +38,7 @@ def backend():
 
         return jax.lax.scan(step, body, action)
 
-    return second, jax.jit(dynamics.init)
+    return second, jax.jit(functools.partial(dynamics.init, jax.random.key(0)))
 
 
 def drive(shapes, *, speed, seconds, throttle=0.0, steer=0.0, brake=0.0):

@@ -12,7 +12,9 @@ from PIL import Image
 
 from scenefactory_jax import layouts
 from scenefactory_jax.report import areas, canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax.report import others as shapes
 from scenefactory_jax.struct import replace
+from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Scene
 from scenefactory_jax.weather import uniform
 
@@ -63,7 +65,7 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
     cars = Agents(jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool))
     row = jnp.zeros((agents, 1), f)
     log = Log(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
-    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, uniform(f(0.5), jnp.int32(1))))
+    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, uniform(f(0.5), jnp.int32(1)), unrecorded(1), nobody()))
     still = np.zeros((steps, agents), np.float32)
     return canvas.Trajectory(
         scene, position, still, still + 8, active, events, np.asarray(size), goal, np.ones(agents, bool), 30.0, title, "SMA, 0.5 mm"
@@ -73,6 +75,33 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
 @pytest.fixture(scope="module")
 def trajectory() -> canvas.Trajectory:
     return make_trajectory()
+
+
+def beside(trajectory: canvas.Trajectory) -> canvas.Trajectory:
+    """With a parked lorry, a cyclist that rides along, and a person who leaves half way."""
+    steps = len(trajectory.active)
+    place = np.stack([np.tile([-30.0, 3.0], (steps, 1)), np.stack([-50 + 0.1 * np.arange(steps), np.full(steps, -2.0)], 1),
+                      np.tile([-20.0, -3.0], (steps, 1))], axis=1)  # fmt: skip
+    size = np.tile([[9.0, 2.5], [1.8, 0.7], [0.8, 0.8]], (steps, 1, 1))
+    present = np.ones((steps, 3), bool)
+    present[steps // 2 :, 2] = False
+    return trajectory._replace(others=canvas.Others(place, np.zeros((steps, 3)), size, present))
+
+
+def test_others_are_drawn_where_they_are(trajectory):
+    film = {**FILM, "columns": 1, "panel": 400}
+    empty, full = (list(video.frames([t], **film)) for t in (trajectory, beside(trajectory)))
+    changed = [(a != b).any(-1) for a, b in zip(empty, full, strict=True)]
+    assert changed[0].sum() > changed[-1].sum() > 50, "the person has left"
+    drawn = shapes.shapes(beside(trajectory).others, 0, np.array([True, False, True]))
+    for shape, (x, y), kind in zip(drawn, ((-30, 3), (-50, -2), (-20, -3)), ("hollow", "lens", "disc"), strict=True):
+        np.testing.assert_allclose((shape.points.min(0) + shape.points.max(0)) / 2, [x, y], atol=0.2)
+        assert (shape.fill == shapes.MOVING) == (kind != "hollow") and (len(shape.points) > 6) == (kind == "disc")
+    assert shapes.parked(beside(trajectory).others).tolist() == [True, False, True]
+    pictures.trajectory_figure(beside(trajectory))
+    wrong = beside(trajectory)
+    with pytest.raises(canvas.TrajectoryError, match=r"others\.yaw: shape \(61, 2\)"):
+        canvas.check(wrong._replace(others=wrong.others._replace(yaw=np.zeros((61, 2)))))
 
 
 # Tables

@@ -9,7 +9,7 @@ import pytest
 from conftest import road_of, scene_of
 
 import scenefactory_jax
-from scenefactory_jax import conflict, ends, facts, geometry, observations, rewards, spawn, world
+from scenefactory_jax import conflict, ends, facts, geometry, observations, others, rewards, spawn, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
@@ -21,7 +21,7 @@ CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
 def glide() -> Dynamics:
     """Cars that keep their velocity; action 0 steers the speed directly. Throttle above 0.99 breaks the car (NaN)."""
 
-    def init(scene):
+    def init(key, scene):
         a = scene.agents
         return {"p": a.position, "yaw": a.yaw, "v": a.speed, "force": jnp.zeros_like(a.speed)}
 
@@ -46,11 +46,12 @@ def config():
     return scenefactory_jax.load("task")
 
 
-def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None):
+def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None, beside=others.ignore):
     parts = world.Parts(
         dynamics=glide(),
         draw_agents=draw,
         draw_weather=keep,
+        others=beside,
         measure=functools.partial(facts.measure, **config["facts"]),
         judge=functools.partial(ends.judge, ending=ending or config["ends"]["ending"]),
         terms=rewards.make(config["reward"]),

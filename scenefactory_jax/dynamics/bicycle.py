@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.build import build
+from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.geometry import heading, norm, wrap_angle
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
@@ -37,6 +38,7 @@ class Body:
 
 def make(
     *,
+    mass: float,
     wheelbase: float,
     rear_length: float,
     centre_height: float,
@@ -52,6 +54,7 @@ def make(
     """Kinematic bicycles, facts sheet 6.6, integrated once a control step as the paper says (the published code does it four times).
 
     Args:
+        mass: kg; it decides the contact force and nothing else.
         wheelbase: m.
         rear_length: from the rear axle to the box's centre, m.
         centre_height: of the box's centre above the ground, m.
@@ -60,22 +63,22 @@ def make(
         deceleration: at full brake, m/s^2; it stops the car and never reverses it.
         drag: deceleration per speed, 1/s.
         speed_limit: m/s.
-        contact: stiffness, damping and friction of `contact.forces`.
+        contact: numbers of `contact.make`.
         grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `grip_use` is the acceleration over friction times
             gravity and exceeds one where a real car would slide.
 
     Raises:
         ConfigError: an unknown or missing number of `contact`.
     """
-    entry = {**contact, "_target_": "forces"}
-    meet = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)
+    entry = {**contact, "_target_": "make"}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)()
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         moved = roll(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
         mu = grip(scene.weather, body.position, body.speed)
-        motion = read(moved, height=centre_height)
-        _, _, force = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
+        cars = boxes_of(read(moved, height=centre_height), scene.agents.size, active, mass)
+        _, _, force = meet.forces(cars, later(meet.neighbours(cars, scene.boxes), control_dt))
         along, across = (moved.speed - body.speed) / control_dt, moved.yaw_rate * moved.speed
         wanted = norm(jnp.stack([along, across], axis=-1))
         moved = replace(moved, contact_force=force, grip=mu, grip_use=wanted / (mu * GRAVITY))

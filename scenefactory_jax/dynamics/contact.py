@@ -1,19 +1,23 @@
-"""Forces between cars that touch: upright boxes seen from above, pushed apart by spring-dampers with friction.
+"""Forces between cars that touch, and on cars that touch something else: upright boxes seen from above, pushed apart by spring-dampers
+with friction.
 
-Every unordered pair is evaluated once and its force enters both cars with opposite sign at the same point, so linear and angular
+Every unordered pair of cars is evaluated once and its force enters both with opposite sign at the same point, so linear and angular
 momentum are kept to rounding. Depth and normal come from the separating-axis theorem; the face of least depth is cut against the
 other box's nearest face, which leaves two contact points, each with half the stiffness.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.geometry import cross, dot, norm
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Boxes, Motion
 
 
 class Touch(NamedTuple):
@@ -24,67 +28,145 @@ class Touch(NamedTuple):
     depths: Float[Array, "2"]
 
 
+class Contact(NamedTuple):
+    """The contact model bound to its numbers. Choose each car's neighbours once a control step, then ask for forces every substep."""
+
+    neighbours: Callable[[Boxes, Boxes], Boxes]  # (cars, others) -> those that each car may touch
+    forces: Callable[[Boxes, Boxes], tuple[Array, Array, Array]]  # (cars, their neighbours) -> see `forces`
+
+
+def make(
+    *, stiffness: float, damping: float, friction: float, mass: float, yield_s: float, nearest: int, height: float
+) -> Contact:
+    """`forces` and `neighbours` with their numbers."""
+    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, yield_s=yield_s, height=height)
+    return Contact(functools.partial(neighbours, nearest=nearest), functools.partial(forces, **numbers))
+
+
+def boxes_of(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
+    """Cars as boxes; `mass` of each, or of all."""
+    return Boxes(
+        position=motion.position[:, :2],
+        elevation=motion.position[:, 2],
+        yaw=motion.yaw,
+        velocity=motion.velocity[:, :2],
+        yaw_rate=motion.yaw_rate,
+        size=size,
+        mass=jnp.broadcast_to(jnp.asarray(mass, jnp.float32), motion.yaw.shape),
+        present=active,
+    )
+
+
+def neighbours(cars: Boxes, others: Boxes, *, nearest: int) -> Boxes:
+    """Each car's nearest others that are present, by the distance to the circle around a box: leaves `[A, K, ...]`, K at most `nearest`."""
+    reach = 0.5 * norm(others.size)
+    gap = norm(others.position[None] - cars.position[:, None]) - reach
+    gap = jnp.where(_sound(others) & jnp.isfinite(gap), gap, jnp.inf)
+    _, rows = jax.lax.top_k(-gap, min(nearest, gap.shape[1]))
+    return jax.tree.map(lambda leaf: leaf[rows], others)
+
+
+def later(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
+    """Neighbours `[A, K, ...]` moved on with their present velocities."""
+    moved = lambda box: replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)  # noqa: E731
+    return jax.vmap(moved)(boxes)
+
+
 def forces(
-    position: Float[Array, "A 3"],
-    yaw: Float[Array, " A"],
-    velocity: Float[Array, "A 2"],
-    yaw_rate: Float[Array, " A"],
-    size: Float[Array, "A 2"],
-    active: Bool[Array, " A"],
+    cars: Boxes, near: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, yield_s: float, height: float
+) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
+    """Horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
+
+    Stiffness and damping of a pair are those given times its reduced mass over the reduced mass of two cars: 1 between cars, 2 against a
+    wall, little against a pedestrian. So every pair bounces alike, with k dt^2 / m of 0.07 at 1e6 N/m and 120 Hz (m its reduced mass) and
+    0.26 where cars meet off centre; semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m stays below 4: 0.58
+    and 2.1 with 3e4 N s/m.
+
+    Args:
+        cars: bodies that are not present, or whose state is not finite, touch nobody. Two that differ by more than `height` in elevation do
+            not meet.
+        near: what each car may touch, leaves `[A, K, ...]`: see `neighbours`. It is on its way and feels nothing. One of finite mass cannot
+            yield as it would, so its push ends where it would have taken on the car's speed within `yield_s`.
+        stiffness: of a contact along a whole face of two cars, N/m.
+        damping: along the same face, N s/m. A contact never pulls.
+        friction: Coulomb coefficient of the bodies. Below the cone `damping` resists sliding, which is as stable as the normal force.
+        mass: of the two cars that `stiffness` and `damping` are meant for, kg.
+        yield_s: s in which a body of finite mass takes on the speed of the car that hits it.
+        height: of the boxes, m.
+    """
+    count, beside = near.mass.shape
+    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, height=height)
+    cars = _still(cars, mass)
+    total, torque, largest = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count)
+    if count > 1:
+        first, second = np.triu_indices(count, 1)
+        one, other = jax.tree.map(lambda leaf: leaf[first], cars), jax.tree.map(lambda leaf: leaf[second], cars)
+        force, torque_one, torque_other = _between(one, other, None, **numbers)
+        rows = _rows_of(count)  # each car's pairs, as the first of them or the second
+        total = jnp.concatenate([-force, force])[rows].sum(1)
+        torque = jnp.concatenate([torque_one, torque_other])[rows].sum(1)
+        largest = jnp.tile(norm(force), 2)[rows].max(1)
+    if beside:
+        one = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
+        other = _still(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), near), mass)
+        force, torque_one, _ = _between(one, other, yield_s, **numbers)
+        total = total - force.reshape(count, beside, 2).sum(1)
+        torque = torque + torque_one.reshape(count, beside).sum(1)
+        largest = jnp.maximum(largest, norm(force).reshape(count, beside).max(1))
+    return total, torque, largest
+
+
+def _between(
+    one: Boxes,
+    other: Boxes,
+    yield_s: float | None,
     *,
     stiffness: float,
     damping: float,
     friction: float,
+    mass: float,
     height: float,
-) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
-    """Horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
-
-    Args:
-        position: centres of the boxes. Cars that differ by more than `height` in elevation do not meet.
-        active: cars that can touch. Cars whose state is not finite touch nobody, whatever this says.
-        stiffness: of a contact along a whole face, N/m. Two cars of 1.98 t bounce with k dt^2 / m of 0.07 at 1e6 N/m and 120 Hz, and
-            0.26 where they meet off centre (reduced masses 0.99 t and 0.26 t); semi-implicit Euler with an explicit damper is stable
-            while that plus 2 c dt / m stays below 4: 0.58 and 2.1 with 3e4 N s/m.
-        damping: along the same face, N s/m. A contact never pulls.
-        friction: Coulomb coefficient of the bodies. Below the cone `damping` resists sliding, which is as stable as the normal force.
-        height: of the boxes, m.
-    """
-    count = position.shape[0]
-    if count < 2:
-        zero = jnp.zeros((count,), position.dtype)
-        return jnp.zeros((count, 2), position.dtype), zero, zero
-    finite = jnp.isfinite(jnp.concatenate([position, velocity, yaw[:, None], yaw_rate[:, None]], axis=-1)).all(-1)
-    alive = active & finite
-    position, yaw, velocity, yaw_rate = (jnp.where(_rows(alive, x), x, 0.0) for x in (position, yaw, velocity, yaw_rate))
-    first, second = np.triu_indices(count, 1)
-
-    box = (position[:, :2], yaw, size / 2.0)
-    one, other = jax.tree.map(lambda x: x[first], box), jax.tree.map(lambda x: x[second], box)
-    normal, points, depths = jax.vmap(touch)(*one, *other)
-    meet = alive[first] & alive[second] & (jnp.abs(position[first, 2] - position[second, 2]) < height)
+) -> tuple[Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
+    """Force on the second box of each pair, which the first feels with opposite sign, and the torques on both."""
+    normal, points, depths = jax.vmap(touch)(one.position, one.yaw, one.size / 2.0, other.position, other.yaw, other.size / 2.0)
+    meet = one.present & other.present & (jnp.abs(one.elevation - other.elevation) < height)
     depths = jnp.where(meet[:, None], depths, 0.0)
 
-    arm_one, arm_other = points - one[0][:, None], points - other[0][:, None]
-    speed = _velocity_at(arm_other, velocity[second], yaw_rate[second]) - _velocity_at(arm_one, velocity[first], yaw_rate[first])
+    arm_one, arm_other = points - one.position[:, None], points - other.position[:, None]
+    speed = _velocity_at(arm_other, other.velocity, other.yaw_rate) - _velocity_at(arm_one, one.velocity, one.yaw_rate)
     tangent = _turn(normal)
     closing = -dot(speed, normal[:, None])
     sliding = dot(speed, tangent[:, None])
-    push = jnp.where(depths > 0.0, jnp.maximum(0.5 * stiffness * depths + 0.5 * damping * closing, 0.0), 0.0)
-    drag = jnp.clip(0.5 * damping * sliding, -friction * push, friction * push)
-    # on the second car; the first feels the opposite
+    scale = (2.0 / (mass / one.mass + mass / other.mass))[:, None]
+    push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * stiffness * depths + 0.5 * damping * closing), 0.0), 0.0)
+    if yield_s is not None:
+        reduced = 0.5 * mass * scale
+        most = 0.5 * reduced * jnp.maximum(closing, 0.0) / yield_s  # one of two points
+        push = jnp.where(jnp.isfinite(other.mass)[:, None], jnp.minimum(push, most), push)
+    drag = jnp.clip(scale * (0.5 * damping * sliding), -friction * push, friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
-
-    total = force.sum(1)
-    torque_one, torque_other = -cross(arm_one, force).sum(1), cross(arm_other, force).sum(1)
-    sum_force = jnp.zeros((count, 2), position.dtype).at[first].add(-total).at[second].add(total)
-    sum_torque = jnp.zeros((count,), position.dtype).at[first].add(torque_one).at[second].add(torque_other)
-    strength = norm(total)
-    largest = jnp.zeros((count,), position.dtype).at[first].max(strength).at[second].max(strength)
-    return sum_force, sum_torque, largest
+    return force.sum(1), -cross(arm_one, force).sum(1), cross(arm_other, force).sum(1)
 
 
-def _rows(mask: Bool[Array, " A"], like: Array) -> Array:
-    return mask.reshape((-1,) + (1,) * (like.ndim - 1))
+def _sound(boxes: Boxes) -> Bool[Array, "*n"]:
+    """Boxes that are there and whose state is finite."""
+    flat = jnp.stack([boxes.elevation, boxes.yaw, boxes.yaw_rate], axis=-1)
+    state = jnp.concatenate([boxes.position, boxes.velocity, boxes.size, flat], axis=-1)
+    return boxes.present & jnp.isfinite(state).all(-1)
+
+
+def _still(boxes: Boxes, mass: float) -> Boxes:
+    """Those that touch nobody as boxes at rest at the origin, so that their numbers spoil nothing."""
+    sound = _sound(boxes)
+    clean = lambda x: jnp.where(sound.reshape((-1,) + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))  # noqa: E731
+    return replace(jax.tree.map(clean, boxes), mass=jnp.where(sound, boxes.mass, mass), present=sound)
+
+
+def _rows_of(count: int) -> Int[np.ndarray, "A partners"]:
+    """For each car the rows of its pairs, in the table of all pairs' first bodies followed by all pairs' second bodies."""
+    first, second = np.triu_indices(count, 1)
+    bodies = np.concatenate([first, second])
+    return np.stack([np.flatnonzero(bodies == car) for car in range(count)])
 
 
 def touch(

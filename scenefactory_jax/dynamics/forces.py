@@ -23,6 +23,14 @@ class Command(NamedTuple):
     torque: Float[Array, ""]
 
 
+def wanted(car: CarParameters, action: Float[Array, "A 3"]) -> tuple[Float[Array, " A"], Float[Array, " A"], Float[Array, "A 4"]]:
+    """Throttle, steer and brake in [-1, 1] as steering angle, torque of a driven wheel, and largest torque of each brake."""
+    throttle, steer, brake = jnp.clip(action, -1.0, 1.0).T
+    brake = jnp.maximum(brake, 0.0)
+    front, rear = car.brake_torque_front * brake, car.brake_torque_rear * brake
+    return car.steering_limit * steer, car.drive_torque * jnp.maximum(throttle, 0.0), jnp.stack([front, front, rear, rear], axis=-1)
+
+
 def generalised(
     car: CarParameters,
     at: Places,

@@ -22,8 +22,9 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import solve
 from scenefactory_jax.dynamics.car import CarParameters, Places, Solver
+from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.dynamics.fleet import AHEAD, LEFT, Fleet, enlist, fit, standing
-from scenefactory_jax.dynamics.forces import Command, generalised, matrix
+from scenefactory_jax.dynamics.forces import Command, generalised, matrix, wanted
 from scenefactory_jax.geometry import heading, norm
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
@@ -93,7 +94,7 @@ def make(
     Args:
         car: numbers of `car.CarParameters`.
         solver: numbers of `car.Solver`.
-        contact: stiffness, damping and friction of `contact.forces`; its height is the car's.
+        contact: numbers of `contact.make`; its height is the car's.
         brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a
             remembered spin direction, which flips every substep once a wheel locks.
         fleet: null: all cars are the reference car. An entry whose target, such as `fleet.draw`, makes (key, scene, car) -> parameters with
@@ -106,8 +107,8 @@ def make(
     """
     parameters: CarParameters = build({**car, "_target_": "CarParameters"}, builtins=cars.__name__, where="dynamics.car")()
     settings: Solver = build({**solver, "_target_": "Solver"}, builtins=cars.__name__, where="dynamics.solver")()
-    entry = {**contact, "_target_": "forces"}
-    meet = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)
+    entry = {**contact, "_target_": "make"}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
     cars.stable_limits(parameters, physics_dt=physics_dt)
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
@@ -171,7 +172,7 @@ def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
 
 def _advance(
     plant: Plant,
-    meet: Callable[..., Any],
+    meet: Contact,
     grip: Callable[..., Any],
     scene: Scene,
     body: Body,
@@ -185,22 +186,21 @@ def _advance(
     speed = norm(before.velocity[:, :2])
     wheels = wheel_positions(car, before.position[:, :2], before.yaw)
     mu = grip(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
-    action = jnp.clip(action, -1.0, 1.0)
-    steer, drive = car.steering_limit * action[:, 1], car.drive_torque * jnp.maximum(action[:, 0], 0.0)
-    front, rear = car.brake_torque_front * jnp.maximum(action[:, 2], 0.0), car.brake_torque_rear * jnp.maximum(action[:, 2], 0.0)
-    brake = jnp.stack([front, front, rear, rear], axis=-1)
+    steer, drive, brake = wanted(car, action)
     one = jax.vmap(functools.partial(move, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
+    mass = fields.get("body_mass", plant.model.body_mass).sum(-1)
+    near = meet.neighbours(boxes_of(before, scene.agents.size, active, mass), scene.boxes)
 
-    def substep(now: Body, _: None) -> tuple[Body, None]:
-        motion = read(plant, now)
-        force, torque, strength = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
+    def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
+        touching = boxes_of(read(plant, now), scene.agents.size, active, mass)
+        force, torque, strength = meet.forces(touching, later(near, time))
         command = Command(steer, drive, brake, mu, force, torque)
         moved, tyres = one(car, fields, Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
         strongest = jnp.maximum(now.contact_force, strength)
         return replace(now, **moved._asdict(), contact_force=strongest, tyres=tyres), None
 
     zero = jnp.zeros_like(body.contact_force)
-    after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), length=plant.substeps)
+    after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), plant.physics_dt * jnp.arange(plant.substeps))
     return choose(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
 
 

@@ -64,6 +64,16 @@ class Trajectory(NamedTuple):
     control_hz: float
     title: str
     weather: str
+    others: "Others | None" = None  # None: nobody but the agents
+
+
+class Others(NamedTuple):
+    """Boxes on the road over the steps of an episode: everybody who is no agent."""
+
+    position: Float[np.ndarray, "T O 2"]
+    yaw: Float[np.ndarray, "T O"]
+    size: Float[np.ndarray, "T O 2"]
+    present: Bool[np.ndarray, "T O"]
 
 
 class TrajectoryError(ValueError):
@@ -85,6 +95,11 @@ def check(trajectory: Trajectory) -> None:
     for name, happened in trajectory.events.items():
         if name not in MARKS or np.shape(happened) != (t, a):
             raise TrajectoryError(f"trajectory.events: {name!r} {np.shape(happened)}; valid are {', '.join(MARKS)}, each of shape {t, a}")
+    if trajectory.others is not None:
+        boxes = trajectory.others.present.shape[1]
+        for name, wanted in {"position": (t, boxes, 2), "yaw": (t, boxes), "size": (t, boxes, 2), "present": (t, boxes)}.items():
+            if np.shape(getattr(trajectory.others, name)) != wanted:
+                raise TrajectoryError(f"trajectory.others.{name}: shape {np.shape(getattr(trajectory.others, name))}; it must be {wanted}")
     if t == 0:
         raise TrajectoryError(f"trajectory {trajectory.title!r}: no steps, so there is nothing to draw")
 

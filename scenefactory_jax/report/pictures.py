@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from scenefactory_jax.report import areas, canvas
+from scenefactory_jax.report import areas, canvas, others
 from scenefactory_jax.report.areas import Area
 from scenefactory_jax.report.canvas import ASPHALT, GROUND, INK, MARKS, Colour, Trajectory
+from scenefactory_jax.report.others import MOVING as OTHERS
 from scenefactory_jax.report.plots import STYLE
 from scenefactory_jax.types import Scene
 
@@ -18,7 +19,7 @@ _INCHES, _SHARE = 6.4, 0.84  # side of the figure, and the axes' share of it
 
 
 def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figure:
-    """A scene as it starts: road, cars as oriented boxes, goals as circles of the same colour and number.
+    """A scene as it starts: road, cars as oriented boxes, goals as circles of the same colour and number, and who else was there.
 
     Args:
         scene: one packed world with numpy or JAX arrays.
@@ -33,12 +34,14 @@ def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figur
         points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
     with matplotlib.rc_context(STYLE):
         figure, axes, scale = _stage(scene, canvas.around(points, margin=12.0, smallest=50.0), title=title)
+        recorded, still = others.at_start(scene)
+        _draw_others(axes, recorded, 0, still)
         for agent in present.tolist():
             look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
             axes.plot(*np.stack([start[agent], goal[agent]]).T, color=_rgb(canvas.colour_of(agent)), **look)
             _draw_goal(axes, goal[agent], agent, scale)
             _draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), agent)
-        _legend(figure, [], car="start", scene=scene, road=True)
+        _legend(figure, [], car="start", scene=scene, road=True, beside=bool(recorded.present.any()))
     return figure
 
 
@@ -54,6 +57,8 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
         view = canvas.around(canvas.places(trajectory), margin=12.0, smallest=50.0)
         title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
         figure, axes, scale = _stage(trajectory.scene, view, title=title)
+        if trajectory.others is not None:
+            _draw_others(axes, trajectory.others, 0, others.parked(trajectory.others))
         for agent in np.flatnonzero(trajectory.present).tolist():
             steps = np.flatnonzero(driven[:, agent])
             way = trajectory.position[:, agent]
@@ -72,7 +77,9 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
                 points = trajectory.position[trajectory.events[name] & trajectory.present]
                 look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
                 axes.plot(*points.T, color=_rgb(MARKS[name].colour), **look)
-        _legend(figure, [name for name in seen if name != "reached"], car="end (start: outline)", scene=trajectory.scene, road=False)
+        beside = trajectory.others is not None and bool(trajectory.others.present[0].any())
+        shown = [name for name in seen if name != "reached"]
+        _legend(figure, shown, car="end (start: outline)", scene=trajectory.scene, road=False, beside=beside)
     return figure
 
 
@@ -111,6 +118,13 @@ def _draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, ag
     axes.add_patch(Polygon(arrow, facecolor=_rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
 
 
+def _draw_others(axes: Axes, boxes: canvas.Others, step: int, still: np.ndarray) -> None:
+    """Everybody who is no agent at one step."""
+    for shape in others.shapes(boxes, step, still):
+        look = {"facecolor": _rgb(shape.fill), "edgecolor": _rgb(shape.outline), "linewidth": 0.6, "zorder": 2.5}
+        axes.add_patch(Polygon(shape.points, **look))
+
+
 def _draw_goal(axes: Axes, place: np.ndarray, agent: int, scale: float) -> None:
     """A circle of the goal's radius with the agent's number, in its colour."""
     x, y = (float(value) for value in place)
@@ -120,7 +134,7 @@ def _draw_goal(axes: Axes, place: np.ndarray, agent: int, scale: float) -> None:
     axes.text(x, y, str(agent), color=colour, fontsize=size, ha="center", va="center_baseline", zorder=3.6, clip_on=True)
 
 
-def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: bool) -> None:
+def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: bool, beside: bool) -> None:
     """What the shapes mean, below the axes."""
     handles = [
         Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(canvas.AGENTS[0]), markersize=7, label=f"car at its {car}"),
@@ -133,6 +147,8 @@ def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: 
     for area in {area.label: area for area in areas.areas(scene.weather)}.values():
         look = {"color": _rgb(area.colour), "markeredgecolor": _rgb(area.edge), "markeredgewidth": 0.6}
         handles.append(Line2D([], [], marker="s", linestyle="none", markersize=8, label=area.label, **look))
+    if beside:
+        handles.append(Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(OTHERS), markersize=7, label="others"))
     for name in events:
         mark = MARKS[name]
         handles.append(Line2D([], [], marker=mark.marker, linestyle="none", color=_rgb(mark.colour), markersize=8, label=mark.label))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from scenefactory_jax.report import areas, canvas, gif
+from scenefactory_jax.report import areas, canvas, gif, others
 from scenefactory_jax.report.areas import Area
 from scenefactory_jax.report.canvas import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
 
@@ -45,6 +45,7 @@ class _Stage(NamedTuple):
     names: list[Image.Image]  # an agent's number, one image each
     goals: list[Image.Image]  # the same for the fine picture
     labels: dict[str, Image.Image]  # event -> its label
+    parked: np.ndarray  # [O] others that never move
 
 
 def write(
@@ -167,6 +168,7 @@ def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
         names=[_sprite(number, bold, colour) for number, colour in numbers],
         goals=[_sprite(number, _font(small * _FINE), colour) for number, colour in numbers],
         labels={name: _sprite(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
+        parked=np.zeros(0, bool) if trajectory.others is None else others.parked(trajectory.others),
     )
 
 
@@ -210,6 +212,10 @@ def _draw_world(stage: _Stage, now: int, *, trail_s: float | int) -> Image.Image
     """The picture between header and footer at one step."""
     image = stage.background.copy()
     draw = ImageDraw.Draw(image)
+    if stage.trajectory.others is not None:
+        for shape in others.shapes(stage.trajectory.others, now, stage.parked):
+            corners = (canvas.to_pixels(stage.view, shape.points) - 0.5).ravel().tolist()
+            draw.polygon(corners, fill=shape.fill, outline=shape.outline, width=_FINE // 2)
     _draw_trails(draw, stage, now, round(trail_s * stage.trajectory.control_hz))
     shares = np.clip(1 - stage.ended[now] / (_FADE_S * stage.trajectory.control_hz), 0.0, 1.0) * stage.trajectory.present
     on_stage = np.flatnonzero(shares > 0)

@@ -88,7 +88,7 @@ def _phases(config, env, policy, state, worlds, *, horizon: int, repeats: int) -
         return jax.random.uniform(key, shape, jnp.float32, -1.0, 1.0)
 
     def advance(scene, state, action):
-        return replace(state, body=dynamics.advance(scene, state.body, action, state.active))
+        return replace(state, body=dynamics.advance(env.now(scene, state), state.body, action, state.active))
 
     def physics(states, key):
         after = jax.vmap(advance)(worlds, states, acting(key))

@@ -13,7 +13,7 @@ from scenefactory_jax import evaluation, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
-from scenefactory_jax.report.canvas import Trajectory
+from scenefactory_jax.report.canvas import Others, Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.run.train import make_policy
@@ -215,6 +215,7 @@ def _trajectories(
                 control_hz=control_hz,
                 title=names[index],
                 weather=_describe(weather, seconds=end / control_hz),
+                others=Others(*(cut(getattr(frames.others, name)) for name in Others._fields)),
             )
         )
     return found

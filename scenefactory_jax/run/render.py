@@ -8,6 +8,7 @@ from typing import Any
 
 import imageio.v3 as imageio
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -36,6 +37,9 @@ def render(config: Mapping[str, Any]) -> Path:
     if not 0 <= index < count:
         raise ConfigError(f"index: {index}; valid: 0 to {count - 1}")
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), loaded.scene)
+    context = {"control_dt": 1.0 / config["timing"]["control_hz"]}
+    who = build(config["others"], builtins="scenefactory_jax.others", where="others", **context)
+    scene = replace(scene, boxes=who(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
     spec = world(config, scene)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
 """Packed scenes on disk: a folder with `bank.json` and one .npy a column, memory-mapped when it is read.
 
-Ragged columns lie end to end, scene after scene; `sizes.npy` holds each scene's segments, agent slots and steps. `lanes` and `edges` repeat
-rows of `road` and are not stored. A bank can be moved; it is written beside its place and renamed, so that nobody ever meets half of one.
+Ragged columns lie end to end, scene after scene; `sizes.npy` holds each scene's segments, agent slots, steps and others. `lanes` and
+`edges` repeat rows of `road` and are not stored. A bank can be moved; it is written beside its place and renamed, so that nobody ever meets
+half of one.
 """
 
 import json
@@ -24,8 +25,8 @@ from scenefactory_jax.scenes.stack import CutReport, stack
 from scenefactory_jax.types import Scene
 
 FORMAT = "scenefactory_jax bank"
-SCHEMA = 1  # rises whenever a bank of before can no longer be read
-SIZES = ("road", "agents", "steps")  # the columns of sizes.npy
+SCHEMA = 2  # rises whenever a bank of before can no longer be read
+SIZES = ("road", "agents", "steps", "others")  # the columns of sizes.npy
 STORED = {n: c for n, c in columns.COLUMNS.items() if not n.startswith(("lanes.", "edges.")) and n != "road.valid"}
 
 
@@ -37,7 +38,7 @@ class Bank:
     reports: tuple[PackReport, ...]  # scene by scene: name, source, metadata, agents and segments dropped
     settings: dict[str, Any]  # what it was packed with
     rejects: tuple[dict[str, Any], ...]  # source, scene and reason of everything that could not be packed
-    sizes: Int[np.ndarray, "N 3"]
+    sizes: Int[np.ndarray, "N 4"]
     starts: Mapping[str, Int[np.ndarray, " N1"]]  # of each scene's rows, for columns by their own axes
     leaves: Mapping[str, np.ndarray]
 
@@ -97,7 +98,7 @@ def _write_columns(folder: Path, packed: Iterable[Packed], settings: Mapping[str
         for scene, report in packed:
             leaves = columns.flatten(scene)
             valid = leaves["road.valid"]
-            sizes.append((int(valid.sum()), *leaves["log.valid"].shape))
+            sizes.append((int(valid.sum()), *leaves["log.valid"].shape, len(leaves["others.kind"])))
             reports.append(asdict(report))
             for name, file in files.items():
                 leaf = leaves[name][valid] if name.startswith("road.") else leaves[name]
@@ -152,8 +153,9 @@ def open(path: Path | str) -> Bank:
     if len(sizes) != len(reports) or (sizes < 0).any():
         raise SceneError(f"{path / 'sizes.npy'}: {len(sizes)} scenes; {INDEX} has {len(reports)}")
     sizes = np.asarray(sizes)
-    road, agents, steps = sizes.T
-    rows = {"road": road, "agents": agents, "log": agents * steps, "one": np.ones(len(sizes), np.int64)}
+    road, agents, steps, others = sizes.T
+    rows = {"road": road, "agents": agents, "log": agents * steps, "others": others, "tracks": others * steps}
+    rows["one"] = np.ones(len(sizes), np.int64)
     starts = {axis: np.concatenate([[0], np.cumsum(count)]).astype(np.int64) for axis, count in rows.items()}
     leaves = {}
     for name, column in STORED.items():
@@ -198,7 +200,8 @@ def _layout(column: columns.Column) -> str:
     """By what a column's rows are counted."""
     if not column.axes:
         return "one"
-    return "log" if "steps" in column.axes else str(column.axes[0])
+    logs = {"agents": "log", "others": "tracks"}
+    return logs[str(column.axes[0])] if "steps" in column.axes else str(column.axes[0])
 
 
 def scene(bank: Bank, index: int) -> Packed:
@@ -211,8 +214,8 @@ def scene(bank: Bank, index: int) -> Packed:
     if not -count <= index < count:
         raise SceneError(f"{bank.path}: no scene {index}; valid: 0 to {count - 1}")
     index = index % count
-    road, agents, steps = (int(size) for size in bank.sizes[index])
-    shapes = {"road": (road,), "agents": (agents,), "log": (agents, steps), "one": ()}
+    road, agents, steps, others = (int(size) for size in bank.sizes[index])
+    shapes = {"road": (road,), "agents": (agents,), "log": (agents, steps), "others": (others,), "tracks": (others, steps), "one": ()}
     leaves: dict[str, np.ndarray] = {"road.valid": np.ones(road, bool)}
     for name, column in STORED.items():
         layout = _layout(column)

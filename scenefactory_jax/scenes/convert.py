@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.scenes import bank, source
-from scenefactory_jax.scenes.pack import CUTS, DROPS, Packed, PackReport, prepare
+from scenefactory_jax.scenes.pack import CUTS, DROPS, OTHER_DROPS, Packed, PackReport, prepare
 from scenefactory_jax.scenes.raw import SceneError
 
 Result = tuple[list[Packed], list[dict[str, Any]]]  # scenes of a file, and its rejects
@@ -26,6 +26,8 @@ class Summary:
     rejects: tuple[dict[str, Any], ...]  # source, scene (null where the file itself cannot be read), reason
     agents_kept: int
     agents_dropped: dict[str, int]  # reason -> count
+    others_kept: int
+    others_dropped: dict[str, int]  # reason -> count
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count
     repaired: dict[str, int]  # repair -> scenes that had it
@@ -135,6 +137,8 @@ def summarise(reports: Sequence[PackReport], *, files: int, rejects: Sequence[Ma
         rejects=tuple(dict(reject) for reject in rejects),
         agents_kept=sum(report.agents_kept for report in reports),
         agents_dropped={reason: sum(report.agents_dropped.get(reason, 0) for report in reports) for reason in DROPS},
+        others_kept=sum(report.others_kept for report in reports),
+        others_dropped={reason: sum(report.others_dropped.get(reason, 0) for report in reports) for reason in OTHER_DROPS},
         segments_kept=sum(report.segments_kept for report in reports),
         segments_cut={reason: sum(report.segments_cut.get(reason, 0) for report in reports) for reason in CUTS},
         repaired=dict(repaired),
@@ -151,6 +155,7 @@ def describe(summary: Summary) -> list[str]:
     lines += [f"in {number} scenes: {repair}" for repair, number in summary.repaired.items()]
     lines.append(f"centred on: {', '.join(f'{what} in {number} scenes' for what, number in summary.centred_on.items())}")
     lines.append(f"segments: {summary.segments_kept} kept; cut: {count(summary.segments_cut)}")
+    lines.append(f"others: {summary.others_kept} kept; dropped: {count(summary.others_dropped)}")
     lines.append(f"agents: {summary.agents_kept} kept; dropped: {count(summary.agents_dropped)}")
     lines.append(
         f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected"

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from scenefactory_jax.scenes import documents
-from scenefactory_jax.scenes.raw import TRACK_KINDS, OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.types import ROAD_USERS
 
 # the map element that a type's name stands for where `map_element_id` is missing
 ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crosswalk": 18, "speed_bump": 19, "driveway": 20}
@@ -98,7 +99,7 @@ def _track(record: dict[str, Any], index: int, steps: int, where: str, degrees: 
     mask = valid[:, None]
     return Track(
         id=documents.expect(record.get("id", index), int, f"{where}.id"),
-        kind=kind if kind in TRACK_KINDS else "other",  # pyright: ignore[reportArgumentType]
+        kind=kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=_size(record, where, height_m),
         xyz=np.where(mask, np.pad(xyz, ((0, 0), (0, 1))) if flat else xyz, 0.0),
         yaw=np.where(valid, np.remainder(yaw + np.pi, 2 * np.pi) - np.pi, 0.0),

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Road, Scene
+from scenefactory_jax.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Boxes, Road, Scene
 
 WHITE, YELLOW = (0.95, 0.95, 0.95, 1.0), (0.95, 0.75, 0.15, 1.0)
 PAINT = dict.fromkeys(LINES[:3], WHITE) | dict.fromkeys(LINES[3:], YELLOW)  # WOMD: 6-8 white, 9-13 yellow
@@ -35,12 +35,14 @@ def world(
     half_width_m: float,
     height_m: float,
     goal_radius_m: float,
+    other_height_m: float,
     box_m: float,
 ) -> mujoco.MjSpec:
     """Ground plane `ground`, road as thin visual boxes, car `agent{slot}/...` at each present agent's start, and `goal{slot}` discs.
 
-    Only the ground and the cars can collide. Wheel contacts that are explicit pairs are the car's business: add them to the result with the
-    prefix `agent{slot}/`. Each car stands at the height that its own spec gives it above z = 0.
+    Present boxes of the scene stand fixed as `other{row}`. Only they, the ground and the cars can collide. Wheel contacts that are explicit
+    pairs are the car's business: add them to the result with the prefix `agent{slot}/`. Each car stands at the height that its own spec
+    gives it above z = 0.
 
     Args:
         scene: one world.
@@ -49,6 +51,7 @@ def world(
         half_width_m: of the boxes in the plane (the published road's half width is 0.05).
         height_m: of the boxes.
         goal_radius_m: of the discs.
+        other_height_m: of the others.
         box_m: side of the ground that is drawn, and the viewer's scale; physically the plane is infinite.
 
     Raises:
@@ -74,7 +77,23 @@ def world(
             contype=0,
             conaffinity=0,
         )
+    _add_others(model, scene.boxes, other_height_m)
     return model
+
+
+def _add_others(model: mujoco.MjSpec, boxes: Boxes, height_m: float) -> None:
+    """Everybody who is there besides the cars, as boxes on the ground that cars can hit."""
+    for row in np.flatnonzero(np.asarray(boxes.present)):
+        (x, y), (length, width) = np.asarray(boxes.position, float)[row].tolist(), np.asarray(boxes.size, float)[row].tolist()
+        yaw = float(boxes.yaw[row])
+        model.worldbody.add_geom(
+            name=f"other{row}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[x, y, height_m / 2],
+            quat=[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)],
+            size=[length / 2, width / 2, height_m / 2],
+            rgba=[*OTHER[:3], 1.0],
+        )
 
 
 def chains(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float[np.ndarray, "N 2"], int]]:

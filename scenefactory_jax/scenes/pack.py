@@ -1,4 +1,4 @@
-"""RawScene -> Scene: which part of the map and which cars, in float32 metres around the scene's centre.
+"""RawScene -> Scene: which part of the map, which cars and who else, in float32 metres around the scene's centre.
 
 Nothing disappears silently: the report counts what was kept and what was dropped, by reason.
 """
@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.raw import RawScene, SceneError, Track
-from scenefactory_jax.types import DRIVABLE, Scene
+from scenefactory_jax.types import DRIVABLE, ROAD_USERS, Scene
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
 )  # fmt: skip
+OTHER_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 
@@ -34,6 +35,8 @@ class PackReport:
     track_ids: tuple[int, ...]  # of the agents, slot by slot
     agents_kept: int
     agents_dropped: dict[str, int]  # reason -> count, every reason of DROPS
+    others_kept: int  # everybody who is no agent is counted here or in the next
+    others_dropped: dict[str, int]  # reason -> count, every reason of OTHER_DROPS
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count, every reason of CUTS
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -71,6 +74,8 @@ def pack(
     start_speed: Literal["logged", "zero"],
     log_from: Literal["start", "current"],
     require_agents: bool,
+    others: int,
+    others_least_m: float,
 ) -> tuple[Scene, PackReport]:
     """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
 
@@ -85,6 +90,8 @@ def pack(
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
         require_agents: refuse a scene in which no agent is left.
+        others: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
+        others_least_m: shortest and narrowest that they may be.
 
     Raises:
         SceneError: no lane segment in the box, or no agent where one is required.
@@ -92,18 +99,16 @@ def pack(
     origin, centred_on = _centre(raw, centre)
     half = box_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m)
-    if not np.isin(road["road.kind"], DRIVABLE).any():
-        place = f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on})"
-        raise SceneError(f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")
+    _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
-        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
+        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped) or 'no tracks'}")
     first = raw.current if log_from == "current" else 0
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    scene = columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
+    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, others, others_least_m)
+    leaves |= beside
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -114,12 +119,23 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
+        others_kept=len(beside["others.kind"]),
+        others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
         metadata=dict(raw.metadata),
     )
-    return scene, report
+    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _require_lane(raw: RawScene, road: dict[str, np.ndarray], place: str) -> None:
+    if not np.isin(road["road.kind"], DRIVABLE).any():
+        raise SceneError(f"{raw.source}: roads: no driving lane within {place}")
+
+
+def _reasons(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
 def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:
@@ -253,21 +269,75 @@ def _agents(
 
 def _log(tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, first: int) -> dict[str, np.ndarray]:
     """Columns of `log`: zeros where the recording has nothing."""
+    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
+    rows = _recording(tracks, raw, origin, slots, first)
+    return {f"log.{name}": leaf for name, leaf in rows.items()} | {"log.dt": np.asarray(step)}
+
+
+def _recording(
+    tracks: list[Track], raw: RawScene, origin: Float[np.ndarray, "3"], slots: int, first: int
+) -> dict[str, np.ndarray]:
+    """What tracks did from a step on, in so many slots: zeros where the recording has nothing."""
     steps = len(raw.times) - first
-    rows = {
-        "log.position": np.zeros((slots, steps, 2)),
-        "log.yaw": np.zeros((slots, steps)),
-        "log.velocity": np.zeros((slots, steps, 2)),
-        "log.valid": np.zeros((slots, steps), bool),
-    }
+    rows = {name: np.zeros((slots, steps, 2)) for name in ("position", "velocity")}
+    rows |= {"yaw": np.zeros((slots, steps)), "valid": np.zeros((slots, steps), bool)}
     for slot, track in enumerate(tracks):
         valid = track.valid[first:]
-        rows["log.valid"][slot] = valid
-        rows["log.position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
-        rows["log.yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
-        rows["log.velocity"][slot][valid] = track.velocity[first:][valid]
-    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
-    return rows | {"log.dt": np.asarray(step)}
+        rows["valid"][slot] = valid
+        rows["position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
+        rows["yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
+        rows["velocity"][slot][valid] = track.velocity[first:][valid]
+    return rows
+
+
+def _choose_others(
+    raw: RawScene, agents: list[int], leaves: dict[str, np.ndarray], origin: Float[np.ndarray, "3"], half: float, limit: int, least: float
+) -> tuple[list[int], dict[str, int]]:
+    """Indices of the tracks that become others, nearest to an agent's start (without agents: to the centre) first, and the rest by reason.
+
+    Whose box overlaps an agent's at the start is left out: the two would burst apart.
+    """
+    rows = [leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")]
+    boxes = np.array([corners(place, float(yaw), *size) for place, yaw, size in zip(*rows, strict=True)]).reshape(-1, 4, 2)
+    starts = rows[0] if len(rows[0]) else np.zeros((1, 2))
+    dropped, candidates = dict.fromkeys(OTHER_DROPS, 0), []
+    for index in sorted(set(range(len(raw.tracks))) - set(agents)):
+        track = raw.tracks[index]
+        now = track.valid[raw.current :]
+        path = track.xyz[raw.current :, :2] - origin[:2]
+        inside = now & (np.abs(path).max(axis=1) <= half)
+        length, width = np.maximum(track.size[:2], least)
+        if not now.any():
+            dropped["absent_from_start_on"] += 1
+        elif not inside.any():
+            dropped["outside_box"] += 1
+        elif now[0] and overlaps(corners(path[0], track.yaw[raw.current], length, width), boxes).any():
+            dropped["overlaps_agent"] += 1
+        else:
+            near = np.linalg.norm(path[inside][:, None] - starts, axis=2).min()
+            candidates.append((float(near), index))
+    kept = [index for _, index in sorted(candidates)]
+    dropped["over_capacity"] = max(len(kept) - limit, 0)
+    return kept[:limit], dropped
+
+
+def _others(
+    raw: RawScene,
+    agents: list[int],
+    leaves: dict[str, np.ndarray],
+    origin: Float[np.ndarray, "3"],
+    half: float,
+    first: int,
+    limit: int,
+    least: float,
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Columns of `others`, and who was left out, by reason."""
+    chosen, dropped = _choose_others(raw, agents, leaves, origin, half, limit, least)
+    tracks = [raw.tracks[i] for i in chosen]
+    rows = _recording(tracks, raw, origin, len(tracks), first)
+    rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
+    rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
+    return {f"others.{name}": leaf for name, leaf in rows.items()}, dropped
 
 
 def _wrap(angle: Any) -> Any:

@@ -5,12 +5,12 @@ from their origin; float32 comes after a centre is subtracted. Values at invalid
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-TRACK_KINDS = ("vehicle", "pedestrian", "cyclist", "other")
+from scenefactory_jax.types import RoadUser
 
 
 class SceneError(ValueError):
@@ -38,7 +38,7 @@ class Track:
     """One object over the whole log."""
 
     id: int
-    kind: Literal["vehicle", "pedestrian", "cyclist", "other"]
+    kind: RoadUser
     size: tuple[float, float, float]  # length, width, height
     xyz: Float[np.ndarray, "L 3"]  # centre of the box
     yaw: Float[np.ndarray, " L"]

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.scenes import documents
-from scenefactory_jax.scenes.raw import TRACK_KINDS, OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.types import ROAD_USERS
 
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 
@@ -112,7 +113,7 @@ def _track(
     kind = TYPES.get(kind, "other") if documents.is_number(kind) else str(kind).lower().removeprefix("type_")
     return Track(
         id=int(documents.get(record, "agent_id", float, where)),  # tf.Example keeps ids as floats
-        kind="vehicle" if all_vehicles else kind if kind in TRACK_KINDS else "other",  # pyright: ignore[reportArgumentType]
+        kind="vehicle" if all_vehicles else kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=size,
         xyz=poses[:, :3].copy(),
         yaw=poses[:, 3].copy(),

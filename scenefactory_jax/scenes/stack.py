@@ -11,7 +11,7 @@ from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.types import Scene
 
-AXES = (*columns.ROADS, "agents", "steps")
+AXES = (*columns.ROADS, "agents", "steps", "others")
 ROW_MULTIPLE = 256  # road capacities are rounded up to this, so that similar selections share a compiled program
 Leaves = dict[str, np.ndarray]
 
@@ -21,7 +21,7 @@ class Cut:
     """What one world lost to a capacity."""
 
     world: int
-    axis: str  # road, lanes, edges, agents or steps
+    axis: str  # road, lanes, edges, agents, steps or others
     had: int
     kept: int
     nearest_m: float | None  # from the nearest segment that was cut to a start, a goal or a logged position
@@ -40,12 +40,13 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     """Worlds along a new first axis, padded with masked rows: numpy leaves `[W, ...]`.
 
     A segment capacity that is too small cuts the segments farthest from every start, goal and logged position of the world's agents (from
-    the centre, if it has none); one of agents the last slots, one of steps the last steps. `lanes` and `edges` are cut on their own.
+    the centre, if it has none); one of agents or others the last rows, one of steps the last steps. `lanes` and `edges` are cut on their
+    own.
 
     Args:
         scenes: single worlds, of any sizes.
-        capacity: axis (road, lanes, edges, agents, steps) -> rows; null or missing: what the largest world needs (segments rounded up to a
-            multiple of 256).
+        capacity: axis (road, lanes, edges, agents, steps, others) -> rows; null or missing: what the largest world needs (segments rounded
+            up to a multiple of 256). Only others may be 0.
 
     Raises:
         SceneError: no scenes, or a capacity that is none.
@@ -75,16 +76,21 @@ def describe(report: CutReport) -> list[str]:
 
 
 def _compact(world: Leaves) -> Leaves:
-    """Without the padding that a scene may bring along."""
+    """Without the padding that a scene may bring along, absent agents apart: their slots are the scene's own."""
     for part in columns.ROADS:
         valid = world[f"{part}.valid"]
         if not valid.all():
             world = world | {name: leaf[valid] for name, leaf in world.items() if name.startswith(f"{part}.")}
-    return world
+    return _rows(world, "others", np.flatnonzero(world["others.valid"].any(axis=1)))
+
+
+def _rows(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
+    """Only these rows of the columns whose first axis this is."""
+    return world | {name: world[name][rows] for name, column in columns.COLUMNS.items() if column.axes[:1] == (axis,)}
 
 
 def _count(world: Leaves, axis: str) -> int:
-    name = {"agents": "agents.present", "steps": "log.valid"}.get(axis, f"{axis}.valid")
+    name = {"agents": "agents.present", "steps": "log.valid", "others": "others.kind"}.get(axis, f"{axis}.valid")
     return world[name].shape[-1]
 
 
@@ -94,12 +100,12 @@ def _resolve(worlds: Sequence[Leaves], capacity: Mapping[str, int | None]) -> di
         raise SceneError(f"capacity.{unknown[0]}: unknown; valid: {', '.join(AXES)}")
     sizes = {}
     for axis in AXES:
-        rows = capacity.get(axis)
+        rows, least = capacity.get(axis), 0 if axis == "others" else 1
         if rows is None:
-            rows = max(1, *(_count(world, axis) for world in worlds))
+            rows = max(least, *(_count(world, axis) for world in worlds))
             rows = -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE if axis in columns.ROADS else rows
-        elif isinstance(rows, bool) or not isinstance(rows, int) or rows < 1:
-            raise SceneError(f"capacity.{axis}: {rows!r} is no capacity; valid: 1 or more, or null for what the largest scene needs")
+        elif isinstance(rows, bool) or not isinstance(rows, int) or rows < least:
+            raise SceneError(f"capacity.{axis}: {rows!r} is no capacity; valid: {least} or more, or null for what the largest scene needs")
         sizes[axis] = rows
     return sizes
 
@@ -108,6 +114,9 @@ def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[Cut]) -
     """One world with exactly these rows."""
     world = _fit_agents(world, sizes["agents"], index, cuts)
     world = _fit_steps(world, sizes["steps"], index, cuts)
+    if (had := _count(world, "others")) > sizes["others"]:
+        cuts.append(Cut(index, "others", had, sizes["others"], None))
+        world = _rows(world, "others", np.arange(sizes["others"]))
     for part in columns.ROADS:
         had = _count(world, part)
         if had > sizes[part]:
@@ -125,7 +134,7 @@ def _fit_agents(world: Leaves, slots: int, index: int, cuts: list[Cut]) -> Leave
     kept = np.sort(np.argsort(~present, kind="stable")[:slots])
     if present.sum() > slots:
         cuts.append(Cut(index, "agents", int(present.sum()), slots, None))
-    return world | {name: world[name][kept] for name, column in columns.COLUMNS.items() if column.axes[:1] == ("agents",)}
+    return _rows(world, "agents", kept)
 
 
 def _fit_steps(world: Leaves, steps: int, index: int, cuts: list[Cut]) -> Leaves:
