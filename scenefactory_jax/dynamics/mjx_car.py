@@ -27,6 +27,16 @@ from scenefactory_jax.types import Dynamics, Motion, Scene
 
 
 @struct
+class Tyres:
+    """What the contact patches of a car did in the last physics step, in the order of `car.WHEELS`."""
+
+    mu: Float[Array, "*cars 4"]  # friction coefficient of the road under the wheel
+    normal: Float[Array, "*cars 4"]  # force, N
+    tangent: Float[Array, "*cars 4"]  # force, N
+    slip: Float[Array, "*cars 4"]  # |velocity of the tyre's surface over the ground|, m/s; zero where it is in the air
+
+
+@struct
 class Body:
     """Cars of one world; every leaf has the agent axis first."""
 
@@ -35,9 +45,7 @@ class Body:
     qacc_warmstart: Float[Array, "A 16"]
     spin_sign: Float[Array, "A 4"]  # last direction of each wheel; only latched brakes read it
     contact_force: Float[Array, " A"]
-    grip: Float[Array, " A"]
-    grip_use: Float[Array, " A"]
-    slip: Float[Array, " A"]
+    tyres: Tyres
 
 
 class Places(NamedTuple):
@@ -158,16 +166,13 @@ def start(plant: Plant, still: np.ndarray, scene: Scene) -> Body:
     velocity = agents.speed[:, None] * jnp.stack([jnp.cos(agents.yaw), jnp.sin(agents.yaw)], axis=-1)
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
     qvel = qvel.at[:, plant.places.spin_v].set(agents.speed[:, None] / plant.car.wheel_radius)
-    zeros = jnp.zeros((count,), jnp.float32)
     return Body(
         qpos=qpos,
         qvel=qvel,
         qacc_warmstart=jnp.zeros((count, 16), jnp.float32),
         spin_sign=jnp.ones((count, 4), jnp.float32),
-        contact_force=zeros,
-        grip=zeros,
-        grip_use=zeros,
-        slip=zeros,
+        contact_force=jnp.zeros((count,), jnp.float32),
+        tyres=Tyres(*[jnp.zeros((count, 4), jnp.float32)] * 4),
     )
 
 
@@ -197,18 +202,17 @@ def _advance(
         force, torque, strength = meet(motion.position, motion.yaw, motion.velocity[:, :2], motion.yaw_rate, scene.agents.size, active)
         command = Command(steer, drive, brake, mu, force, torque)
         car_of = Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign)
-        moved, use, slip = jax.vmap(functools.partial(move, plant))(car_of, command)
+        moved, tyres = jax.vmap(functools.partial(move, plant))(car_of, command)
         strongest = jnp.maximum(now.contact_force, strength)
-        return replace(now, **moved._asdict(), contact_force=strongest, grip_use=use, slip=slip), None
+        return replace(now, **moved._asdict(), contact_force=strongest, tyres=tyres), None
 
-    quiet = replace(body, contact_force=jnp.zeros_like(body.contact_force), grip=mu.mean(-1))
-    after, _ = jax.lax.scan(substep, quiet, length=substeps)
-    zero = jnp.zeros_like(body.slip)
-    return choose(active, after, replace(body, contact_force=zero, grip_use=zero, slip=zero))
+    zero = jnp.zeros_like(body.contact_force)
+    after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), length=substeps)
+    return choose(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
 
 
-def move(plant: Plant, car: Single, command: Command) -> tuple[Single, Float[Array, ""], Float[Array, ""]]:
-    """One physics step of one car; also the largest share of grip that a tyre used, and the fastest sliding of a tyre, m/s."""
+def move(plant: Plant, car: Single, command: Command) -> tuple[Single, Tyres]:
+    """One physics step of one car."""
     applied, sign = _generalised_force(plant, car, command)
     model = plant.model.replace(pair_friction=plant.model.pair_friction.at[:, :2].set(command.mu[:, None]))
     if not plant.latched:
@@ -216,7 +220,7 @@ def move(plant: Plant, car: Single, command: Command) -> tuple[Single, Float[Arr
         model = model.replace(dof_frictionloss=loss)
     data = plant.data.replace(qpos=car.qpos, qvel=car.qvel, qacc_warmstart=car.qacc_warmstart, qfrc_applied=applied)
     data = mjx.step(model, data)
-    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), *_tyres(data, command.mu)
+    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(data, command.mu)
 
 
 def _generalised_force(plant: Plant, body: Single, command: Command) -> tuple[Float[Array, "16"], Float[Array, "4"]]:
@@ -244,14 +248,12 @@ def _generalised_force(plant: Plant, body: Single, command: Command) -> tuple[Fl
     return applied, sign
 
 
-def _tyres(data: mjx.Data, mu: Float[Array, "4"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Largest share of its grip that a tyre uses, and the fastest sliding of a contact patch, m/s."""
+def _tyres(data: mjx.Data, mu: Float[Array, "4"]) -> Tyres:
+    """What the contact rows say of the tyres, before the step's integration."""
     rows = np.asarray(data._impl.contact.efc_address)[:, None] + np.arange(3)
     force = data._impl.efc_force[rows]
     slide = (data._impl.efc_J @ data.qvel)[rows][:, 1:]
-    loaded = force[:, 0] > 1.0  # N
-    use = norm(force[:, 1:]) / (mu * jnp.where(loaded, force[:, 0], 1.0))
-    return jnp.where(loaded, use, 0.0).max(), jnp.where(loaded, norm(slide), 0.0).max()
+    return Tyres(mu=mu, normal=force[:, 0], tangent=norm(force[:, 1:]), slip=norm(slide))
 
 
 def matrix(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -278,6 +280,7 @@ def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Floa
 def read(plant: Plant, body: Body) -> Motion:
     """What the rest of the system may know of the cars."""
     rotation = jax.vmap(matrix)(body.qpos[:, 3:7])
+    tyres, loaded = body.tyres, body.tyres.normal > 1.0  # N
     return Motion(
         position=body.qpos[:, :3],
         velocity=body.qvel[:, :3],
@@ -286,7 +289,7 @@ def read(plant: Plant, body: Body) -> Motion:
         upright=rotation[:, 2, 2],
         steer=body.qpos[:, plant.places.steer_q].mean(-1),
         contact_force=body.contact_force,
-        grip=body.grip,
-        grip_use=body.grip_use,
-        slip=body.slip,
+        grip=tyres.mu.mean(-1),
+        grip_use=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
+        slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
     )
