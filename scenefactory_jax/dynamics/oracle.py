@@ -54,13 +54,19 @@ class Rig(NamedTuple):
     model: mujoco.MjModel
     data: mujoco.MjData
     car: CarParameters
-    suspension: Int[np.ndarray, "4"]  # in one car's velocities; positions come one later
+    suspension_q: Int[np.ndarray, "4"]  # in one car's positions; the others in its velocities
+    suspension: Int[np.ndarray, "4"]
+    steer_q: Int[np.ndarray, "2"]
     steer: Int[np.ndarray, "2"]
     spin: Int[np.ndarray, "4"]
     chassis: Int[np.ndarray, " N"]  # bodies
     boxes: Int[np.ndarray, " N"]  # geoms
     pairs: Int[np.ndarray, "N 4"]  # of the tyres with the ground
     tyre_of: Int[np.ndarray, " geoms"]  # geom -> car * 4 + wheel; 4 N for every other geom
+    qpos: Float[np.ndarray, "N 17"]  # these four are views of the engine's own memory
+    qvel: Float[np.ndarray, "N 16"]
+    applied: Float[np.ndarray, "N 16"]
+    wrenches: list[Float[np.ndarray, "6"]]  # on each chassis at its centre of mass, force then torque, in the world's frame
 
 
 def simulate(
@@ -192,7 +198,7 @@ def place(
 ) -> None:
     """Put the cars at their starts, wheels turning as fast as the road passes under them, and forget what happened before."""
     mujoco.mj_resetData(rig.model, rig.data)
-    qpos, qvel = _states(rig)
+    qpos, qvel = rig.qpos, rig.qvel
     qpos[:] = still
     qpos[:, :2] = position
     qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
@@ -223,38 +229,41 @@ def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray,
 
 
 def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> Rig:
-    def at(kind: str, wheels: tuple[str, ...]) -> np.ndarray:
-        return np.array([model.joint(f"{prefixes[0]}{kind}_{wheel}").dofadr[0] for wheel in wheels])
+    def at(kind: str, wheels: tuple[str, ...], address: str = "dofadr") -> np.ndarray:
+        return np.array([getattr(model.joint(f"{prefixes[0]}{kind}_{wheel}"), address)[0] for wheel in wheels])
 
     tyre_of = np.full(model.ngeom, 4 * len(prefixes))
     for slot, prefix in enumerate(prefixes):
         for wheel, name in enumerate(cars.WHEELS):
             tyre_of[model.geom(f"{prefix}tyre_{name}").id] = 4 * slot + wheel
+    data = mujoco.MjData(model)
+    chassis = np.array([model.body(f"{prefix}chassis").id for prefix in prefixes])
     return Rig(
         model=model,
-        data=mujoco.MjData(model),
+        data=data,
         car=car,
+        suspension_q=at("suspension", cars.WHEELS, "qposadr"),
         suspension=at("suspension", cars.WHEELS),
+        steer_q=at("steer", cars.FRONT, "qposadr"),
         steer=at("steer", cars.FRONT),
         spin=at("spin", cars.WHEELS),
-        chassis=np.array([model.body(f"{prefix}chassis").id for prefix in prefixes]),
+        chassis=chassis,
         boxes=np.array([model.geom(f"{prefix}box").id for prefix in prefixes]),
         pairs=np.array([[model.pair(f"{prefix}ground_{name}").id for name in cars.WHEELS] for prefix in prefixes]),
         tyre_of=tyre_of,
+        qpos=data.qpos.reshape(-1, 17),
+        qvel=data.qvel.reshape(-1, 16),
+        applied=data.qfrc_applied.reshape(-1, 16),
+        wrenches=[data.xfrc_applied[body] for body in chassis],
     )
-
-
-def _states(rig: Rig) -> tuple[Float[np.ndarray, "N 17"], Float[np.ndarray, "N 16"]]:
-    """Views of positions and velocities with an axis of cars."""
-    return rig.data.qpos.reshape(-1, 17), rig.data.qvel.reshape(-1, 16)
 
 
 def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
     """What holds for a whole control step: engine torque and brake friction, which are set, and the wanted steering angle."""
     car = rig.car
     throttle, steer, brake = np.clip(control[:, 0], 0.0, 1.0), np.clip(control[:, 1], -1.0, 1.0), np.clip(control[:, 2], 0.0, 1.0)
-    applied, loss = rig.data.qfrc_applied.reshape(-1, 16), rig.model.dof_frictionloss.reshape(-1, 16)
-    applied[:, rig.spin[:2]] = (throttle * car.drive_torque)[:, None]
+    loss = rig.model.dof_frictionloss.reshape(-1, 16)
+    rig.applied[:, rig.spin[:2]] = (throttle * car.drive_torque)[:, None]
     strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
     loss[:, rig.spin] = brake[:, None] * strongest + cars.LATENT_FRICTION
     return car.steering_limit * steer
@@ -262,40 +271,34 @@ def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "
 
 def _push(rig: Rig, wanted: Float[np.ndarray, " N"]) -> None:
     """What changes with every physics step: servo, bump stops and dampings."""
-    car, data = rig.car, rig.data
-    qpos, qvel = _states(rig)
-    applied = data.qfrc_applied.reshape(-1, 16)
-    travel = qpos[:, rig.suspension + 1]
+    car, qpos, qvel = rig.car, rig.qpos, rig.qvel
+    travel = qpos[:, rig.suspension_q]
     within = np.minimum(np.maximum(travel, -car.suspension_travel), car.suspension_travel)
-    applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
-    angle, rate = qpos[:, rig.steer + 1], qvel[:, rig.steer]
-    torque = car.steering_stiffness * (wanted[:, None] - angle) - car.steering_damping * rate
-    applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)
-    turn = np.zeros(9)
-    for slot, chassis in enumerate(rig.chassis):
+    rig.applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
+    torque = car.steering_stiffness * (wanted[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
+    rig.applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)
+    turn = np.empty(9)
+    for slot, wrench in enumerate(rig.wrenches):
         mujoco.mju_quat2Mat(turn, qpos[slot, 3:7])
-        left, up = turn[1::3], turn[2::3]
-        # a wrench at the chassis' centre of mass, in the world's frame
-        data.xfrc_applied[chassis, :3] = -car.lateral_damping * (qvel[slot, :3] @ left) * left
-        data.xfrc_applied[chassis, 3:] = -car.yaw_damping * qvel[slot, 5] * up
+        if car.lateral_damping:
+            left = turn[1::3]
+            wrench[:3] = -car.lateral_damping * (qvel[slot, :3] @ left) * left
+        wrench[3:] = (-car.yaw_damping * qvel[slot, 5]) * turn[2::3]
 
 
 def _record(rig: Rig) -> tuple[np.ndarray, ...]:
     """State and tyres of every car, as `Trajectory` has them."""
     model, data = rig.model, rig.data
     count = len(rig.chassis)
-    qpos, qvel = _states(rig)
-    tyres = np.zeros((3, 4 * count + 1))
     contact = data.contact
     wheel, address = rig.tyre_of[contact.geom[:, 1]], contact.efc_address
-    jacobian = data.efc_J.reshape(-1, model.nv)
-    force = np.zeros(6)
-    for index in np.flatnonzero((wheel < 4 * count) & (address >= 0)):
-        mujoco.mj_contactForce(model, data, index, force)
-        slide = jacobian[address[index] + 1 : address[index] + 3] @ data.qvel
-        tyres[:, wheel[index]] = force[0], np.hypot(force[1], force[2]), np.hypot(*slide)
-    normal, tangent, slip = tyres[:, :-1].reshape(3, count, 4)
-    return qpos.copy(), qvel.copy(), model.pair_friction[rig.pairs, 0], normal, tangent, slip
+    pressed = (wheel < 4 * count) & (address >= 0)
+    rows = address[pressed, None] + np.arange(3)
+    force, slide = data.efc_force[rows], (data.efc_J.reshape(-1, model.nv) @ data.qvel)[rows]
+    tyres = np.zeros((3, 4 * count))
+    tyres[:, wheel[pressed]] = force[:, 0], np.hypot(force[:, 1], force[:, 2]), np.hypot(slide[:, 1], slide[:, 2])
+    normal, tangent, slip = tyres.reshape(3, count, 4)
+    return rig.qpos.copy(), rig.qvel.copy(), model.pair_friction[rig.pairs, 0], normal, tangent, slip
 
 
 def _between(rig: Rig) -> float:
