@@ -194,7 +194,11 @@ def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: flo
 
 
 def place(
-    rig: Rig, still: Float[np.ndarray, "17"], position: Float[np.ndarray, "N 2"], yaw: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"]
+    rig: Rig,
+    still: Float[np.ndarray, "17"],
+    position: Float[np.ndarray, "N 2"],
+    yaw: Float[np.ndarray, " N"],
+    speed: Float[np.ndarray, " N"],
 ) -> None:
     """Put the cars at their starts, wheels turning as fast as the road passes under them, and forget what happened before."""
     mujoco.mj_resetData(rig.model, rig.data)

@@ -39,13 +39,17 @@ def numbers(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
     return car, solver
 
 
-def wheel_friction(friction: Array, pattern: Array, *, slippery: float, friction_min: float) -> Array:
+def wheel_friction(
+    friction: Float[Array, "*cases"], pattern: Int[Array, "*cases"], *, slippery: float, friction_min: float
+) -> Float[Array, "*cases 4"]:
     """Friction [..., 4] under each wheel: `slippery` times the road's where the pattern says so, and `friction_min` at least."""
     share = jnp.where(jnp.asarray(PATTERNS)[pattern], slippery, 1.0)
     return jnp.maximum(friction[..., None] * share, friction_min)
 
 
-def grip(weather: Weather, position: Float[Array, "A 4 2"], speed: Float[Array, "A 4"], *, slippery: float, friction_min: float) -> Array:
+def grip(
+    weather: Weather, position: Float[Array, "A 4 2"], speed: Float[Array, "A 4"], *, slippery: float, friction_min: float
+) -> Float[Array, "A 4"]:
     """Friction of a world whose weather holds the coefficient (`film_mm`) and the pattern (`surface`) themselves."""
     mu = wheel_friction(weather.film_mm, weather.surface, slippery=slippery, friction_min=friction_min)
     return jnp.broadcast_to(mu, speed.shape)

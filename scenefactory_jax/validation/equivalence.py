@@ -27,7 +27,7 @@ class Errors(NamedTuple):
     yaw: Float[np.ndarray, "N T A"]  # absolute, rad
     velocity: Float[np.ndarray, "N T A"]  # in the plane, m/s
     yaw_rate: Float[np.ndarray, "N T A"]  # absolute, rad/s
-    state: Float[np.ndarray, "N T A"]  # L2 over every position and velocity, SI units; wheels count by their rim speeds, not by their angles
+    state: Float[np.ndarray, "N T A"]  # L2 over all positions and velocities, SI units; wheels count by their rim speeds, not by angles
 
 
 class Histogram(NamedTuple):
