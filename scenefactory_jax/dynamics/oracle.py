@@ -157,16 +157,16 @@ def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "
 def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: float, iterations: int, line_search: int) -> Rig:
     """Two cars on the ground whose boxes collide, as a spring-damper with Coulomb friction in MuJoCo's terms.
 
-    MuJoCo gives a contact that closes by r at rate v the force f with (A + R) f = -(b v + k r) / d - a0 (its solref in the direct form is
-    [-k, -b] and its impedance d constant): A is the inverse mass that the contact moves, R = A (1 - d) / d for an A of its own, taken from
-    the model at rest, and a0 what would happen without contact. n equal contacts of a face act as one with (n + (1 - d) / d) A F / n. So
+    Of a contact that is r deep and closes at rate v, MuJoCo's force f obeys (A + R) f = (b v + k r) / d, if solref is [-k, -b], the
+    impedance is d at any depth, and nothing else accelerates the cars. A is the inverse mass that the contact moves and R = A' (1 - d) / d,
+    with A' taken from the model at rest. The n equal contacts of a face share its force F = n f, so (A + R / n) F = (b v + k r) / d, and
 
-        k = stiffness A d (n + (1 - d) / d) / n,  b = damping A d (n + (1 - d) / d) / n
+        k = stiffness (A d + A' (1 - d) / n),  b = damping (A d + A' (1 - d) / n)
 
-    make the force of a whole face `stiffness r + damping v`, for any impedance. d near 1 is a constraint: a corner that moves less mass
-    feels a force that is smaller in proportion, and the forces of one face are not known one by one. d near 0 is a spring at each of the
-    face's n points, whatever mass it moves: the law of `contact.forces`. Friction below the cone is the damper alone; MuJoCo divides its R
-    by the friction ratio.
+    make it `stiffness r + damping v` for two whole cars that meet centrally (A = 2 / mass), whatever d is. What d decides is a blow off
+    centre, which moves less mass. Near 1 the contact is a constraint that prescribes the acceleration, so its force is smaller in
+    proportion. Near 0 each of the face's points is a spring of its own, whatever it moves: the law of `contact.forces`. Friction below the
+    cone is the damper alone; MuJoCo divides its R by the friction ratio.
     """
     converged = dataclasses.replace(solver, iterations=iterations, line_search=line_search)
     spec = mujoco.MjSpec()
@@ -182,10 +182,11 @@ def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: flo
     pair.condim = 3
     pair.friction = [touch.friction, touch.friction, 0.005, 1e-4, 1e-4]
     model = spec.compile()
-    inverse_mass = 2.0 * model.body_invweight0[model.body("one/chassis").id, 0]
-    d, n = touch.impedance, FACE_POINTS
-    soft = (1.0 - d) / d
-    normal, sliding = (inverse_mass * d * (n + softness) / n for softness in (soft, soft / converged.friction_ratio))
+    chassis = model.body("one/chassis").id
+    inverse, at_rest = 2.0 / model.body_subtreemass[chassis], 2.0 * model.body_invweight0[chassis, 0]
+    d = touch.impedance
+    rigid, soft = inverse * d, at_rest * (1.0 - d) / FACE_POINTS
+    normal, sliding = rigid + soft, rigid + soft / converged.friction_ratio
     index = model.pair("cars").id
     model.pair_solimp[index] = [d, d, 1e-3, 0.5, 2.0]
     model.pair_solref[index] = [-touch.stiffness * normal, -touch.damping * normal]
