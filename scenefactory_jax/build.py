@@ -10,7 +10,7 @@ import importlib
 import inspect
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 
@@ -84,6 +84,17 @@ def check_type(value: Any, hint: Any, *, where: str) -> None:
     if not _fits(value, hint):
         wanted = getattr(hint, "__name__", None) if not typing.get_args(hint) else None
         raise ConfigError(f"{where}: {value!r} is of type {type(value).__name__}, wanted {wanted or hint}")
+
+
+def check_range(span: Sequence[float | int], *, where: str, least: float | None = 0.0) -> tuple[float | int, float | int]:
+    """The ends of a range of the config, [least, most].
+
+    Raises:
+        ConfigError: other than two ascending numbers, or one below `least`.
+    """
+    if len(span) != 2 or span[0] > span[1] or (least is not None and span[0] < least):
+        raise ConfigError(f"{where}: {list(span)}; wanted is [least, most]" + (f", nothing below {least:g}" if least is not None else ""))
+    return span[0], span[1]
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Planar geometry: angles, frames, the three circles that stand for a car, distances to segments."""
+"""Planar geometry: angles, frames, the three circles that stand for a car, distances to segments, places along lanes."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.types import Road
 
 CAR_CIRCLES = 3
+CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 
 def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -81,3 +82,20 @@ def distance_to_segments(point: Float[Array, "*n 2"], road: Road, *, half_width_
     along = jnp.maximum(jnp.abs(dot(offset, road.direction)) - road.half_length, 0.0)
     across = jnp.maximum(jnp.abs(cross(offset, road.direction)) - half_width_m, 0.0)
     return jnp.where(road.valid, norm(jnp.stack([along, across], axis=-1)), jnp.inf)
+
+
+def running_length(road: Road) -> Float[Array, " P"]:
+    """Length of all valid segments up to the end of each, laid end to end in storage order."""
+    return jnp.cumsum(jnp.where(road.valid, 2 * road.half_length, 0.0))
+
+
+def locate(
+    road: Road, running: Float[Array, " P"], distance: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
+    """Point, yaw, polyline and arc length at a distance along all valid segments laid end to end; `running` is their `running_length`."""
+    row = jnp.clip(jnp.searchsorted(running, distance), 0, running.shape[0] - 1)
+    along = distance - running[row] + road.half_length[row]  # from the midpoint
+    along = jnp.clip(along, -road.half_length[row], road.half_length[row])
+    direction = road.direction[row]
+    point = road.midpoint[row] + along[..., None] * direction
+    return point, jnp.arctan2(direction[..., 1], direction[..., 0]), road.polyline[row], road.arc[row] + along

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax import conflict
-from scenefactory_jax.build import build
+from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
+from scenefactory_jax.patches import condition
 from scenefactory_jax.types import SURFACES, Observation, Rows, Scene, State
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | Rows]
@@ -31,11 +32,22 @@ def ego(scene: Scene, state: State, *, distance_scale_m: float, speed_scale_mps:
     return jnp.concatenate(parts, axis=1)
 
 
-def weather(scene: Scene, state: State, *, film_scale_mm: float) -> Float[Array, "A 4"]:
-    """Water film and one-hot surface [film, AC, SMA, OGFC] (Eq. 2 of the paper), the same for every car of a world."""
-    surface = jax.nn.one_hot(state.weather.surface, len(SURFACES), dtype=jnp.float32)
-    token = jnp.concatenate([(state.weather.film_mm / film_scale_mm)[None], surface])
-    return jnp.broadcast_to(token, (len(state.active), len(token)))
+def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[str]) -> Float[Array, "A F"]:
+    """Water film and one-hot surface at each car's place, [film, AC, SMA, OGFC] in Eq. 2 of the paper.
+
+    Args:
+        film_scale_mm: the film that reads one.
+        surfaces: the columns of the one-hot; a surface that is not among them reads zeros.
+
+    Raises:
+        ConfigError: an unknown surface, by name.
+    """
+    if unknown := [name for name in surfaces if name not in SURFACES]:
+        raise ConfigError(f"observe.weather.surfaces: {unknown[0]!r}; valid: {', '.join(SURFACES)}")
+    film_mm, surface = condition(state.weather, state.motion.position[:, :2])
+    listed = jnp.array([SURFACES.index(name) for name in surfaces], jnp.int32)
+    one_hot = (surface[:, None] == listed).astype(jnp.float32)
+    return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
 
 
 def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float) -> Rows:

@@ -4,11 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.geometry import heading, norm
+from scenefactory_jax.geometry import CONTIGUOUS_M, heading, locate, norm, running_length
 from scenefactory_jax.struct import replace
-from scenefactory_jax.types import Agents, Road, Scene
-
-CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
+from scenefactory_jax.types import Agents, Scene
 
 
 def logged(key: PRNGKeyArray, scene: Scene) -> Agents:
@@ -42,12 +40,12 @@ def random_pairs(
     slots = scene.agents.present.shape[0]
     place_key, travel_key = jax.random.split(key)
     travel = jax.random.uniform(travel_key, (slots, candidates), minval=travel_min_m, maxval=travel_max_m)
-    cumulative = jnp.cumsum(jnp.where(scene.lanes.valid, 2 * scene.lanes.half_length, 0.0))
-    begin = jax.random.uniform(place_key, (slots, candidates)) * cumulative[-1]
-    start, start_yaw, start_lane, start_arc = _locate(scene.lanes, cumulative, begin)
-    goal, _, goal_lane, goal_arc = _locate(scene.lanes, cumulative, begin + travel)
-    _, _, first_lane, first_arc = _locate(scene.lanes, cumulative, begin - margin_m)
-    _, _, last_lane, last_arc = _locate(scene.lanes, cumulative, begin + travel + margin_m)
+    running = running_length(scene.lanes)
+    begin = jax.random.uniform(place_key, (slots, candidates)) * running[-1]
+    start, start_yaw, start_lane, start_arc = locate(scene.lanes, running, begin)
+    goal, _, goal_lane, goal_arc = locate(scene.lanes, running, begin + travel)
+    _, _, first_lane, first_arc = locate(scene.lanes, running, begin - margin_m)
+    _, _, last_lane, last_arc = locate(scene.lanes, running, begin + travel + margin_m)
     unbroken = (
         (goal_lane == start_lane)
         & (first_lane == start_lane)
@@ -68,16 +66,6 @@ def random_pairs(
         route=hide(pick(travel)),
         present=present,
     )
-
-
-def _locate(lanes: Road, cumulative: Float[Array, " P"], distance: Float[Array, "A C"]) -> tuple[Array, Array, Array, Array]:
-    """Point, yaw, lane and arc length at a distance along all valid lane segments laid end to end."""
-    row = jnp.clip(jnp.searchsorted(cumulative, distance), 0, cumulative.shape[0] - 1)
-    along = distance - cumulative[row] + lanes.half_length[row]  # from the midpoint
-    along = jnp.clip(along, -lanes.half_length[row], lanes.half_length[row])
-    direction = lanes.direction[row]
-    point = lanes.midpoint[row] + along[..., None] * direction
-    return point, jnp.arctan2(direction[..., 1], direction[..., 0]), lanes.polyline[row], lanes.arc[row] + along
 
 
 def _choose(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from scenefactory_jax.struct import struct
 
-SURFACES = ("AC", "SMA", "OGFC")  # asphalt concrete, stone mastic, open-graded; the order of the one-hot in observations
+SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
 
 # WOMD map element ids: the `kind` of a road segment (Waymo Open Motion Dataset, map.proto and GPUDrive's MapElementIds)
 LANE_FREEWAY, LANE_STREET, LANE_BIKE = 1, 2, 3

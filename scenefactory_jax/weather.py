@@ -6,15 +6,15 @@ of Zhao et al. (2024) as published with SceneFactory: `conf/weather/base.yaml` h
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.types import SURFACES, Patches, Rain, Scene, Weather
+from scenefactory_jax.patches import condition
+from scenefactory_jax.types import SURFACES, Patches, Rain, Weather
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,7 +114,7 @@ def grip(
 
     Args:
         weather: this world's road condition.
-        position: of the wheels, m; a uniform road does not read it.
+        position: of the wheels, m: each reads the condition of the road under it.
         speed: of the cars, m/s.
         mode: `static` and `dynamic` evaluate the model at `reference_speed` and `slip_static` or `slip_dynamic` (the published choice is
             `static`); `speed` evaluates it at each car's own speed and `slip_static`.
@@ -128,14 +128,14 @@ def grip(
     constants = build({**tyre, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
     if mode not in ("static", "dynamic", "speed"):
         raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
-    place = jnp.broadcast_to(weather.film_mm, position.shape[:-1])
+    film_mm, surface = condition(weather, position)
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
-    theta, texture = (jnp.broadcast_to(table[weather.surface], speed.shape) for table in _surfaces(surfaces))
-    return jnp.maximum(friction(v, place, theta, texture, s, tyre=constants), floor)
+    theta, texture = (table[surface] for table in _surfaces(surfaces))
+    return jnp.maximum(friction(v, film_mm, theta, texture, s, tyre=constants), floor)
 
 
-def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
     """theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
@@ -143,53 +143,8 @@ def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, "3"], Float[Arr
     return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Case:
-    """One road condition that may be drawn, and how often relative to the others."""
-
-    surface: str
-    film_mm: float
-    weight: float
-
-
-def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Weather:
-    """A road condition for one episode, drawn from `cases` with probability proportional to their weights.
-
-    Raises:
-        ConfigError: no case, an unknown surface, a negative film or weight, or no positive weight.
-    """
-    chosen = _cases(cases)
-    weights = jnp.asarray([case.weight for case in chosen], jnp.float32)
-    index = jax.random.choice(key, len(chosen), p=weights / weights.sum())
-    film = jnp.asarray([case.film_mm for case in chosen], jnp.float32)
-    surface = jnp.asarray([SURFACES.index(case.surface) for case in chosen], jnp.int32)
-    return uniform(film[index], surface[index])
-
-
-def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
-    make: Callable[..., Case]
-    chosen = []
-    for i, numbers in enumerate(cases):
-        where = f"weather.draw.cases[{i}]"
-        make = build({**numbers, "_target_": "Case"}, builtins=__name__, where=where)
-        case = make()
-        if case.surface not in SURFACES:
-            raise ConfigError(f"{where}.surface: {case.surface!r}; valid: {', '.join(SURFACES)}")
-        if case.film_mm < 0 or case.weight < 0:
-            raise ConfigError(f"{where}: film_mm {case.film_mm} and weight {case.weight} must not be negative")
-        chosen.append(case)
-    if sum(case.weight for case in chosen) <= 0:
-        raise ConfigError("weather.draw.cases: no case with a positive weight")
-    return chosen
-
-
 def uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:
     """One condition everywhere and for ever: no patches, no rain."""
     none, nothing = jnp.zeros(0, jnp.float32), jnp.zeros(0, bool)
     patches = Patches(jnp.zeros((0, 1, 2), jnp.float32), nothing, none, jnp.zeros(0, jnp.int32), none, none, nothing)
     return Weather(film_mm, surface, patches, Rain(now_s=jnp.float32(0.0), time_s=none, film_mm=none))
-
-
-def keep(key: PRNGKeyArray, scene: Scene) -> Weather:
-    """The scene's own road condition, as it was packed."""
-    return scene.weather

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax import ends, observations, rewards, spawn
+from scenefactory_jax import conditions, ends, observations, rain, rewards, spawn
 from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.struct import choose, replace, strong
 from scenefactory_jax.types import Agents, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
@@ -41,12 +41,13 @@ def make(config: Mapping[str, Any]) -> Env:
     parts = Parts(
         dynamics=dynamics,
         draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
-        draw_weather=build(config["weather"]["draw"], builtins="scenefactory_jax.weather", where="weather.draw"),
+        draw_weather=conditions.make(config["weather"]),
         measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
         judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.ends", where="ends"),
         terms=rewards.make(config["reward"], **context),
         groups=observations.make(config["observe"], **context),
         episode_steps=episode_steps(timing),
+        control_dt=context["control_dt"],
         respawn_clear_m=config["spawn"]["respawn_clear_m"],
     )
     return assemble(parts)
@@ -68,6 +69,7 @@ class Parts(NamedTuple):
     terms: Mapping[str, tuple[float, rewards.Term]]
     groups: Mapping[str, observations.Group]
     episode_steps: int  # control steps after which a world is truncated
+    control_dt: float  # s; the weather moves on by as much before every control step
     # None parks finished agents until the world ends (the paper's rule); a number of metres starts them again at a fresh draw
     # once no active car stands within that distance
     respawn_clear_m: float | None
@@ -113,7 +115,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
 
 def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
     """One control step, without the observation."""
-    scene = replace(scene, agents=state.agents, weather=state.weather)
+    scene = replace(scene, agents=state.agents, weather=rain.pass_time(state.weather, dt=parts.control_dt))
     action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
     measured, after = _quarantine(parts.measure(scene, state, after), state, after)
@@ -139,6 +141,7 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
         state,
         body=body,
         motion=dynamics.read(body),
+        weather=scene.weather,
         age=state.age + state.active.astype(jnp.int32),
         previous_action=action,
         step=state.step + 1,

@@ -10,7 +10,9 @@ import pytest
 from conftest import road_of
 from PIL import Image
 
-from scenefactory_jax.report import canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax import layouts
+from scenefactory_jax.report import areas, canvas, document, gif, pictures, plots, tables, video
+from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Agents, Log, Scene
 from scenefactory_jax.weather import uniform
 
@@ -399,3 +401,33 @@ def test_report_refuses_what_does_not_fit(tmp_path):
     with pytest.raises(document.DocumentError, match="no such file"):
         document.write(tmp_path, summary=summary, records=records, figures={"x": Path("nowhere.png")}, **rest)
     assert not (tmp_path / "report.md").exists()
+
+
+def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
+    spots = [
+        {"circle": [-20, 0], "radius": 3.0, "surface": None, "film_mm": 0.3, "follows": 1.0},
+        {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "follows": 0.0},
+        {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "follows": 0.0},
+    ]
+    road = jax.tree.map(jnp.asarray, trajectory.scene.weather)
+    laid = layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=spots)
+    hidden = replace(laid, present=jnp.zeros(3, bool))
+    shown, none = (replace(trajectory.scene, weather=jax.device_get(replace(road, patches=p))) for p in (laid, hidden))
+    assert [area.label for area in areas.areas(shown.weather)] == ["water", "ice", "gravel"] and not areas.areas(none.weather)
+    assert areas.look("AC", 0.8)[0][0] < areas.look("AC", 0.1)[0][0], "deeper water is bluer"
+    view = canvas.View(-60.0, -40.0, 100.0, 500)
+    lines = canvas.strokes(shown.road)
+    with_them = np.array(video.road_image(lines, view, patches=areas.areas(shown.weather)))
+    without = np.array(video.road_image(lines, view))
+    at = lambda image, x, y: image[tuple(canvas.to_pixels(view, np.array([x, y])).astype(int)[::-1])]  # noqa: E731
+    places = ((-20.0, 1.0), (-37.0, -2.0), (5.0, 21.0))
+    for (x, y), area in zip(places, areas.areas(shown.weather), strict=True):
+        assert np.abs(at(with_them, x, y).astype(int) - area.colour).max() < 6
+    assert (at(with_them, -50.0, 0.5) == at(without, -50.0, 0.5)).all() and (with_them != without).any(-1).mean() < 0.02
+    edge = at(with_them, -37.0, 4.0)
+    np.testing.assert_array_equal(edge, at(without, -37.0, 4.0))
+    figure = pictures.trajectory_figure(trajectory._replace(scene=shown))
+    assert {"water", "ice", "gravel"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+    assert not {"water", "ice"} & {text.get_text() for text in pictures.scene_figure(none).legends[0].get_texts()}
+    box, width = figure.legends[0].get_window_extent(), figure.bbox.width
+    assert box.x0 >= 0 and box.x1 <= width, "the legend fits the figure"

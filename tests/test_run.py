@@ -210,7 +210,7 @@ def test_scenes_lists_and_draws(tmp_path, capsys):
 def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
     import mujoco
 
-    settings = config.load("render", "scenes.count=1", f"out={tmp_path}")
+    settings = config.load("render", "scenes.count=1", f"out={tmp_path}", "weather=split")
     monkeypatch.setattr(rendering, "photograph", lambda model, **size: np.zeros((4, 6, 3), np.uint8))
     xml = render(settings)
     assert {str(xml), str(tmp_path / "mujoco.png")} <= set(capsys.readouterr().out.replace(": ", "\n").split("\n"))

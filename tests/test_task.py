@@ -11,9 +11,9 @@ from conftest import road_of, scene_of
 import scenefactory_jax
 from scenefactory_jax import conflict, ends, facts, geometry, observations, rewards, spawn, world
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Dynamics, Motion
-from scenefactory_jax.weather import keep
 
 CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
 
@@ -56,6 +56,7 @@ def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=Non
         terms=rewards.make(config["reward"]),
         groups=observations.make({**config["observe"], "road": {**config["observe"]["road"], "count": 40}}),
         episode_steps=steps,
+        control_dt=1 / 30,
         respawn_clear_m=respawn,
     )
     return world.assemble(parts)

@@ -9,9 +9,8 @@ import pytest
 import yaml
 from conftest import ROOT, SHARED, scene_of
 
-from scenefactory_jax import weather
+from scenefactory_jax import conditions, weather
 from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.types import SURFACES
 from scenefactory_jax.weather import uniform
 
 CONF = ROOT / "conf" / "weather"
@@ -44,7 +43,7 @@ def test_friction_matches_the_reference_table(column, slip):
     np.testing.assert_allclose(mu_of(speed, film, theta, texture, jnp.full_like(speed, slip)), wanted, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", PUBLISHED)
 def test_friction_matches_the_published_cells_to_the_printed_digit(name):
     film = jnp.array(FILMS)
     full = lambda x: jnp.full_like(film, x)  # noqa: E731
@@ -112,11 +111,11 @@ def test_draw_follows_the_weights_and_keep_keeps():
         {"surface": "SMA", "film_mm": 9.0, "weight": 0.0},
     ]
     scene = scene_of([[0, 0]], [[1, 0]])
-    drawn = jax.vmap(lambda key: weather.draw(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
+    drawn = jax.vmap(lambda key: conditions.draw(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
     assert set(np.unique(drawn.surface)) == {0, 2}
     assert float((drawn.surface == 0).mean()) == pytest.approx(0.75, abs=0.03)
     np.testing.assert_array_equal(drawn.film_mm == 0.5, drawn.surface == 2)
-    assert weather.keep(jax.random.key(0), scene) is scene.weather
+    assert conditions.keep(jax.random.key(0), scene) is scene.weather
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_grip_refuses_by_name(change, named):
 @pytest.mark.parametrize(
     ("case", "named"),
     [
-        ({"surface": "ICE", "film_mm": 0.0, "weight": 1.0}, "AC, SMA, OGFC"),
+        ({"surface": "MUD", "film_mm": 0.0, "weight": 1.0}, "AC, SMA, OGFC"),
         ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
         ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
         ({"surface": "AC", "weight": 1.0}, "film_mm"),
@@ -145,13 +144,13 @@ def test_grip_refuses_by_name(change, named):
 )
 def test_draw_refuses_by_name(case, named):
     with pytest.raises(ConfigError, match=named):
-        weather.draw(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
+        conditions.draw(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
 
 
 @pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
 def test_every_shipped_weather_draws_a_drivable_road(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    draw = build({**BASE["draw"], **config["draw"]}, builtins=weather, where="weather.draw")
+    draw = build({**BASE["draw"], **config["draw"]}, builtins=conditions, where="weather.draw")
     scene = scene_of([[0, 0]], [[1, 0]])
     drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
     mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)

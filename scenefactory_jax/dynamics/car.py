@@ -68,7 +68,7 @@ class CarParameters:
 class Solver:
     """How MuJoCo solves contacts and friction. Elliptic cones always: pyramidal ones gave NaN at few iterations."""
 
-    algorithm: Literal["Newton", "CG"]
+    algorithm: Literal["arrow", "Newton", "CG"]  # `solve.newton`, or MJX's own
     integrator: Literal["Euler", "implicitfast"]
     iterations: int
     line_search: int  # iterations
@@ -180,7 +180,7 @@ def set_options(model: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> N
     option = model.option
     option.timestep = physics_dt
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.solver = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}[solver.algorithm]
+    option.solver = mujoco.mjtSolver.mjSOL_CG if solver.algorithm == "CG" else mujoco.mjtSolver.mjSOL_NEWTON
     option.integrator = {
         "Euler": mujoco.mjtIntegrator.mjINT_EULER,
         "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,

@@ -20,6 +20,7 @@ from mujoco import mjx
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.dynamics import solve
 from scenefactory_jax.dynamics.car import CarParameters, Solver
 from scenefactory_jax.geometry import norm
 from scenefactory_jax.struct import choose, replace, struct
@@ -66,6 +67,8 @@ class Plant(NamedTuple):
     data: mjx.Data  # a template: MJX wants one, only four of its fields are ever written
     places: Places
     latched: bool
+    solver: Solver
+    layout: solve.Layout
 
 
 class Single(NamedTuple):
@@ -127,6 +130,8 @@ def make(
         data=mjx.make_data(model, impl="jax"),
         places=places(model),
         latched=brakes == "latched",
+        solver=settings,
+        layout=layout(model, brake_rows=brakes == "friction"),
     )
     still = cars.rest(model, parameters)
 
@@ -153,6 +158,15 @@ def places(model: mujoco.MjModel) -> Places:
         steer_v=at("steer", cars.FRONT, "dofadr"),
         spin_v=at("spin", cars.WHEELS, "dofadr"),
     )
+
+
+def layout(model: mujoco.MjModel, *, brake_rows: bool) -> solve.Layout:
+    """Where `solve` finds the chassis, the wheels and their constraint rows: brakes first, then three rows a tyre."""
+    at = places(model)
+    own = np.full((4, solve.OWN), model.nv)
+    own[:, 0], own[:, solve.SPIN], own[:2, 2] = at.suspension_v, at.spin_v, at.steer_v
+    first = 4 if brake_rows else 0
+    return solve.Layout(own=own, contact=first + np.arange(12).reshape(4, 3), brake=np.arange(4) if brake_rows else None)
 
 
 def start(plant: Plant, still: np.ndarray, scene: Scene) -> Body:
@@ -219,8 +233,34 @@ def move(plant: Plant, car: Single, command: Command) -> tuple[Single, Tyres]:
         loss = model.dof_frictionloss.at[plant.places.spin_v].set(command.brake + cars.LATENT_FRICTION)
         model = model.replace(dof_frictionloss=loss)
     data = plant.data.replace(qpos=car.qpos, qvel=car.qvel, qacc_warmstart=car.qacc_warmstart, qfrc_applied=applied)
-    data = mjx.step(model, data)
-    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(data, command.mu)
+    if plant.solver.algorithm != "arrow":
+        data = mjx.step(model, data)
+        rows = data._impl.efc_force[plant.layout.contact]
+    else:
+        data, rows = _step(plant, model, data, command)
+    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(plant, data, rows, car.qvel, command.mu)
+
+
+def _step(plant: Plant, model: mjx.Model, data: mjx.Data, command: Command) -> tuple[mjx.Data, Float[Array, "4 3"]]:
+    """`mjx.step` with the solver made for this tree; also the forces of the tyres' contacts."""
+    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+        data = stage(model, data)
+    rows = data._impl
+    acceleration, force = solve.newton(
+        rows.M,
+        data.qfrc_smooth,
+        rows.efc_J,
+        rows.efc_aref,
+        rows.efc_D,
+        command.mu,
+        command.brake + cars.LATENT_FRICTION,
+        data.qacc_warmstart,
+        layout=plant.layout,
+        friction_ratio=plant.solver.friction_ratio,
+        iterations=plant.solver.iterations,
+        line_search=plant.solver.line_search,
+    )
+    return mjx.euler(model, data.replace(qacc=acceleration)), force
 
 
 def _generalised_force(plant: Plant, body: Single, command: Command) -> tuple[Float[Array, "16"], Float[Array, "4"]]:
@@ -248,11 +288,9 @@ def _generalised_force(plant: Plant, body: Single, command: Command) -> tuple[Fl
     return applied, sign
 
 
-def _tyres(data: mjx.Data, mu: Float[Array, "4"]) -> Tyres:
-    """What the contact rows say of the tyres, before the step's integration."""
-    rows = np.asarray(data._impl.contact.efc_address)[:, None] + np.arange(3)
-    force = data._impl.efc_force[rows]
-    slide = (data._impl.efc_J @ data.qvel)[rows][:, 1:]
+def _tyres(plant: Plant, data: mjx.Data, force: Float[Array, "4 3"], qvel: Float[Array, "16"], mu: Float[Array, "4"]) -> Tyres:
+    """What the contact rows say of the tyres, at the beginning of the step."""
+    slide = (data._impl.efc_J @ qvel)[plant.layout.contact[:, 1:]]
     return Tyres(mu=mu, normal=force[:, 0], tangent=norm(force[:, 1:]), slip=norm(slide))
 
 

@@ -47,8 +47,9 @@ MARKS: dict[str, Mark] = {
 class Trajectory(NamedTuple):
     """One recorded world: what a picture or a video of an episode needs, as numpy arrays.
 
-    `goal` is `[A, 2]`, or `[T, A, 2]` where agents are respawned with new goals. `events` maps a name of `MARKS` to the steps at which it
-    is new. `weather` is text such as "SMA, 0.5 mm".
+    `scene` holds the episode's own weather, whose patches are drawn with the films of its start. `goal` is `[A, 2]`, or `[T, A, 2]` where
+    agents are respawned with new goals. `events` maps a name of `MARKS` to the steps at which it is new. `weather` is text:
+    "SMA, 0.5 mm", or "AC, 0.0 to 0.4 mm" where it rains.
     """
 
     scene: Scene

@@ -18,8 +18,9 @@ PROTOCOLS = {
     "invincible": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
 }
 KEY_NUMBERS = (
-    "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.draw", "weather.grip.mode",
-    "spawn.draw", "facts.goal_radius_m", "facts.collision_force_n", "ends.ending", "ppo", "policy._target_", "scenes",
+    "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.draw", "weather.patches",
+    "weather.rain", "weather.grip.mode", "spawn.draw", "facts.goal_radius_m", "facts.collision_force_n", "ends.ending", "ppo",
+    "policy._target_", "scenes",
 )  # fmt: skip
 _GROUPS, _FAILURES = 20, 40  # the longest tables that a reader still reads; the CSV holds everything
 

@@ -3,15 +3,16 @@
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from scenefactory_jax.report import canvas
+from scenefactory_jax.report import areas, canvas
+from scenefactory_jax.report.areas import Area
 from scenefactory_jax.report.canvas import ASPHALT, GROUND, INK, MARKS, Colour, Trajectory
 from scenefactory_jax.report.plots import STYLE
-from scenefactory_jax.types import Road, Scene
+from scenefactory_jax.types import Scene
 
 _INCHES, _SHARE = 6.4, 0.84  # side of the figure, and the axes' share of it
 
@@ -37,7 +38,7 @@ def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figur
             axes.plot(*np.stack([start[agent], goal[agent]]).T, color=_rgb(canvas.colour_of(agent)), **look)
             _draw_goal(axes, goal[agent], agent, scale)
             _draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), agent)
-        _legend(figure, [], car="start", road=scene.road)
+        _legend(figure, [], car="start", scene=scene, road=True)
     return figure
 
 
@@ -71,7 +72,7 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
                 points = trajectory.position[trajectory.events[name] & trajectory.present]
                 look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
                 axes.plot(*points.T, color=_rgb(MARKS[name].colour), **look)
-        _legend(figure, [name for name in seen if name != "reached"], car="end (start: outline)", road=None)
+        _legend(figure, [name for name in seen if name != "reached"], car="end (start: outline)", scene=trajectory.scene, road=False)
     return figure
 
 
@@ -84,11 +85,21 @@ def _stage(scene: Scene, window: tuple[float, float, float], *, title: str) -> t
     axes.grid(False)
     axes.set_title(title)
     scale = _INCHES * _SHARE * 72 / side
-    for order, stroke in enumerate(canvas.strokes(scene.road)):
+    lines = canvas.strokes(scene.road)
+    _draw_areas(axes, areas.areas(scene.weather), zorder=1 + (areas.under(lines) - 0.5) / 100)
+    for order, stroke in enumerate(lines):
         width = max(stroke.width * scale, 0.5 * stroke.thinnest)
         look = {"linewidths": width, "capstyle": "round" if width > 4 else "butt", "zorder": 1 + order / 100}
         axes.add_collection(LineCollection(list(stroke.lines), colors=[_rgb(stroke.colour)], **look))
     return figure, axes, scale
+
+
+def _draw_areas(axes: Axes, patches: list[Area], *, zorder: float) -> None:
+    """Patches with an edge about the union of each one's pieces: all pieces with their edge first, then filled once more without."""
+    for rank, area in enumerate(patches):
+        for colour, width, above in ((area.edge, 1.0, 0.0), (area.colour, 0.1, 0.5)):
+            look = {"facecolors": [_rgb(colour)], "edgecolors": [_rgb(colour)], "linewidths": width}
+            axes.add_collection(PolyCollection(area.pieces, **look, zorder=zorder + 0.004 * (rank + above) / len(patches)))
 
 
 def _draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, agent: int, *, hollow: bool = False) -> None:
@@ -109,20 +120,26 @@ def _draw_goal(axes: Axes, place: np.ndarray, agent: int, scale: float) -> None:
     axes.text(x, y, str(agent), color=colour, fontsize=size, ha="center", va="center_baseline", zorder=3.6, clip_on=True)
 
 
-def _legend(figure: Figure, events: list[str], *, car: str, road: Road | None) -> None:
+def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: bool) -> None:
     """What the shapes mean, below the axes."""
     handles = [
         Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(canvas.AGENTS[0]), markersize=7, label=f"car at its {car}"),
         Line2D([], [], marker="o", linestyle="none", color=_rgb(canvas.AGENTS[0]), markerfacecolor="none", markersize=8, label="its goal"),
     ]
-    if road is not None:
-        drawn = {stroke.colour for stroke in canvas.strokes(road)}
+    if road:
+        drawn = {stroke.colour for stroke in canvas.strokes(scene.road)}
         looks = (("lane", ASPHALT, 6), ("road edge", canvas.EDGE, 1.5), ("yellow line", canvas.YELLOW, 1.5))
         handles += [Line2D([], [], color=_rgb(colour), linewidth=width, label=label) for label, colour, width in looks if colour in drawn]
+    for area in {area.label: area for area in areas.areas(scene.weather)}.values():
+        look = {"color": _rgb(area.colour), "markeredgecolor": _rgb(area.edge), "markeredgewidth": 0.6}
+        handles.append(Line2D([], [], marker="s", linestyle="none", markersize=8, label=area.label, **look))
     for name in events:
         mark = MARKS[name]
         handles.append(Line2D([], [], marker=mark.marker, linestyle="none", color=_rgb(mark.colour), markersize=8, label=mark.label))
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), handletextpad=0.5, columnspacing=1.4)
+    crowded = len(handles) > 6  # two rows below the axes, in smaller print
+    look = {"fontsize": 7.5, "labelspacing": 0.25, "borderpad": 0.0} if crowded else {}
+    columns = -(-len(handles) // (2 if crowded else 1))
+    figure.legend(handles=handles, loc="lower center", ncols=columns, handletextpad=0.5, columnspacing=1.4, **look)
 
 
 def _rgb(colour: Colour) -> tuple[float, float, float]:

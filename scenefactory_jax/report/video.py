@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from scenefactory_jax.report import canvas, gif
+from scenefactory_jax.report import areas, canvas, gif
+from scenefactory_jax.report.areas import Area
 from scenefactory_jax.report.canvas import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
 
 _FINE = 2  # pictures are drawn at this many times their size and reduced
@@ -157,7 +158,7 @@ def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
     return _Stage(
         trajectory=trajectory,
         view=view,
-        background=road_image(canvas.strokes(trajectory.scene.road), view),
+        background=road_image(canvas.strokes(trajectory.scene.road), view, patches=areas.areas(trajectory.scene.weather)),
         way=canvas.to_pixels(view, trajectory.position),
         driven=canvas.moves(trajectory),
         ended=steps - last,
@@ -169,13 +170,16 @@ def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
     )
 
 
-def road_image(lines: Sequence[Stroke], view: View) -> Image.Image:
-    """The static picture of a road in a window, with a 20 m scale bar in its lower left corner."""
+def road_image(lines: Sequence[Stroke], view: View, *, patches: Sequence[Area] = ()) -> Image.Image:
+    """The static picture of a road and its patches in a window, with a 20 m scale bar in its lower left corner."""
     fine = view._replace(pixels=view.pixels * 2)
     image = Image.new("RGB", (fine.pixels, fine.pixels), GROUND)
     draw = ImageDraw.Draw(image)
     scale = fine.pixels / view.side
-    for stroke in lines:
+    first = areas.under(list(lines))
+    for order, stroke in enumerate(lines):
+        if order == first:
+            _draw_areas(draw, fine, patches)
         width = max(stroke.width * scale, stroke.thinnest * _FINE * 2)
         ends = canvas.to_pixels(fine, stroke.lines)
         near = (ends.max(axis=(1, 2)) > -width) & (ends.min(axis=(1, 2)) < fine.pixels + width)
@@ -184,10 +188,22 @@ def road_image(lines: Sequence[Stroke], view: View) -> Image.Image:
             if width > 6:  # round ends close the gaps between the segments of a bend
                 for x, y in ((x0, y0), (x1, y1)):
                     draw.ellipse((x - width / 2, y - width / 2, x + width / 2, y + width / 2), fill=stroke.colour)
+    if first == len(lines):
+        _draw_areas(draw, fine, patches)
     left, low, thick = 0.03 * fine.pixels, 0.97 * fine.pixels, 0.004 * fine.pixels
     draw.rectangle((left, low - thick, left + 20.0 * scale, low), fill=INK)
     draw.text((left, low - 2 * thick), "20 m", font=_font(round(fine.pixels / 38)), fill=INK, anchor="lb")
     return image.reduce(2)
+
+
+def _draw_areas(draw: ImageDraw.ImageDraw, view: View, patches: Sequence[Area]) -> None:
+    """Patches with an edge about the union of each one's pieces."""
+    for area in patches:
+        pieces = [canvas.to_pixels(view, piece).ravel().tolist() for piece in area.pieces]
+        for piece in pieces:  # a line reaches to both sides, a polygon's own outline only inwards
+            draw.line([*piece, *piece[:4]], fill=area.edge, width=3 * _FINE, joint="curve")
+        for piece in pieces:
+            draw.polygon(piece, fill=area.colour)
 
 
 def _draw_world(stage: _Stage, now: int, *, trail_s: float | int) -> Image.Image:

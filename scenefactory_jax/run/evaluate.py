@@ -17,7 +17,8 @@ from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, sources
 from scenefactory_jax.run.train import make_policy
-from scenefactory_jax.types import SURFACES
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import SURFACES, Weather
 
 PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
@@ -139,7 +140,7 @@ def make_examiner(
 
     def examine(parameters):
         episode = begin(keys, batch)
-        present, started = jax.device_get((episode.state.agents.present, episode.tally.goal_distance))
+        present, started, weather = jax.device_get((episode.state.agents.present, episode.tally.goal_distance, episode.state.weather))
         kept = []
         for step in range(0, limit, chunk):
             episode, frames = play(parameters, batch, episode)
@@ -147,14 +148,16 @@ def make_examiner(
                 kept.append(jax.device_get(frames))
             if bool(episode.over.all()):
                 break
-        records = _records(jax.device_get(episode), present, started, names, seed=settings["seed"], control_hz=control_hz)
-        return records, _trajectories(kept, episode, batch, names, filmed, control_hz) if film else []
+        records = _records(jax.device_get(episode), present, started, weather, names, seed=settings["seed"], control_hz=control_hz)
+        return records, _trajectories(kept, episode, batch, weather, names, filmed, control_hz) if film else []
 
     return examine
 
 
-def _records(episode, present, started, names: list[str], *, seed: int, control_hz: float) -> dict[str, np.ndarray]:
-    """One row for every spawned agent of every world."""
+def _records(
+    episode, present, started, weather: Weather, names: list[str], *, seed: int, control_hz: float
+) -> dict[str, np.ndarray]:
+    """One row for every spawned agent of every world; film and surface are the open road's at the start."""
     tally, state = episode.tally, episode.state
     row_world, row_agent = np.nonzero(present)
     of = lambda leaf: np.asarray(leaf)[row_world, row_agent]  # noqa: E731
@@ -179,13 +182,15 @@ def _records(episode, present, started, names: list[str], *, seed: int, control_
         "has_ttc": seen > 0,
         "mean_speed": of(tally.speed_sum) / steps,
         "max_contact_force_n": of(tally.force_max),
-        "film_mm": np.asarray(state.weather.film_mm)[row_world],
-        "surface": np.array(SURFACES)[np.asarray(state.weather.surface)[row_world]],
+        "film_mm": np.asarray(weather.film_mm)[row_world],
+        "surface": np.array(SURFACES)[np.asarray(weather.surface)[row_world]],
         "friction": of(tally.grip_sum) / steps,
     }
 
 
-def _trajectories(kept: list, episode, batch, names: list[str], steps: int, control_hz: float) -> list[Trajectory]:
+def _trajectories(
+    kept: list, episode, batch, weathers: Weather, names: list[str], steps: int, control_hz: float
+) -> list[Trajectory]:
     """The filmed worlds as a viewer wants them: cut where the last car finished."""
     frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :steps], *kept)
     found = []
@@ -194,11 +199,11 @@ def _trajectories(kept: list, episode, batch, names: list[str], steps: int, cont
         live = np.flatnonzero(frames.active[index].any(axis=1))
         end = min((live[-1] if len(live) else 0) + round(control_hz), frames.active.shape[1])
         cut = lambda leaf, i=index, end=end: leaf[i, :end]  # noqa: E731
-        weather = jax.device_get(jax.tree.map(lambda leaf, i=index: leaf[i], episode.state.weather))
+        weather = jax.tree.map(lambda leaf, i=index: leaf[i], weathers)
         agents = jax.device_get(jax.tree.map(lambda leaf, i=index: leaf[i], episode.state.agents))
         found.append(
             Trajectory(
-                scene=scene,
+                scene=replace(scene, weather=weather),
                 position=cut(frames.position),
                 yaw=cut(frames.yaw),
                 speed=cut(frames.speed),
@@ -209,7 +214,14 @@ def _trajectories(kept: list, episode, batch, names: list[str], steps: int, cont
                 present=agents.present,
                 control_hz=control_hz,
                 title=names[index],
-                weather=f"{SURFACES[int(weather.surface)]}, {float(weather.film_mm):.1f} mm",
+                weather=_describe(weather, seconds=end / control_hz),
             )
         )
     return found
+
+
+def _describe(weather: Weather, *, seconds: float) -> str:
+    """Surface and film of the open road at the start, and the film at the end where that is another."""
+    rain, first = weather.rain, f"{float(weather.film_mm):.1f}"
+    last = f"{np.interp(seconds, rain.time_s, rain.film_mm):.1f}" if len(rain.time_s) else first
+    return f"{SURFACES[int(weather.surface)]}, {first} mm" if first == last else f"{SURFACES[int(weather.surface)]}, {first} to {last} mm"

@@ -11,16 +11,20 @@ import jax
 import mujoco
 import numpy as np
 
+from scenefactory_jax import conditions
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.run import keys, sources
 from scenefactory_jax.run.scenes import draw
 from scenefactory_jax.scenes import mjcf
+from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Scene
 
 
 def render(config: Mapping[str, Any]) -> Path:
     """Write `scene.xml` (open it with `python -m mujoco.viewer --mjcf=...`), a bird's-eye picture and MuJoCo's own view to `out`.
+
+    The bird's-eye picture shows the patches of one draw of the weather.
 
     Raises:
         ConfigError: no such scene, or a dynamics without a car to show.
@@ -38,7 +42,9 @@ def render(config: Mapping[str, Any]) -> Path:
     xml = out / "scene.xml"
     xml.write_text(spec.to_xml())
     print(f"{loaded.names[index]}: {xml}", flush=True)
-    one = sources.Scenes(jax.tree.map(lambda leaf: leaf[None], scene), (loaded.names[index],), loaded.account)
+    weather = jax.jit(conditions.make(config["weather"]))(jax.random.key(config["seed"]), scene)
+    drawn = replace(scene, weather=jax.device_get(weather))
+    one = sources.Scenes(jax.tree.map(lambda leaf: leaf[None], drawn), (loaded.names[index],), loaded.account)
     print(draw(one, out, limit=1)[0], flush=True)
     try:
         imageio.imwrite(out / "mujoco.png", photograph(spec.compile(), **config["image"]))
