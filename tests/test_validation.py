@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import mjx_car, oracle
@@ -30,9 +29,8 @@ STUCK = sequences.Sequences(
 
 @pytest.fixture(scope="module")
 def entry():
-    """The shipped car, with a solver that holds the bound."""
-    changes = {"solver": {"iterations": 4, "line_search": 8}}
-    return OmegaConf.to_container(OmegaConf.merge(load("task", "dynamics=mjx_car")["dynamics"], changes))
+    """The shipped car, with the shipped solver."""
+    return load("task", "dynamics=mjx_car")["dynamics"]
 
 
 @pytest.fixture(scope="module")

@@ -299,7 +299,7 @@ def _record(rig: Rig) -> tuple[np.ndarray, ...]:
     wheel, address = rig.tyre_of[contact.geom[:, 1]], contact.efc_address
     pressed = (wheel < 4 * count) & (address >= 0)
     rows = address[pressed, None] + np.arange(3)
-    force, slide = data.efc_force[rows], (data.efc_J.reshape(-1, model.nv) @ data.qvel)[rows]
+    force, slide = data.efc_force[rows], data.efc_vel[rows]  # both at the beginning of the step
     tyres = np.zeros((3, 4 * count))
     tyres[:, wheel[pressed]] = force[:, 0], np.hypot(force[:, 1], force[:, 2]), np.hypot(slide[:, 1], slide[:, 2])
     normal, tangent, slip = tyres.reshape(3, count, 4)

@@ -90,9 +90,9 @@ def scenes(
             route=jnp.zeros_like(heading),
             present=jnp.ones(count, bool),
         )
-        still = jnp.zeros((count, 1), jnp.float32)
-        log = Log(place[:, None], heading[:, None], jnp.zeros((count, 1, 2), jnp.float32), still > 0.0, jnp.float32(1.0))
-        return Scene(lines, lines, lines, agents, log, uniform(mu, row))
+        none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
+        log = Log(position=place[:, None], yaw=heading[:, None], **none)
+        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=uniform(mu, row))
 
     arrays = [jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction)]
     return jax.vmap(world)(*arrays, jnp.asarray(pattern, jnp.int32), road())

@@ -122,9 +122,9 @@ def compare(
 
 def phase(run: Run, *, force_min: float, window: int, gap_steps: int) -> Phase:
     """Where each encounter's first collision begins and ends, in control steps."""
-    push = run.contact_force >= force_min
+    push = np.asarray(run.contact_force >= force_min)
     count, steps = push.shape
-    touched = push.any(1)
+    touched = np.asarray(push.any(axis=1))
     first = np.where(touched, push.argmax(1), 0)
     after, parted = first.copy(), np.zeros(count, bool)
     for case in np.flatnonzero(touched):

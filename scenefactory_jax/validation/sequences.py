@@ -70,7 +70,8 @@ def draw(
         rows.append((speed, friction, pattern, levels[held]))
     speed, friction, pattern, controls = zip(*rows, strict=True)
     # single precision, so that both engines get the same numbers
-    return Sequences(np.float32(speed), np.float32(friction), np.array(pattern, np.int32), np.array(controls, np.float32))
+    start, road, actions = (np.array(column, np.float32) for column in (speed, friction, controls))
+    return Sequences(start, road, np.array(pattern, np.int32), actions)
 
 
 def describe(cases: Sequences, index: int) -> str:
