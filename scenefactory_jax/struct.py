@@ -40,7 +40,11 @@ def static(**options: Any) -> Any:
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static))
 def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and a pytree; every field not declared `static()` is a child."""
-    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    return pytree(dataclasses.dataclass(frozen=True, eq=False)(cls))
+
+
+def pytree(cls: type[T]) -> type[T]:
+    """Make a frozen dataclass a pytree."""
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     data = [f.name for f in fields if not f.metadata.get("static")]
     meta = [f.name for f in fields if f.metadata.get("static")]

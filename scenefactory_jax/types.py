@@ -235,7 +235,7 @@ class Outcome:
 class Dynamics(NamedTuple):
     """A backend: cars of one world. `advance` covers one control step; bodies of inactive cars are held and touch nobody."""
 
-    init: Callable[[Scene], Any]
+    init: Callable[[PRNGKeyArray, Scene], Any]
     advance: Callable[[Scene, Any, Float[Array, "A 3"], Bool[Array, " A"]], Any]  # (scene, body, action, active) -> body
     read: Callable[[Any], Motion]
 

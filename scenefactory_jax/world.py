@@ -96,7 +96,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
     """A fresh episode."""
     agents_key, weather_key, key = jax.random.split(key, 3)
     agents, weather = parts.draw_agents(agents_key, scene), parts.draw_weather(weather_key, scene)
-    body = parts.dynamics.init(replace(scene, agents=agents, weather=weather))
+    body = parts.dynamics.init(jax.random.fold_in(key, 0), replace(scene, agents=agents, weather=weather))
     count = agents.present.shape[0]
     state = State(
         body=body,
@@ -164,12 +164,13 @@ def _finite(value: Array) -> Array:
 def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
     """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
     draw_key, key = jax.random.split(state.key)
+    body_key = jax.random.fold_in(draw_key, 0)
     fresh = draw_agents(draw_key, scene)
     waiting = ~state.active & fresh.present
     clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, clear_m=clear_m)
     begins = waiting & clear
     agents = choose(begins, fresh, state.agents)
-    body = choose(begins, dynamics.init(replace(scene, agents=agents)), state.body)
+    body = choose(begins, dynamics.init(body_key, replace(scene, agents=agents)), state.body)
     count = begins.shape[0]
     return replace(
         state,

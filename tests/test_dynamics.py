@@ -24,6 +24,7 @@ G, WHEELBASE = 9.81, 2.6
 MU = np.array([0.86, 0.05, 0.1, 0.3, 0.5, 0.7, 1.0, 1.1], np.float32)
 LANES = 500.0 * np.arange(8)
 EVERYONE = jnp.ones(8, bool)
+KEY = jax.random.key(0)
 CHUNK = 30  # control steps in one compiled run: a second
 BACKENDS = ("mjx_car", "bicycle", "replay")
 
@@ -69,7 +70,7 @@ def compile_(dynamics):
 @functools.cache
 def backend(name):
     dynamics = make(name)
-    return dynamics, compile_(dynamics), jax.jit(dynamics.init)
+    return dynamics, compile_(dynamics), jax.jit(functools.partial(dynamics.init, KEY))
 
 
 def drive(name, scene, action, active=EVERYONE, body=None):
@@ -298,8 +299,8 @@ def test_bicycle_circle_closes_and_braking_stops():
     steps = round(period * 30)
     run = jax.jit(lambda body: jax.lax.scan(lambda b, a: (b := free.advance(scene, b, a, EVERYONE), free.read(b)), body, turn))
     turn = jnp.tile(jnp.array([0.0, steer, 0.0]), (steps, 8, 1))
-    _, motion = run(free.init(scene))
-    start = free.read(free.init(scene)).position
+    _, motion = run(free.init(KEY, scene))
+    start = free.read(free.init(KEY, scene)).position
     missing = abs(period - steps / 30) * speed  # the last step does not end exactly at the start
     assert np.linalg.norm(motion.position[-1] - start, axis=-1).max() < missing + 0.01
     across = np.ptp(np.asarray(motion.position[:, 0, :2]), axis=0)
@@ -368,7 +369,7 @@ def test_published_car_drives_and_creeps_under_its_latched_brakes():
     """The published scheme flips the brake torque every substep at a locked wheel: the car never holds."""
     scene = scene_for(speed=15.0)
     dynamics = make("mjx_published")
-    second, body = compile_(dynamics), dynamics.init(scene)
+    second, body = compile_(dynamics), dynamics.init(KEY, scene)
     for _ in range(34):
         body, (_, motion) = second(scene, body, jnp.asarray(constant(brake=1.0), jnp.float32), EVERYONE)
     assert np.isfinite(body.qpos).all()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.build import build
 from scenefactory_jax.geometry import heading, norm, wrap_angle
@@ -97,7 +97,7 @@ class Limits(NamedTuple):
     speed: float
 
 
-def init(scene: Scene) -> Body:
+def init(key: PRNGKeyArray, scene: Scene) -> Body:
     """Cars at their starts."""
     agents = scene.agents
     zero = jnp.zeros(agents.yaw.shape, jnp.float32)

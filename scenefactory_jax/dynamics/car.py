@@ -8,30 +8,37 @@ faster. What does not spin adds to the wheel body's mass, and to its inertia abo
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.struct import pytree
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
 FRONT = WHEELS[:2]
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
+GRAVITY = 9.81  # m/s^2, MuJoCo's default
 LATENT_FRICTION = 1e-3  # N m; the brakes' solver rows exist only if the model is compiled with a positive friction loss
 
 
+@pytree
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CarParameters:
-    """Every number of the car. Sources: SceneFactory's vehicle (URDF and system identification), facts sheet section 2."""
+    """Every number of the car. Sources: SceneFactory's vehicle (URDF and system identification), facts sheet section 2.
+
+    Plain numbers describe one car; `fleet` makes trees of the same shape with an agent axis, for cars that differ.
+    """
 
     length: float  # of the chassis box, m
     width: float  # of the chassis box, m
     height: float  # of the chassis box, m
     mass: float  # of the chassis, kg
     inertia: tuple[float, float, float] | list[float]  # of the chassis about its centre of mass, roll, pitch, yaw, kg m^2
-    mass_height: float  # of the chassis' centre of mass above the box's centre, m
+    mass_forward: float  # of the chassis' centre of mass before the box's centre, m
+    mass_height: float  # and above it, m
     wheelbase: float  # m
     track: float  # between the wheels' centres, m
     wheel_height: float  # of the wheels' centres above the box's centre at mid travel, m
@@ -46,7 +53,7 @@ class CarParameters:
     knuckle_inertia: float  # of the same, kg m^2
     suspension_stiffness: float  # of a corner, N/m
     suspension_damping: float  # of a corner, N s/m
-    suspension_preload: float  # spring force of a corner at mid travel, N; a quarter of the chassis' weight rides at mid travel
+    suspension_preload: float  # share of its corner's load that a spring carries at mid travel: 1 rides there, 0 is an unloaded spring
     suspension_travel: float  # from mid travel to either stop, m
     stop_stiffness: float  # of the bump stops beyond the travel, N/m
     steering_limit: float  # rad
@@ -57,6 +64,9 @@ class CarParameters:
     drive_torque: float  # of each front wheel at full throttle, N m
     brake_torque_front: float  # of each front wheel at full brake, N m
     brake_torque_rear: float  # of each rear wheel at full brake, N m
+    body_stiffness: float  # of a corner of the chassis that touches the ground (roll-over), N/m
+    body_damping: float  # of the same, N s/m
+    body_friction: float  # of the same, Coulomb coefficient
     lateral_damping: float  # force against sideways speed of the chassis, N s/m
     yaw_damping: float  # torque against yaw rate of the chassis, N m s/rad
     tyre_time_constant: float  # of the contact with the ground (MuJoCo solref), s
@@ -88,7 +98,7 @@ def spec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec
     model.compiler.autolimits = False
     chassis = model.worldbody.add_body(name="chassis", pos=[0, 0, car.wheel_radius - car.wheel_height])
     chassis.add_freejoint(name="root")
-    _inertial(chassis, car.mass, car.inertia, at=[0.0, 0.0, car.mass_height])
+    _inertial(chassis, car.mass, car.inertia, at=[car.mass_forward, 0.0, car.mass_height])
     _solid(chassis, "box", mujoco.mjtGeom.mjGEOM_BOX, [car.length / 2, car.width / 2, car.height / 2], rgba=PAINT)
     for name in WHEELS:
         _add_wheel(chassis, name, car, visual=visual, brake_rows=brake_rows)
@@ -106,7 +116,7 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
     hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
     spring = wheel.add_joint(name=f"suspension_{name}", type=slide, axis=[0, 0, 1])
     spring.stiffness, spring.damping = _linear(car.suspension_stiffness), _linear(car.suspension_damping)
-    spring.springref = -car.suspension_preload / car.suspension_stiffness
+    spring.springref = -corner_load(car, front=front) * car.suspension_preload / car.suspension_stiffness
     if front:
         wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1]).damping = _linear(car.steering_friction)
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
@@ -125,6 +135,44 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
         _solid(wheel, f"rim_{name}", mujoco.mjtGeom.mjGEOM_CYLINDER, size, rgba=RUBBER, quat=lie)
         spoke = [0.9 * car.wheel_radius, car.wheel_width / 2 + 0.005, 0.04]
         _solid(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1.0])
+
+
+class Places(NamedTuple):
+    """Where the compiled car's parts stand in MuJoCo's arrays, wheels in the order of `WHEELS`; all static."""
+
+    chassis: int  # body
+    wheel: np.ndarray  # bodies
+    tyre: np.ndarray  # geoms
+    suspension: np.ndarray  # joints
+    suspension_q: np.ndarray  # in qpos
+    suspension_v: np.ndarray  # in qvel
+    steer_q: np.ndarray  # of the front wheels
+    steer_v: np.ndarray
+    spin_v: np.ndarray
+
+
+def places(model: mujoco.MjModel) -> Places:
+    """Look them up by name."""
+
+    def each(kind: Callable[[str], Any], prefix: str, number: str, wheels: Sequence[str] = WHEELS) -> np.ndarray:
+        return np.array([np.atleast_1d(getattr(kind(f"{prefix}_{wheel}"), number))[0] for wheel in wheels])
+
+    return Places(
+        chassis=model.body("chassis").id,
+        wheel=each(model.body, "wheel", "id"),
+        tyre=each(model.geom, "tyre", "id"),
+        suspension=each(model.joint, "suspension", "id"),
+        suspension_q=each(model.joint, "suspension", "qposadr"),
+        suspension_v=each(model.joint, "suspension", "dofadr"),
+        steer_q=each(model.joint, "steer", "qposadr", FRONT),
+        steer_v=each(model.joint, "steer", "dofadr", FRONT),
+        spin_v=each(model.joint, "spin", "dofadr"),
+    )
+
+
+def corner_load(car: CarParameters, *, front: bool) -> float:
+    """Weight of the chassis on one wheel at rest, N: the axle nearer to the centre of mass carries more."""
+    return car.mass * GRAVITY / 2 * (0.5 + car.mass_forward / car.wheelbase * (1 if front else -1))
 
 
 def _linear(coefficient: float) -> list[float]:
@@ -212,12 +260,19 @@ def stable_limits(car: CarParameters, *, physics_dt: float) -> None:
     springs = {
         "suspension and stop": (unsprung, car.suspension_stiffness + car.stop_stiffness, car.suspension_damping),
         "steering": (about_steer, car.steering_stiffness, car.steering_damping + car.steering_friction),
+        "body on the ground": (light_corner(car), car.body_stiffness, car.body_damping),
     }
     for name, (mass, stiffness, damping) in springs.items():
         load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
         if load >= 4.0:
             message = f"(k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}; it must stay below 4"
             raise ConfigError(f"dynamics.car: the {name} cannot be integrated: {message}")
+
+
+def light_corner(car: CarParameters) -> float:
+    """Mass that a corner of the chassis pushes against, kg: what a force there moves, turning included."""
+    roll, pitch, _ = car.inertia
+    return 1.0 / (1.0 / car.mass + (car.width / 2) ** 2 / roll + (car.length / 2) ** 2 / pitch)
 
 
 def rest(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
@@ -232,5 +287,5 @@ def rest(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
         mujoco.mj_step(model, data)
     settled = model.qpos0.copy()
     settled[2] = data.qpos[2]
-    settled[position] = data.qpos[position].mean()
+    settled[position] = data.qpos[position]
     return settled

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import build
 from scenefactory_jax.geometry import norm, wrap_angle
@@ -54,7 +54,7 @@ def make(*, start_row: int, centre_height: float, contact: dict[str, Any], grip:
             slip=zero,
         )
 
-    def init(scene: Scene) -> Body:
+    def init(key: PRNGKeyArray, scene: Scene) -> Body:
         steps = jnp.zeros(scene.agents.yaw.shape, jnp.int32)
         return Body(steps=steps, motion=at(scene, steps))
 

@@ -240,6 +240,13 @@ def _search(problem: Problem, at: Acceleration, along: Acceleration, *, steps: i
     return length
 
 
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Of a small symmetric positive definite matrix, without a library call."""
+    count = matrix.shape[0]
+    factors = _factor([[matrix[i, j] for j in range(i + 1)] for i in range(count)])
+    return jnp.stack([jnp.stack(_solve(factors, list(row))) for row in jnp.eye(count)])
+
+
 def _factor(matrix: list[list[Number]]) -> tuple[list[list[Number]], list[Number]]:
     """L and 1/D of a symmetric positive definite matrix L D L^T; only its lower half is read."""
     lower: list[list[Number]] = []
