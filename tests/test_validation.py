@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import mjx_car, oracle
+from scenefactory_jax.dynamics import oracle
 from scenefactory_jax.run.config import load
 from scenefactory_jax.validation import encounters, engines, equivalence, impacts, sequences
 
@@ -179,7 +179,7 @@ def test_places_of_the_wheels_rates():
     car, solver = cars.CarParameters(**dynamics["car"]), cars.Solver(**dynamics["solver"])
     model = cars.standalone(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
     assert isinstance(model, mujoco.MjModel)
-    np.testing.assert_array_equal(mjx_car.places(model).spin_v, equivalence.SPIN)
+    np.testing.assert_array_equal(cars.places(model).spin_v, equivalence.SPIN)
 
 
 def test_drives_are_seeded_and_cover_their_ranges():

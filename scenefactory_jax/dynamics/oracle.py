@@ -3,7 +3,7 @@
 """The same cars and controls in MuJoCo's C engine, in double precision and with the solver run to convergence: MJX is tested against it.
 
 The force laws are written a second time here, on MuJoCo's own rotation matrices and external wrenches, so that a slip in either shows. Two
-cars meet by MuJoCo's own box-box contact (`meeting`), not by `contact.forces`.
+cars meet by MuJoCo's own box-box contact (`meeting`), not by `contact.forces`. The ground pushes the tyres only: no car here may roll over.
 """
 
 import dataclasses

@@ -94,13 +94,14 @@ def scenes(
         log = Log(position=place[:, None], yaw=heading[:, None], **none)
         return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=uniform(mu, row))
 
-    arrays = [jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction)]
-    return jax.vmap(world)(*arrays, jnp.asarray(pattern, jnp.int32), road())
+    place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))
+    return jax.vmap(world)(place, heading, pace, mu, jnp.asarray(pattern, jnp.int32), road())
 
 
 def batched(backend: Dynamics, worlds: Scene, controls: Float[np.ndarray, "N T A 3"]) -> Run:
     """All cases at once through `Dynamics.init` and `.advance`: one compilation, a scan over time, vmap over worlds."""
-    active = jnp.ones(controls.shape[0:1] + controls.shape[2:3], bool)
+    active = jnp.ones((controls.shape[0], controls.shape[2]), bool)
+    start = functools.partial(backend.init, jax.random.key(0))  # cars that are all the same read no key
 
     @jax.jit
     def run(scene: Scene, actions: Array) -> tuple[Array, ...]:
@@ -109,7 +110,7 @@ def batched(backend: Dynamics, worlds: Scene, controls: Float[np.ndarray, "N T A
             tyres = body.tyres
             return body, (body.qpos, body.qvel, tyres.mu, tyres.normal, tyres.tangent, tyres.slip, body.contact_force.max(-1))
 
-        return jax.lax.scan(step, jax.vmap(backend.init)(scene), actions)[1]
+        return jax.lax.scan(step, jax.vmap(start)(scene), actions)[1]
 
     trace = run(worlds, jnp.asarray(np.swapaxes(controls, 0, 1), jnp.float32))
     return Run(*(np.swapaxes(np.asarray(leaf, np.float64), 0, 1) for leaf in trace))
