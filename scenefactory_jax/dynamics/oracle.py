@@ -1,23 +1,72 @@
 # pyright: reportAttributeAccessIssue=false
 # (the compiled parts of mujoco carry no types)
-"""The same car and controls in MuJoCo's C engine, in double precision and with the solver run to convergence: MJX is tested against it."""
+"""The same cars and controls in MuJoCo's C engine, in double precision and with the solver run to convergence: MJX is tested against it.
+
+The force laws are written a second time here, on MuJoCo's own rotation matrices and external wrenches, so that a slip in either shows. Two
+cars meet by MuJoCo's own box-box contact (`meeting`), not by `contact.forces`. The ground pushes the tyres only: no car here may roll over.
+"""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics.car import CarParameters, Solver
 
+FACE_POINTS = 4  # contacts that MuJoCo makes where two upright boxes meet face to face
+
 
 class Trajectory(NamedTuple):
-    """State at the end of every control step."""
+    """State at the end of every control step, and the tyres in its last physics step."""
 
-    qpos: Float[np.ndarray, "T 17"]
-    qvel: Float[np.ndarray, "T 16"]
+    qpos: Float[np.ndarray, "T *cars 17"]
+    qvel: Float[np.ndarray, "T *cars 16"]
+    mu: Float[np.ndarray, "T *cars 4"]
+    normal: Float[np.ndarray, "T *cars 4"]  # N
+    tangent: Float[np.ndarray, "T *cars 4"]  # N
+    slip: Float[np.ndarray, "T *cars 4"]  # m/s; 0 in the air
+
+
+class Encounter(NamedTuple):
+    """Two cars that may meet."""
+
+    path: Trajectory
+    contact_force: Float[np.ndarray, " T"]  # between the cars, N: largest of the control step, summed over the contact points
+    first_contact_s: float  # end of the physics step that first pushed; inf if none did
+
+
+class Touch(NamedTuple):
+    """How two cars push each other, in the words of `contact.forces`, and how rigid MuJoCo's constraint is."""
+
+    stiffness: float  # along a whole face, N/m
+    damping: float  # N s/m
+    friction: float
+    impedance: float  # 0..1: near 1 a constraint, near 0 a spring (see `meeting`)
+
+
+class Rig(NamedTuple):
+    """A compiled model of N equal cars and the addresses of what is read and written at every step."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    car: CarParameters
+    suspension_q: Int[np.ndarray, "4"]  # in one car's positions; the others in its velocities
+    suspension: Int[np.ndarray, "4"]
+    steer_q: Int[np.ndarray, "2"]
+    steer: Int[np.ndarray, "2"]
+    spin: Int[np.ndarray, "4"]
+    chassis: Int[np.ndarray, " N"]  # bodies
+    boxes: Int[np.ndarray, " N"]  # geoms
+    pairs: Int[np.ndarray, "N 4"]  # of the tyres with the ground
+    tyre_of: Int[np.ndarray, " geoms"]  # geom -> car * 4 + wheel; 4 N for every other geom
+    qpos: Float[np.ndarray, "N 17"]  # these four are views of the engine's own memory
+    qvel: Float[np.ndarray, "N 16"]
+    applied: Float[np.ndarray, "N 16"]
+    wrenches: list[Float[np.ndarray, "6"]]  # on each chassis at its centre of mass, force then torque, in the world's frame
 
 
 def simulate(
@@ -40,48 +89,228 @@ def simulate(
         iterations: of the solver, instead of `solver`'s; enough to converge.
         line_search: iterations, likewise.
     """
+    rig = single(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    place(rig, cars.rest(rig.model, car), np.zeros((1, 2)), np.zeros(1), np.array([speed]))
+    return drive(rig, controls[:, None], mu[None], substeps=substeps)
+
+
+def single(car: CarParameters, solver: Solver, *, physics_dt: float, iterations: int, line_search: int) -> Rig:
+    """One car on the ground, to be placed and driven many times."""
     converged = dataclasses.replace(solver, iterations=iterations, line_search=line_search)
-    model = cars.standalone(car, converged, physics_dt=physics_dt, visual=False, brake_rows=True)
-    data = mujoco.MjData(model)
-    data.qpos[:] = cars.rest(model, car)
-    spin = np.array([model.joint(f"spin_{name}").dofadr[0] for name in cars.WHEELS])
-    data.qvel[0], data.qvel[spin] = speed, speed / car.wheel_radius
-    model.pair_friction[:, :2] = mu[:, None]
-    qpos, qvel = [], []
+    return _rig(cars.standalone(car, converged, physics_dt=physics_dt, visual=False, brake_rows=True), car, [""])
+
+
+def drive(rig: Rig, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, "1 4"], *, substeps: int) -> Trajectory:
+    """Drive one car on from the state that its rig is in."""
+    rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    rows = []
     for control in controls:
+        angle = _command(rig, control)
         for _ in range(substeps):
-            _command(model, data, car, control)
-            mujoco.mj_step(model, data)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    return Trajectory(np.array(qpos), np.array(qvel))
+            _push(rig, angle)
+            mujoco.mj_step(rig.model, rig.data)
+        rows.append(_record(rig))
+    return Trajectory(*(np.array(column)[:, 0] for column in zip(*rows, strict=True)))
 
 
-def _command(model: mujoco.MjModel, data: mujoco.MjData, car: CarParameters, control: Float[np.ndarray, "3"]) -> None:
-    """Servo, engine, brakes, bump stops and dampings, from MuJoCo's own joint views and rotation matrix."""
-    throttle, steer, brake = np.clip([max(control[0], 0.0), control[1], max(control[2], 0.0)], -1.0, 1.0)
-    data.qfrc_applied[:] = 0.0
-    for name in cars.WHEELS:
-        spring, spin = data.joint(f"suspension_{name}"), data.joint(f"spin_{name}")
-        beyond = spring.qpos[0] - np.clip(spring.qpos[0], -car.suspension_travel, car.suspension_travel)
-        spring.qfrc_applied[0] = -car.stop_stiffness * beyond
-        front = name in cars.FRONT
-        model.joint(f"spin_{name}").frictionloss[0] = (
-            brake * (car.brake_torque_front if front else car.brake_torque_rear) + cars.LATENT_FRICTION
-        )
-        if front:
-            spin.qfrc_applied[0] = throttle * car.drive_torque
-            hinge = data.joint(f"steer_{name}")
-            torque = car.steering_stiffness * (car.steering_limit * steer - hinge.qpos[0]) - car.steering_damping * hinge.qvel[0]
-            hinge.qfrc_applied[0] = np.clip(torque, -car.steering_torque, car.steering_torque)
-    root = data.joint("root")
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, root.qpos[3:7])
-    left = turn.reshape(3, 3)[:, 1]
-    force = -car.lateral_damping * (root.qvel[:3] @ left) * left
-    torque = turn.reshape(3, 3) @ np.array([0.0, 0.0, -car.yaw_damping * root.qvel[5]])
-    chassis = model.body("chassis").id
-    generalised = np.zeros(model.nv)
-    centre = root.qpos[:3] + turn.reshape(3, 3) @ np.array([0.0, 0.0, car.mass_height])
-    mujoco.mj_applyFT(model, data, force, torque, centre, chassis, generalised)
-    data.qfrc_applied[:] += generalised
+def encounter(
+    car: CarParameters,
+    solver: Solver,
+    controls: Float[np.ndarray, "T 2 3"],
+    mu: Float[np.ndarray, "2 4"],
+    touch: Touch,
+    *,
+    position: Float[np.ndarray, "2 2"],
+    yaw: Float[np.ndarray, "2"],
+    speed: Float[np.ndarray, "2"],
+    physics_dt: float,
+    substeps: int,
+    iterations: int,
+    line_search: int,
+) -> Encounter:
+    """Drive two cars that meet by MuJoCo's box-box contact; arguments as those of `simulate`, with an axis of cars."""
+    rig = meeting(car, solver, touch, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    alone = single(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    place(rig, cars.rest(alone.model, car), position, yaw, speed)
+    return meet(rig, controls, mu, substeps=substeps)
+
+
+def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "2 4"], *, substeps: int) -> Encounter:
+    """Drive two cars on from the state that their rig is in."""
+    rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    rows, strongest, first = [], [], np.inf
+    for control in controls:
+        angle = _command(rig, control)
+        largest = 0.0
+        for _ in range(substeps):
+            _push(rig, angle)
+            mujoco.mj_step(rig.model, rig.data)
+            largest = max(largest, _between(rig))
+            if largest > 0.0 and np.isinf(first):
+                first = rig.data.time
+        rows.append(_record(rig))
+        strongest.append(largest)
+    path = Trajectory(*(np.array(column) for column in zip(*rows, strict=True)))
+    return Encounter(path, np.array(strongest), float(first))
+
+
+def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: float, iterations: int, line_search: int) -> Rig:
+    """Two cars on the ground whose boxes collide, as a spring-damper with Coulomb friction in MuJoCo's terms.
+
+    Of a contact that is r deep and closes at rate v, MuJoCo's force f obeys (A + R) f = (b v + k r) / d, if solref is [-k, -b], the
+    impedance is d at any depth, and nothing else accelerates the cars. A is the inverse mass that the contact moves and R = A' (1 - d) / d,
+    with A' taken from the model at rest. The n equal contacts of a face share its force F = n f, so (A + R / n) F = (b v + k r) / d, and
+
+        k = stiffness (A d + A' (1 - d) / n),  b = damping (A d + A' (1 - d) / n)
+
+    make it `stiffness r + damping v` for two whole cars that meet centrally (A = 2 / mass), whatever d is. What d decides is a blow off
+    centre, which moves less mass. Near 1 the contact is a constraint that prescribes the acceleration, so its force is smaller in
+    proportion. Near 0 each of the face's points is a spring of its own, whatever it moves: the law of `contact.forces`. Friction below the
+    cone is the damper alone; MuJoCo divides its R by the friction ratio.
+    """
+    converged = dataclasses.replace(solver, iterations=iterations, line_search=line_search)
+    spec = mujoco.MjSpec()
+    spec.compiler.autolimits = False
+    ground = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name="ground", type=ground, size=[0, 0, 1], contype=0, conaffinity=0)
+    prefixes = ["one/", "two/"]
+    for prefix in prefixes:
+        spec.attach(cars.spec(car, visual=False, brake_rows=True), prefix=prefix, frame=spec.worldbody.add_frame())
+        cars.add_ground_pairs(spec, car, ground="ground", prefix=prefix)
+    cars.set_options(spec, converged, physics_dt=physics_dt)
+    pair = spec.add_pair(name="cars", geomname1="one/box", geomname2="two/box")
+    pair.condim = 3
+    pair.friction = [touch.friction, touch.friction, 0.005, 1e-4, 1e-4]
+    model = spec.compile()
+    chassis = model.body("one/chassis").id
+    inverse, at_rest = 2.0 / model.body_subtreemass[chassis], 2.0 * model.body_invweight0[chassis, 0]
+    d = touch.impedance
+    rigid, soft = inverse * d, at_rest * (1.0 - d) / FACE_POINTS
+    normal, sliding = rigid + soft, rigid + soft / converged.friction_ratio
+    index = model.pair("cars").id
+    model.pair_solimp[index] = [d, d, 1e-3, 0.5, 2.0]
+    model.pair_solref[index] = [-touch.stiffness * normal, -touch.damping * normal]
+    model.pair_solreffriction[index] = [-1e-3, -touch.damping * sliding]
+    return _rig(model, car, prefixes)
+
+
+def place(
+    rig: Rig,
+    still: Float[np.ndarray, "17"],
+    position: Float[np.ndarray, "N 2"],
+    yaw: Float[np.ndarray, " N"],
+    speed: Float[np.ndarray, " N"],
+) -> None:
+    """Put the cars at their starts, wheels turning as fast as the road passes under them, and forget what happened before."""
+    mujoco.mj_resetData(rig.model, rig.data)
+    qpos, qvel = rig.qpos, rig.qvel
+    qpos[:] = still
+    qpos[:, :2] = position
+    qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
+    qvel[:, 0], qvel[:, 1] = speed * np.cos(yaw), speed * np.sin(yaw)
+    qvel[:, rig.spin] = speed[:, None] / rig.car.wheel_radius
+
+
+class Mechanics(NamedTuple):
+    """What a collision trades: of all cars together, in the world's frame and about its origin."""
+
+    momentum: Float[np.ndarray, "3"]  # kg m/s
+    angular_momentum: Float[np.ndarray, "3"]  # kg m^2/s
+    kinetic_energy: float  # J
+
+
+def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
+    """Momentum and energy of a state, of this engine or of another; wheels and suspension count."""
+    data = rig.data
+    data.qpos[:], data.qvel[:] = qpos.ravel(), qvel.ravel()
+    mujoco.mj_fwdPosition(rig.model, data)
+    mujoco.mj_fwdVelocity(rig.model, data)
+    mujoco.mj_subtreeVel(rig.model, data)
+    mujoco.mj_energyVel(rig.model, data)
+    mass = rig.model.body_subtreemass[rig.chassis, None]
+    each = mass * data.subtree_linvel[rig.chassis]
+    angular = data.subtree_angmom[rig.chassis] + np.cross(data.subtree_com[rig.chassis], each)
+    return Mechanics(each.sum(0), angular.sum(0), float(data.energy[1]))
+
+
+def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> Rig:
+    def at(kind: str, wheels: tuple[str, ...], address: str = "dofadr") -> np.ndarray:
+        return np.array([getattr(model.joint(f"{prefixes[0]}{kind}_{wheel}"), address)[0] for wheel in wheels])
+
+    tyre_of = np.full(model.ngeom, 4 * len(prefixes))
+    for slot, prefix in enumerate(prefixes):
+        for wheel, name in enumerate(cars.WHEELS):
+            tyre_of[model.geom(f"{prefix}tyre_{name}").id] = 4 * slot + wheel
+    data = mujoco.MjData(model)
+    chassis = np.array([model.body(f"{prefix}chassis").id for prefix in prefixes])
+    return Rig(
+        model=model,
+        data=data,
+        car=car,
+        suspension_q=at("suspension", cars.WHEELS, "qposadr"),
+        suspension=at("suspension", cars.WHEELS),
+        steer_q=at("steer", cars.FRONT, "qposadr"),
+        steer=at("steer", cars.FRONT),
+        spin=at("spin", cars.WHEELS),
+        chassis=chassis,
+        boxes=np.array([model.geom(f"{prefix}box").id for prefix in prefixes]),
+        pairs=np.array([[model.pair(f"{prefix}ground_{name}").id for name in cars.WHEELS] for prefix in prefixes]),
+        tyre_of=tyre_of,
+        qpos=data.qpos.reshape(-1, 17),
+        qvel=data.qvel.reshape(-1, 16),
+        applied=data.qfrc_applied.reshape(-1, 16),
+        wrenches=[data.xfrc_applied[body] for body in chassis],
+    )
+
+
+def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+    """What holds for a whole control step: engine torque and brake friction, which are set, and the wanted steering angle."""
+    car = rig.car
+    throttle, steer, brake = np.clip(control[:, 0], 0.0, 1.0), np.clip(control[:, 1], -1.0, 1.0), np.clip(control[:, 2], 0.0, 1.0)
+    loss = rig.model.dof_frictionloss.reshape(-1, 16)
+    rig.applied[:, rig.spin[:2]] = (throttle * car.drive_torque)[:, None]
+    strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
+    loss[:, rig.spin] = brake[:, None] * strongest + cars.LATENT_FRICTION
+    return car.steering_limit * steer
+
+
+def _push(rig: Rig, wanted: Float[np.ndarray, " N"]) -> None:
+    """What changes with every physics step: servo, bump stops and dampings."""
+    car, qpos, qvel = rig.car, rig.qpos, rig.qvel
+    travel = qpos[:, rig.suspension_q]
+    within = np.minimum(np.maximum(travel, -car.suspension_travel), car.suspension_travel)
+    rig.applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
+    torque = car.steering_stiffness * (wanted[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
+    rig.applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)
+    turn = np.empty(9)
+    for slot, wrench in enumerate(rig.wrenches):
+        mujoco.mju_quat2Mat(turn, qpos[slot, 3:7])
+        if car.lateral_damping:
+            left = turn[1::3]
+            wrench[:3] = -car.lateral_damping * (qvel[slot, :3] @ left) * left
+        wrench[3:] = (-car.yaw_damping * qvel[slot, 5]) * turn[2::3]
+
+
+def _record(rig: Rig) -> tuple[np.ndarray, ...]:
+    """State and tyres of every car, as `Trajectory` has them."""
+    model, data = rig.model, rig.data
+    count = len(rig.chassis)
+    contact = data.contact
+    wheel, address = rig.tyre_of[contact.geom[:, 1]], contact.efc_address
+    pressed = (wheel < 4 * count) & (address >= 0)
+    rows = address[pressed, None] + np.arange(3)
+    force, slide = data.efc_force[rows], data.efc_vel[rows]  # both at the beginning of the step
+    tyres = np.zeros((3, 4 * count))
+    tyres[:, wheel[pressed]] = force[:, 0], np.hypot(force[:, 1], force[:, 2]), np.hypot(slide[:, 1], slide[:, 2])
+    normal, tangent, slip = tyres.reshape(3, count, 4)
+    return rig.qpos.copy(), rig.qvel.copy(), model.pair_friction[rig.pairs, 0], normal, tangent, slip
+
+
+def _between(rig: Rig) -> float:
+    """Force between two cars in the step just taken, N."""
+    contact = rig.data.contact
+    hits = np.flatnonzero(np.isin(contact.geom, rig.boxes).all(-1) & (contact.efc_address >= 0))
+    if not len(hits):
+        return 0.0
+    rows = rig.data.efc_force[contact.efc_address[hits][:, None] + np.arange(3)]
+    return float(np.linalg.norm(np.einsum("cij,ci->j", contact.frame[hits].reshape(-1, 3, 3), rows)))
