@@ -8,9 +8,11 @@ with one elliptic cone a tyre and one Huber cost a brake (MuJoCo documentation, 
 model: dense 16 x 16 matrices, library calls for their factors, and loops until the last car of a batch is done. A car needs none of
 this. Its wheels meet only through the chassis, so the Hessian is an arrow: a 6 x 6 block for the chassis and a 3 x 3 block for each
 wheel. Eliminating the wheels leaves 6 equations. Everything below is arithmetic on single numbers with the four wheels as an axis, so
-that XLA fuses it, and the numbers of iterations are fixed, so that nothing waits and reverse-mode gradients exist.
+that XLA fuses it, and the numbers of iterations are fixed, so that nothing waits. Gradients, forward and reverse, come from the implicit
+function theorem: they cost one more elimination and do not walk back through the iterations.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,6 +25,7 @@ BASE = 6  # degrees of freedom of the chassis
 OWN = 3  # of a wheel: suspension, spin, steering; a rear wheel's steering is a row of zeros with a unit diagonal
 SPIN = 1  # place of the spin among them
 SMALL = 1e-12
+ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a sum of a few terms, relative to their magnitudes
 
 Number = Array  # [] for the chassis, [4] for the wheels
 
@@ -100,16 +103,31 @@ def newton(
     padded = jnp.concatenate([start, jnp.zeros(1)])
     base, own = [start[i] for i in range(BASE)], [padded[layout.own[:, k]] for k in range(OWN)]
 
+    at = _minimum(problem, Acceleration(base, own), iterations, line_search)
+    flat = jnp.concatenate([jnp.stack(at.base), jnp.stack(at.own, axis=-1).reshape(-1)])
+    order = np.concatenate([np.arange(BASE), BASE + np.argsort(layout.own.reshape(-1), kind="stable")[: mass.shape[0] - BASE]])
+    contact = _cone(_rows(problem, at), problem)
+    return flat[order], jnp.stack(contact.force, axis=-1)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
+def _minimum(problem: Problem, start: Acceleration, iterations: int, line_search: int) -> Acceleration:
+    """Where the cost is least, by a fixed number of Newton steps."""
+
     def step(at: Acceleration, _: None) -> tuple[Acceleration, None]:
         along = _direction(problem, at)
         length = _search(problem, at, along, steps=line_search)
         return jax.tree.map(lambda a, d: a + length * d, at, along), None
 
-    at, _ = jax.lax.scan(step, Acceleration(base, own), length=iterations)
-    flat = jnp.concatenate([jnp.stack(at.base), jnp.stack(at.own, axis=-1).reshape(-1)])
-    order = np.concatenate([np.arange(BASE), BASE + np.argsort(layout.own.reshape(-1), kind="stable")[: mass.shape[0] - BASE]])
-    contact = _cone(_rows(problem, at), problem)
-    return flat[order], jnp.stack(contact.force, axis=-1)
+    return jax.lax.scan(step, start, length=iterations)[0]
+
+
+@_minimum.defjvp
+def _minimum_jvp(iterations: int, line_search: int, primals: tuple, tangents: tuple) -> tuple[Acceleration, Acceleration]:
+    """The implicit function theorem: where the slope is zero, a Newton direction changes with the problem as the minimum does."""
+    problem, start = primals
+    at = _minimum(problem, start, iterations, line_search)
+    return at, jax.jvp(lambda changed: _direction(changed, at), (problem,), (tangents[0],))[1]
 
 
 def _take_apart(mass, force, jacobian, reference, weight, mu, brake, layout: Layout, friction_ratio: float) -> Problem:
@@ -223,20 +241,24 @@ def _search(problem: Problem, at: Acceleration, along: Acceleration, *, steps: i
     bend = _dot(along_base, heavy_base) + _sum(_dot(along_own, heavy_own))
     tilt = _dot(heavy_base, base) - _dot(along_base, problem.force_base)
     tilt = tilt + _sum(_dot(heavy_own, own) - _dot(along_own, problem.force_own))
+    terms = _size(heavy_base, base) + _size(along_base, problem.force_base)
+    terms = terms + _sum(_size(heavy_own, own) + _size(along_own, problem.force_own))
 
-    def slope(length: Number) -> tuple[Number, Number]:
+    def slope(length: Number) -> tuple[Number, Number, Number]:
+        """First and second derivative of the cost, and how large rounding makes the first where it should be zero."""
         contact = _cone([a + length * b for a, b in zip(x, y, strict=True)], problem)
         torque, hold = _brake(tight + length * along_own[SPIN], problem)
         first = tilt + length * bend - _sum(_dot(contact.force, y) + torque * along_own[SPIN])
         second = bend + _sum(_dot([_dot(row, y) for row in contact.stiffness], y) + hold * along_own[SPIN] ** 2)
-        return first, second
+        return first, second, ROUNDING * (terms + length * bend + _sum(_size(contact.force, y)))
 
     low, high, length = jnp.zeros_like(tilt), jnp.full_like(tilt, jnp.inf), jnp.ones_like(tilt)
     for _ in range(steps):
-        first, second = slope(length)
+        first, second, noise = slope(length)
         low, high = jnp.where(first < 0.0, length, low), jnp.where(first < 0.0, high, length)
         wanted = length - first / jnp.maximum(second, SMALL)
-        length = jnp.where((wanted >= low) & (wanted <= high), wanted, 0.5 * (low + high))
+        better = jnp.where((wanted >= low) & (wanted <= high), wanted, 0.5 * (low + high))
+        length = jnp.where(jnp.abs(first) <= noise, length, better)  # at the minimum noise would send it anywhere
     return length
 
 
@@ -279,6 +301,11 @@ def _dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     for one, other in zip(a[1:], b[1:], strict=True):
         total = total + one * other
     return total
+
+
+def _size(a: Sequence[Number], b: Sequence[Number]) -> Number:
+    """Sum of the products' magnitudes: what rounding errors of their sum are measured by."""
+    return _dot([jnp.abs(one) for one in a], [jnp.abs(other) for other in b])
 
 
 def _sum(wheels: Number) -> Number:

@@ -1,0 +1,91 @@
+"""What each feature of the physics costs: control steps of cars a second, physics alone, features switched on one by one.
+
+Everything that moves cars is in it (weather, friction under every wheel, others, contacts, MJX), nothing else is: no facts, observations,
+rewards or policy.
+"""
+
+import statistics
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scenefactory_jax import rain, world
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import sources
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Scene, Tracks
+
+
+def costs(config: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Measure every variant of `config["variants"]`, side by side in one run.
+
+    Args:
+        config: `scenes` (a source), `worlds`, `steps` (control steps in a timed scan), `repeats`, `others` (road users put into every world
+            that has none), `seed`, and `variants`, name -> overrides of the task.
+
+    Returns:
+        A row a variant: name, overrides, cars x control steps a second (median, least, most), milliseconds a control step, seconds of
+        compilation, and whether all stayed finite.
+    """
+    loaded = sources.training(config["scenes"])
+    worlds, _ = sources.assign(loaded, config["worlds"], seed=config["seed"])
+    worlds = _peopled(worlds, config["others"], seed=config["seed"])
+    variants = config["variants"].items()
+    return [{"name": name, "overrides": list(overrides), **_measure(worlds, overrides, config)} for name, overrides in variants]
+
+
+def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
+    """Worlds with others: where the source has none, cars driving straight on, so that every variant has something to look at."""
+    present = worlds.agents.present
+    if worlds.others.valid.shape[1] or not count:
+        return worlds
+    rng = np.random.default_rng(seed)
+    shape, steps = (present.shape[0], count), worlds.log.valid.shape[2]
+    begin, yaw = rng.uniform(-90.0, 90.0, (*shape, 1, 2)), rng.uniform(-np.pi, np.pi, shape)
+    velocity = 5.0 * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)[:, :, None]
+    time_s = 0.1 * np.arange(steps)[:, None]
+    tracks = Tracks(
+        position=jnp.asarray(begin + velocity * time_s, jnp.float32),
+        yaw=jnp.asarray(np.broadcast_to(yaw[..., None], (*shape, steps)), jnp.float32),
+        velocity=jnp.asarray(np.broadcast_to(velocity, (*shape, steps, 2)), jnp.float32),
+        valid=jnp.ones((*shape, steps), bool),
+        size=jnp.tile(jnp.array([4.0, 2.0]), (*shape, 1)),
+        kind=jnp.zeros(shape, jnp.int32),
+    )
+    return replace(worlds, others=tracks)
+
+
+def _measure(worlds: Scene, overrides: list[str], config: Mapping[str, Any]) -> dict[str, Any]:
+    """One variant: a warm-up that compiles, then the median of several timed scans."""
+    parts = world.parts_of(configs.load("task", *overrides))
+    env = world.assemble(parts)
+    slots, steps = worlds.agents.present.shape, config["steps"]
+
+    def physics(scene, state, action):
+        state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
+        body = parts.dynamics.advance(env.now(scene, state), state.body, action, jnp.ones_like(state.active))
+        return replace(state, body=body, step=state.step + 1)
+
+    def step(states, key):
+        return jax.vmap(physics)(worlds, states, jax.random.uniform(key, (*slots, 3), jnp.float32, -1.0, 1.0)), None
+
+    run = jax.jit(lambda states, key: jax.lax.scan(step, states, jax.random.split(key, steps))[0])
+    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+    seconds = []
+    for repeat in range(config["repeats"] + 1):
+        begun = time.perf_counter()
+        states = jax.block_until_ready(run(states, jax.random.key(repeat)))
+        seconds.append(time.perf_counter() - begun)
+    done = slots[0] * slots[1] * steps
+    median = statistics.median(seconds[1:])
+    return {
+        "per_s": done / median,
+        "per_s_range": [done / max(seconds[1:]), done / min(seconds[1:])],
+        "ms_a_control_step": 1e3 * median / steps,
+        "compile_s": seconds[0] - median,
+        "finite": bool(jnp.isfinite(parts.dynamics.read(jax.tree.map(lambda leaf: leaf[0], states.body)).position).all()),
+    }
