@@ -97,7 +97,7 @@ def test_converges_to_the_c_engine(solved, truth):
     scale = np.abs(truth[0]).max(0)
     assert np.percentile(apart / scale, 95) < 1e-5 and (apart / scale).max() < 2e-3
     np.testing.assert_allclose(force, truth[1], atol=2e-3 * truth[1].max())
-    assert (truth[1][:, :, 0] > 1000).any() and not np.asarray(force)[-4:].any()  # the last are in the air
+    assert (truth[1][:, :, 0] > 1000).any() and np.abs(force[-4:]).max() < 1e-6  # the last are in the air
 
 
 def test_forces_stay_within_the_cone_and_never_pull(solved, cases):
@@ -123,11 +123,18 @@ def test_newtons_equation_holds(solved):
 
 def test_more_iterations_are_nearer(solved, truth):
     problem, newton = solved
-    medians = []
-    for iterations in (1, 2, 4):
-        found = jax.jit(jax.vmap(functools.partial(newton, iterations=iterations, line_search=4)))(*problem)[0]
-        medians.append(np.median(np.linalg.norm(np.asarray(found) - truth[0], axis=1)))
-    assert medians[0] > 2 * medians[1] > 20 * medians[2]
+    one, four = (
+        np.asarray(jax.jit(jax.vmap(functools.partial(newton, iterations=iterations, line_search=4)))(*problem)[0]) for iterations in (1, 4)
+    )
+    assert np.median(np.linalg.norm(one - truth[0], axis=1)) > 50 * np.median(np.linalg.norm(four - truth[0], axis=1))
+
+
+def test_rounding_does_not_move_what_has_converged(solved, truth):
+    """At the minimum slopes are noise, and a search that follows them walks away: 40 steps must be as near as 20."""
+    problem, newton = solved
+    scale = np.abs(truth[0]).max(0)
+    long = jax.jit(jax.vmap(functools.partial(newton, iterations=40, line_search=10)))(*problem)[0]
+    assert (np.abs(np.asarray(long) - truth[0]) / scale).max() < 2e-3
 
 
 def test_gradients_are_finite(solved):

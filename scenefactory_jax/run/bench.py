@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 
 from scenefactory_jax import world
-from scenefactory_jax.build import build
 from scenefactory_jax.ppo import rollout
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
@@ -79,9 +78,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _phases(config, env, policy, state, worlds, *, horizon: int, repeats: int) -> dict[str, float]:
     """Seconds for `horizon` control steps of each part, the others left out."""
-    context = {"physics_dt": 1.0 / config["timing"]["physics_hz"], "control_dt": 1.0 / config["timing"]["control_hz"]}
-    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
-    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    dynamics = world.parts_of(config).dynamics
     shape = (*state.worlds.active.shape, 3)
 
     def acting(key):

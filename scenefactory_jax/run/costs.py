@@ -67,7 +67,7 @@ def _measure(worlds: Scene, overrides: list[str], config: Mapping[str, Any]) -> 
 
     def physics(scene, state, action):
         state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
-        body = parts.dynamics.advance(env.now(scene, state), state.body, action, jnp.ones_like(state.active))
+        body = parts.dynamics.advance(env.now(scene, state), state.body, action, state.active)
         return replace(state, body=body, step=state.step + 1)
 
     def step(states, key):
