@@ -18,42 +18,6 @@ from scenefactory_jax.struct import choose, replace, strong
 from scenefactory_jax.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
 
-def make(config: Mapping[str, Any]) -> Env:
-    """The environment of a config with the groups timing, dynamics, weather, spawn, others, facts, ends, reward and observe.
-
-    Raises:
-        ConfigError: naming the entry and key that does not fit, with the valid ones.
-    """
-    _require(config, ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
-    timing = config["timing"]
-    for key in ("physics_hz", "control_hz", "episode_s"):
-        if key not in timing:
-            raise ConfigError(f"timing.{key}: missing; timing needs physics_hz, control_hz, episode_s")
-        check_type(timing[key], float, where=f"timing.{key}")
-        if not timing[key] > 0:
-            raise ConfigError(f"timing.{key}: {timing[key]}; wanted is a number above 0")
-    check_type(config["spawn"]["respawn_clear_m"], float | None, where="spawn.respawn_clear_m")
-    context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
-    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
-    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
-    bound = functools.partial(build, builtins="scenefactory_jax.facts")
-    ends.check(config["ends"].get("ending", []), where="ends")
-    parts = Parts(
-        dynamics=dynamics,
-        draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
-        draw_weather=conditions.make(config["weather"]),
-        others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
-        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
-        judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.ends", where="ends"),
-        terms=rewards.make(config["reward"], **context),
-        groups=observations.make(config["observe"], **context),
-        episode_steps=episode_steps(timing),
-        control_dt=context["control_dt"],
-        respawn_clear_m=config["spawn"]["respawn_clear_m"],
-    )
-    return assemble(parts)
-
-
 def episode_steps(timing: Mapping[str, float | int]) -> int:
     """Control steps in an episode."""
     return round(timing["episode_s"] * timing["control_hz"])
@@ -75,6 +39,50 @@ class Parts(NamedTuple):
     # None parks finished agents until the world ends (the paper's rule); a number of metres starts them again at a fresh draw
     # once no active car stands within that distance
     respawn_clear_m: float | None
+
+
+def make(config: Mapping[str, Any]) -> Env:
+    """The environment of a config, joined from its `parts_of`.
+
+    Raises:
+        ConfigError: naming the entry and key that does not fit, with the valid ones.
+    """
+    return assemble(parts_of(config))
+
+
+def parts_of(config: Mapping[str, Any]) -> Parts:
+    """The parts of a config with the groups timing, dynamics, weather, spawn, others, facts, ends, reward and observe.
+
+    Raises:
+        ConfigError: naming the entry and key that does not fit, with the valid ones.
+    """
+    _require(config, ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
+    timing = config["timing"]
+    for key in ("physics_hz", "control_hz", "episode_s"):
+        if key not in timing:
+            raise ConfigError(f"timing.{key}: missing; timing needs physics_hz, control_hz, episode_s")
+        check_type(timing[key], float, where=f"timing.{key}")
+        if not timing[key] > 0:
+            raise ConfigError(f"timing.{key}: {timing[key]}; wanted is a number above 0")
+    check_type(config["spawn"]["respawn_clear_m"], float | None, where="spawn.respawn_clear_m")
+    context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
+    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
+    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    bound = functools.partial(build, builtins="scenefactory_jax.facts")
+    ends.check(config["ends"].get("ending", []), where="ends")
+    return Parts(
+        dynamics=dynamics,
+        draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
+        draw_weather=conditions.make(config["weather"]),
+        others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
+        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
+        judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.ends", where="ends"),
+        terms=rewards.make(config["reward"], **context),
+        groups=observations.make(config["observe"], **context),
+        episode_steps=episode_steps(timing),
+        control_dt=context["control_dt"],
+        respawn_clear_m=config["spawn"]["respawn_clear_m"],
+    )
 
 
 def assemble(parts: Parts) -> Env:
