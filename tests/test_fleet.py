@@ -32,6 +32,7 @@ def random_car(seed):
     draw = lambda number: float(number * rng.uniform(0.8, 1.2) if number else rng.uniform(-0.3, 0.3))  # noqa: E731
     numbers = {name: [draw(x) for x in n] if isinstance(n, (list, tuple)) else draw(n) for name, n in vars(CAR).items()}
     numbers["inertia"] = [0.25 * numbers["mass"] * sum(x) for x in ((0.9, 0.2), (3.0, 0.2), (3.0, 0.9))]  # of bodies that can be
+    numbers["brake_impedance"] = 0.98
     numbers["wheel_inertia"] = [x * numbers["wheel_mass"] / CAR.wheel_mass for x in CAR.wheel_inertia]
     return cars.CarParameters(**numbers | {"lateral_damping": 0.0})
 

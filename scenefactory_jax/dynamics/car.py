@@ -64,6 +64,7 @@ class CarParameters:
     drive_torque: float  # of each front wheel at full throttle, N m
     brake_torque_front: float  # of each front wheel at full brake, N m
     brake_torque_rear: float  # of each rear wheel at full brake, N m
+    brake_impedance: float  # of the brakes' friction (solimp), 0..1: a held wheel creeps by torque x (1 - impedance) / impedance
     body_stiffness: float  # of a corner of the chassis that touches the ground (roll-over), N/m
     body_damping: float  # of the same, N s/m
     body_friction: float  # of the same, Coulomb coefficient
@@ -122,6 +123,7 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
     spin.damping = _linear(car.wheel_damping)
     spin.frictionloss = LATENT_FRICTION if brake_rows else 0.0
+    spin.solimp_friction = [car.brake_impedance, car.brake_impedance, 1e-3, 0.5, 2.0]
     about, across = car.wheel_inertia
     still = car.carrier_inertia + (car.knuckle_inertia if front else 0.0)
     mass = car.wheel_mass + car.carrier_mass + (car.knuckle_mass if front else 0.0)

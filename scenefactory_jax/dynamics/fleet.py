@@ -192,6 +192,7 @@ def fit(model: mjx.Model, at: Places, fleet: Fleet) -> dict[str, Array]:
         "body_invweight0": model.body_invweight0.at[at.wheel, 0].set(fleet.wheel_weight),
         "dof_invweight0": model.dof_invweight0.at[at.spin_v].set(fleet.spin_weight),
         "dof_damping": damping.at[at.steer_v].set(car.steering_friction),
+        "dof_solimp": model.dof_solimp.at[at.spin_v, :2].set(car.brake_impedance),
         "jnt_stiffness": model.jnt_stiffness.at[at.suspension].set(car.suspension_stiffness),
         "qpos_spring": model.qpos_spring.at[at.suspension_q].set(-_load(car) * car.suspension_preload / car.suspension_stiffness),
         "geom_size": model.geom_size.at[at.tyre].set(radius),
