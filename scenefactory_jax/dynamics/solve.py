@@ -122,12 +122,12 @@ def _minimise(problem: Problem, start: Acceleration, iterations: int, line_searc
 
 @_minimise.defjvp
 def _minimise_jvp(iterations: int, line_search: int, primals: tuple, tangents: tuple) -> tuple[Acceleration, Acceleration]:
-    """By the implicit function theorem: at the minimum the gradient g is zero, so the solution moves by -H^-1 dg, which is the derivative of
-    one more Newton step from there. Differentiating the iterations instead compiles for minutes and says the same."""
+    """By the implicit function theorem: the slope g stays zero at the minimum, so that moves by -H^-1 dg. Differentiating the iterations
+    instead compiles for minutes, and says the same where they have converged."""
     problem, start = primals
     at = _minimise(problem, start, iterations, line_search)
-    _, moved = jax.jvp(lambda changed: _direction(changed, at), (problem,), (tangents[0],))
-    return at, moved
+    _, change = jax.jvp(lambda changed: _slope(changed, at), (problem,), (tangents[0],))
+    return at, _descend(problem, at, change)
 
 
 def _take_apart(mass, force, jacobian, reference, weight, mu, brake, layout: Layout, friction_ratio: float) -> Problem:
@@ -197,13 +197,32 @@ def _brake(x: Number, problem: Problem) -> tuple[Number, Number]:
 
 
 def _direction(problem: Problem, at: Acceleration) -> Acceleration:
-    """Newton's direction: the arrow-shaped system, the wheels eliminated first."""
+    """Newton's direction."""
+    return _descend(problem, at, _slope(problem, at))
+
+
+def _slope(problem: Problem, at: Acceleration) -> Acceleration:
+    """Gradient of the convex problem: M a less all forces."""
     base, own = at
     contact = _cone(_rows(problem, at), problem)
-    torque, hold = _brake(own[SPIN] - problem.brake_reference, problem)
-    jacobian = problem.jacobian
-    push = [_dot([row[c] for row in jacobian], contact.force) for c in range(BASE + OWN)]  # J^T f
+    torque, _ = _brake(own[SPIN] - problem.brake_reference, problem)
+    push = [_dot([row[c] for row in problem.jacobian], contact.force) for c in range(BASE + OWN)]  # J^T f
     push[BASE + SPIN] = push[BASE + SPIN] + torque
+    slope_own = [
+        _dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) - problem.force_own[k] - push[BASE + k]
+        for k in range(OWN)
+    ]
+    slope_base = [
+        _dot(problem.base[i], base) - problem.force_base[i] + _sum(_dot(problem.across[i], own) - push[i]) for i in range(BASE)
+    ]
+    return Acceleration(slope_base, slope_own)
+
+
+def _descend(problem: Problem, at: Acceleration, slope: Acceleration) -> Acceleration:
+    """The Hessian's inverse times a slope, with opposite sign: the arrow-shaped system, the wheels eliminated first."""
+    contact = _cone(_rows(problem, at), problem)
+    _, hold = _brake(at.own[SPIN] - problem.brake_reference, problem)
+    jacobian = problem.jacobian
     bent = [[_dot(contact.stiffness[r], [row[c] for row in jacobian]) for c in range(BASE + OWN)] for r in range(3)]  # H J
 
     def curvature(i: int, j: int) -> Number:
@@ -212,21 +231,11 @@ def _direction(problem: Problem, at: Acceleration) -> Acceleration:
     within = [[problem.own[j][k] + curvature(BASE + j, BASE + k) for k in range(OWN)] for j in range(OWN)]
     within[SPIN][SPIN] = within[SPIN][SPIN] + hold
     across = [[problem.across[i][k] + curvature(i, BASE + k) for k in range(OWN)] for i in range(BASE)]
-    slope_own = [
-        _dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) - problem.force_own[k] - push[BASE + k]
-        for k in range(OWN)
-    ]
     factors = _factor(within)
     shed = [_solve(factors, row) for row in across]  # within^-1 across^T, row by row
-    rest = _solve(factors, slope_own)
+    rest = _solve(factors, slope.own)
     system = [[problem.base[i][j] + _sum(curvature(i, j) - _dot(across[i], shed[j])) for j in range(i + 1)] for i in range(BASE)]
-    slope = [
-        _dot(problem.base[i], base)
-        - problem.force_base[i]
-        + _sum(_dot(problem.across[i], own) - push[i] - _dot(across[i], rest))
-        for i in range(BASE)
-    ]
-    step = [-s for s in _solve(_factor(system), slope)]
+    step = [-s for s in _solve(_factor(system), [slope.base[i] - _sum(_dot(across[i], rest)) for i in range(BASE)])]
     return Acceleration(step, [-r - _dot([shed[i][k] for i in range(BASE)], step) for k, r in enumerate(rest)])
 
 

@@ -201,7 +201,7 @@ def _actions(crowd: Sequence[Case], steps: int, hold: int) -> Float[np.ndarray, 
 
 def _drive(
     backend: Dynamics, scene: Scene, start: Any, actions: Float[np.ndarray, "T A 3"]
-) -> tuple[Float[np.ndarray, "T+1 A 17"], Float[np.ndarray, "T+1 A 16"]]:
+) -> tuple[Float[np.ndarray, "steps A 17"], Float[np.ndarray, "steps A 16"]]:
     """Positions and velocities at the start and after every control step."""
     everyone = jnp.ones(actions.shape[1], bool)
 
@@ -220,7 +220,7 @@ def _drive(
 
 
 def _judge(
-    case: Case, car: CarParameters, qpos: Float[np.ndarray, "T+1 17"], qvel: Float[np.ndarray, "T+1 16"], *, control_hz: float
+    case: Case, car: CarParameters, qpos: Float[np.ndarray, "steps 17"], qvel: Float[np.ndarray, "steps 16"], *, control_hz: float
 ) -> Row:
     """Numbers of one car's path."""
     speed = np.linalg.norm(qvel[:, :3], axis=-1)
