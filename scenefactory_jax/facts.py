@@ -42,7 +42,8 @@ def measure(
     """
     motion, active, cars = after.motion, before.active, len(before.active)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    everyone = conflict.bodies(motion, after.agents.size, active, scene.boxes)
+    finite = is_finite(motion)
+    everyone = conflict.bodies(motion, after.agents.size, active & finite, scene.boxes)  # nobody meets a broken car
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
@@ -56,7 +57,7 @@ def measure(
     lost = strayed > jnp.maximum(stray_m, stray_ratio * after.agents.route)
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
     events = Events(
-        fault=~is_finite(motion),
+        fault=~finite,
         reached=norm(to_goal) <= goal_radius_m,
         collided=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
         crashed=fell | outside | lost,

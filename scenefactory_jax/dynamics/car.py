@@ -64,6 +64,7 @@ class CarParameters:
     drive_torque: float  # of each front wheel at full throttle, N m
     brake_torque_front: float  # of each front wheel at full brake, N m
     brake_torque_rear: float  # of each rear wheel at full brake, N m
+    brake_impedance: float  # of the brakes' friction (solimp), 0..1: a held wheel creeps by torque x (1 - impedance) / impedance
     body_stiffness: float  # of a corner of the chassis that touches the ground (roll-over), N/m
     body_damping: float  # of the same, N s/m
     body_friction: float  # of the same, Coulomb coefficient
@@ -122,6 +123,7 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
     spin.damping = _linear(car.wheel_damping)
     spin.frictionloss = LATENT_FRICTION if brake_rows else 0.0
+    spin.solimp_friction = [car.brake_impedance, car.brake_impedance, 1e-3, 0.5, 2.0]
     about, across = car.wheel_inertia
     still = car.carrier_inertia + (car.knuckle_inertia if front else 0.0)
     mass = car.wheel_mass + car.carrier_mass + (car.knuckle_mass if front else 0.0)
@@ -247,26 +249,35 @@ def standalone(car: CarParameters, solver: Solver, *, physics_dt: float, visual:
     return model.compile()
 
 
-def stable_limits(car: CarParameters, *, physics_dt: float) -> None:
+def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
     """Refuse springs and dampings that the explicit integrator cannot carry.
 
     A mass m on an explicit spring k and damper c is stable under semi-implicit Euler if k dt^2 / m + 2 c dt / m < 4.
 
     Raises:
-        ConfigError: naming the spring, the sum and the bound.
+        ConfigError: naming `where`, the spring, the sum and the bound; or a mass of zero.
     """
     unsprung = car.wheel_mass + car.carrier_mass
     about_steer = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia
     springs = {
         "suspension and stop": (unsprung, car.suspension_stiffness + car.stop_stiffness, car.suspension_damping),
         "steering": (about_steer, car.steering_stiffness, car.steering_damping + car.steering_friction),
-        "body on the ground": (light_corner(car), car.body_stiffness, car.body_damping),
+        "wheel's bearing": (car.wheel_inertia[0], 0.0, car.wheel_damping),
+        "lateral damping": (car.mass, 0.0, car.lateral_damping),
+        "yaw damping": (car.inertia[2], 0.0, car.yaw_damping),
     }
     for name, (mass, stiffness, damping) in springs.items():
-        load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
-        if load >= 4.0:
-            message = f"(k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}; it must stay below 4"
-            raise ConfigError(f"dynamics.car: the {name} cannot be integrated: {message}")
+        _check_spring(name, mass, stiffness, damping, physics_dt=physics_dt, where=where)
+    _check_spring("body on the ground", light_corner(car), car.body_stiffness, car.body_damping, physics_dt=physics_dt, where=where)
+
+
+def _check_spring(name: str, mass: float, stiffness: float, damping: float, *, physics_dt: float, where: str) -> None:
+    if mass <= 0.0:
+        raise ConfigError(f"{where}: the {name} moves a mass or inertia of {mass:g}; it must be above 0")
+    load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
+    if load >= 4.0:
+        message = f"(k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}; it must stay below 4"
+        raise ConfigError(f"{where}: the {name} cannot be integrated: {message}")
 
 
 def light_corner(car: CarParameters) -> float:

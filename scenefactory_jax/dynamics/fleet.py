@@ -4,7 +4,9 @@ A `Fleet` carries `CarParameters` with an agent axis and what MuJoCo's compiler 
 MJX model; under `vmap` every car then has its own. Derived constants follow MuJoCo's `mj_setConst`.
 """
 
-from collections.abc import Mapping
+import functools
+import itertools
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import jax
@@ -33,20 +35,20 @@ class Fleet:
     wheel_weight: Float[Array, "*cars 4"]  # inverse mass that a force at a wheel's centre feels, mean over directions (body_invweight0)
 
 
-def draw(
-    key: PRNGKeyArray,
-    scene: Scene,
-    car: CarParameters,
+def drawn(
     *,
+    car: CarParameters,
+    physics_dt: float,
     size: Literal["reference", "logged"],
     length_m: list[float],
     width_m: list[float],
-    scale: Mapping[str, list[float]],
-) -> CarParameters:
-    """Parameters of every agent's car.
+    scale: dict[str, list[float]],
+) -> Callable[[PRNGKeyArray, Scene], CarParameters]:
+    """(key, scene) -> parameters of every agent's car, drawn anew at each start.
 
     Args:
         car: the reference car.
+        physics_dt: s, for which the softest, stiffest, lightest and most damped of the cars must be stable together.
         size: `logged` takes length and width from `scene.agents.size`; wheelbase and track keep their share of them. Masses, springs,
             dampers and torques grow with the footprint, so a larger car of the same shape accelerates and brakes like the reference.
         length_m, width_m: [least, most]; logged sizes beyond are cut.
@@ -54,22 +56,54 @@ def draw(
             inertia too.
 
     Raises:
-        ConfigError: an unknown parameter or a bad range, by name.
+        ConfigError: an unknown parameter, a bad range, or a spread that the integrator cannot carry, by name.
     """
-    count = scene.agents.yaw.shape[0]
-    drawn = jax.tree.map(lambda leaf: jnp.full((count,), leaf, jnp.float32), car)
+    spans = {name: check_range(span, where=f"dynamics.fleet.{name}") for name, span in (("length_m", length_m), ("width_m", width_m))}
+    factors = {}
+    for name, span in scale.items():
+        if name not in vars(car):
+            raise ConfigError(f"dynamics.fleet.scale.{name}: unknown parameter; valid: {', '.join(vars(car))}")
+        factors[name] = check_range(span, where=f"dynamics.fleet.scale.{name}")
+    hardest = worst(car, factors)
+    cars.stable_limits(hardest, physics_dt=physics_dt, where="dynamics.fleet.scale")
     if size == "logged":
-        least, most = zip(check_range(length_m, where="length_m"), check_range(width_m, where="width_m"), strict=True)
-        drawn = resize(drawn, jnp.clip(scene.agents.size, jnp.asarray(least), jnp.asarray(most)))
-    numbers = dict(vars(drawn))
-    for place, (name, span) in enumerate(scale.items()):
-        if name not in numbers:
-            raise ConfigError(f"dynamics.fleet.scale.{name}: unknown parameter; valid: {', '.join(numbers)}")
-        low, high = check_range(span, where=f"dynamics.fleet.scale.{name}")
-        factor = jax.random.uniform(jax.random.fold_in(key, place), (count,), jnp.float32, low, high)
+        for extreme in itertools.product(*spans.values()):
+            cars.stable_limits(resize(hardest, np.array(extreme)), physics_dt=physics_dt, where=f"dynamics.fleet, size {extreme}")
+    return functools.partial(draw, car=car, size_m=spans if size == "logged" else None, scale=factors)
+
+
+def draw(
+    key: PRNGKeyArray,
+    scene: Scene,
+    *,
+    car: CarParameters,
+    size_m: Mapping[str, tuple[float, float]] | None,
+    scale: Mapping[str, tuple[float, float]],
+) -> CarParameters:
+    """Parameters with an agent axis: see `drawn`. Without `size_m` every car is as large as the reference."""
+    count = scene.agents.yaw.shape[0]
+    fleet = jax.tree.map(lambda leaf: jnp.full((count,), leaf, jnp.float32), car)
+    if size_m is not None:
+        least, most = zip(size_m["length_m"], size_m["width_m"], strict=True)
+        fleet = resize(fleet, jnp.clip(scene.agents.size, jnp.asarray(least), jnp.asarray(most)))
+    factors = {}
+    for place, (name, (low, high)) in enumerate(scale.items()):
+        factors[name] = jax.random.uniform(jax.random.fold_in(key, place), (count,), jnp.float32, low, high)
+    return scaled(fleet, factors)
+
+
+def scaled(car: CarParameters, factors: Mapping[str, Any]) -> CarParameters:
+    """Parameters times factors; that of `mass` is the chassis' inertia's as well."""
+    numbers = dict(vars(car))
+    for name, factor in factors.items():
         for part in (name, "inertia") if name == "mass" else (name,):
             numbers[part] = jax.tree.map(lambda leaf, by=factor: leaf * by, numbers[part])
     return with_numbers(car, numbers)
+
+
+def worst(car: CarParameters, scale: Mapping[str, tuple[float, float]]) -> CarParameters:
+    """The car that is hardest to integrate: what has mass at its least, all else (springs, dampers, arms) at its most."""
+    return scaled(car, {name: span[0 if "mass" in name or "inertia" in name else 1] for name, span in scale.items()})
 
 
 FORCES = (
@@ -80,15 +114,19 @@ FORCES = (
 )  # fmt: skip
 
 
-def resize(car: CarParameters, size: Float[Array, "A 2"]) -> CarParameters:
-    """The same car at another length and width: everything with a newton or a kilogram in it grows with the footprint."""
-    longer, wider = size[:, 0] / car.length, size[:, 1] / car.width
+def resize(car: CarParameters, size: Float[Array | np.ndarray, "*cars 2"]) -> CarParameters:
+    """The same car at another length and width: everything with a newton or a kilogram in it grows with the footprint.
+
+    Inertia by the second moments of the mass along each axis, so that it stays one that a body can have.
+    """
+    longer, wider = size[..., 0] / car.length, size[..., 1] / car.width
     numbers = dict(vars(car))
     numbers |= {name: jax.tree.map(lambda leaf: leaf * longer * wider, numbers[name]) for name in FORCES}
     roll, pitch, yaw = numbers["inertia"]
-    numbers["inertia"] = type(car.inertia)((roll * wider**2, pitch * longer**2, yaw * (longer**2 + wider**2) / 2))
-    along = {name: numbers[name] * longer for name in ("length", "wheelbase", "mass_forward")}
-    return with_numbers(car, numbers | along | {name: numbers[name] * wider for name in ("width", "track")})
+    along, across, up = (pitch + yaw - roll) / 2 * longer**2, (yaw + roll - pitch) / 2 * wider**2, (roll + pitch - yaw) / 2
+    numbers["inertia"] = type(car.inertia)((across + up, along + up, along + across))
+    lengths = {name: numbers[name] * longer for name in ("length", "wheelbase", "mass_forward")}
+    return with_numbers(car, numbers | lengths | {name: numbers[name] * wider for name in ("width", "track")})
 
 
 def with_numbers(like: CarParameters, numbers: Mapping[str, Any]) -> CarParameters:
@@ -154,6 +192,7 @@ def fit(model: mjx.Model, at: Places, fleet: Fleet) -> dict[str, Array]:
         "body_invweight0": model.body_invweight0.at[at.wheel, 0].set(fleet.wheel_weight),
         "dof_invweight0": model.dof_invweight0.at[at.spin_v].set(fleet.spin_weight),
         "dof_damping": damping.at[at.steer_v].set(car.steering_friction),
+        "dof_solimp": model.dof_solimp.at[at.spin_v, :2].set(car.brake_impedance),
         "jnt_stiffness": model.jnt_stiffness.at[at.suspension].set(car.suspension_stiffness),
         "qpos_spring": model.qpos_spring.at[at.suspension_q].set(-_load(car) * car.suspension_preload / car.suspension_stiffness),
         "geom_size": model.geom_size.at[at.tyre].set(radius),

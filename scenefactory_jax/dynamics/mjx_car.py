@@ -20,6 +20,7 @@ from mujoco import mjx
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.dynamics import fleet as fleets
 from scenefactory_jax.dynamics import solve
 from scenefactory_jax.dynamics.car import CarParameters, Places, Solver
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
@@ -57,7 +58,7 @@ class Plant(NamedTuple):
     """The compiled car and all that is constant about it."""
 
     car: CarParameters  # the reference car
-    vary: Callable[..., CarParameters] | None  # (key, scene, car) -> the cars of an episode
+    vary: Callable[..., CarParameters] | None  # (key, scene) -> the cars of an episode
     model: mjx.Model
     data: mjx.Data  # a template: MJX wants one, only four of its fields are ever written
     places: Places
@@ -97,8 +98,8 @@ def make(
         contact: numbers of `contact.make`; its height is the car's.
         brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a
             remembered spin direction, which flips every substep once a wheel locks.
-        fleet: null: all cars are the reference car. An entry whose target, such as `fleet.draw`, makes (key, scene, car) -> parameters with
-            an agent axis at every start: nothing is compiled anew.
+        fleet: null: all cars are the reference car. An entry whose target, such as `fleet.drawn`, gives a function (key, scene) ->
+            parameters with an agent axis, called at every start: nothing is compiled anew. It may declare `car` and `physics_dt`.
         grip: (weather, position, speed) -> friction coefficient, asked for every wheel at the start of every control step.
         physics_dt: s; `control_dt` must be a whole multiple of it.
 
@@ -109,14 +110,15 @@ def make(
     settings: Solver = build({**solver, "_target_": "Solver"}, builtins=cars.__name__, where="dynamics.solver")()
     entry = {**contact, "_target_": "make"}
     meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
-    cars.stable_limits(parameters, physics_dt=physics_dt)
+    cars.stable_limits(parameters, physics_dt=physics_dt, where="dynamics.car")
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
+    context = {"car": parameters, "physics_dt": physics_dt}
     model = cars.standalone(parameters, settings, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
     plant = Plant(
         car=parameters,
-        vary=None if fleet is None else build(fleet, builtins="scenefactory_jax.dynamics.fleet", where="dynamics.fleet"),
+        vary=None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)(),
         model=mjx.put_model(model, impl="jax"),
         data=mjx.make_data(model, impl="jax"),
         places=cars.places(model),
@@ -151,7 +153,7 @@ def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
     half = agents.yaw / 2.0
     zero = jnp.zeros_like(half)
     qpos = jnp.tile(jnp.asarray(plant.still, jnp.float32), (count, 1))
-    fleet = None if plant.vary is None else jax.vmap(enlist)(plant.vary(key, scene, plant.car))
+    fleet = None if plant.vary is None else jax.vmap(enlist)(plant.vary(key, scene))
     if fleet is not None:
         height, travel = jax.vmap(functools.partial(standing, physics_dt=plant.physics_dt))(fleet)
         qpos = qpos.at[:, 2].set(height).at[:, at.suspension_q].set(travel)

@@ -8,8 +8,7 @@ with one elliptic cone a tyre and one Huber cost a brake (MuJoCo documentation, 
 model: dense 16 x 16 matrices, library calls for their factors, and loops until the last car of a batch is done. A car needs none of
 this. Its wheels meet only through the chassis, so the Hessian is an arrow: a 6 x 6 block for the chassis and a 3 x 3 block for each
 wheel. Eliminating the wheels leaves 6 equations. Everything below is arithmetic on single numbers with the four wheels as an axis, so
-that XLA fuses it, and the numbers of iterations are fixed, so that nothing waits. Gradients, forward and reverse, come from the implicit
-function theorem: they cost one more elimination and do not walk back through the iterations.
+that XLA fuses it, and the numbers of iterations are fixed, so that nothing waits. Derivatives are those of the minimum, in either mode.
 """
 
 import functools
@@ -103,7 +102,7 @@ def newton(
     padded = jnp.concatenate([start, jnp.zeros(1)])
     base, own = [start[i] for i in range(BASE)], [padded[layout.own[:, k]] for k in range(OWN)]
 
-    at = _minimum(problem, Acceleration(base, own), iterations, line_search)
+    at = _minimise(problem, Acceleration(base, own), iterations, line_search)
     flat = jnp.concatenate([jnp.stack(at.base), jnp.stack(at.own, axis=-1).reshape(-1)])
     order = np.concatenate([np.arange(BASE), BASE + np.argsort(layout.own.reshape(-1), kind="stable")[: mass.shape[0] - BASE]])
     contact = _cone(_rows(problem, at), problem)
@@ -111,8 +110,8 @@ def newton(
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
-def _minimum(problem: Problem, start: Acceleration, iterations: int, line_search: int) -> Acceleration:
-    """Where the cost is least, by a fixed number of Newton steps."""
+def _minimise(problem: Problem, start: Acceleration, iterations: int, line_search: int) -> Acceleration:
+    """Newton's method, a fixed number of steps."""
 
     def step(at: Acceleration, _: None) -> tuple[Acceleration, None]:
         along = _direction(problem, at)
@@ -122,12 +121,14 @@ def _minimum(problem: Problem, start: Acceleration, iterations: int, line_search
     return jax.lax.scan(step, start, length=iterations)[0]
 
 
-@_minimum.defjvp
-def _minimum_jvp(iterations: int, line_search: int, primals: tuple, tangents: tuple) -> tuple[Acceleration, Acceleration]:
-    """The implicit function theorem: where the slope is zero, a Newton direction changes with the problem as the minimum does."""
+@_minimise.defjvp
+def _minimise_jvp(iterations: int, line_search: int, primals: tuple, tangents: tuple) -> tuple[Acceleration, Acceleration]:
+    """By the implicit function theorem: the slope g stays zero at the minimum, so that moves by -H^-1 dg. Differentiating the iterations
+    instead compiles for minutes, and says the same where they have converged."""
     problem, start = primals
-    at = _minimum(problem, start, iterations, line_search)
-    return at, jax.jvp(lambda changed: _direction(changed, at), (problem,), (tangents[0],))[1]
+    at = _minimise(problem, start, iterations, line_search)
+    _, change = jax.jvp(lambda changed: _slope(changed, at), (problem,), (tangents[0],))
+    return at, _descend(problem, at, change)
 
 
 def _take_apart(mass, force, jacobian, reference, weight, mu, brake, layout: Layout, friction_ratio: float) -> Problem:
@@ -197,13 +198,32 @@ def _brake(x: Number, problem: Problem) -> tuple[Number, Number]:
 
 
 def _direction(problem: Problem, at: Acceleration) -> Acceleration:
-    """Newton's direction: the arrow-shaped system, the wheels eliminated first."""
+    """Newton's direction."""
+    return _descend(problem, at, _slope(problem, at))
+
+
+def _slope(problem: Problem, at: Acceleration) -> Acceleration:
+    """Gradient of the convex problem: M a less all forces."""
     base, own = at
     contact = _cone(_rows(problem, at), problem)
-    torque, hold = _brake(own[SPIN] - problem.brake_reference, problem)
-    jacobian = problem.jacobian
-    push = [_dot([row[c] for row in jacobian], contact.force) for c in range(BASE + OWN)]  # J^T f
+    torque, _ = _brake(own[SPIN] - problem.brake_reference, problem)
+    push = [_dot([row[c] for row in problem.jacobian], contact.force) for c in range(BASE + OWN)]  # J^T f
     push[BASE + SPIN] = push[BASE + SPIN] + torque
+    slope_own = [
+        _dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) - problem.force_own[k] - push[BASE + k]
+        for k in range(OWN)
+    ]
+    slope_base = [
+        _dot(problem.base[i], base) - problem.force_base[i] + _sum(_dot(problem.across[i], own) - push[i]) for i in range(BASE)
+    ]
+    return Acceleration(slope_base, slope_own)
+
+
+def _descend(problem: Problem, at: Acceleration, slope: Acceleration) -> Acceleration:
+    """The Hessian's inverse times a slope, with opposite sign: the arrow-shaped system, the wheels eliminated first."""
+    contact = _cone(_rows(problem, at), problem)
+    _, hold = _brake(at.own[SPIN] - problem.brake_reference, problem)
+    jacobian = problem.jacobian
     bent = [[_dot(contact.stiffness[r], [row[c] for row in jacobian]) for c in range(BASE + OWN)] for r in range(3)]  # H J
 
     def curvature(i: int, j: int) -> Number:
@@ -212,21 +232,11 @@ def _direction(problem: Problem, at: Acceleration) -> Acceleration:
     within = [[problem.own[j][k] + curvature(BASE + j, BASE + k) for k in range(OWN)] for j in range(OWN)]
     within[SPIN][SPIN] = within[SPIN][SPIN] + hold
     across = [[problem.across[i][k] + curvature(i, BASE + k) for k in range(OWN)] for i in range(BASE)]
-    slope_own = [
-        _dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) - problem.force_own[k] - push[BASE + k]
-        for k in range(OWN)
-    ]
     factors = _factor(within)
     shed = [_solve(factors, row) for row in across]  # within^-1 across^T, row by row
-    rest = _solve(factors, slope_own)
+    rest = _solve(factors, slope.own)
     system = [[problem.base[i][j] + _sum(curvature(i, j) - _dot(across[i], shed[j])) for j in range(i + 1)] for i in range(BASE)]
-    slope = [
-        _dot(problem.base[i], base)
-        - problem.force_base[i]
-        + _sum(_dot(problem.across[i], own) - push[i] - _dot(across[i], rest))
-        for i in range(BASE)
-    ]
-    step = [-s for s in _solve(_factor(system), slope)]
+    step = [-s for s in _solve(_factor(system), [slope.base[i] - _sum(_dot(across[i], rest)) for i in range(BASE)])]
     return Acceleration(step, [-r - _dot([shed[i][k] for i in range(BASE)], step) for k, r in enumerate(rest)])
 
 

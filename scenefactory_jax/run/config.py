@@ -108,7 +108,11 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
         if not separator:
             raise ConfigError(f"overrides: {override!r} is no setting; write key=value")
         if not parents and (folder() / last).is_dir():
-            result[last] = load("task", override)[last]
+            *outer, inner = last.split("/")  # `dynamics/fleet=spread`: a group within a group
+            fresh, node = load("task", override), result
+            for name in outer:
+                fresh, node = fresh[name], node[name]
+            node[inner] = fresh[inner]
             continue
         node: Any = result
         for depth, key in enumerate([*parents, last]):
