@@ -14,6 +14,7 @@ from scenefactory_jax.build import build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import oracle
 from scenefactory_jax.dynamics.car import CarParameters, Solver
+from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Dynamics, Log, Road, Scene, Weather
 from scenefactory_jax.validation.encounters import Encounters
 from scenefactory_jax.validation.sequences import PATTERNS, Sequences
@@ -92,7 +93,8 @@ def scenes(
         )
         none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
         log = Log(position=place[:, None], yaw=heading[:, None], **none)
-        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=uniform(mu, row))
+        alone = {"others": unrecorded(1), "boxes": nobody()}
+        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=uniform(mu, row), **alone)
 
     place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))
     return jax.vmap(world)(place, heading, pace, mu, jnp.asarray(pattern, jnp.int32), road())
