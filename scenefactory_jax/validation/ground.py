@@ -85,6 +85,8 @@ def patches(
     cases = [*sides, None, *sides, None]
     split = run(scenes(cases, split_speed, size=size), _steady(FULL_BRAKE, np.ones(6), round(split_seconds * control_hz)))
     return {
+        "spot": [ahead_m, radius_m],
+        "split_speed": split_speed,
         "bend": {"surface": ["ICE", "SNOW", "AC"] * 2, "way_m": way, "wide_m": _wide(bend, way, turns)},
         "split": {
             "side": ["left", "right", "none"],

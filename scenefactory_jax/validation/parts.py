@@ -44,6 +44,7 @@ def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     position = equivalence.errors(run, reference).position[..., 0]
     sensitivity = equivalence.errors(nudged, reference).position[..., 0]
     return {
+        "bound": settings["bound"],
         "count": len(cases.speed),
         "control_steps": int(cases.controls.shape[1]),
         "percents": equivalence.PERCENTILES,
@@ -82,6 +83,7 @@ def trials(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         **settings["reference"],
     )
     return {
+        "bound": settings["bound"],
         "count": own["count"],
         "fine_hz": own["fine_hz"],
         "percents": equivalence.PERCENTILES,
