@@ -24,7 +24,12 @@ def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figur
 
 def errors(result: Result) -> Figure:
     """Differences from the C engine over time, as bands of percentiles."""
-    shown = {"position": ("Position", "m"), "yaw": ("Yaw", "rad"), "velocity": ("Velocity", "m/s"), "state": ("Whole state, L2", "SI units")}
+    shown = {
+        "position": ("Position", "m"),
+        "yaw": ("Yaw", "rad"),
+        "velocity": ("Velocity", "m/s"),
+        "state": ("Whole state, L2", "SI units"),
+    }
     time, bound = np.array(result["time_s"]), result["bound"]
     with matplotlib.rc_context(STYLE):
         figure, grid = _panels(9.5, 5.6, 2, 2)
@@ -66,7 +71,11 @@ def settings(result: Result) -> Figure:
         for index, kind in enumerate(dict.fromkeys(row["solver"]["algorithm"] for row in here)):
             line = sorted((row["solver"]["iterations"], 100 * row["share_within"]) for row in here if row["solver"]["algorithm"] == kind)
             right.plot(*zip(*line, strict=True), color=COLOURS[index], marker=MARKERS[index], label=kind)
-        right.set(xlabel="iterations", ylabel=f"% inside {1e3 * result['bound']['bound_m']:g} mm", title=f"Within the bound, {result['shipped_hz']:g} Hz")
+        right.set(
+            xlabel="iterations",
+            ylabel=f"% inside {1e3 * result['bound']['bound_m']:g} mm",
+            title=f"Within the bound, {result['shipped_hz']:g} Hz",
+        )
         right.set_ylim(top=102)
         right.legend(loc="lower right")
     return figure
@@ -122,7 +131,9 @@ def stopping(result: Result) -> Figure:
             friction = np.array(result["backends"][have[0]][kind]["friction"])
             axes.plot(friction, result["grip_limit_m"], color="#000000", linewidth=1.2, label="v²/(2 μ g)")
             if kind == "stopping":
-                axes.axhline(result["brake_limit_m"], color="#000000", linewidth=1.2, linestyle="--", label="brakes' torque, wheels rolling")
+                axes.axhline(
+                    result["brake_limit_m"], color="#000000", linewidth=1.2, linestyle="--", label="brakes' torque, wheels rolling"
+                )
             for index, name in enumerate(have):
                 found = result["backends"][name][kind]
                 axes.plot(friction, found["distance_m"], MARKERS[index], mfc="none", mec=COLOURS[index], markersize=5 + 2.2 * index,
@@ -152,7 +163,9 @@ def cornering(result: Result) -> Figure:
                 limit = friction * GRAVITY
                 axes.plot(found["demand"][index] / limit, found["lateral"][index] / limit, MARKERS[index], color=COLOURS[index],
                           markersize=4.5, linestyle="-", linewidth=0.7, label=f"μ = {friction:g}")  # fmt: skip
-            axes.set(xscale="log", yscale="log", title=NAMES.get(name, name), xlabel="needed to roll / μ g", xlim=(0.03, 30), ylim=(0.03, 30))
+            axes.set(
+                xscale="log", yscale="log", title=NAMES.get(name, name), xlabel="needed to roll / μ g", xlim=(0.03, 30), ylim=(0.03, 30)
+            )
             axes.set_xticks([0.1, 1, 10], ["0.1", "1", "10"])
             axes.set_yticks([0.1, 1, 10], ["0.1", "1", "10"])
         grid[0].set_ylabel("lateral acceleration / μ g")
@@ -175,7 +188,13 @@ def split(result: Result) -> Figure:
         left.legend()
         ice = result["patches"]["split"]
         for index, (side, style) in enumerate(zip(ice["side"], ("-", "--", ":"), strict=True)):
-            right.plot(ice["time_s"], np.rad2deg(ice["yaw"][index]), style, color=COLOURS[0], label=f"ice on {side} side" if index < 2 else "no ice")
+            right.plot(
+                ice["time_s"],
+                np.rad2deg(ice["yaw"][index]),
+                style,
+                color=COLOURS[0],
+                label=f"ice on {side} side" if index < 2 else "no ice",
+            )
         right.set(title=f"On a strip of ice, from {result['patches']['split_speed']:g} m/s", xlabel="time, s", ylabel="yaw, degrees")
         right.legend()
     return figure

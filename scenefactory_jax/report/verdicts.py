@@ -29,12 +29,14 @@ def of(results: Results, targets: Targets) -> list[Verdict]:
 
 def table(verdicts: list[Verdict]) -> str:
     """As Markdown."""
-    return tables.grid(["What", "Target", "Measured", "Met"], [[v.what, v.target, v.measured, "yes" if v.met else "**no**"] for v in verdicts])
+    return tables.grid(
+        ["What", "Target", "Measured", "Met"], [[v.what, v.target, v.measured, "yes" if v.met else "**no**"] for v in verdicts]
+    )
 
 
 def text(verdicts: list[Verdict]) -> str:
     """As lines for a terminal."""
-    width = [max((len(verdict[i]) for verdict in verdicts), default=0) for i in range(3)]
+    width = [max((len(str(verdict[i])) for verdict in verdicts), default=0) for i in range(3)]
     lines = [f"{v.what:{width[0]}}  {v.target:{width[1]}}  {v.measured:{width[2]}}  {'met' if v.met else 'NOT MET'}" for v in verdicts]
     return "\n".join([*lines, f"{sum(v.met for v in verdicts)} of {len(verdicts)} targets met"])
 
@@ -43,7 +45,9 @@ def _drives(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     bound = result["bound"]
     what = f"Single cars: position error against the C engine below {1e3 * bound['bound_m']:g} mm until {bound['horizon_s']:g} s"
     least = targets["within_min"]
-    return [Verdict(what, f">= {100 * least:g} % of drives", f"{_percent(result['within'])} of {result['count']}", result["within"] >= least)]
+    return [
+        Verdict(what, f">= {100 * least:g} % of drives", f"{_percent(result['within'])} of {result['count']}", result["within"] >= least)
+    ]
 
 
 def _encounters(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
@@ -63,7 +67,7 @@ def _encounters(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
                 bool(speed < targets["speed_error_max"])),
         Verdict(f"{where}: difference of the momentum's change, median", f"< {100 * targets['momentum_max']:g} %", _percent(apart),
                 bool(apart < targets["momentum_max"])),
-        Verdict("Collisions: both cars' momentum changes by no more than their tyres can", "100 %", _percent(kept), bool(kept == 1.0)),
+        Verdict("Collisions: momentum changes by no more than the tyres can", "100 %", _percent(float(kept)), bool(kept == 1.0)),
         Verdict("Collisions: energy is lost, smallest loss of either engine", "> 0", f"{1e-3 * lost:.3g} kJ", bool(lost > 0.0)),
     ]  # fmt: skip
 
@@ -95,7 +99,8 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
         ("Wheel loads sum to the weight, error", "load_error", load, "%"),
     ]
     made = [
-        Verdict(what, f"< {_size(targets[key], unit)}", _size(float(value), unit), bool(value < targets[key])) for what, key, value, unit in rows
+        Verdict(what, f"< {_size(targets[key], unit)}", _size(float(value), unit), bool(value < targets[key]))
+        for what, key, value, unit in rows
     ]
     sides = Verdict("Split friction: the car turns to the side that grips", "both", _turns(turned), bool(turned[0] < 0.0 < turned[1]))
     return [*made, sides]

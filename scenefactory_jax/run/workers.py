@@ -1,6 +1,7 @@
 """Cases spread over processes: the C engine runs one car at a time, and its loop is Python's."""
 
 import contextlib
+import itertools
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -23,7 +24,7 @@ def spreading(workers: int) -> Iterator[Spread]:
         def spread(function: Callable[[Any], Any], cases: Any) -> Any:
             count = len(cases[0])
             edges = np.linspace(0, count, min(workers, count) + 1).round().astype(int)
-            pieces = [type(cases)(*(column[a:b] for column in cases)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+            pieces = [type(cases)(*(column[a:b] for column in cases)) for a, b in itertools.pairwise(edges)]
             return jax.tree.map(lambda *parts: np.concatenate(parts), *pool.map(function, pieces))
 
         yield spread

@@ -99,9 +99,7 @@ def tracer(backend: Dynamics, *, control_hz: float, width: int) -> Callable[[Sce
     return run
 
 
-def held(
-    friction: Sequence[float] | np.ndarray, speed: Any, control: Sequence[float], *, steps: int, pattern: Any = EVEN
-) -> Sequences:
+def held(friction: Sequence[float] | np.ndarray, speed: Any, control: Sequence[float], *, steps: int, pattern: Any = EVEN) -> Sequences:
     """Drives with one control throughout; speeds and patterns are one for all or one each."""
     count = len(friction)
     one = np.broadcast_to(np.asarray(control, np.float32), (count, steps, 3)).copy()

@@ -1,7 +1,7 @@
 """The parts of `validate`: each takes the command's config and returns plain numbers, from which the report is written."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -57,7 +57,12 @@ def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "histograms": {name: histogram._asdict() for name, histogram in found.histograms.items()},
         "overlap": {name: equivalence.overlap(histogram) for name, histogram in found.histograms.items()},
         "worst": [
-            {"case": sequences.describe(cases, i), "horizon_m": position[i, horizon], "end_m": position[i, -1], "nudged_m": sensitivity[i, -1]}
+            {
+                "case": sequences.describe(cases, i),
+                "horizon_m": position[i, horizon],
+                "end_m": position[i, -1],
+                "nudged_m": sensitivity[i, -1],
+            }
             for i in map(int, found.worst[: settings["worst"]])
         ],
     }
