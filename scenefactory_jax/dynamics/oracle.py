@@ -217,6 +217,7 @@ class Mechanics(NamedTuple):
     momentum: Float[np.ndarray, "3"]  # kg m/s
     angular_momentum: Float[np.ndarray, "3"]  # kg m^2/s
     kinetic_energy: float  # J
+    potential_energy: float  # of gravity, springs and stops, J; the tyres' compression is not in it
 
 
 def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
@@ -227,10 +228,13 @@ def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray,
     mujoco.mj_fwdVelocity(rig.model, data)
     mujoco.mj_subtreeVel(rig.model, data)
     mujoco.mj_energyVel(rig.model, data)
+    mujoco.mj_energyPos(rig.model, data)
+    beyond = np.maximum(np.abs(rig.qpos[:, rig.suspension_q]) - rig.car.suspension_travel, 0.0)
+    stops = 0.5 * rig.car.stop_stiffness * (beyond**2).sum()
     mass = rig.model.body_subtreemass[rig.chassis, None]
     each = mass * data.subtree_linvel[rig.chassis]
     angular = data.subtree_angmom[rig.chassis] + np.cross(data.subtree_com[rig.chassis], each)
-    return Mechanics(each.sum(0), angular.sum(0), float(data.energy[1]))
+    return Mechanics(each.sum(0), angular.sum(0), float(data.energy[1]), float(data.energy[0] + stops))
 
 
 def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> Rig:

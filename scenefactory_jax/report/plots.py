@@ -65,10 +65,10 @@ class PlotError(ValueError):
     """Data that no figure can be made of; the message names what is missing."""
 
 
-def save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path, *, dpi: int = 160) -> Path:
     """Write a figure; the suffix decides the format (.png, .svg, .pdf)."""
     with matplotlib.rc_context(STYLE):
-        figure.savefig(path, dpi=160, facecolor="white")
+        figure.savefig(path, dpi=dpi, facecolor="white")
     return path
 
 

@@ -5,12 +5,13 @@ arithmetic's alone; `trials` can put a finer time step beside it, to see what ei
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.validation import engines
 from scenefactory_jax.validation.engines import Run
 from scenefactory_jax.validation.sequences import Sequences
@@ -56,8 +57,9 @@ class Trial(NamedTuple):
     name: str
     physics_hz: float
     solver: dict[str, Any]
-    error_m: Float[np.ndarray, "4"]  # PERCENTILES of the position error at the horizon
-    share_within: float
+    refused: str | None  # why this car cannot be simulated so; the rest is None then
+    error_m: Float[np.ndarray, "4"] | None  # PERCENTILES of the position error at the horizon
+    share_within: float | None
     fine_m: Float[np.ndarray, "4"] | None  # the same error against the fine time step
 
 
@@ -133,6 +135,7 @@ def overlap(histogram: Histogram) -> float:
 
 
 def settings(
+    reference: Callable[..., Run],
     entry: Mapping[str, Any],
     cases: Sequences,
     trials: Sequence[Mapping[str, Any]],
@@ -152,6 +155,7 @@ def settings(
     such combination.
 
     Args:
+        reference: `engines.drive_c`, or something that spreads its cases over processes.
         entry: the dynamics of a config; every trial changes it.
         trials: `name`, `physics_hz`, and whatever of the solver (`algorithm`, `integrator`, `iterations`, ...) is not the entry's.
         fine_hz: of a C engine whose time step leaves no error of its own, to compare with besides; null leaves that out.
@@ -161,22 +165,26 @@ def settings(
     truth = {**road, "friction_scale": 1.0, "nudge": 0.0, "iterations": iterations, "line_search": line_search}
     steps = round(horizon_s * control_hz)
     cases = cases._replace(controls=cases.controls[:, :steps])
-    fine = engines.drive_c(entry, cases, physics_hz=fine_hz, **truth) if fine_hz is not None else None
+    fine = reference(entry, cases, physics_hz=fine_hz, **truth) if fine_hz is not None else None
     references: dict[tuple, Run] = {}
     rows = []
     for trial in trials:
         changes = {key: value for key, value in trial.items() if key not in ("name", "physics_hz")}
         changed = {**entry, "solver": {**entry["solver"], **changes}}
+        names = {"name": trial["name"], "physics_hz": float(trial["physics_hz"]), "solver": dict(changed["solver"])}
+        try:
+            run = engines.drive(changed, cases, physics_hz=trial["physics_hz"], **road)
+        except ConfigError as error:
+            rows.append(Trial(**names, refused=str(error), error_m=None, share_within=None, fine_m=None))
+            continue
         key = (trial["physics_hz"], changed["solver"]["integrator"], changed["solver"]["friction_ratio"])
         if key not in references:
-            references[key] = engines.drive_c(changed, cases, physics_hz=trial["physics_hz"], **truth)
-        run = engines.drive(changed, cases, physics_hz=trial["physics_hz"], **road)
+            references[key] = reference(changed, cases, physics_hz=trial["physics_hz"], **truth)
         position = errors(run, references[key]).position[:, :, 0]
         rows.append(
             Trial(
-                name=trial["name"],
-                physics_hz=trial["physics_hz"],
-                solver=dict(changed["solver"]),
+                **names,
+                refused=None,
                 error_m=np.percentile(position[:, -1], PERCENTILES),
                 share_within=float((position.max(1) < bound_m).mean()),
                 fine_m=None if fine is None else np.percentile(errors(run, fine).position[:, -1, 0], PERCENTILES),

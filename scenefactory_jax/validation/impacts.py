@@ -59,7 +59,8 @@ class Impacts:
     relative: Float[np.ndarray, " N"]  # the larger of both over the closing speed
     speed_share: Float[np.ndarray, "N 2"]  # error of each car's speed over that speed (over 1 m/s at least)
     yaw_rate: Float[np.ndarray, "N 2"]  # rad/s
-    after_velocity: Float[np.ndarray, "N 2 2"]  # of the reference
+    after_velocity: Float[np.ndarray, "N 2 2"]  # of the reference, m/s
+    batched_velocity: Float[np.ndarray, "N 2 2"]  # of the batched path, at the same time
     peak: Float[np.ndarray, "N 2"]  # largest contact force of the batched path and of the reference, N
     delay_steps: Int[np.ndarray, " N"]  # control steps by which the batched path touches later
     batched: Balance
@@ -112,6 +113,7 @@ def compare(
         speed_share=np.abs(speed - wanted) / np.maximum(wanted, 1.0),
         yaw_rate=yaw_rate,
         after_velocity=outgoing,
+        batched_velocity=run.qvel[row, after, :, :2],
         peak=np.stack([run.contact_force.max(1), reference.contact_force.max(1)], -1),
         delay_steps=np.where(compared, one.before - other.before, 0),
         batched=both[0],

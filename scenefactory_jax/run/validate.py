@@ -1,0 +1,125 @@
+"""`validate`: the physics against the C engine and against laws of motion, and a report of it.
+
+Every part writes its numbers to `out/results/PART.json` as soon as they are there; `validation.md` and its figures are made of these files
+alone, so a part can be measured again, or elsewhere, without the others.
+"""
+
+import hashlib
+import json
+import shlex
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import validation as report
+from scenefactory_jax.report import verdicts
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import keys, sources
+from scenefactory_jax.run.workers import spreading
+from scenefactory_jax.validation import parts
+from scenefactory_jax.validation.parts import Spread
+
+
+class Part(NamedTuple):
+    """One part of the command: what computes it, and the keys of the config that it reads, dotted."""
+
+    run: Callable[[Mapping[str, Any], Spread], dict[str, Any]]
+    reads: tuple[str, ...]
+
+
+SHARED = ("validation.seed", "validation.reference", "validation.road", "validation.bound", "validation.worst", "timing", "dynamics")
+PARTS = {
+    "drives": Part(parts.drives, (*SHARED, "validation.drives")),
+    "settings": Part(parts.trials, (*SHARED, "validation.drives", "validation.settings")),
+    "encounters": Part(parts.encounters, (*SHARED, "validation.encounters")),
+    "laws": Part(parts.laws_of_motion, ("validation.laws", "timing", "dynamics", "backends", "weather")),
+}
+
+
+def validate(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Run the parts of a config (`load("validate", "validation=full", "parts=[laws]")`) and write the report of all results in `out`.
+
+    Returns:
+        The results by part, as they were written.
+
+    Raises:
+        ConfigError: an unknown part, or a number that does not fit, by name.
+    """
+    keys.check(config, keys.VALIDATE)
+    if unknown := [name for name in config["parts"] if name not in PARTS]:
+        raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
+    sources.use_compilation_cache()
+    out = Path(config["out"])
+    (out / "results").mkdir(parents=True, exist_ok=True)
+    with spreading(config["workers"]) as spread:
+        for name in (name for name in PARTS if name in config["parts"]):
+            _measure(name, config, out, spread)
+    results = read(out)
+    if results:
+        written = report.write(out, results, config["validation"]["targets"])
+        print(f"{written}\n{verdicts.text(verdicts.of(results, config['validation']['targets']))}", flush=True)
+    return results
+
+
+def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) -> None:
+    """One part, unless its result is there already."""
+    path, part = out / "results" / f"{name}.json", PARTS[name]
+    read = subset(config, part.reads)
+    made = {"settings": _digest(read), "versions": configs.versions()}
+    if config["resume"] and path.is_file():
+        before = json.loads(path.read_text())
+        if all(before[key] == value for key, value in made.items()):
+            print(f"{name}: kept", flush=True)
+            return
+    begun = time.perf_counter()
+    print(f"{name} ...", flush=True)
+    result = part.run(read, spread)
+    seconds = time.perf_counter() - begun
+    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": _command(), "result": _plain(result)}
+    path.write_text(json.dumps(whole, separators=(",", ":")) + "\n")
+    print(f"{name}: {seconds:.0f} s", flush=True)
+
+
+def read(out: Path) -> dict[str, Any]:
+    """The results in a folder by part, in the order of `PARTS`; others that lie there follow."""
+    files = {path.stem: path for path in sorted((out / "results").glob("*.json"))}
+    return {name: json.loads(files[name].read_text()) for name in (*PARTS, *sorted(set(files) - set(PARTS))) if name in files}
+
+
+def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
+    """The parts of a config that these dotted keys name, and nothing else."""
+    found: dict[str, Any] = {}
+    for place in places:
+        *parents, last = place.split(".")
+        source, target = config, found
+        for name in parents:
+            source, target = source[name], target.setdefault(name, {})
+        target[last] = source[last]
+    return found
+
+
+def _digest(config: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _command() -> str:
+    """How this was called, for the report."""
+    return f"python -m scenefactory_jax {shlex.join(['validate', *sys.argv[1:]])}" if "validate" in sys.argv[0] else "validate(config)"
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and numbers with as many digits as anybody reads."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return float(f"{value:.5g}") if isinstance(value, float) else value

@@ -1,0 +1,262 @@
+"""The laws' ability to fail, and the command at toy size."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import verdicts
+from scenefactory_jax.run import validate as command
+from scenefactory_jax.run.config import load
+from scenefactory_jax.run.workers import spreading
+from scenefactory_jax.validation import engines, ground, laws, sequences
+
+G = 9.81
+RATES = dict(physics_hz=120.0, control_hz=30.0)
+CLOCK = dict(control_hz=30.0)
+MU = [0.002, 0.1, 0.3, 0.8]
+STANDING = dict(frictions=MU, speed_max=2.0, brake_s=1.0, settle_s=2.0, hold_s=2.0, **CLOCK)
+
+
+def entry_of(name, **car):
+    entry = load("task", f"dynamics={name}")["dynamics"]
+    return {**entry, "car": {**entry["car"], **car}} if car else entry
+
+
+@pytest.fixture(scope="module")
+def entry():
+    return entry_of("mjx_car")
+
+
+@pytest.fixture(scope="module")
+def car(entry):
+    return engines.numbers(entry)[0]
+
+
+@pytest.fixture(scope="module")
+def drive(entry):
+    return laws.driver(entry, slippery=0.125, width=4, **RATES)
+
+
+@pytest.fixture(scope="module")
+def latched(entry):
+    """The published brakes: torque with a remembered sign."""
+    return laws.driver({**entry, "brakes": "latched"}, slippery=0.125, width=4, **RATES)
+
+
+@pytest.fixture(scope="module")
+def locking():
+    """Brakes that lock the wheels, and a car that another law has been broken for: springs that carry nothing."""
+    return laws.driver(entry_of("mjx_car", brake_torque_front=4120.0, brake_torque_rear=3705.0), slippery=0.125, width=4, **RATES)
+
+
+def slid(drive, frictions=(0.1, 0.3, 0.8), seconds=6.0):
+    return laws.stopping(drive, frictions=list(frictions), speed=5.0, seconds=seconds, **CLOCK)
+
+
+def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, locking, car):
+    locked, own = slid(locking), slid(drive)
+    limit = laws.grip_limit_m(5.0, locked["friction"])
+    assert locked["stopped"].all() and locked["aside_m"].max() < 0.1
+    np.testing.assert_allclose(locked["distance_m"], limit, rtol=0.03)
+    assert own["distance_m"][2] == pytest.approx(laws.brake_limit_m(car, 5.0), rel=0.03)
+    assert own["distance_m"][2] > 1.5 * limit[2], "the brakes are the limit there: the same check would fail for them"
+    assert not slid(drive, [0.1], seconds=1.0)["stopped"].any()
+
+
+def test_the_brakes_limit_solves_its_equation(car):
+    inertia = laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    speed, way, dt = 15.0, 0.0, 1e-4
+    while speed > 0.0:
+        way += speed * dt
+        torque = 2 * (car.brake_torque_front + car.brake_torque_rear) + 4 * car.wheel_damping * speed / car.wheel_radius
+        speed -= torque / car.wheel_radius / inertia * dt
+    assert laws.brake_limit_m(car, 15.0) == pytest.approx(way, rel=1e-3)
+    assert laws.mass(car) == pytest.approx(1980.03, abs=0.01)
+
+
+def test_braked_cars_stand_and_latched_brakes_do_not(drive, latched):
+    held, shaken = laws.standing(drive, **STANDING), laws.standing(latched, **STANDING)
+    assert held["brake_creep_mm"].max() < 0.01 and held["brake_rest"].max() < 1e-3
+    assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max() and shaken["brake_creep_mm"].max() > 0.01
+
+
+def test_cornering_ends_at_the_grip(drive, car):
+    numbers = dict(frictions=[0.1, 0.9], speeds=[3.0, 12.0], from_s=1.0, to_s=2.0, wheelbase=car.wheelbase, **CLOCK)
+    found = laws.cornering(drive, steer=0.5, **numbers)
+    limit = found["friction"][:, None] * G
+    assert (found["lateral"] <= 1.05 * limit).all() and found["demand"][0, 1] > 5 * limit[0, 0]
+    assert 0.8 < found["lateral"][0, 1] / limit[0, 0] < 1.05
+    assert found["yaw_ratio"][1, 0] == pytest.approx(1.0, abs=0.03) and found["yaw_ratio"][0, 1] < 0.2
+    right = laws.cornering(drive, steer=-0.5, **numbers)
+    np.testing.assert_allclose(right["yaw_ratio"][1, 0], found["yaw_ratio"][1, 0], atol=1e-3)
+
+
+def test_a_kinematic_car_knows_no_grip(entry):
+    free = laws.driver(entry_of("bicycle"), slippery=0.125, width=4, **RATES)
+    found = laws.cornering(free, frictions=[0.1], speeds=[3.0, 12.0], steer=0.5, from_s=1.0, to_s=2.0, wheelbase=2.6, **CLOCK)
+    np.testing.assert_allclose(found["lateral"], found["demand"], rtol=0.01)
+    assert found["lateral"].max() > 5 * 0.1 * G
+    own = slid(free)
+    assert np.ptp(own["distance_m"]) < 1e-4
+
+
+def test_split_friction_turns_to_the_grip_and_is_mirrored(drive):
+    found = laws.split(drive, friction=0.8, speed=10.0, seconds=1.0, **CLOCK)
+    yaw = found["yaw"]
+    assert yaw[0, -1] < -0.05 and yaw[1, -1] > 0.05 and found["aside_m"][0, -1] < 0 < found["aside_m"][1, -1]
+    np.testing.assert_allclose(yaw[0], -yaw[1], atol=0.01 * np.abs(yaw).max())
+
+
+def test_the_car_rides_on_its_springs_and_the_published_one_on_its_stops(drive, car):
+    found = laws.ride(drive, car, friction=0.9, seconds=2.0, **CLOCK)
+    assert found["on_springs"] == 1.0 and np.abs(found["travel_m"]).max() < 1e-3
+    assert found["load_sum"] == pytest.approx(1.0, abs=1e-3) and found["height_m"] == pytest.approx(0.755, abs=0.005)
+    published = entry_of("mjx_published")
+    hard = laws.driver(published, slippery=1.0, width=4, **RATES)
+    lying = laws.ride(hard, engines.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
+    assert 0.03 < lying["on_springs"] < 0.06 and lying["travel_m"].min() > lying["room_m"]
+    assert lying["load_sum"] == pytest.approx(1.0, abs=5e-3)
+
+
+def test_rolling_cars_gain_nothing_and_driven_ones_do(drive, entry, car):
+    numbers = dict(frictions=[0.1, 0.9], steers=[0.0, 0.6], speed=10.0, seconds=2.0, **CLOCK)
+    found = laws.rolling(drive, entry, **numbers)
+    assert found["rise"].max() < 2e-3 and (found["spent"][:, -1] > 0.02).all()
+    assert found["spent"][3, -1] > 1.5 * found["spent"][2, -1], "sliding costs more than rolling"
+
+    def pushed(cases):
+        cases.controls[..., 0] = 1.0
+        return drive(cases)
+
+    assert laws.rolling(pushed, entry, **numbers)["rise"].min() > 0.05
+
+
+def test_pieces_do_not_matter(drive, entry):
+    """Five cases in pieces of four, of a second each, are the five cases, one by one."""
+    cases = laws.held([0.1, 0.3, 0.5, 0.7, 0.9], 5.0, (0.2, 0.1, 0.0), steps=40)
+    whole = drive(cases)
+    assert whole.position.shape == (5, 40, 3) and whole.qpos.shape == (5, 40, 17)
+    last = drive(sequences.Sequences(*(column[4:] for column in cases)))
+    np.testing.assert_allclose(last.position[0], whole.position[4], atol=1e-5)
+
+
+def test_ice_pushes_wide_and_splits(entry):
+    grip = load("task")["weather"]["grip"]
+    options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
+    found = ground.patches(entry, grip, **RATES, **options)
+    wide = np.array(found["bend"]["wide_m"])
+    assert (wide[[0, 3]] > 3.0).all() and (wide[[1, 4]] > 1.0).all() and np.abs(wide[[2, 5]]).max() < 1.0
+    np.testing.assert_allclose(wide[:3], wide[3:], atol=0.3)
+    yaw = found["split"]["yaw"][:, -1]
+    assert yaw[0] < -0.03 and yaw[1] > 0.03 and abs(yaw[2]) < 0.005
+
+
+# ---- the command
+
+TOY = (
+    "parts=[drives,encounters]", "validation.drives.draw.count=6", "validation.drives.draw.seconds=1", "validation.bound.horizon_s=0.5",
+    "validation.encounters.draw.count=10", "validation.encounters.draw.seconds=1.6", "validation.worst=3",
+)  # fmt: skip
+
+
+def toy(out, *overrides):
+    return command.validate(load("validate", f"out={out}", *TOY, *overrides))
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    out = tmp_path_factory.mktemp("validation")
+    return out, toy(out)
+
+
+def test_a_run_writes_numbers_figures_and_verdicts(measured, capsys):
+    out, results = measured
+    assert list(results) == ["drives", "encounters"]
+    text = (out / "validation.md").read_text()
+    assert "## Verdicts" in text and "| yes |" in text and "sequence " in text and "encounter " in text and "nan" not in text
+    for name in ("errors", "forces", "collisions"):
+        assert (out / f"{name}.png").is_file() and f"({name}.png)" in text
+    assert results["drives"]["result"]["count"] == 6 and results["drives"]["seconds"] > 0
+
+
+def test_resume_keeps_what_fits_and_no_parts_write_the_report_anew(measured, capsys):
+    out, results = measured
+    (out / "validation.md").unlink()
+    assert toy(out, "resume=true") == results
+    assert "drives: kept\nencounters: kept\n" in capsys.readouterr().out and (out / "validation.md").is_file()
+    (out / "validation.md").unlink()
+    assert toy(out, "parts=[]", "validation.targets.within_min=1.1") == results
+    assert "**no**" in (out / "validation.md").read_text() and "NOT MET" in capsys.readouterr().out
+
+
+def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, capsys):
+    out, results = measured
+    (tmp_path / "results").mkdir()
+    for name in results:
+        (tmp_path / "results" / f"{name}.json").write_bytes((out / "results" / f"{name}.json").read_bytes())
+    again = []
+    for name, part in list(command.PARTS.items()):
+        known = results.get(name, {}).get("result")
+        fake = part._replace(run=lambda config, spread, name=name, known=known: (again.append(name), known)[1])
+        monkeypatch.setitem(command.PARTS, name, fake)
+    toy(tmp_path, "resume=true", "validation.encounters.draw.speed_max=19")
+    assert again == ["encounters"]
+    toy(tmp_path, "resume=true", "validation.encounters.draw.speed_max=19", "workers=2", "validation.targets.creep_mm=2")
+    assert again == ["encounters"]
+    toy(tmp_path)
+    assert again == ["encounters", "drives", "encounters"]
+
+
+def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
+    for override, message in {
+        "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws",
+        "workers=0": "workers: 0; wanted is at least 1",
+        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: 'fast' is of type str, wanted float",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            toy(tmp_path, override)
+
+
+def test_verdicts_can_fail(measured):
+    _, results = measured
+    targets = load("validate")["validation"]["targets"]
+    worse = json.loads(json.dumps(results))
+    worse["drives"]["result"]["within"] = 0.5
+    rows = worse["encounters"]["result"]["contacts"]["spring"]["rows"]
+    rows["lost"] = [-1.0 for _ in rows["lost"]]
+    honest, broken = (verdicts.of(r, targets) for r in (results, worse))
+    assert [a.what for a, b in zip(honest, broken, strict=True) if a.met and not b.met] == [honest[0].what, honest[-1].what]
+
+
+def square(cases):
+    """Runs in a process of its own."""
+    return engines.Run(*[cases.speed[:, None] ** 2] * 7)
+
+
+def test_cases_spread_over_processes_come_back_in_order():
+    cases = laws.held([0.1] * 5, np.arange(5.0), laws.COAST, steps=1)
+    with spreading(1) as here, spreading(2) as there:
+        np.testing.assert_array_equal(here(square, cases).qpos, there(square, cases).qpos)
+
+
+@pytest.mark.parametrize("size", ["reduced", "full"])
+def test_sizes_compose(size):
+    config = load("validate", f"validation={size}")
+    assert config["validation"]["drives"]["draw"]["count"] >= 48 and config["validation"]["settings"]["trials"]
+    assert {"mjx_car", "latched", "published", "bicycle"} == set(config["backends"])
+
+
+@pytest.mark.slow
+def test_all_parts(tmp_path):
+    small = (
+        "validation.settings.count=4", "validation.settings.fine_hz=240",
+        "validation.settings.trials=[{name: few, physics_hz: 120, iterations: 2}, {name: coarse, physics_hz: 60}]",
+        "validation.laws.stopping.frictions=[0.3,1.0]", "validation.laws.stopping.seconds=6",
+        "validation.laws.standing.frictions=[0.01,0.8]",
+    )  # fmt: skip
+    results = toy(tmp_path, "parts=[drives,settings,encounters,laws]", *small)
+    text = (tmp_path / "validation.md").read_text()
+    assert list(results) == list(command.PARTS) and "is refused: dynamics.car" in text and "mjx_published" in text
+    assert len(list(tmp_path.glob("*.png"))) == 8
