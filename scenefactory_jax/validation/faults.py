@@ -75,7 +75,8 @@ def run(
         iterations: of learning.
     """
     play = player(env, seed=seed)
-    shape = (steps, *np.shape(scenes.agents.yaw))
+    worlds, agents = scenes.agents.yaw.shape
+    shape = (steps, worlds, agents)
     actions = jax.random.uniform(jax.random.key(seed), (*shape, 3), jnp.float32, -1.0, 1.0)
     place = (fault_step, world, agent)
     clean = play(scenes, actions, harm(shape))
