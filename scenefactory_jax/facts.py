@@ -40,9 +40,8 @@ def measure(
     Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
     tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
     """
-    motion, active, cars = after.motion, before.active, len(before.active)
+    motion, active, cars, finite = after.motion, before.active, len(before.active), is_finite(after.motion)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    finite = is_finite(motion)
     everyone = conflict.bodies(motion, after.agents.size, active & finite, scene.boxes)  # nobody meets a broken car
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)

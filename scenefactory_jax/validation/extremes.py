@@ -51,7 +51,7 @@ CASES = (
     Case("on its side, friction 1.3", friction=1.3, above=0.4, roll=HALF_TURN / 2, velocity=(10.0, 0.0, 0.0)),
     Case("on its roof at 20 m/s", roll=HALF_TURN, velocity=(20.0, 0.0, 0.0), action=(1.0, 0.0, 0.0)),
     Case("on its nose", above=2.0, pitch=HALF_TURN / 2, action=(1.0, 1.0, 0.0)),
-    Case("high centre of mass, full lock at 25 m/s, friction 1.3", friction=1.3, velocity=(25.0, 0.0, 0.0), action=(0.0, 1.0, 0.0), mass_height=0.4),
+    Case("high centre of mass, full lock, friction 1.3", friction=1.3, velocity=(25.0, 0.0, 0.0), action=(0.0, 1.0, 0.0), mass_height=0.4),
     Case("sideways at 25 m/s, friction 1.3", friction=1.3, velocity=(0.0, 25.0, 0.0), spin=0.0, action=(0.0, 0.0, 1.0), mass_height=0.4),
     Case("10 km outside", position=(1e4, 0.0), velocity=(10.0, 0.0, 0.0), action=(1.0, 0.1, 0.0)),
     Case("wheels spin backwards at 100 rad/s", spin=-100.0),

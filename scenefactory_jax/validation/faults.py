@@ -1,4 +1,4 @@
-"""Faults and determinism: what one broken car changes elsewhere, and whether the same seed gives the same bits, on whatever device this runs.
+"""Faults and determinism: what one broken car changes elsewhere, and whether the same seed gives the same bits, on any device.
 
 Everything is compared bit for bit (NaN equals NaN). On a GPU, XLA may choose kernels that add in any order: with
 `XLA_FLAGS=--xla_gpu_deterministic_ops=true` it does not.
@@ -47,7 +47,8 @@ class Harm(NamedTuple):
     retired: Bool[np.ndarray | Array, "*steps A"]  # made inactive
 
 
-Play = Callable[[Scene, Float[Array, "T W A 3"], Harm], tuple[State, Outcome]]
+Traces = tuple[Any, Any]  # State and Outcome of every step of every world
+Play = Callable[[Scene, Float[Array, "T W A 3"], Harm], Traces]
 
 
 def run(
@@ -74,7 +75,8 @@ def run(
         iterations: of learning.
     """
     play = player(env, seed=seed)
-    shape = (steps, *np.shape(scenes.agents.yaw))
+    worlds, agents = scenes.agents.yaw.shape
+    shape = (steps, worlds, agents)
     actions = jax.random.uniform(jax.random.key(seed), (*shape, 3), jnp.float32, -1.0, 1.0)
     place = (fault_step, world, agent)
     clean = play(scenes, actions, harm(shape))
@@ -132,9 +134,9 @@ def harm(
 
 def judge(
     name: str,
-    hurt: tuple[State, Outcome],
-    clean: tuple[State, Outcome],
-    without: tuple[State, Outcome],
+    hurt: Traces,
+    clean: Traces,
+    without: Traces,
     step: int,
     world: int,
     agent: int,
@@ -181,7 +183,7 @@ def different(one: Any, other: Any, part: Callable[[np.ndarray], np.ndarray]) ->
     return tuple(jax.tree_util.keystr(path) for (path, a), b in pairs if not _alike(part(_plain(a)), part(_plain(b))))
 
 
-def _plain(leaf: Array) -> np.ndarray:
+def _plain(leaf: Array | np.ndarray) -> np.ndarray:
     """As numpy; random keys as their words."""
     return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
 
