@@ -1,5 +1,6 @@
 """The laws' ability to fail, and the command at toy size."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -39,29 +40,17 @@ def drive(entry):
     return laws.driver(entry, slippery=0.125, width=4, **RATES)
 
 
-@pytest.fixture(scope="module")
-def latched(entry):
-    """The published brakes: torque with a remembered sign."""
-    return laws.driver({**entry, "brakes": "latched"}, slippery=0.125, width=4, **RATES)
-
-
-@pytest.fixture(scope="module")
-def locking():
-    """Brakes that lock the wheels, and a car that another law has been broken for: springs that carry nothing."""
-    return laws.driver(entry_of("mjx_car", brake_torque_front=4120.0, brake_torque_rear=3705.0), slippery=0.125, width=4, **RATES)
-
-
 def slid(drive, frictions=(0.1, 0.3, 0.8), seconds=6.0):
     return laws.stopping(drive, frictions=list(frictions), speed=5.0, seconds=seconds, **CLOCK)
 
 
-def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, locking, car):
-    locked, own = slid(locking), slid(drive)
-    limit = laws.grip_limit_m(5.0, locked["friction"])
-    assert locked["stopped"].all() and locked["aside_m"].max() < 0.1
-    np.testing.assert_allclose(locked["distance_m"], limit, rtol=0.03)
-    assert own["distance_m"][2] == pytest.approx(laws.brake_limit_m(car, 5.0), rel=0.03)
-    assert own["distance_m"][2] > 1.5 * limit[2], "the brakes are the limit there: the same check would fail for them"
+def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, car):
+    found = slid(drive)
+    limit = laws.grip_limit_m(5.0, found["friction"])
+    assert found["stopped"].all() and found["aside_m"].max() < 0.1
+    np.testing.assert_allclose(found["distance_m"][:2], limit[:2], rtol=0.03)
+    assert found["distance_m"][2] == pytest.approx(laws.brake_limit_m(car, 5.0), rel=0.03)
+    assert found["distance_m"][2] > 1.3 * limit[2], "the brakes are the limit there: the same check would fail for them"
     assert not slid(drive, [0.1], seconds=1.0)["stopped"].any()
 
 
@@ -76,10 +65,22 @@ def test_the_brakes_limit_solves_its_equation(car):
     assert laws.mass(car) == pytest.approx(1980.03, abs=0.01)
 
 
-def test_braked_cars_stand_and_latched_brakes_do_not(drive, latched):
-    held, shaken = laws.standing(drive, **STANDING), laws.standing(latched, **STANDING)
+def test_braked_cars_stand(drive):
+    held = laws.standing(drive, **STANDING)
     assert held["brake_creep_mm"].max() < 0.01 and held["brake_rest"].max() < 1e-3
-    assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max() and shaken["brake_creep_mm"].max() > 0.01
+
+    def released(cases):
+        cases.controls[..., 2] = 0.0
+        return drive(cases)
+
+    assert laws.standing(released, **STANDING)["brake_creep_mm"].min() > 1.0
+
+
+@pytest.mark.slow
+def test_latched_brakes_shake(drive, entry):
+    latched = laws.driver({**entry, "brakes": "latched"}, slippery=0.125, width=4, **RATES)
+    held, shaken = laws.standing(drive, **STANDING), laws.standing(latched, **STANDING)
+    assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max()
 
 
 def test_cornering_ends_at_the_grip(drive, car):
@@ -109,10 +110,16 @@ def test_split_friction_turns_to_the_grip_and_is_mirrored(drive):
     np.testing.assert_allclose(yaw[0], -yaw[1], atol=0.01 * np.abs(yaw).max())
 
 
-def test_the_car_rides_on_its_springs_and_the_published_one_on_its_stops(drive, car):
+def test_the_car_rides_on_its_springs(drive, car):
     found = laws.ride(drive, car, friction=0.9, seconds=2.0, **CLOCK)
     assert found["on_springs"] == 1.0 and np.abs(found["travel_m"]).max() < 1e-3
     assert found["load_sum"] == pytest.approx(1.0, abs=1e-3) and found["height_m"] == pytest.approx(0.755, abs=0.005)
+    softer = dataclasses.replace(car, suspension_travel=1e-4, suspension_preload=0.0)
+    assert laws.ride(drive, softer, friction=0.9, seconds=2.0, **CLOCK)["on_springs"] < 0.9, "reads the car that it is told"
+
+
+@pytest.mark.slow
+def test_the_published_car_rides_on_its_stops():
     published = entry_of("mjx_published")
     hard = laws.driver(published, slippery=1.0, width=4, **RATES)
     lying = laws.ride(hard, engines.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
@@ -142,6 +149,7 @@ def test_pieces_do_not_matter(drive, entry):
     np.testing.assert_allclose(last.position[0], whole.position[4], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_ice_pushes_wide_and_splits(entry):
     grip = load("task")["weather"]["grip"]
     options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
@@ -156,7 +164,7 @@ def test_ice_pushes_wide_and_splits(entry):
 # ---- the command
 
 TOY = (
-    "parts=[drives,encounters]", "validation.drives.draw.count=6", "validation.drives.draw.seconds=1", "validation.bound.horizon_s=0.5",
+    "parts=[drives,encounters]", "validation.drives.draw.count=6", "validation.drives.draw.seconds=1.0", "validation.bound.horizon_s=0.5",
     "validation.encounters.draw.count=10", "validation.encounters.draw.seconds=1.6", "validation.worst=3",
 )  # fmt: skip
 
@@ -253,7 +261,7 @@ def test_all_parts(tmp_path):
     small = (
         "validation.settings.count=4", "validation.settings.fine_hz=240",
         "validation.settings.trials=[{name: few, physics_hz: 120, iterations: 2}, {name: coarse, physics_hz: 60}]",
-        "validation.laws.stopping.frictions=[0.3,1.0]", "validation.laws.stopping.seconds=6",
+        "validation.laws.stopping.frictions=[0.3,1.0]", "validation.laws.stopping.seconds=6.0",
         "validation.laws.standing.frictions=[0.01,0.8]",
     )  # fmt: skip
     results = toy(tmp_path, "parts=[drives,settings,encounters,laws]", *small)

@@ -49,11 +49,14 @@ def wheel_friction(
 
 
 def grip(
-    weather: Weather, position: Float[Array, "A 4 2"], speed: Float[Array, "A 4"], *, slippery: float, friction_min: float
-) -> Float[Array, "A 4"]:
-    """Friction of a world whose weather holds the coefficient (`film_mm`) and the pattern (`surface`) themselves."""
+    weather: Weather, position: Float[Array, "A *wheels 2"], speed: Float[Array, "A *wheels"], *, slippery: float, friction_min: float
+) -> Float[Array, "A *wheels"]:
+    """Friction of a world whose weather holds the coefficient (`film_mm`) and the pattern (`surface`) themselves.
+
+    Backends that ask for the whole car get the mean over its wheels.
+    """
     mu = wheel_friction(weather.film_mm, weather.surface, slippery=slippery, friction_min=friction_min)
-    return jnp.broadcast_to(mu, speed.shape)
+    return jnp.broadcast_to(mu if speed.ndim == 2 else mu.mean(), speed.shape)
 
 
 def dynamics(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, slippery: float, friction_min: float) -> Dynamics:

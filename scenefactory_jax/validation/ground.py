@@ -3,8 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from scenefactory_jax.build import build
 from scenefactory_jax.struct import replace
@@ -28,20 +30,18 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
     dry, asphalt = np.zeros(count), np.full(count, SURFACES.index("AC"), np.int32)
     worlds = engines.scenes(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
     some = [patch or Patch([(0.0, 0.0), (0.0, 0.0)], 0.0, "AC") for patch in patches]
-    column = lambda values, dtype=jnp.float32: jnp.asarray(values, dtype)[:, None]  # noqa: E731
-    nothing = [0.0] * count
-    weather = replace(
-        worlds.weather,
-        patches=Patches(
-            vertices=column([patch.line for patch in some]),
-            closed=column([False] * count, bool),
-            radius=column([patch.radius for patch in some]),
-            surface=column([SURFACES.index(patch.surface) for patch in some], jnp.int32),
-            film_mm=column(nothing),
-            follows=column(nothing),
-            present=column([patch is not None for patch in patches], bool),
-        ),
+
+    def one(line: Array, radius: Array, surface: Array, present: Array) -> Patches:
+        nothing = jnp.zeros(1)
+        return Patches(line[None], jnp.zeros(1, bool), radius[None], surface[None], nothing, nothing, present[None])
+
+    columns = (
+        jnp.array([patch.line for patch in some], jnp.float32),
+        jnp.array([patch.radius for patch in some], jnp.float32),
+        jnp.array([SURFACES.index(patch.surface) for patch in some], jnp.int32),
+        jnp.array([patch is not None for patch in patches], bool),
     )
+    weather = replace(worlds.weather, patches=jax.vmap(one)(*columns))
     return replace(worlds, weather=weather)
 
 
