@@ -108,8 +108,9 @@ def _digest(config: Mapping[str, Any]) -> str:
 
 
 def _command() -> str:
-    """How this was called, for the report."""
-    return f"python -m scenefactory_jax {shlex.join(['validate', *sys.argv[1:]])}" if "validate" in sys.argv[0] else "validate(config)"
+    """How this was called, for the report; where the files went is nobody else's business."""
+    arguments = [argument for argument in sys.argv[1:] if not argument.startswith("out=")]
+    return f"python -m scenefactory_jax {shlex.join(['validate', *arguments])}" if "validate" in sys.argv[0] else "validate(config)"
 
 
 def _plain(value: Any) -> Any:
