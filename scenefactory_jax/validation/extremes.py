@@ -235,7 +235,7 @@ def _judge(
         acceleration=float(np.linalg.norm(np.diff(qvel[:, :3], axis=0), axis=-1).max() * control_hz),
         spin=float(np.linalg.norm(qvel[:, 3:6], axis=-1).max()),
         gain=0.0 if driven else float(stored.max() / stored[0] - 1.0),
-        end=tuple(float(x) for x in qpos[-1, :3]),
+        end=(float(qpos[-1, 0]), float(qpos[-1, 1]), float(qpos[-1, 2])),
         end_speed=float(speed[-1]),
         passed=False,
     )
