@@ -229,12 +229,11 @@ def _brakes(found: Mapping[str, Mapping[str, np.ndarray]], limit: np.ndarray) ->
         return ""
     own = (pair[0]["distance_m"] / limit)[locks]
     return (
-        f"Brakes as joint friction slide a locked wheel: up to friction {pair[0]['friction'][locks].max():g} the car needs "
-        f"{own.min():.3f} to "
-        f"{own.max():.3f} of v²/(2 μ g). The published latched torque acts against a remembered sign of the wheel's rate, which "
-        "flips with every "
-        f"physics step once the wheel locks: there it needs {share[locks].min():.2f} to {share[locks].max():.2f} of it, and "
-        f"{int((~pair[1]['stopped']).sum())} of {len(limit)} cars never come to rest."
+        f"Brakes as joint friction let a locked wheel slide: up to friction {pair[0]['friction'][locks].max():g} the car needs "
+        f"{own.min():.3f} to {own.max():.3f} of v²/(2 μ g). The published latched torque acts against a remembered sign of the wheel's "
+        "rate, which flips with every physics step once the wheel locks: there the car needs "
+        f"{share[locks].min():.2f} to {share[locks].max():.2f} of it, and {int((~pair[1]['stopped']).sum())} of {len(limit)} cars have "
+        "not come to rest when the time is up."
     )
 
 
@@ -246,11 +245,9 @@ def _standing(result: Result) -> Sequence[str]:
         [f"{name}, {what}", *(f"{value:.2g}" for value in one[column])] for name, one in found.items() for what, column in columns.items()
     ]
     words = (
-        f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by "
-        "friction. Friction in "
-        "MuJoCo is soft: a joint that holds a torque yields at a rate in proportion, so a car whose engine pushes against its "
-        "brakes creeps. The C "
-        "engine does the same."
+        f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by friction. "
+        "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion, so a car whose engine pushes "
+        "against its brakes creeps, in the C engine, too."
     )
     return [words, tables.grid(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
 
