@@ -173,7 +173,7 @@ def _encounters(result: Result, folder: Path) -> list[str]:
 def _laws(result: Result, folder: Path) -> list[str]:
     return [
         "## Stopping",
-        _stopping(result),
+        *_stopping(result),
         _picture(folder, "stopping", "Way to a halt against friction", figures.stopping(result)),
         "## Standstill",
         *_standing(result),
@@ -193,24 +193,48 @@ def _rows(result: Result, key: str) -> dict[str, dict[str, np.ndarray]]:
     return {str(NAMES.get(name, name)): {column: np.array(value) for column, value in found.items()} for name, found in have.items()}
 
 
-def _stopping(result: Result) -> str:
+def _stopping(result: Result) -> Sequence[str]:
     limit = np.array(result["grip_limit_m"])
-    rows = []
-    for name, found in _rows(result, "stopping").items():
-        locked = _rows(result, "locked").get(name)
-        ratio = "" if locked is None else f"{(locked['distance_m'] / limit).min():.3f} to {(locked['distance_m'] / limit).max():.3f}"
-        dry = int(np.argmax(found["friction"]))
-        rows.append([name, f"{found['distance_m'][dry]:.1f}", f"{found['deceleration'][dry]:.2f}", f"{found['aside_m'].max():.2f}",
-                     f"{int(found['stopped'].sum())} of {len(limit)}", ratio])  # fmt: skip
+    found, locked = _rows(result, "stopping"), _rows(result, "locked")
+    friction = next(iter(found.values()))["friction"]
+    dry = int(np.argmax(friction))
     words = (
-        f"Full brake from {result['speed']:g} m/s, friction {found['friction'].min():g} to {found['friction'].max():g}. With "
-        "wheels that roll the "
-        f"brakes' torque alone needs {result['brake_limit_m']:.1f} m; brakes {result['strong']:g} times as strong lock the "
-        "wheels on any road."
+        f"Full brake from {result['speed']:g} m/s. With wheels that roll the brakes' torque alone needs {result['brake_limit_m']:.1f} m; "
+        f"brakes {result['strong']:g} times as strong lock the wheels on any road. Ways along the path; * still moves when the time is up. "
+        f"Mean deceleration at friction {friction[dry]:g}: "
+        f"{', '.join(f'{name} {_at(one, dry)} m/s²' for name, one in found.items())}."
     )
-    header = ["Backend", "Way at the highest friction, m", "Mean deceleration there, m/s²", "Farthest off its line, m",
-              "Stand in the end", "Locked: way over v²/(2 μ g)"]  # fmt: skip
-    return "\n\n".join([words, tables.grid(header, rows)])
+    rows = [["v²/(2 μ g)", *(f"{way:.1f}" for way in limit)]]
+    for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
+        rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
+    return [words, tables.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows), _brakes(found, limit)]
+
+
+def _at(found: Mapping[str, np.ndarray], index: int) -> str:
+    return f"{found['deceleration'][index]:.2f}"
+
+
+def _ways(found: Mapping[str, np.ndarray]) -> list[str]:
+    return [f"{way:.1f}{'' if stands else '*'}" for way, stands in zip(found["distance_m"], found["stopped"], strict=True)]
+
+
+def _brakes(found: Mapping[str, Mapping[str, np.ndarray]], limit: np.ndarray) -> str:
+    """What brakes as friction and latched ones do where wheels lock."""
+    pair = [found.get(str(NAMES[name])) for name in ("mjx_car", "latched")]
+    if pair[0] is None or pair[1] is None:
+        return ""
+    share = pair[1]["distance_m"] / limit
+    locks = np.flatnonzero(pair[0]["distance_m"] < 1.05 * limit)
+    if not len(locks):
+        return ""
+    own = (pair[0]["distance_m"] / limit)[locks]
+    return (
+        f"Brakes as joint friction let a locked wheel slide: up to friction {pair[0]['friction'][locks].max():g} the car needs "
+        f"{own.min():.3f} to {own.max():.3f} of v²/(2 μ g). The published latched torque acts against a remembered sign of the wheel's "
+        "rate, which flips with every physics step once the wheel locks: there the car needs "
+        f"{share[locks].min():.2f} to {share[locks].max():.2f} of it, and {int((~pair[1]['stopped']).sum())} of {len(limit)} cars have "
+        "not come to rest when the time is up."
+    )
 
 
 def _standing(result: Result) -> Sequence[str]:
@@ -220,7 +244,11 @@ def _standing(result: Result) -> Sequence[str]:
     rows = [
         [f"{name}, {what}", *(f"{value:.2g}" for value in one[column])] for name, one in found.items() for what, column in columns.items()
     ]
-    words = f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, mm, by friction."
+    words = (
+        f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by friction. "
+        "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion, so a car whose engine pushes "
+        "against its brakes creeps, in the C engine, too."
+    )
     return [words, tables.grid(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
 
 
@@ -285,4 +313,6 @@ def _ride(result: Result) -> Sequence[str]:
         "straight and turning, "
         "on several frictions: its energy (motion, height, springs) may never rise, but for what the tyres' compression gives back."
     )
-    return [words, tables.grid(header, rows)]
+    lying = [name for name, found in _rows(result, "ride").items() if found["on_springs"] < 0.5]
+    note = f"{' and '.join(lying)}: lies on the bump stops, so its springs do nothing and the stops are its suspension." if lying else ""
+    return [words, tables.grid(header, rows), note]

@@ -42,7 +42,7 @@ def errors(result: Result) -> Figure:
             axes.set(yscale="log", title=title, ylabel=unit, xlabel="time, s", xlim=(0, time[-1]))
         grid[0].plot([0, bound["horizon_s"]], [bound["bound_m"]] * 2, color=REFERENCE, linestyle="--")
         place = (bound["horizon_s"], bound["bound_m"])
-        grid[0].annotate("bound", place, (4, -3), textcoords="offset points", color=REFERENCE, fontsize=8)
+        grid[0].annotate("bound", place, (6, -4), textcoords="offset points", color=REFERENCE, fontsize=8)
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return figure
 
@@ -135,11 +135,14 @@ def stopping(result: Result) -> Figure:
                     result["brake_limit_m"], color="#000000", linewidth=1.2, linestyle="--", label="brakes' torque, wheels rolling"
                 )
             for index, name in enumerate(have):
-                found = result["backends"][name][kind]
-                axes.plot(friction, found["distance_m"], MARKERS[index], mfc="none", mec=COLOURS[index], markersize=5 + 2.2 * index,
-                          markeredgewidth=1.4, linestyle="none", label=NAMES.get(name, name))  # fmt: skip
+                way, stands = (np.array(result["backends"][name][kind][key]) for key in ("distance_m", "stopped"))
+                look = {"mec": COLOURS[index], "mfc": "none", "markersize": 5 + 2.2 * index, "markeredgewidth": 1.4, "linestyle": "none"}
+                axes.plot(friction[stands], way[stands], MARKERS[index], **look, label=NAMES.get(name, name))
+                axes.plot(friction[~stands], way[~stands], MARKERS[index], **look, alpha=0.4)
             axes.set(xscale="log", yscale="log", title=title, xlabel="friction μ", ylabel=f"way to a halt from {result['speed']:g} m/s, m")
-            axes.legend()
+            if kind == "stopping":
+                axes.plot([], [], "o", mfc="none", mec=GREY, alpha=0.5, label="pale: still moving at the end")
+                axes.legend()
             _plain_ticks(axes, [0.05, 0.1, 0.2, 0.5, 1.0], [10, 20, 50, 100, 200])
     return figure
 
@@ -193,7 +196,7 @@ def split(result: Result) -> Figure:
                 np.rad2deg(ice["yaw"][index]),
                 style,
                 color=COLOURS[0],
-                label=f"ice on {side} side" if index < 2 else "no ice",
+                label=f"ice on the {side}" if index < 2 else "no ice",
             )
         right.set(title=f"On a strip of ice, from {result['patches']['split_speed']:g} m/s", xlabel="time, s", ylabel="yaw, degrees")
         right.legend()

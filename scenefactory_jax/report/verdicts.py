@@ -85,7 +85,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     use = corner["lateral"] / limit
     slides = corner["demand"] > 2.0 * limit
     under = 1.0 - use[slides].min() if slides.any() else 0.0
-    turned = split["yaw"][:, -1]
+    turned = split["yaw"][:, len(split["time_s"]) // 2]
     mirror = np.abs(split["yaw"].sum(0)).max() / np.abs(turned).max()
     load = abs(own["ride"]["load_sum"] - 1.0)
     rows = [
@@ -102,7 +102,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
         Verdict(what, f"< {_size(targets[key], unit)}", _size(float(value), unit), bool(value < targets[key]))
         for what, key, value, unit in rows
     ]
-    sides = Verdict("Split friction: the car turns to the side that grips", "both", _turns(turned), bool(turned[0] < 0.0 < turned[1]))
+    sides = Verdict("Split friction: the car turns to the side that grips", "right, left", _turns(turned), bool(turned[0] < 0.0 < turned[1]))
     return [*made, sides]
 
 

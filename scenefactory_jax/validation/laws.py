@@ -111,10 +111,12 @@ def stopping(drive: Drive, *, control_hz: float, frictions: list[float], speed: 
     """Full brake until every car stands or the time is up.
 
     Returns:
-        For each friction the way to a halt, the mean deceleration over it, how far the car came off its line, and whether it stopped.
+        For each friction the way to a halt along the path, the mean deceleration over it, how far the car came off its line, and whether
+        it stopped.
     """
     trace = drive(held(frictions, speed, FULL_BRAKE, steps=round(seconds * control_hz)))
-    way = trace.position[:, -1, 0]
+    path = np.concatenate([np.zeros((len(frictions), 1, 2)), trace.position[..., :2]], axis=1)
+    way = np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(1)
     return {
         "friction": np.array(frictions),
         "distance_m": way,
