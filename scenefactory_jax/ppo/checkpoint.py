@@ -139,7 +139,7 @@ def _like(flat: dict[str, Any], like: Any) -> Any:
 
     def put(name: str, leaf: Any) -> Any:
         if not leaf.size:
-            return leaf
+            return jnp.copy(leaf)  # its own, so that donating the one does not delete the other
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(flat[name], impl=jax.random.key_impl(leaf))
         return flat[name]

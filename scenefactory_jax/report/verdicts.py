@@ -102,7 +102,8 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
         Verdict(what, f"< {_size(targets[key], unit)}", _size(float(value), unit), bool(value < targets[key]))
         for what, key, value, unit in rows
     ]
-    sides = Verdict("Split friction: the car turns to the side that grips", "right, left", _turns(turned), bool(turned[0] < 0.0 < turned[1]))
+    gripped = bool(turned[0] < 0.0 < turned[1])
+    sides = Verdict("Split friction: the car turns to the side that grips", "right, left", _turns(turned), gripped)
     return [*made, sides]
 
 
