@@ -288,3 +288,21 @@ def test_a_person_hardly_slows_a_car_but_is_felt(speed):
     assert float(trace.position[-1, 0, 0]) > 4.0, "and the car drives on"
     trace, _, _ = collide((MASS, np.inf), speed, driven=True)
     assert float(trace.velocity[-1, 0, 0]) < 0.0, "a wall throws it back"
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.5])
+def test_a_heap_flies_apart_and_does_not_blow_up(spread):
+    """16 cars at one place, or nearly: what they start with inside each other is at most 64 MJ, 2 MJ a pair at two contacts' strength."""
+    cars = crowd(1, 16, spread) if spread else boxes(np.zeros((16, 2)))
+    cars = replace(cars, velocity=jnp.zeros((16, 2)), yaw_rate=jnp.zeros(16))
+    inertia = MASS * (4.0**2 + 2.0**2) / 12
+
+    def step(now, _):
+        force, torque, _ = forces(now)
+        velocity, rate = now.velocity + force / MASS / 120, now.yaw_rate + torque / inertia / 120
+        now = replace(now, velocity=velocity, yaw_rate=rate, position=now.position + velocity / 120, yaw=now.yaw + rate / 120)
+        return now, jnp.sum(MASS * (velocity**2).sum(-1) + inertia * rate**2) / 2
+
+    end, energy = jax.lax.scan(step, cars, length=600)
+    assert np.isfinite(energy).all() and float(energy.max()) < 64e6
+    assert np.abs(np.asarray(end.velocity)).max() < 80.0 and np.abs(np.asarray(end.velocity.sum(0))).max() < 1.0

@@ -201,20 +201,27 @@ def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
 
 
 def test_mass_reaches_the_contact():
-    """Car 0, three times as heavy, is hit by car 1 at 10 m/s: momentum before is momentum after, with the masses that they have."""
-    crew = [changed(mass=3.0), changed(mass=0.8)] + [CAR] * 6
+    """Car 1 into car 0, 3 into 2 and 7 into 6, at 10 m/s. Momentum stays; and twice as heavy a pair pushes itself apart twice as hard."""
+    crew = [changed(mass=3.0), changed(mass=0.8), *[changed(mass=3.0)] * 2, *[CAR] * 4]
     position = np.stack([np.zeros(8), LANES], 1)
-    position[1] = [-5.0, 0.0]
-    scene = scene_for(position, speed=np.array([0.0, 10.0] + [0.0] * 6))
+    front, rear = np.array([0, 2, 6]), np.array([1, 3, 7])
+    position[rear] = position[front] - [5.0, 0.0]
+    speed = np.zeros(8)
+    speed[rear] = 10.0
+    scene = scene_for(position, speed=speed)
     _, (_, motion) = drive(scene, constant(seconds=1), body=started(scene, crew))
-    touching = np.nonzero(motion.contact_force[:, 0] > 25)[0]
-    before, after = touching[0] - 1, touching[-1] + 1
     unsprung = 4 * (CAR.wheel_mass + CAR.carrier_mass) + 2 * CAR.knuckle_mass
-    mass = np.array([one.mass + unsprung for one in crew[:2]])
-    total = (mass * motion.velocity[:, :2, 0]).sum(1)
-    assert total[after] == pytest.approx(total[before], rel=0.04)
-    gained = motion.velocity[after, :2, 0] - motion.velocity[before, :2, 0]
-    assert gained[0] == pytest.approx(-gained[1] * mass[1] / mass[0], rel=0.1)  # wheels that roll take a little
+    mass = np.array([one.mass + unsprung for one in crew])
+    for one, other in zip(front, rear, strict=True):
+        touching = np.nonzero(motion.contact_force[:, one] > 25)[0]
+        before, after = touching[0] - 1, touching[-1] + 1
+        momentum = mass[[one, other]] * motion.velocity[:, [one, other], 0]
+        assert momentum[after].sum() == pytest.approx(momentum[before].sum(), rel=0.04)
+        assert momentum[after, 0] - momentum[before, 0] == pytest.approx(momentum[before, 1] - momentum[after, 1], rel=0.1)
+    peak = motion.contact_force.max(0)
+    assert peak[2] / peak[6] == pytest.approx(mass[2] / mass[6], rel=0.05)
+    reduced = mass[0] * mass[1] / (mass[0] + mass[1]), mass[6] / 2
+    assert peak[0] / peak[6] == pytest.approx(reduced[0] / reduced[1], rel=0.05)
 
 
 def spread(**changes):
