@@ -102,8 +102,9 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
         Verdict(what, f"< {_size(targets[key], unit)}", _size(float(value), unit), bool(value < targets[key]))
         for what, key, value, unit in rows
     ]
-    sides = Verdict("Split friction: the car turns to the side that grips", "right, left", _turns(turned), bool(turned[0] < 0.0 < turned[1]))
-    return [*made, sides]
+    sides = "Split friction: the car turns to the side that grips"
+    made.append(Verdict(sides, "right, left", _turns(turned), bool(turned[0] < 0.0 < turned[1])))
+    return made
 
 
 def _turns(yaw: Any) -> str:
