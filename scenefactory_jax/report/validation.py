@@ -317,6 +317,7 @@ def _ride(result: Result) -> Sequence[str]:
         "straight and turning, on several frictions: its energy (motion, height, springs) may never rise, "
         "but for what the tyres' compression gives back."
     )
-    lying = [name for name, found in _rows(result, "ride").items() if found["on_springs"] < 0.5]
-    note = f"{' and '.join(lying)}: lies on the bump stops, so its springs do nothing and the stops are its suspension." if lying else ""
-    return [words, tables.grid(header, rows), note]
+    carried = {name: found["on_springs"] for name, found in _rows(result, "ride").items()}
+    lying = [(name, f"{100 * share:.0f} %") for name, share in carried.items() if share < 0.5]
+    notes = [f"{name} lies on its bump stops: its springs carry {share} of the weight." for name, share in lying]
+    return [words, tables.grid(header, rows), " ".join(notes)]
