@@ -11,16 +11,15 @@ from scenefactory_jax.dynamics import oracle
 from scenefactory_jax.run.config import load
 from scenefactory_jax.validation import encounters, engines, equivalence, impacts, sequences
 
-DRAWN = dict(speed_max=20.0, friction_min=0.05, friction_max=1.3, control_hz=30.0)
-DRIVES = dict(**DRAWN, seconds=2.0, patterned_share=0.25, extreme_share=0.4, hold_min_s=0.2, hold_max_s=1.0)
-MEETINGS = dict(
-    **DRAWN, seconds=2.0, size=(4.0, 2.0), closing_min=1.0, parked_share=0.2, braking_share=0.5, lead_min_s=0.3, lead_max_s=0.6
-)
+SETTINGS = load("validate")["validation"]  # what `validate` runs, at toy size
+DRIVES = {**SETTINGS["drives"]["draw"], "control_hz": 30.0, "seconds": 2.0}
+MEETINGS = {**SETTINGS["encounters"]["draw"], "control_hz": 30.0}
+del DRIVES["count"], MEETINGS["count"]
 TIMING = dict(physics_hz=120.0, control_hz=30.0)
-ROAD = dict(slippery=0.3, friction_min=0.05)
-CONVERGED = dict(iterations=100, line_search=50, nudge=0.0)
-BOUND = dict(control_hz=30.0, bound_m=0.02, horizon_s=2.0, bins=40)
-COLLISION = dict(control_hz=30.0, force_min=25.0, window_s=0.7, gap_steps=3)
+ROAD = SETTINGS["road"]
+CONVERGED = dict(**SETTINGS["reference"], nudge=0.0)
+BOUND = dict(**SETTINGS["bound"], control_hz=30.0, bins=40)
+COLLISION = dict(**SETTINGS["encounters"]["collision"], control_hz=30.0)
 # With a line search of 4 this drive never leaves its first step's forces: engine and brakes nearly cancel, and no step is accepted
 STUCK = sequences.Sequences(
     np.float32([15.1]), np.float32([0.35]), np.int32([0]), np.tile(np.float32([0.471, -0.11, 0.26]), (1, 60, 1))

@@ -80,7 +80,8 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     arrays = {name: {key: np.array(value) for key, value in found.items()} for name, found in own.items()}
     stand, locked, corner, split = (arrays[name] for name in ("standing", "locked", "cornering", "split"))
     held = f"Standstill: farthest in {result['hold_s']:g} s at friction {stand['friction'].min():g} to {stand['friction'].max():g}"
-    stop = np.abs(locked["distance_m"] / np.array(result["grip_limit_m"]) - 1.0).max()
+    stop = np.abs(locked["distance_m"] / np.array(result["grip_limit_m"]) - 1.0)
+    worst = locked["friction"][stop.argmax()]
     limit = corner["friction"][:, None] * 9.81
     use = corner["lateral"] / limit
     slides = corner["demand"] > 2.0 * limit
@@ -91,7 +92,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     rows = [
         (f"{held}, full brake", "creep_mm", stand["brake_creep_mm"].max(), "mm"),
         (f"{held}, full brake against full throttle", "creep_mm", stand["brake_and_throttle_creep_mm"].max(), "mm"),
-        (f"Stopping with locked wheels against v²/(2 μ g), from {result['speed']:g} m/s, worst friction", "stopping_error", stop, "%"),
+        (f"Stopping with locked wheels against v²/(2 μ g), worst at μ = {worst:g}", "stopping_error", stop.max(), "%"),
         ("Cornering: lateral acceleration above μ g, worst case", "lateral_over", max(use.max() - 1.0, 0.0), "%"),
         ("Cornering: below μ g where rolling would need more than twice that, worst case", "lateral_under", under, "%"),
         ("Split friction: left and right are mirror images, difference of yaw over yaw", "mirror", mirror, "%"),
