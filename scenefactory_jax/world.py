@@ -138,7 +138,7 @@ def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "
     measured, after = _quarantine(parts.measure(scene, state, after), state, after)
     events, done = parts.judge(measured, state.happened, state.active)
     after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
-    reward, terms = rewards.weigh(Step(scene, state, action, after, measured, events), parts.terms)
+    reward, terms = rewards.weigh(Step(scene, state, after.previous_action, after, measured, events), parts.terms)
     truncated = after.step >= parts.episode_steps
     if parts.respawn_clear_m is None:
         over = truncated | ~jnp.any(after.active)
@@ -166,11 +166,13 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
 
 
 def _quarantine(measured: Facts, before: State, after: State) -> tuple[Facts, State]:
-    """A car whose motion is no longer finite is put back where it last was: its NaN reaches neither rewards nor anybody else."""
+    """A car whose motion is no longer finite is put back where it last was, and its action forgotten: its NaN reaches neither rewards nor
+    observations nor anybody else."""
     fault = measured.events.fault
     clean = Facts(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
     body, motion = choose(fault, (before.body, before.motion), (after.body, after.motion))
-    return clean, replace(after, body=body, motion=motion)
+    action = jnp.where(fault[:, None], 0.0, after.previous_action)  # it may be what was broken
+    return clean, replace(after, body=body, motion=motion, previous_action=action)
 
 
 def _finite(value: Array) -> Array:

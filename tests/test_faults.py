@@ -50,7 +50,7 @@ def test_addresses(env):
 def test_a_fault_ends_the_car_and_changes_nothing_elsewhere(report, name):
     finding = next(finding for finding in report.faults if finding.name == name)
     assert finding.faults == 1 and finding.ended and not finding.other_faults
-    assert finding.beside == () and finding.elsewhere == ()
+    assert finding.beside == () and finding.elsewhere == () and finding.unclean == ()
     assert finding.passed and faults.verdicts(report)[f"fault in {name}"]
 
 
@@ -114,6 +114,9 @@ def test_a_fault_that_spreads_is_seen():
     assert judge(nudged(5, 0, 1)).passed  # the broken car itself may be anything
     assert judge(nudged(5, 0, 2)).beside == "[0].yaw" and not judge(nudged(5, 0, 2)).passed
     assert judge(nudged(5, 1, 2)).elsewhere == "[0].yaw" and not judge(nudged(5, 1, 2)).passed
+    foul = yaw.copy()
+    foul[5, 0, 1] = np.nan
+    assert judge(run(broken, yaw=foul)).unclean == ("[0].yaw", "[1].yaw") and not judge(run(broken, yaw=foul)).passed
     twice = broken.copy()
     twice[6, 0, 1] = True
     assert judge(run(twice)).faults == 2 and not judge(run(twice)).passed

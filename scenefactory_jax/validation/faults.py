@@ -27,6 +27,7 @@ class Finding(NamedTuple):
     faults: int  # events `fault` of the broken car; 1 is right
     other_faults: int  # of everybody else
     ended: bool  # it is not active from that step on
+    unclean: tuple[str, ...]  # leaves that hold NaN afterwards; its body may, if that is where the NaN was put
     beside: tuple[str, ...]  # leaves in which somebody in its world differs from a run without the car from that step on
     elsewhere: tuple[str, ...]  # leaves in which another world differs from the run without a fault
     passed: bool
@@ -159,7 +160,11 @@ def judge(
     near = different(hurt, without, beside)
     far = different(hurt, clean, elsewhere)
     strangers = int(fault.sum()) - own
-    return Finding(name, own, strangers, ended, near, far, own == 1 and not strangers and ended and not near and not far)
+    leaves = jax.tree_util.tree_leaves_with_path(hurt)
+    named = [(jax.tree_util.keystr(path), _plain(leaf)) for path, leaf in leaves]
+    unclean = tuple(path for path, leaf in named if np.isnan(leaf).any() and (name == "action" or ".body." not in path))
+    passed = own == 1 and not strangers and ended and not unclean and not near and not far
+    return Finding(name, own, strangers, ended, unclean, near, far, passed)
 
 
 def learn(trainer: Trainer, scenes: Scene, seed: int, iterations: int) -> Any:
