@@ -234,7 +234,7 @@ def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, caps
 
 def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
     for override, message in {
-        "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws",
+        "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws, extremes, faults, costs",
         "workers=0": "workers: 0; wanted is at least 1",
         "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: 'fast' is of type str, wanted float",
     }.items():
@@ -277,9 +277,13 @@ def test_all_parts(tmp_path):
         "validation.settings.count=4", "validation.settings.fine_hz=240",
         "validation.settings.trials=[{name: few, physics_hz: 120, iterations: 2}, {name: coarse, physics_hz: 60}]",
         "validation.laws.stopping.frictions=[0.3,1.0]", "validation.laws.stopping.seconds=6.0",
-        "validation.laws.standing.frictions=[0.01,0.8]",
+        "validation.laws.standing.frictions=[0.01,0.8]", "validation.extremes.seconds=1.0", "validation.extremes.heap=3",
+        "validation.costs.worlds=2", "validation.costs.steps=2", "validation.costs.repeats=1",
     )  # fmt: skip
-    results = toy(tmp_path, "parts=[drives,settings,encounters,laws]", *small)
+    results = toy(tmp_path, f"parts=[{','.join(command.PARTS)}]", *small)
     text = (tmp_path / "validation.md").read_text()
     assert list(results) == list(command.PARTS) and "is refused: dynamics.car" in text and "mjx_published" in text
+    for title in ("Extremes", "Faults", "Determinism", "What features cost"):
+        assert f"## {title}" in text
+    assert [row["name"] for row in results["costs"]["result"]["rows"]] == ["plain", "all of it"]
     assert len(list(tmp_path.glob("*.png"))) == 8

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from scenefactory_jax.report import plots, tables, verdicts
+from scenefactory_jax.report import plots, robustness, tables, verdicts
 from scenefactory_jax.report import validation_figures as figures
 from scenefactory_jax.report.validation_figures import NAMES
 
@@ -25,6 +25,7 @@ def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mappi
     folder.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[Result, Path], list[str]]] = {
         "drives": _drives, "settings": _settings, "encounters": _encounters, "laws": _laws,
+        "extremes": robustness.extremes, "faults": robustness.faults, "costs": robustness.costs,
     }  # fmt: skip
     lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(verdicts.of(results, targets))]
     for name, make in makers.items():
@@ -211,7 +212,18 @@ def _stopping(result: Result) -> Sequence[str]:
     rows = [["v²/(2 μ g)", *(f"{way:.1f}" for way in limit)]]
     for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
         rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
-    return [words, tables.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows), _brakes(found, limit)]
+    rows += [[f"C engine, mjx_car, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
+    return [words, tables.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows), _brakes(found, limit), _hops(result)]
+
+
+def _hops(result: Result) -> str:
+    """Why the way may be longer than that of tyres that slide throughout."""
+    share = np.array(result["locked_c_m"]) / np.array(result["grip_limit_m"])
+    worst, friction = int(share.argmax()), result["backends"]["mjx_car"]["locked"]["friction"]
+    return (
+        f"The C engine needs up to {share[worst]:.3f} of v²/(2 μ g), at friction {friction[worst]:g}: "
+        "wheels that lock so suddenly hop, and the soft contact does not reach the whole friction of a wheel's short landings."
+    )
 
 
 def _at(found: Mapping[str, np.ndarray], index: int) -> str:

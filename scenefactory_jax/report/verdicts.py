@@ -23,7 +23,9 @@ Targets = Mapping[str, float]
 
 def of(results: Results, targets: Targets) -> list[Verdict]:
     """Verdicts on the parts that were run."""
-    makers: dict[str, Callable[[Mapping[str, Any], Targets], list[Verdict]]] = {"drives": _drives, "encounters": _encounters, "laws": _laws}
+    makers: dict[str, Callable[[Mapping[str, Any], Targets], list[Verdict]]] = {
+        "drives": _drives, "encounters": _encounters, "laws": _laws, "extremes": _extremes, "faults": _faults, "costs": _costs,
+    }  # fmt: skip
     return [verdict for name, make in makers.items() if name in results for verdict in make(results[name]["result"], targets)]
 
 
@@ -82,6 +84,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     held = f"Standstill: farthest in {result['hold_s']:g} s at friction {stand['friction'].min():g} to {stand['friction'].max():g}"
     stop = np.abs(locked["distance_m"] / np.array(result["grip_limit_m"]) - 1.0)
     worst = locked["friction"][stop.argmax()]
+    other = np.abs(locked["distance_m"] / np.array(result["locked_c_m"]) - 1.0).max()
     limit = corner["friction"][:, None] * 9.81
     use = corner["lateral"] / limit
     slides = corner["demand"] > 2.0 * limit
@@ -93,6 +96,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
         (f"{held}, full brake", "creep_mm", stand["brake_creep_mm"].max(), "mm"),
         (f"{held}, full brake against full throttle", "creep_mm", stand["brake_and_throttle_creep_mm"].max(), "mm"),
         (f"Stopping with locked wheels against v²/(2 μ g), worst at μ = {worst:g}", "stopping_error", stop.max(), "%"),
+        ("Stopping with locked wheels against the C engine, worst", "stopping_error", other, "%"),
         ("Cornering: lateral acceleration above μ g, worst case", "lateral_over", max(use.max() - 1.0, 0.0), "%"),
         ("Cornering: below μ g where rolling would need more than twice that, worst case", "lateral_under", under, "%"),
         ("Split friction: left and right are mirror images, difference of yaw over yaw", "mirror", mirror, "%"),
@@ -106,6 +110,33 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     gripped = bool(turned[0] < 0.0 < turned[1])
     sides = Verdict("Split friction: the car turns to the side that grips", "right, left", _turns(turned), gripped)
     return [*made, sides]
+
+
+def _extremes(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
+    del targets  # the bounds of a case are settings of the experiment
+    passed, every = sum(row["passed"] for row in result["rows"]), len(result["rows"])
+    return [Verdict(f"Extremes: bounded and finite for {result['seconds']:g} s", "all", f"{passed} of {every}", passed == every)]
+
+
+def _faults(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
+    del targets
+    clean, every = sum(found["passed"] for found in result["faults"]), len(result["faults"])
+    same = [f"{total - len(gone)} of {total} arrays" for total, gone in (result["driving"], result["learning"])]
+    exact = not result["driving"][1] and not result["learning"][1]
+    return [
+        Verdict("Faults: a broken car ends and changes nothing elsewhere, bit for bit", "all", f"{clean} of {every}", clean == every),
+        Verdict("Determinism: the same seed drives and learns the same bits", "all", " and ".join(same), exact),
+    ]
+
+
+def _costs(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
+    """Of a whole GPU: elsewhere the table is all there is to say."""
+    if result["backend"] != "gpu":
+        return []
+    row = next(row for row in result["rows"] if row["name"] == result["everything"])
+    what = f"Physics alone, {result['slots']:,} car slots, {row['name']} ({' '.join(row['overrides'])}): car control steps a second"
+    least = targets["steps_min"]
+    return [Verdict(what, f">= {least:,.0f}", f"{row['per_s']:,.0f}", row["per_s"] >= least and row["finite"])]
 
 
 def _turns(yaw: Any) -> str:

@@ -6,7 +6,6 @@ rewards or policy.
 
 import statistics
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -15,27 +14,29 @@ import numpy as np
 
 from scenefactory_jax import rain, world
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import sources
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Scene, Tracks
 
 
-def costs(config: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Measure every variant of `config["variants"]`, side by side in one run.
+def costs(
+    worlds: Scene, *, variants: dict[str, list[str]], others: int, steps: int, repeats: int, seed: int
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Measure every variant on the same worlds, side by side in one run.
 
     Args:
-        config: `scenes` (a source), `worlds`, `steps` (control steps in a timed scan), `repeats`, `others` (road users put into every world
-            that has none), `seed`, and `variants`, name -> overrides of the task.
+        worlds: stacked scenes, one a world.
+        variants: name -> overrides of the task.
+        others: road users put into every world where the scenes have none.
+        steps: control steps in a timed scan.
+        repeats: timed scans after the one that compiles.
 
     Returns:
-        A row a variant: name, overrides, cars x control steps a second (median, least, most), milliseconds a control step, seconds of
-        compilation, and whether all stayed finite.
+        A row a variant: name, overrides, car slots x control steps a second (median, least, most), milliseconds a control step, seconds of
+        compilation, and whether all that moves stayed finite.
     """
-    loaded = sources.training(config["scenes"])
-    worlds, _ = sources.assign(loaded, config["worlds"], seed=config["seed"])
-    worlds = _peopled(worlds, config["others"], seed=config["seed"])
-    variants = config["variants"].items()
-    return [{"name": name, "overrides": list(overrides), **_measure(worlds, overrides, config)} for name, overrides in variants]
+    worlds = _peopled(worlds, others, seed=seed)
+    numbers = {"steps": steps, "repeats": repeats, "seed": seed}
+    return [{"name": name, "overrides": list(changes), **_measure(worlds, changes, **numbers)} for name, changes in variants.items()]
 
 
 def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
@@ -59,11 +60,11 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     return replace(worlds, others=tracks)
 
 
-def _measure(worlds: Scene, overrides: list[str], config: Mapping[str, Any]) -> dict[str, Any]:
+def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, seed: int) -> dict[str, Any]:
     """One variant: a warm-up that compiles, then the median of several timed scans."""
     parts = world.parts_of(configs.load("task", *overrides))
     env = world.assemble(parts)
-    slots, steps = worlds.agents.present.shape, config["steps"]
+    slots = worlds.agents.present.shape
 
     def physics(scene, state, action):
         state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
@@ -74,9 +75,9 @@ def _measure(worlds: Scene, overrides: list[str], config: Mapping[str, Any]) -> 
         return jax.vmap(physics)(worlds, states, jax.random.uniform(key, (*slots, 3), jnp.float32, -1.0, 1.0)), None
 
     run = jax.jit(lambda states, key: jax.lax.scan(step, states, jax.random.split(key, steps))[0])
-    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(seed), slots[0]), worlds)
     seconds = []
-    for repeat in range(config["repeats"] + 1):
+    for repeat in range(repeats + 1):
         begun = time.perf_counter()
         states = jax.block_until_ready(run(states, jax.random.key(repeat)))
         seconds.append(time.perf_counter() - begun)
@@ -87,5 +88,5 @@ def _measure(worlds: Scene, overrides: list[str], config: Mapping[str, Any]) -> 
         "per_s_range": [done / max(seconds[1:]), done / min(seconds[1:])],
         "ms_a_control_step": 1e3 * median / steps,
         "compile_s": seconds[0] - median,
-        "finite": bool(jnp.isfinite(parts.dynamics.read(jax.tree.map(lambda leaf: leaf[0], states.body)).position).all()),
+        "finite": bool(jnp.isfinite(jax.vmap(parts.dynamics.read)(states.body).position)[worlds.agents.present].all()),
     }

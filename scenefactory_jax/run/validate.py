@@ -19,7 +19,7 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import validation as report
 from scenefactory_jax.report import verdicts
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, sources
+from scenefactory_jax.run import keys, sources, task_parts
 from scenefactory_jax.run.workers import spreading
 from scenefactory_jax.validation import parts
 from scenefactory_jax.validation.parts import Spread
@@ -37,7 +37,10 @@ PARTS = {
     "drives": Part(parts.drives, (*SHARED, "validation.drives")),
     "settings": Part(parts.trials, (*SHARED, "validation.drives", "validation.settings")),
     "encounters": Part(parts.encounters, (*SHARED, "validation.encounters")),
-    "laws": Part(parts.laws_of_motion, ("validation.laws", "timing", "dynamics", "backends", "weather")),
+    "laws": Part(parts.laws_of_motion, ("validation.laws", "validation.reference", "timing", "dynamics", "backends", "weather")),
+    "extremes": Part(parts.whole_episodes, ("validation.extremes", "timing", "dynamics")),
+    "faults": Part(task_parts.faults, ("validation.seed", "validation.faults")),
+    "costs": Part(task_parts.costs, ("validation.seed", "validation.costs")),
 }
 
 

@@ -88,8 +88,8 @@ class Row(NamedTuple):
 
 def run(
     entry: Mapping[str, Any],
-    *,
     cases: Sequence[Case],
+    *,
     seconds: float,
     heap: int,
     wall_m: float,

@@ -115,15 +115,20 @@ def stopping(drive: Drive, *, control_hz: float, frictions: list[float], speed: 
         it stopped.
     """
     trace = drive(held(frictions, speed, FULL_BRAKE, steps=round(seconds * control_hz)))
-    path = np.concatenate([np.zeros((len(frictions), 1, 2)), trace.position[..., :2]], axis=1)
-    way = np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(1)
+    distance = way(trace.position[..., :2])
     return {
         "friction": np.array(frictions),
-        "distance_m": way,
-        "deceleration": speed**2 / (2.0 * np.maximum(way, 1e-9)),
+        "distance_m": distance,
+        "deceleration": speed**2 / (2.0 * np.maximum(distance, 1e-9)),
         "aside_m": np.abs(trace.position[..., 1]).max(1),
         "stopped": np.linalg.norm(trace.velocity[:, -1, :2], axis=-1) < 0.02,  # m/s
     }
+
+
+def way(position: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, " N"]:
+    """Length of paths that begin at the origin, m."""
+    path = np.concatenate([np.zeros((len(position), 1, 2)), position], axis=1)
+    return np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(1)
 
 
 def grip_limit_m(speed: float, friction: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from scenefactory_jax.build import build
 from scenefactory_jax.validation import encounters as meetings
-from scenefactory_jax.validation import engines, equivalence, ground, impacts, laws, sequences
+from scenefactory_jax.validation import engines, equivalence, extremes, ground, impacts, laws, sequences
 from scenefactory_jax.validation.engines import Run
 
 Spread = Callable[..., Any]  # (function, cases) -> what the function makes of all cases, computed in pieces
@@ -82,7 +82,7 @@ def trials(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         cases,
         own["trials"],
         control_hz=_rates(config)["control_hz"],
-        fine_hz=own["fine_hz"],
+        fine_hz=None if own["fine_hz"] is None else float(own["fine_hz"]),
         **settings["bound"],
         **settings["road"],
         **settings["reference"],
@@ -148,7 +148,6 @@ def _impacts(seen: impacts.Impacts, cases: meetings.Encounters, most: int) -> di
 
 def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Every backend against the laws that it is meant to obey, and the car on patches of the real weather."""
-    del spread  # all on the batched path
     settings, rates = config["validation"]["laws"], _rates(config)
     car, _ = engines.numbers(config["dynamics"])
     speed = settings["stopping"]["speed"]
@@ -159,10 +158,20 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "brake_limit_m": laws.brake_limit_m(car, speed),
         "hold_s": settings["standing"]["hold_s"],
         "strong": settings["strong"],
+        "locked_c_m": _locked_in_c(config, spread),
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
         "backends": {name: _obeys(settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
         "patches": on_patches(config["dynamics"], config["weather"]["grip"]),
     }
+
+
+def whole_episodes(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
+    """States and controls that no driver would choose."""
+    del spread
+    own = config["validation"]["extremes"]
+    run = bound(own, extremes, "run", "validation.extremes", **_rates(config))
+    rows = run(config["dynamics"], extremes.CASES)
+    return {"seconds": own["seconds"], "rows": [row._asdict() for row in rows]}
 
 
 def _obeys(settings: Mapping[str, Any], entry: Mapping[str, Any], rates: Mapping[str, float], *, wheelbase: float) -> dict[str, Any]:
@@ -176,6 +185,20 @@ def _obeys(settings: Mapping[str, Any], entry: Mapping[str, Any], rates: Mapping
         return found
     car, _ = engines.numbers(entry)
     found |= {"split": experiment("split")(drive), "ride": experiment("ride")(drive, car), "rolling": experiment("rolling")(drive, entry)}
+    return found | {"locked": experiment("stopping")(laws.driver(_locking(settings, entry), **look))}
+
+
+def _locking(settings: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The same car with brakes that lock its wheels on any road."""
     torques = ("brake_torque_front", "brake_torque_rear")
-    locking = {**entry["car"], **{torque: settings["strong"] * entry["car"][torque] for torque in torques}}
-    return found | {"locked": experiment("stopping")(laws.driver({**entry, "car": locking}, **look))}
+    return {**entry, "car": {**entry["car"], **{torque: settings["strong"] * entry["car"][torque] for torque in torques}}}
+
+
+def _locked_in_c(config: Mapping[str, Any], spread: Spread) -> np.ndarray:
+    """Ways to a halt with locked wheels in the C engine, as `laws.stopping` has them on the batched path."""
+    settings, rates = config["validation"]["laws"], _rates(config)
+    stop, reference = settings["stopping"], config["validation"]["reference"]
+    cases = laws.held(stop["frictions"], stop["speed"], laws.FULL_BRAKE, steps=round(stop["seconds"] * rates["control_hz"]))
+    exact = {"slippery": 1.0, "friction_min": 0.0, "friction_scale": 1.0, "nudge": 0.0}
+    run = spread(functools.partial(engines.drive_c, _locking(settings, config["dynamics"]), **rates, **reference, **exact), cases)
+    return laws.way(run.qpos[:, :, 0, :2])
