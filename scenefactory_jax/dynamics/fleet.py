@@ -154,7 +154,8 @@ def enlist(car: CarParameters) -> Fleet:
     inverse = solve.inverse(total)
     forward = jnp.stack([one, zero, zero, zero, h, -y], axis=-1)  # velocity of a wheel's centre along x, and along y
     aside = jnp.stack([zero, one, zero, -h, zero, x], axis=-1)
-    flat = jnp.einsum("wi,ij,wj->w", forward, inverse, forward) + jnp.einsum("wi,ij,wj->w", aside, inverse, aside)
+    along = jnp.stack([forward, aside])[..., :, None] * jnp.stack([forward, aside])[..., None, :]  # [2, wheels, 6, 6]
+    flat = (along * inverse).sum((0, -2, -1))  # as sums: XLA's Triton has no kernel for so small a product in deterministic mode
     return Fleet(car=car, spin_weight=1.0 / about + inverse[4, 4] * one, wheel_weight=(flat + 1.0 / mass) / 3)
 
 
