@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import validation as report
 from scenefactory_jax.report import verdicts
+from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import validate as command
 from scenefactory_jax.run.config import load
 from scenefactory_jax.run.workers import spreading
@@ -251,6 +253,16 @@ def test_verdicts_can_fail(measured):
     rows["lost"] = [-1.0 for _ in rows["lost"]]
     honest, broken = (verdicts.of(r, targets) for r in (results, worse))
     assert [a.what for a, b in zip(honest, broken, strict=True) if a.met and not b.met] == [honest[0].what, honest[-1].what]
+
+
+def test_the_committed_report_is_made_of_its_results(tmp_path):
+    """No number in it was typed in."""
+    committed = configs.folder().parent / "experiments" / "validation"
+    results = command.read(committed)
+    assert list(results) == list(command.PARTS)
+    written = report.write(tmp_path, results, load("validate")["validation"]["targets"])
+    assert written.read_text() == (committed / "validation.md").read_text()
+    assert {path.name for path in tmp_path.glob("*.png")} == {path.name for path in committed.glob("*.png")}
 
 
 def square(cases):

@@ -143,7 +143,7 @@ def stopping(result: Result) -> Figure:
             if kind == "stopping":
                 axes.plot([], [], "o", mfc="none", mec=GREY, alpha=0.5, label="pale: still moving at the end")
                 axes.legend()
-            _plain_ticks(axes, [0.05, 0.1, 0.2, 0.5, 1.0], [10, 20, 50, 100, 200])
+            _plain_ticks(axes, [0.05, 0.1, 0.2, 0.5, 1.0], [10.0, 20.0, 50.0, 100.0, 200.0])
     return figure
 
 

@@ -49,14 +49,15 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     begin, yaw = rng.uniform(-90.0, 90.0, (*shape, 1, 2)), rng.uniform(-np.pi, np.pi, shape)
     velocity = 5.0 * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)[:, :, None]
     time_s = 0.1 * np.arange(steps)[:, None]
-    tracks = Tracks(
-        position=jnp.asarray(begin + velocity * time_s, jnp.float32),
-        yaw=jnp.asarray(np.broadcast_to(yaw[..., None], (*shape, steps)), jnp.float32),
-        velocity=jnp.asarray(np.broadcast_to(velocity, (*shape, steps, 2)), jnp.float32),
-        valid=jnp.ones((*shape, steps), bool),
-        size=jnp.tile(jnp.array([4.0, 2.0]), (*shape, 1)),
-        kind=jnp.zeros(shape, jnp.int32),
-    )
+    columns = {
+        "position": begin + velocity * time_s,
+        "yaw": np.broadcast_to(yaw[..., None], (*shape, steps)),
+        "velocity": np.broadcast_to(velocity, (*shape, steps, 2)),
+        "size": np.broadcast_to([4.0, 2.0], (*shape, 2)),
+    }
+    columns = {name: jnp.asarray(column, jnp.float32) for name, column in columns.items()}
+    columns |= {"valid": jnp.ones((*shape, steps), bool), "kind": jnp.zeros(shape, jnp.int32)}
+    tracks = jax.vmap(lambda columns: Tracks(**columns))(columns)
     return replace(worlds, others=tracks)
 
 

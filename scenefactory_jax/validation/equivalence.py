@@ -171,15 +171,16 @@ def settings(
     for trial in trials:
         changes = {key: value for key, value in trial.items() if key not in ("name", "physics_hz")}
         changed = {**entry, "solver": {**entry["solver"], **changes}}
-        names = {"name": trial["name"], "physics_hz": float(trial["physics_hz"]), "solver": dict(changed["solver"])}
+        hz = float(trial["physics_hz"])
+        names = {"name": trial["name"], "physics_hz": hz, "solver": dict(changed["solver"])}
         try:
-            run = engines.drive(changed, cases, physics_hz=trial["physics_hz"], **road)
+            run = engines.drive(changed, cases, physics_hz=hz, **road)
         except ConfigError as error:
             rows.append(Trial(**names, refused=str(error), error_m=None, share_within=None, fine_m=None))
             continue
-        key = (trial["physics_hz"], changed["solver"]["integrator"], changed["solver"]["friction_ratio"])
+        key = (hz, changed["solver"]["integrator"], changed["solver"]["friction_ratio"])
         if key not in references:
-            references[key] = reference(changed, cases, physics_hz=trial["physics_hz"], **truth)
+            references[key] = reference(changed, cases, physics_hz=hz, **truth)
         position = errors(run, references[key]).position[:, :, 0]
         rows.append(
             Trial(

@@ -41,7 +41,7 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
         jnp.array([SURFACES.index(patch.surface) for patch in some], jnp.int32),
         jnp.array([patch is not None for patch in patches], bool),
     )
-    weather = replace(worlds.weather, patches=jax.vmap(one)(*columns))
+    weather = jax.vmap(lambda weather, *patch: replace(weather, patches=one(*patch)))(worlds.weather, *columns)
     return replace(worlds, weather=weather)
 
 
