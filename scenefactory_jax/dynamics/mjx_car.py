@@ -110,25 +110,42 @@ def make(
     settings: Solver = build({**solver, "_target_": "Solver"}, builtins=cars.__name__, where="dynamics.solver")()
     entry = {**contact, "_target_": "make"}
     meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
-    cars.stable_limits(parameters, physics_dt=physics_dt, where="dynamics.car")
+    plant = compiled(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
+    context = {"car": parameters, "physics_dt": physics_dt}
+    vary = None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)()
+    return bind(plant._replace(vary=vary), meet, grip)
+
+
+def compiled(
+    car: CarParameters, solver: Solver, *, brakes: Literal["friction", "latched"], physics_dt: float, control_dt: float
+) -> Plant:  # fmt: skip
+    """The car as MJX wants it; all cars are this one until `vary` says otherwise.
+
+    Raises:
+        ConfigError: a spring too stiff for the time step, or time steps that do not fit.
+    """
+    cars.stable_limits(car, physics_dt=physics_dt, where="dynamics.car")
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
-    context = {"car": parameters, "physics_dt": physics_dt}
-    model = cars.standalone(parameters, settings, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
-    plant = Plant(
-        car=parameters,
-        vary=None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)(),
+    model = cars.standalone(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
+    return Plant(
+        car=car,
+        vary=None,
         model=mjx.put_model(model, impl="jax"),
         data=mjx.make_data(model, impl="jax"),
         places=cars.places(model),
         latched=brakes == "latched",
-        solver=settings,
+        solver=solver,
         layout=layout(model, brake_rows=brakes == "friction"),
-        still=cars.rest(model, parameters),
+        still=cars.rest(model, car),
         physics_dt=physics_dt,
         substeps=substeps,
     )
+
+
+def bind(plant: Plant, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
+    """The backend of a compiled car, on a road that `grip` tells."""
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         with jax.default_matmul_precision("highest"):  # TF32 costs accuracy and buys 8 %

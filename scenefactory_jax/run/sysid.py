@@ -1,0 +1,176 @@
+"""`sysid`: fit the articulated car to the teacher, stage by stage, and write what came out.
+
+Every stage writes `out/stages/NAME.json` as soon as it is done; with `resume=true` a stage is kept if it was made with the same settings.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import keys, sources
+from scenefactory_jax.sysid import fit, manoeuvres, space, student, teacher
+from scenefactory_jax.sysid.fit import Outcome, Refined, Score, Stage
+from scenefactory_jax.sysid.manoeuvres import Recording
+from scenefactory_jax.sysid.space import Space
+from scenefactory_jax.sysid.student import Replay, Suite
+
+
+def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Fit a config's car (`load("sysid", "sysid=full")`).
+
+    Returns:
+        What is in `out/result.json`: the stages, the refinement, the fitted numbers with their spread, and how well each car drives the
+        manoeuvres of the fit and those kept out of it.
+
+    Raises:
+        ConfigError: a key or number that does not fit, by name; a missing teacher package.
+    """
+    keys.check(config, keys.SYSID)
+    sources.use_compilation_cache()
+    out, settings = Path(config["out"]), config["sysid"]
+    (out / "stages").mkdir(parents=True, exist_ok=True)
+    known = recorded(config, out)
+    lessons = known["training"][:: settings["every"]]
+    where = space.make(settings["space"])
+    replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=config["physics_hz"])
+    plan = student.suite(lessons)
+    score = student.scorer(replay, plan, width=settings["width"])
+    begin = space.start(where, numbers(config["dynamics"]), settings["friction"])
+    outcomes = stages(config, out, lessons, where, score, begin)
+    refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
+    result = summary(config, known, where, replay, begin, outcomes, refined, score, len(lessons))
+    (out / "result.json").write_text(json.dumps(plain(result), indent=1) + "\n")
+    return result
+
+
+def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
+    """What the teacher did on the manoeuvres of the fit and on those kept out of it: from files that fit these settings, or driven now."""
+    car, found = numbers(config["dynamics"]), {}
+    for name in ("training", "heldout"):
+        path, digest = out / f"{name}.npz", _digest({"car": config["dynamics"]["car"], "teacher": config["teacher"], "plan": config[name]})
+        if path.is_file() and teacher.digest(path) == digest:
+            found[name] = teacher.load(path)
+            continue
+        begun = time.perf_counter()
+        drive = teacher.make(config["teacher"], car)
+        found[name] = [drive(plan) for plan in manoeuvres.make(config[name])]
+        teacher.save(path, found[name], digest=digest)
+        print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
+    return found
+
+
+def numbers(dynamics: Mapping[str, Any]) -> cars.CarParameters:
+    """The car of a config's dynamics."""
+    return build({**dynamics["car"], "_target_": "CarParameters"}, builtins=cars.__name__, where="dynamics.car")()
+
+
+def stages(
+    config: Mapping[str, Any], out: Path, lessons: Sequence[Recording], where: Space, score: Score, begin: np.ndarray
+) -> list[Outcome]:  # fmt: skip
+    """The search, each stage from where the one before ended."""
+    settings = config["sysid"]
+    found: dict[str, Outcome] = {}
+    for place, (name, entry) in enumerate(settings["stages"].items()):
+        stage, rows = _stage(name, entry, settings, where, lessons)
+        start = begin.copy()
+        if entry["restores"] is not None:  # the published fifth stage: what the first found for its parameters, once more
+            tuned = [where.names.index(parameter) for parameter in stage.tuned]
+            start[tuned] = found[entry["restores"]].best[tuned]
+        made = _digest({"stage": entry, "budget": settings["budget"][name], "start": start.tolist(), "settings": _shared(config)})
+        path = out / "stages" / f"{place + 1}_{name}.json"
+        outcome = _kept(path, made, Outcome) if config["resume"] else None
+        if outcome is None:
+            outcome = fit.search(
+                score, where, start, stage, rows, seed=settings["seed"] + place + 1, weights=settings["weights"], **settings["search"],
+                clock=time.perf_counter, tell=lambda line: print(line, flush=True),
+            )  # fmt: skip
+            _write(path, {"made": made, **outcome._asdict()})
+        print(f"{name}: {outcome.start_loss:.4f} -> {outcome.loss:.4f}, {outcome.evaluations} candidates on {len(rows)} manoeuvres, "
+              f"{outcome.seconds:.0f} s", flush=True)  # fmt: skip
+        found[name], begin = outcome, outcome.best
+    return list(found.values())
+
+
+def _stage(
+    name: str, entry: Mapping[str, Any], settings: Mapping[str, Any], where: Space, lessons: Sequence[Recording]
+) -> tuple[Stage, list[int]]:  # fmt: skip
+    """A stage of the config, and the manoeuvres that it looks at; no families are all of them, no parameters likewise."""
+    families = entry["families"] or sorted({recording.manoeuvre.family for recording in lessons})
+    rows = [i for i, recording in enumerate(lessons) if recording.manoeuvre.family in families]
+    if unknown := [parameter for parameter in entry["tuned"] if parameter not in where.names]:
+        raise ConfigError(f"sysid.stages.{name}.tuned: {unknown[0]!r}; valid: {', '.join(where.names)}")
+    if not rows:
+        raise ConfigError(f"sysid.stages.{name}.families: {families}; no manoeuvre of theirs is driven with sysid.every={settings['every']}")
+    population, generations = settings["budget"][name]
+    return Stage(name, tuple(entry["tuned"]) or where.names, entry["window"], population, generations), rows
+
+
+def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: Suite, begin: np.ndarray) -> Refined:
+    """Least squares on all manoeuvres."""
+    settings = config["sysid"]
+    path, made = out / "stages" / "refine.json", _digest({"refine": settings["refine"], "start": begin.tolist(), "shared": _shared(config)})
+    found = _kept(path, made, Refined) if config["resume"] else None
+    if found is None:
+        weights, index = fit.weight_row(settings["weights"]), np.arange(len(plan.frames))
+
+        def residuals(rows: np.ndarray) -> np.ndarray:
+            made = []
+            for some in np.array_split(rows, -(-len(rows) // max(1, settings["width"] // len(index) // 4))):
+                pairs = jnp.asarray(np.repeat(some, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(some)))
+                path = jax.tree.map(lambda leaf, n=len(some): np.asarray(leaf).reshape(n, len(index), *leaf.shape[1:]), replay.trace(*pairs, plan))
+                made += [student.residuals(jax.tree.map(lambda leaf, i=i: leaf[i], path), plan, index, weights) for i in range(len(some))]
+            return np.stack(made)
+
+        found = fit.refine(residuals, where, begin, **settings["refine"])
+        _write(path, {"made": made, **found._asdict()})
+    print(f"least squares: {found.start_loss:.4f} -> {found.loss:.4f}, {found.evaluations} candidates", flush=True)
+    return found
+
+
+def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What every stage depends on."""
+    names = ("seed", "friction", "weights", "space", "search", "every")
+    rest = {name: config[name] for name in ("dynamics", "teacher", "training", "physics_hz")}
+    return {**rest, **{name: config["sysid"][name] for name in names}}
+
+
+def _digest(settings: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    """All of it or nothing."""
+    half = path.with_suffix(".part")
+    half.write_text(json.dumps(plain(content)) + "\n")
+    half.replace(path)
+
+
+def _kept(path: Path, made: str, kind: type) -> Any:
+    """What an earlier run left, if it was made with these settings."""
+    if not path.is_file():
+        return None
+    content = json.loads(path.read_text())
+    if content.pop("made") != made:
+        return None
+    return kind(**{name: np.array(value) if isinstance(value, list) else value for name, value in content.items()})
+
+
+def plain(value: Any) -> Any:
+    """Arrays and tuples as lists, for JSON."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(one) for key, one in value.items()}
+    if hasattr(value, "_asdict"):
+        return plain(value._asdict())
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
