@@ -50,10 +50,20 @@ class Recording(NamedTuple):
     roll: Float[np.ndarray, " T"]  # of the body, right side down is positive, rad
 
 
-def suite(entries: Mapping[str, Mapping[str, Any]], *, where: str, **context: Any) -> list[Manoeuvre]:
-    """All manoeuvres of the families in `entries` (`conf/sysid/manoeuvres.yaml`: training, heldout).
+def training(entries: Mapping[str, Mapping[str, Any]]) -> list[Manoeuvre]:
+    """The 139, from the entries under `training` in `conf/sysid/manoeuvres.yaml`; those under `heldout` are `heldout.heldout`'s.
+
+    Raises:
+        ConfigError: an entry that cannot be built, or two manoeuvres of one name.
+    """
+    return suite(entries, builtins=__name__, where="sysid.manoeuvres.training")
+
+
+def suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str, **context: Any) -> list[Manoeuvre]:
+    """All manoeuvres of the families in `entries`.
 
     Args:
+        builtins: module of the targets.
         where: place in the config, for messages.
         context: what targets may ask for beside their numbers (`teacher`, for those that a driver steers).
 
@@ -62,7 +72,7 @@ def suite(entries: Mapping[str, Mapping[str, Any]], *, where: str, **context: An
     """
     found: list[Manoeuvre] = []
     for key, entry in entries.items():
-        found += build(entry, builtins="scenefactory_jax.sysid.manoeuvres", where=f"{where}.{key}", **context)()
+        found += build(entry, builtins=builtins, where=f"{where}.{key}", **context)()
     names = [m.name for m in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ConfigError(f"{where}: more than one manoeuvre of the name {sorted(twice)[0]!r}; every name must be its own")
