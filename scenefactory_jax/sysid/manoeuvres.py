@@ -21,7 +21,7 @@ HELDOUT = ("steady_circle", "iso_step_steer", "brake_in_turn", "sine_with_dwell"
 FAMILIES = TRAINING + HELDOUT
 RATE_HZ = 60.0  # of commands and records
 SIDES = (("left", 1.0), ("right", -1.0))
-Segment = tuple[float, float, float, float]  # s, throttle, steer, brake
+Segment = tuple[float | int, ...]  # s, throttle, steer, brake
 
 
 class Manoeuvre(NamedTuple):

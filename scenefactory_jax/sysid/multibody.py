@@ -35,7 +35,7 @@ import itertools
 import math
 import types
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -133,6 +133,7 @@ class Body(types.SimpleNamespace):
     turn: "itertools.cycle[types.SimpleNamespace]"
 
     @property
+    @no_type_check
     def tire(self) -> types.SimpleNamespace:
         return next(self.turn)
 
@@ -149,6 +150,7 @@ class Vehicle:
         self.load = self.body.m * GRAVITY / 4
         self.rolling_mass = self.body.m + 4 * car.wheel_inertia[0] / car.wheel_radius**2
 
+    @no_type_check
     def set_grip(self, factors: Sequence[float]) -> None:
         """Put each of the model's wheels on its surface."""
         for tyre, factor in zip(self.body.tyres, factors, strict=True):
@@ -211,6 +213,7 @@ def start(vehicle: Vehicle, speed: float) -> Float[np.ndarray, "29"]:
     return state
 
 
+@no_type_check  # called thousands of times a simulated second
 def rates(state: Float[np.ndarray, "29"], time: float, vehicle: Vehicle, command: Sequence[float], road: Any) -> list[float]:
     """Time derivative of the state under a command (throttle, steer, brake), where `road(x, y)` is the grip factor at a place or None."""
     p, teacher, x = vehicle.body, vehicle.teacher, state.tolist()
@@ -248,6 +251,7 @@ def rates(state: Float[np.ndarray, "29"], time: float, vehicle: Vehicle, command
     return f
 
 
+@no_type_check  # called thousands of times a simulated second
 def _torques(vehicle: Vehicle, command: Sequence[float]) -> tuple[list[float], list[float]]:
     """Torque that drives each wheel, and the most that holds it, N m."""
     teacher = vehicle.teacher
@@ -256,6 +260,7 @@ def _torques(vehicle: Vehicle, command: Sequence[float]) -> tuple[list[float], l
     return [drive, drive, 0.0, 0.0], [front, front, rear, rear]
 
 
+@no_type_check  # called thousands of times a simulated second
 def _roll(
     vehicle: Vehicle, torque: tuple[float, float], spins: list[float], angle: float, steering: float, *motion: float
 ) -> list[float]:
@@ -271,6 +276,7 @@ def _roll(
     return [gain, turning + (turn - yaw_rate) / settle_s, p.b * turning + (p.b * turn - sideways) / settle_s, *spinning]
 
 
+@no_type_check  # called thousands of times a simulated second
 def _wheel_speeds(p: Body, angle: float, forward: float, yaw_rate: float, sideways: float) -> list[float]:
     """Speed of each of the model's wheels along its own plane, m/s."""
     half, across = 0.5 * p.T_f * yaw_rate, (sideways + p.a * yaw_rate) * math.sin(angle)
@@ -278,6 +284,7 @@ def _wheel_speeds(p: Body, angle: float, forward: float, yaw_rate: float, sidewa
     return [*front, forward + 0.5 * p.T_r * yaw_rate, forward - 0.5 * p.T_r * yaw_rate]
 
 
+@no_type_check  # called thousands of times a simulated second
 def _floor(p: Body, x: list[float]) -> float:
     """How much forward speed car and wheels must have more, with the same sliding, so that the model divides by no wheel's speed below FLOOR."""
     swing, angle = 0.5 * abs(x[YAW_RATE]), x[STEER]
@@ -286,6 +293,7 @@ def _floor(p: Body, x: list[float]) -> float:
     return max(0.0, least - x[FORWARD])
 
 
+@no_type_check  # called thousands of times a simulated second
 def _wheels_at(p: Body, x: list[float]) -> list[tuple[float, float]]:
     """Where the model's wheels stand: its left ones are on our right."""
     cos, sin, half = math.cos(x[YAW]), math.sin(x[YAW]), p.T_f / 2
