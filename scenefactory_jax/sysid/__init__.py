@@ -1,1 +1,1 @@
-"""System identification: a validated teacher, manoeuvres, and the fit of the articulated car to what the teacher did."""
+"""System identification: a validated car drives manoeuvres, ours is fitted until it drives them likewise."""
