@@ -143,6 +143,9 @@ def test_standing_car_stands_and_brakes_hold(teacher):
     assert fall.min() > -1e-6 and fall.max() < 1.3 * 5.7 / RATE_HZ  # it never gains speed, nor loses it in a jump
     assert stop.speed[-60:].max() < 1e-6 and np.ptp(stop.position[-60:], axis=0).max() < 1e-4
     away = record(drive((1.5, 0.4, 0.5, 0.0)), teacher=teacher)
+    mass, rolling = whole_mass(teacher)
+    pull = (2 * 0.4 * teacher.drive_torque / teacher.car.wheel_radius - teacher.rolling_resistance * mass * 9.81) / rolling
+    assert away.speed[5] == pytest.approx(pull * 0.1, rel=0.1)  # slower than the tyre model goes
     assert np.diff(away.speed[1:]).max() < 2.0 / RATE_HZ and np.diff(away.speed).min() > -1e-6
 
 
