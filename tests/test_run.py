@@ -293,7 +293,8 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 
 def options():
-    groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name not in ("experiment", "validation")]
+    others = ("experiment", "sysid", "validation")
+    groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name not in others]
     return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
 
 

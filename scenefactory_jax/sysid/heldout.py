@@ -1,8 +1,8 @@
 """Standard tests that no fit may see: what a car fitted to the training manoeuvres is judged by.
 
-Open loop: steady circles (ISO 4138), step steer (ISO 7401), braking in a turn (ISO 7975), sine with dwell (FMVSS 126), straight and split stops.
-Closed loop: double lane changes (ISO 3888-1, 3888-2). There a driver steers the teacher and its commands are the manoeuvre: the replay is open loop,
-as of all others. The tests start at speed, with the wheels rolling. Numbers: `conf/sysid/manoeuvres.yaml`.
+Open loop: steady circles (ISO 4138), step steer (ISO 7401), braking in a turn (ISO 7975), sine with dwell (FMVSS 126), straight and split
+stops. Closed loop: double lane changes (ISO 3888-1, 3888-2). There a driver steers the teacher and its commands are the manoeuvre: the
+replay is open loop, as of all others. The tests start at speed, with the wheels rolling. Numbers: `conf/sysid/manoeuvres.yaml`.
 """
 
 import math
@@ -127,8 +127,9 @@ def lane_change(
 ) -> list[Manoeuvre]:
     """ISO 3888 double lane change, to the left and back.
 
-    The driver is pure pursuit: it steers for the circle through a point of the track's centre line, some time ahead, that is tangent to the
-    car's heading, by the wheelbase alone. In the transit sections the centre line is half a cosine wave. Nobody holds the cones: it may miss them.
+    The driver is pure pursuit: it steers, by the wheelbase alone, for the circle that is tangent to the car's heading and goes through a
+    point of the track's centre line some time ahead. In the transit sections that line is half a cosine wave.
+    The driver does not see the cones.
 
     Args:
         track: for the names.

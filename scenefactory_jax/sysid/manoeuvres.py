@@ -1,7 +1,7 @@
 """Manoeuvres of one car as commands over time on a road of up to a few surfaces, and what a recording of one holds.
 
-The 139 of training are SceneFactory's suite (facts sheet section 3.2): same families, grids, durations and numbers of frames. They start from rest.
-Their numbers are in `conf/sysid/manoeuvres.yaml`, an entry a family; the functions here are those entries' targets.
+The 139 of training are SceneFactory's suite: same families, grids, durations and numbers of frames, all from rest. Their numbers are in
+`conf/sysid/manoeuvres.yaml`, an entry a family; the functions here are those entries' targets.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ Segment = tuple[float | int, ...]  # s, throttle, steer, brake
 
 
 class Manoeuvre(NamedTuple):
-    """Commands, one row a frame, and the road: strips across x, each with one surface left and one right of y = 0, the outer ones endless."""
+    """Commands, one row a frame, and the road: strips along x with a surface left and one right of y = 0, the outer strips endless."""
 
     name: str
     family: str
@@ -81,7 +81,7 @@ def suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str
 
 def commands(segments: Sequence[Segment]) -> Float[np.ndarray, "T 3"]:
     """One row a frame, held over each segment."""
-    return np.concatenate([np.tile(np.float64(levels), (round(seconds * RATE_HZ), 1)) for seconds, *levels in segments])
+    return np.concatenate([np.tile(np.array(levels, np.float64), (round(seconds * RATE_HZ), 1)) for seconds, *levels in segments])
 
 
 def on_one_surface(name: str, family: str, segments: Sequence[Segment], *, speed: float = 0.0, surface: int = 0) -> Manoeuvre:
@@ -107,7 +107,9 @@ def straight_accel(
     return [one(throttle) for throttle in throttles]
 
 
-def straight_brake(*, brakes: list[float], idle_s: float, drive_s: float, throttle: float, coast_s: float, stop_s: float) -> list[Manoeuvre]:
+def straight_brake(
+    *, brakes: list[float], idle_s: float, drive_s: float, throttle: float, coast_s: float, stop_s: float
+) -> list[Manoeuvre]:
     """One start, brakes of several strengths."""
 
     def one(brake: float) -> Manoeuvre:
@@ -225,7 +227,11 @@ def chirp_steer(
     stop_brake: float,
     extra_frames: int,
 ) -> list[Manoeuvre]:
-    """Steering that quickens: amplitude x sin(2 pi f(t) t). As published, the phase is not the integral of f: the end is at 2 f - `first_hz`."""
+    """Steering that quickens: amplitude x sin(2 pi f(t) t), f from `first_hz` to `last_hz`.
+
+    As published: the phase is not the integral of f, so the wave itself ends at 2 x `last_hz` - `first_hz`.
+    `extra_frames` as in `trail_brake`.
+    """
 
     def one(throttle: float) -> Manoeuvre:
         times = np.arange(round(steer_s / hold_s)) * hold_s
@@ -252,7 +258,7 @@ def surface_transition(*, segments: list[list[float]], edges: list[float], surfa
         raise ConfigError(f"surface_transition: {len(surfaces)} surfaces with {len(edges)} edges; wanted is one edge fewer")
     strips = np.array([surface_id(name) for name in surfaces])
     legs = [(seconds, throttle, steer, brake) for seconds, throttle, steer, brake in segments]
-    return [Manoeuvre("surface_transition_s", "surface_transition", 0.0, commands(legs), np.float64(edges), strips, strips)]
+    return [Manoeuvre("surface_transition_s", "surface_transition", 0.0, commands(legs), np.array(edges, np.float64), strips, strips)]
 
 
 def surface_id(name: str) -> int:

@@ -1,7 +1,7 @@
 """The CommonRoad multi-body car (`vehicle_dynamics_mb`, Althoff and Wuersching 2020) with our car's masses, as rates of a state.
 
-Source: M. Althoff, G. Wuersching, "CommonRoad: Vehicle Models" (2020), package commonroad-vehicle-models, BSD licence; the model is the US DOT's
-(R. W. Allen et al. 1992): sprung mass and two axles with compliant joints, Pacejka tyres with combined slip, 29 states.
+Source: M. Althoff, G. Wuersching, "CommonRoad: Vehicle Models" (2020), package commonroad-vehicle-models, BSD licence; the model is that
+of the US DOT (R. W. Allen et al. 1992): sprung mass and two axles with compliant joints, Pacejka tyres with combined slip, 29 states.
 Vehicle 2 is a BMW 320i. What is ours and what is scaled from it:
 
     mass, inertia, axles, CoM height,  ours. p.m is the whole car, m_s the chassis, m_uf and m_ur an axle's wheels, carriers, knuckles;
@@ -14,20 +14,20 @@ Vehicle 2 is a BMW 320i. What is ours and what is scaled from it:
     I_uf, I_ur                         x unsprung mass x track^2
     D_f, D_r                           / track: camber per roll angle stays
     E_f, E_r, I_xz_s, h_raf, h_rar     as they are (0)
-    Pacejka's coefficients             as they are, but the shifts p_hx1, p_vx1, p_hy1, p_vy1, r_hx1, r_hy1, r_by3, r_vy1 (ply steer, conicity) are 0:
-                                       a mirrored command gives a mirrored path, and a wheel that rolls freely pulls nowhere
+    Pacejka's coefficients             as they are, but the shifts (ply steer, conicity) p_hx1, p_vx1, p_hy1, p_vy1, r_hx1, r_hy1, r_by3,
+                                       r_vy1 are 0: mirrored commands give the mirrored path, and a wheel that rolls freely pulls nowhere
     limits of steering, acceleration   out of reach: `rates` has its own
 
-Signs: the model is written for y to the right (SAE); mirrored, its positive yaw, steer and y are left, its "left" wheels are our right ones, and its
-roll angle is minus ours.
+Signs: the model is written for y to the right (SAE). Mirrored, its positive yaw, steer and y are left, its "left" wheels are our right
+ones, and its roll angle is minus ours.
 
 What the model lacks, `rates` adds; the model's own input of acceleration stays 0:
     torque of every wheel              drive, brake and rolling resistance at once; it would brake or drive, with one split for all
     drag                               a force against the car's forward speed
     grip under every wheel             p.tire is read wheel by wheel, in turns: a tyre each
-    standstill                         below 0.1 m/s the model rolls without slip or resistance: here with resistance, and brakes hold; from there
-                                       to 0.2 m/s rolling passes into the tyre model, in the plane, without a jump
-    beyond 80 degrees of slip angle    slip ratios have a floor under their denominators. Motion there is damped, no more: Pacejka knows none
+    standstill                         below 0.1 m/s the model rolls without slip or resistance: here with resistance, and brakes hold; from
+                                       there to 0.2 m/s rolling passes into the tyre model, in the plane, without a jump
+    a car that slides sideways         or backwards: a floor under the speeds that the model divides by. All that is right is that it ends
 """
 
 import dataclasses
@@ -127,7 +127,7 @@ def make(
 
 
 class Body(types.SimpleNamespace):
-    """What `vehicle_dynamics_mb` reads. It asks for `tire` in whole rounds over the wheels, left front, right front, left rear, right rear."""
+    """What `vehicle_dynamics_mb` reads. It asks for `tire` in whole rounds over its wheels, front left, right, rear left, right."""
 
     tyres: list[types.SimpleNamespace]
     turn: "itertools.cycle[types.SimpleNamespace]"
@@ -190,7 +190,8 @@ def body(car: CarParameters, bmw: Any) -> Body:
     return Body(
         m=whole, m_s=car.mass, m_uf=front, m_ur=rear, a=a, b=b,
         I_Phi_s=car.inertia[0], I_y_s=car.inertia[1], I_z=car.inertia[2] + wheels_yaw, I_xz_s=bmw.I_xz_s,
-        h_s=car.wheel_radius - car.wheel_height + car.mass_height, R_w=car.wheel_radius, I_y_w=car.wheel_inertia[0], T_f=car.track, T_r=car.track,
+        h_s=car.wheel_radius - car.wheel_height + car.mass_height, R_w=car.wheel_radius, I_y_w=car.wheel_inertia[0],
+        T_f=car.track, T_r=car.track,
         K_sf=bmw.K_sf * on_front, K_sdf=bmw.K_sdf * on_front, K_sr=bmw.K_sr * on_rear, K_sdr=bmw.K_sdr * on_rear,
         K_tsf=bmw.K_tsf * on_front * wider_f**2, K_tsr=bmw.K_tsr * on_rear * wider_r**2,
         K_ras=bmw.K_ras * sprung, K_rad=bmw.K_rad * sprung, K_zt=bmw.K_zt * total, K_lt=bmw.K_lt / total,
@@ -264,7 +265,7 @@ def _torques(vehicle: Vehicle, command: Sequence[float]) -> tuple[list[float], l
 def _roll(
     vehicle: Vehicle, torque: tuple[float, float], spins: list[float], angle: float, steering: float, *motion: float
 ) -> list[float]:
-    """Rates of PLANAR when rolling without slip, slower than the tyre model goes: the car follows its wheels, brakes and drag bring it to rest."""
+    """Rates of PLANAR when rolling without slip, slower than the tyre model goes: the car follows its wheels, resistance stops it."""
     p, settle_s = vehicle.body, vehicle.teacher.settle_s
     forward, yaw_rate, sideways = motion
     drive, hold = torque
@@ -286,7 +287,7 @@ def _wheel_speeds(p: Body, angle: float, forward: float, yaw_rate: float, sidewa
 
 @no_type_check  # called thousands of times a simulated second
 def _floor(p: Body, x: list[float]) -> float:
-    """How much forward speed car and wheels must have more, with the same sliding, so that the model divides by no wheel's speed below FLOOR."""
+    """Forward speed that car and wheels must have more, at the same sliding, so that the model divides by no speed below FLOOR."""
     swing, angle = 0.5 * abs(x[YAW_RATE]), x[STEER]
     across = (x[SIDEWAYS] + p.a * x[YAW_RATE]) * math.sin(angle)
     least = max(CREEP, swing * p.T_r + FLOOR, swing * p.T_f + (FLOOR - across) / math.cos(angle))
