@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ TABLE = {
 }  # fmt: skip
 
 
-def conf(name):
+def conf(name) -> Any:
     return OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / f"{name}.yaml"))
 
 
@@ -199,6 +200,7 @@ def test_a_split_road_turns_the_car_to_the_side_that_grips(teacher, side):
 def test_strips_follow_one_another_along_the_road(teacher):
     m = drive((0.1, 0.0, 0.0, 0.0))._replace(edges=np.array([5.0, 9.0]), left=np.array([0, 1, 2]), right=np.array([2, 1, 0]))
     road = road_of(m, multibody.Vehicle(teacher))
+    assert road is not None
     assert [road(x, 1.0) for x in (-50.0, 4.0, 6.0, 10.0)] == pytest.approx([1.0, 1.0, 0.72, 0.58])
     assert [road(x, -1.0) for x in (-50.0, 6.0, 99.0)] == pytest.approx([0.58, 0.72, 1.0])
     with pytest.raises(ConfigError, match="2 surfaces"):
