@@ -2,6 +2,8 @@
 
 import copy
 import re
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -17,8 +19,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
 
-COMMANDS = ("train", "evaluate", "convert", "scenes", "render", "bench", "validate")
+COMMANDS = ("train", "evaluate", "convert", "scenes", "render", "bench", "validate", "sysid")
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
+
+
+def command(name: str) -> str:
+    """How the process was called, for reports; where the files went is nobody else's business."""
+    arguments = [argument for argument in sys.argv[1:] if not argument.startswith("out=")]
+    return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if name in sys.argv[0] else f"{name}(config)"
 
 
 def folder() -> Path:

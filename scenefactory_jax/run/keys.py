@@ -26,6 +26,7 @@ EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
 TRAIN |= {"minutes": Key(float | None, 0), "checkpoint_every": COUNT, "checkpoints_kept": COUNT, "tensorboard": FLAG, "progress": FLAG}
 BENCH = {"seed": SEED, "worlds": COUNT, "warmup": SEED, "repeats": COUNT, "out": PLACE}
+SYSID = {"out": Key(str), "resume": FLAG, "workers": COUNT, "physics_hz": Key(float, 1)}
 VALIDATE = {"out": Key(str), "parts": Key(list[str]), "resume": FLAG, "workers": COUNT}
 RENDER = {"index": SEED, "seed": SEED, "out": Key(str)}
 SCENES = {"op": Key(str), "out": Key(str), "limit": SEED}

@@ -3,10 +3,14 @@
 Every stage writes `out/stages/NAME.json` as soon as it is done; with `resume=true` a stage is kept if it was made with the same settings.
 """
 
+import contextlib
+import functools
 import hashlib
 import json
+import multiprocessing
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +22,7 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, sources
-from scenefactory_jax.sysid import fit, manoeuvres, space, student, teacher
+from scenefactory_jax.sysid import fit, heldout, manoeuvres, measure, multibody, space, student, teacher
 from scenefactory_jax.sysid.fit import Outcome, Refined, Score, Stage
 from scenefactory_jax.sysid.manoeuvres import Recording
 from scenefactory_jax.sysid.space import Space
@@ -48,25 +52,75 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     begin = space.start(where, numbers(config["dynamics"]), settings["friction"])
     outcomes = stages(config, out, lessons, where, score, begin)
     refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
-    result = summary(config, known, where, replay, begin, outcomes, refined, score, len(lessons))
-    (out / "result.json").write_text(json.dumps(plain(result), indent=1) + "\n")
+    places, along = fit.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
+    rows = {"fitted": refined.best, "default": begin}
+    result = {
+        "command": configs.command("sysid"),
+        "versions": configs.versions(),
+        "manoeuvres": {name: len(recordings) for name, recordings in {"fit": lessons, **known}.items()},
+        "space": where._asdict(),
+        "default": begin,
+        "stages": outcomes,
+        "refined": refined,
+        "slices": {"place": places, "loss": along},
+        "cars": {name: judged(config, known, where, replay, row) for name, row in rows.items()} | {"published": published(config, known)},
+    }
+    _write(out / "result.json", result)
     return result
+
+
+def judged(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]], where: Space, replay: Replay, row: np.ndarray) -> Any:
+    """How one car drives the manoeuvres of the fit and those kept out of it: a row a manoeuvre."""
+    weights, found = fit.weight_row(config["sysid"]["weights"]), {}
+    for name, recordings in known.items():
+        plan, index = student.suite(recordings), np.arange(len(recordings))
+        rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
+        path = jax.tree.map(np.asarray, replay.trace(rows, jnp.asarray(index), plan))
+        squares = [student.residuals(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], path), plan, index[i : i + 1], weights) for i in index]
+        found[name] = {
+            "name": [recording.manoeuvre.name for recording in recordings],
+            "family": [recording.manoeuvre.family for recording in recordings],
+            "loss": [float((square**2).sum()) for square in squares],
+            **measure.measure(path, recordings)._asdict(),
+        }
+    return found
+
+
+def published(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]]) -> Any:
+    """The published car, with its own friction of the surfaces and nothing left open."""
+    nothing = space.make({})
+    replay = student.make(config["others"]["published"], nothing, config["sysid"]["published_friction"], physics_hz=config["physics_hz"])
+    return judged(config, known, nothing, replay, np.zeros(0))
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
     """What the teacher did on the manoeuvres of the fit and on those kept out of it: from files that fit these settings, or driven now."""
-    car, found = numbers(config["dynamics"]), {}
-    for name in ("training", "heldout"):
-        path, digest = out / f"{name}.npz", _digest({"car": config["dynamics"]["car"], "teacher": config["teacher"], "plan": config[name]})
-        if path.is_file() and teacher.digest(path) == digest:
-            found[name] = teacher.load(path)
-            continue
-        begun = time.perf_counter()
-        drive = teacher.make(config["teacher"], car)
-        found[name] = [drive(plan) for plan in manoeuvres.make(config[name])]
-        teacher.save(path, found[name], digest=digest)
-        print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
+    instructor = build(config["teacher"], builtins=multibody, where="teacher")(numbers(config["dynamics"]))
+    suites = {"training": manoeuvres.training, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
+    found = {}
+    with contextlib.ExitStack() as stack:
+        for name, suite in suites.items():
+            path, entries = out / f"{name}.npz", config["manoeuvres"][name]
+            made = _digest({"car": config["dynamics"]["car"], "teacher": config["teacher"], "manoeuvres": entries})
+            if path.is_file():
+                try:
+                    found[name] = teacher.load(path, digest=made)
+                    continue
+                except ConfigError:
+                    print(f"{path}: of other settings, recorded anew", flush=True)
+            begun = time.perf_counter()
+            drive = functools.partial(teacher.record, teacher=instructor)
+            found[name] = list(_mapping(config["workers"], stack)(drive, suite(entries)))
+            teacher.save(path, found[name], digest=made)
+            print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found
+
+
+def _mapping(workers: int, stack: contextlib.ExitStack) -> Any:
+    """`map`, in this process or over several."""
+    if workers == 1:
+        return map
+    return stack.enter_context(ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))).map
 
 
 def numbers(dynamics: Mapping[str, Any]) -> cars.CarParameters:
@@ -110,9 +164,9 @@ def _stage(
     if unknown := [parameter for parameter in entry["tuned"] if parameter not in where.names]:
         raise ConfigError(f"sysid.stages.{name}.tuned: {unknown[0]!r}; valid: {', '.join(where.names)}")
     if not rows:
-        raise ConfigError(f"sysid.stages.{name}.families: {families}; no manoeuvre of theirs is driven with sysid.every={settings['every']}")
+        raise ConfigError(f"sysid.stages.{name}.families: {families}; sysid.every={settings['every']} leaves none of their manoeuvres")
     population, generations = settings["budget"][name]
-    return Stage(name, tuple(entry["tuned"]) or where.names, entry["window"], population, generations), rows
+    return Stage(name, tuple(families), tuple(entry["tuned"]) or where.names, entry["window"], population, generations), rows
 
 
 def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: Suite, begin: np.ndarray) -> Refined:
@@ -122,14 +176,17 @@ def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Repla
     found = _kept(path, made, Refined) if config["resume"] else None
     if found is None:
         weights, index = fit.weight_row(settings["weights"]), np.arange(len(plan.frames))
+        together = max(1, settings["width"] // len(index) // 4)  # candidates whose whole traces are on the device at once
+
+        def piece(some: np.ndarray) -> list[np.ndarray]:
+            pairs = jnp.asarray(np.repeat(some, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(some)))
+            path = jax.tree.map(np.asarray, replay.trace(*pairs, plan))
+            each = [slice(i * len(index), (i + 1) * len(index)) for i in range(len(some))]
+            return [student.residuals(jax.tree.map(lambda leaf, own=own: leaf[own], path), plan, index, weights) for own in each]
 
         def residuals(rows: np.ndarray) -> np.ndarray:
-            made = []
-            for some in np.array_split(rows, -(-len(rows) // max(1, settings["width"] // len(index) // 4))):
-                pairs = jnp.asarray(np.repeat(some, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(some)))
-                path = jax.tree.map(lambda leaf, n=len(some): np.asarray(leaf).reshape(n, len(index), *leaf.shape[1:]), replay.trace(*pairs, plan))
-                made += [student.residuals(jax.tree.map(lambda leaf, i=i: leaf[i], path), plan, index, weights) for i in range(len(some))]
-            return np.stack(made)
+            pieces = [np.resize(rows[i : i + together], (together, rows.shape[1])) for i in range(0, len(rows), together)]
+            return np.stack([row for some in pieces for row in piece(some)][: len(rows)])
 
         found = fit.refine(residuals, where, begin, **settings["refine"])
         _write(path, {"made": made, **found._asdict()})
@@ -140,7 +197,7 @@ def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Repla
 def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
     """What every stage depends on."""
     names = ("seed", "friction", "weights", "space", "search", "every")
-    rest = {name: config[name] for name in ("dynamics", "teacher", "training", "physics_hz")}
+    rest = {name: config[name] for name in ("dynamics", "teacher", "manoeuvres", "physics_hz")}
     return {**rest, **{name: config["sysid"][name] for name in names}}
 
 

@@ -6,8 +6,6 @@ alone, so a part can be measured again, or elsewhere, without the others.
 
 import hashlib
 import json
-import shlex
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -83,7 +81,7 @@ def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) ->
     print(f"{name} ...", flush=True)
     result = part.run(read, spread)
     seconds = time.perf_counter() - begun
-    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": _command(), "result": _plain(result)}
+    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": configs.command("validate"), "result": _plain(result)}
     path.write_text(json.dumps(whole, separators=(",", ":")) + "\n")
     print(f"{name}: {seconds:.0f} s", flush=True)
 
@@ -108,12 +106,6 @@ def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
 
 def _digest(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _command() -> str:
-    """How this was called, for the report; where the files went is nobody else's business."""
-    arguments = [argument for argument in sys.argv[1:] if not argument.startswith("out=")]
-    return f"python -m scenefactory_jax {shlex.join(['validate', *arguments])}" if "validate" in sys.argv[0] else "validate(config)"
 
 
 def _plain(value: Any) -> Any:

@@ -145,7 +145,7 @@ def refine(
     rounds: int,
     effective: int,
 ) -> Refined:
-    """Least squares within the ranges (scipy's trust-region reflective), Jacobian by central differences, all in one batch.
+    """Least squares within the ranges (scipy's dogleg in a box), Jacobian by central differences, all in one batch.
 
     The loss is the sum of the squared residuals. The standard deviations are those of the linearised problem with the residuals' own
     size as noise, s^2 (J^T J)^-1, where residuals of one manoeuvre are correlated over time: only `effective` of them count as independent.
@@ -171,7 +171,7 @@ def refine(
 
     place = np.clip(unit(space, begin), 1e-4, 1.0 - 1e-4)
     start_loss = float((at(place) ** 2).sum())
-    found = least_squares(at, place, jac=jacobian, bounds=(0.0, 1.0), max_nfev=rounds, method="trf", x_scale=1.0)  # pyright: ignore
+    found = least_squares(at, place, jac=jacobian, bounds=(0.0, 1.0), max_nfev=rounds, method="dogbox")  # pyright: ignore
     slope = jacobian(found.x)
     loss = float((found.fun**2).sum())
     inverse = np.linalg.pinv(slope.T @ slope)
@@ -190,8 +190,15 @@ def refine(
 
 
 def slices(
-    score: Score, space: Space, best: Float[np.ndarray, " P"], manoeuvres: Sequence[int], *, weights: Mapping[str, Any], points: int, span: float
-) -> tuple[Float[np.ndarray, "P points"], Float[np.ndarray, "P points"]]:  # fmt: skip
+    score: Score,
+    space: Space,
+    best: Float[np.ndarray, " P"],
+    manoeuvres: Sequence[int],
+    *,
+    weights: Mapping[str, Any],
+    points: int,
+    span: float,
+) -> tuple[Float[np.ndarray, "P points"], Float[np.ndarray, "P points"]]:
     """The loss along each parameter alone: places in its range (unit box) and losses."""
     centre = unit(space, best)
     places = np.clip(centre[:, None] + np.linspace(-span, span, points), 0.0, 1.0)

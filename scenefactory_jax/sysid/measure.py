@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Recording
 from scenefactory_jax.sysid.student import Path
@@ -35,15 +35,16 @@ def measure(path: Path, recordings: Sequence[Recording]) -> Measures:
         end = np.linalg.norm(own.position[-1] - teacher.position[-1])
         peak = np.abs(teacher.yaw_rate).max()
         nrmse = np.sqrt(np.mean((own.yaw_rate - teacher.yaw_rate) ** 2)) / peak if peak > TURNING else np.nan
-        stops = stopping_m(teacher.manoeuvre.controls, teacher.position, teacher.speed), stopping_m(
-            teacher.manoeuvre.controls, own.position, own.pace
-        )
+        controls = teacher.manoeuvre.controls
+        stops = stopping_m(controls, teacher.position, teacher.speed), stopping_m(controls, own.position, own.pace)
         rows.append((end, way, end / max(way, 1e-9), nrmse, np.sqrt(np.mean((own.pace - teacher.speed) ** 2)), stops[1] / stops[0] - 1.0,
                      np.abs(teacher.lateral).max()))  # fmt: skip
     return Measures(*(np.array(column, float) for column in zip(*rows, strict=True)))
 
 
-def stopping_m(controls: Float[np.ndarray, "T 3"], position: Float[np.ndarray, "T 2"], speed: Float[np.ndarray, " T"]) -> float:
+def stopping_m(
+    controls: Float[np.ndarray, "T 3"], position: Float[Array | np.ndarray, "T 2"], speed: Float[Array | np.ndarray, " T"]
+) -> float:  # fmt: skip
     """Way from where the brakes are put on for the last time to standstill, m; NaN if the car is not braked to a halt.
 
     A car that still moves at the end but slower than 2 m/s is taken to stop with the mean deceleration of its last second.

@@ -38,7 +38,7 @@ def make(ranges: Mapping[str, Any]) -> Space:
         entry = entry if isinstance(entry, Mapping) else {"range": entry, "scale": "linear"}
         if set(entry) != {"range", "scale"} or entry["scale"] not in ("linear", "log"):
             raise ConfigError(f"sysid.space.{name}: {dict(entry)}; write [least, most] or {{range: [least, most], scale: log}}")
-        least, most = check_range(entry["range"], where=f"sysid.space.{name}")
+        least, most = check_range(entry["range"], where=f"sysid.space.{name}", least=None)
         if not least < most or (entry["scale"] == "log" and least <= 0.0):
             raise ConfigError(f"sysid.space.{name}: [{least:g}, {most:g}] is no range to search")
         low, high, logarithmic = [*low, least], [*high, most], [*logarithmic, entry["scale"] == "log"]
@@ -74,7 +74,7 @@ def apply(
     """One car with these values (scalar leaves), and the friction of each surface; what is not in the space stays."""
     chosen = {name: row[index] for index, name in enumerate(space.names)}
     numbers = {name: chosen.get(name, value) for name, value in vars(car).items()}
-    road = [chosen.get(name, jnp.float32(value)) for name, value in zip(FRICTION, friction, strict=True)]
+    road = [jnp.asarray(chosen.get(name, value), jnp.float32) for name, value in zip(FRICTION, friction, strict=True)]
     numbers = {name: [jnp.float32(x) for x in value] if isinstance(value, (list, tuple)) else jnp.asarray(value, jnp.float32)
                for name, value in numbers.items()}  # fmt: skip
     return with_numbers(car, numbers), jnp.stack(road)

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.build import build
+from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import contact, mjx_car
-from scenefactory_jax.dynamics.car import CarParameters, Solver
-from scenefactory_jax.struct import struct
+from scenefactory_jax.dynamics.car import CarParameters
+from scenefactory_jax.struct import replace, struct
 from scenefactory_jax.sysid import space as spaces
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Recording
 from scenefactory_jax.sysid.space import Space
@@ -46,21 +47,21 @@ class Suite:
 class Path(NamedTuple):
     """What a car did at the end of a frame."""
 
-    position: Float[Array, "*n 2"]
-    yaw: Float[Array, "*n"]
-    pace: Float[Array, "*n"]
-    yaw_rate: Float[Array, "*n"]
-    wheel_spin: Float[Array, "*n 4"]
-    steer: Float[Array, "*n 2"]
-    normal: Float[Array, "*n 4"]  # of the tyres, N
-    travel: Float[Array, "*n 4"]  # of the suspension, m
+    position: Float[Array | np.ndarray, "*n 2"]
+    yaw: Float[Array | np.ndarray, "*n"]
+    pace: Float[Array | np.ndarray, "*n"]
+    yaw_rate: Float[Array | np.ndarray, "*n"]
+    wheel_spin: Float[Array | np.ndarray, "*n 4"]
+    steer: Float[Array | np.ndarray, "*n 2"]
+    normal: Float[Array | np.ndarray, "*n 4"]  # of the tyres, N
+    travel: Float[Array | np.ndarray, "*n 4"]  # of the suspension, m
 
 
 class Replay(NamedTuple):
     """A compiled car that drives recordings."""
 
-    terms: Callable[[Array, Array, Array, Array], Array]  # (rows [N, P], manoeuvre [N], suite, frames) -> squared errors [N, 8]
-    trace: Callable[[Array, Array, Suite], Path]  # (rows [N, P], manoeuvre [N], suite) -> leaves [N, T, ...]
+    terms: Callable[..., Array]  # (rows [N, P], manoeuvre [N], suite, frames) -> squared errors [N, 8]
+    trace: Callable[..., Path]  # (rows [N, P], manoeuvre [N], suite) -> leaves [N, T, ...]
 
 
 def suite(recordings: Sequence[Recording]) -> Suite:
@@ -100,13 +101,11 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
         dynamics: of the articulated car; its fleet is replaced.
         friction: of the surfaces, where the space leaves them alone.
     """
-    car: CarParameters = build({**dynamics["car"], "_target_": "CarParameters"}, builtins="scenefactory_jax.dynamics.car", where="dynamics.car")()
-    solver: Solver = build({**dynamics["solver"], "_target_": "Solver"}, builtins="scenefactory_jax.dynamics.car", where="dynamics.solver")()
-    rates = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / RATE_HZ}
-    plant = mjx_car.compiled(car, solver, brakes=dynamics["brakes"], **rates)
+    kinds = {"car": "CarParameters", "solver": "Solver"}
+    car, solver = (build({**dynamics[k], "_target_": t}, builtins=cars, where=f"dynamics.{k}")() for k, t in kinds.items())
+    plant = mjx_car.compiled(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
     meet = build({**dynamics["contact"], "_target_": "make"}, builtins=contact, where="dynamics.contact", height=car.height)()
-    one = np.zeros((1, 1), np.float32)
-    empty = jax.tree.map(lambda leaf: leaf[0], engines.scenes(one[..., None].repeat(2, -1), one, one, one[0], one[0].astype(int), size=(car.length, car.width)))
+    empty = _ground(car)
 
     def bound(row: Array, index: Array, plan: Suite) -> tuple[Dynamics, Scene]:
         own, mu = spaces.apply(space, car, friction, row)
@@ -118,7 +117,7 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
             return mu[surface]
 
         crew = jax.tree.map(lambda leaf: leaf[None], own)
-        scene = mjx_car.replace(empty, agents=mjx_car.replace(empty.agents, speed=plan.speed[index][None]))
+        scene = replace(empty, agents=replace(empty.agents, speed=plan.speed[index][None]))
         return mjx_car.bind(plant._replace(vary=lambda key, scene: crew), meet, grip), scene
 
     def driver(row: Array, index: Array, plan: Suite) -> tuple[Any, Callable[[Any, Array], tuple[Any, Path]]]:
@@ -131,10 +130,10 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         return backend.init(jax.random.key(0), scene), step
 
-    def errors(path: Path, yaw: Array, index: Array, frame: Array, plan: Suite) -> Array:
+    def errors(path: Path, index: Array, frame: Array, plan: Suite) -> Array:
         """Squared errors of a frame, TERMS without the last two."""
         gap = path.position - plan.position[index, frame]
-        turn = yaw - plan.yaw[index, frame]
+        turn = path.yaw - plan.yaw[index, frame]
         spin, steer = path.wheel_spin - plan.wheel_spin[index, frame], path.steer - plan.steer[index, frame]  # of both front wheels
         pace, rate = path.pace - plan.pace[index, frame], path.yaw_rate - plan.yaw_rate[index, frame]
         turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
@@ -149,7 +148,7 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         def step(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
             body, path = driver(row, index, plan)[1](body, frame)
-            now = errors(path, path.yaw, index, frame, plan)
+            now = errors(path, index, frame, plan)
             count = plan.frames[index]
             end = jnp.where(frame == count - 1, 1.0, 0.0)
             share = jnp.where(frame < count, 1.0 / count, 0.0)
@@ -199,7 +198,7 @@ def scorer(replay: Replay, plan: Suite, *, width: int) -> Callable[[np.ndarray, 
     return score
 
 
-def residuals(path: Path, plan: Suite, index: Sequence[int], weights: Float[np.ndarray, "8"]) -> Float[np.ndarray, "*n R"]:
+def residuals(path: Path, plan: Suite, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]) -> Float[np.ndarray, "*n R"]:
     """Of traced manoeuvres [M, T], flat: their squares sum to the loss of `fit.losses`."""
     rows = np.asarray(index)
     count = np.asarray(plan.frames)[rows][:, None]
@@ -223,6 +222,13 @@ def residuals(path: Path, plan: Suite, index: Sequence[int], weights: Float[np.n
         error = error if error.ndim == 3 else error[..., None]
         parts.append((np.sqrt(weight / len(rows)) * np.asarray(share_of, float)[..., None] * error).ravel())
     return np.concatenate(parts)
+
+
+def _ground(car: CarParameters) -> Scene:
+    """A world that holds one car at the origin."""
+    zero = np.zeros((1, 1), np.float32)
+    worlds = engines.scenes(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=(car.length, car.width))
+    return jax.tree.map(lambda leaf: leaf[0], worlds)
 
 
 def _seen(backend: Dynamics, plant: mjx_car.Plant, body: Any) -> Path:

@@ -1,0 +1,195 @@
+"""The search and the refinement on problems whose answer is known, and the car replaying itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import sysid as command
+from scenefactory_jax.run.config import load
+from scenefactory_jax.sysid import fit, measure, space, student
+from scenefactory_jax.sysid.manoeuvres import Manoeuvre, Recording
+from scenefactory_jax.sysid.student import TERMS
+
+WEIGHTS = {name: 1.0 for name in TERMS}
+SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, tell=lambda line: None)
+BOX = space.make({"mass": [0.0, 10.0], "track": {"range": [0.1, 10.0], "scale": "log"}, "wheelbase": [-1.0, 1.0]})
+
+
+# ---- the space
+
+
+def test_values_and_places_are_inverse():
+    values = np.array([[2.5, 1.0, 0.5], [12.0, 20.0, -2.0]])
+    places = space.unit(BOX, values)
+    np.testing.assert_allclose(places[0], [0.25, 0.5, 0.75])
+    assert (places[1, :2] > 1.0).all() and places[1, 2] < 0.0
+    np.testing.assert_allclose(space.values(BOX, places), values)
+
+
+@pytest.mark.parametrize(
+    "entry, message",
+    [
+        ({"mas": [0.0, 1.0]}, r"sysid.space.mas: unknown parameter; valid: length.*friction_gravel"),
+        ({"mass": [1.0, 1.0]}, r"sysid.space.mass: \[1, 1\] is no range"),
+        ({"mass": {"range": [0.0, 1.0], "scale": "log"}}, r"sysid.space.mass: \[0, 1\] is no range"),
+        ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass: .*write \[least, most\]"),
+        ({"mass": [2.0, 1.0]}, r"sysid.space.mass: \[2.0, 1.0\]; wanted is \[least, most\]"),
+    ],
+)
+def test_bad_spaces_are_refused(entry, message):
+    with pytest.raises(ConfigError, match=message):
+        space.make(entry)
+
+
+# ---- the search
+
+
+def bowl(rows, manoeuvres):
+    """Least at mass 7, track 0.5, wheelbase 0.2; wheelbase counts on the second manoeuvre alone."""
+    gap = space.unit(BOX, rows) - space.unit(BOX, np.array([7.0, 0.5, 0.2]))
+    terms = np.zeros((len(rows), 2, len(TERMS)))
+    terms[:, 0, 0], terms[:, 1, 1] = gap[:, 0] ** 2 + gap[:, 1] ** 2, gap[:, 2] ** 2
+    return terms[:, list(manoeuvres)]
+
+
+def searched(stage, manoeuvres, begin=(1.0, 5.0, 0.9), **changes):
+    return fit.search(bowl, BOX, np.array(begin), stage, manoeuvres, seed=1, weights=WEIGHTS, **{**SEARCH, **changes})
+
+
+def test_the_search_finds_the_bottom_of_what_it_tunes_and_leaves_the_rest():
+    found = searched(fit.Stage("all", (), ("mass", "track"), 1.0, 64, 12), [0])
+    np.testing.assert_allclose(found.best[:2], [7.0, 0.5], rtol=0.03)
+    assert found.best[2] == 0.9 and found.loss < 1e-4 < found.start_loss and found.evaluations == 1 + 64 * 12
+    assert (np.diff(found.history[:, 0]) <= 0.0).all() and found.terms.sum() == pytest.approx(found.loss)
+
+
+def test_a_stage_never_ends_worse_than_it_began():
+    found = searched(fit.Stage("few", (), ("mass", "track"), 1.0, 2, 1), [0], begin=(7.0, 0.5, 0.9))
+    assert found.loss == found.start_loss == 0.0
+
+
+def test_a_window_holds_the_search_near_its_start():
+    found = searched(fit.Stage("near", (), ("mass",), 0.1, 64, 8), [0], begin=(1.0, 0.5, 0.2))
+    assert found.best[0] == pytest.approx(1.5)
+
+
+def test_cars_that_do_not_stay_finite_lose():
+    terms = np.zeros((3, 2, len(TERMS)))
+    terms[1, 0, 3], terms[2, 1, 0] = np.nan, 4.0
+    np.testing.assert_array_equal(fit.losses(terms, WEIGHTS), [0.0, np.inf, 2.0])
+    with pytest.raises(ConfigError, match=r"sysid.weights: position; wanted are position, yaw"):
+        fit.losses(terms, {"position": 1.0})
+
+
+def test_least_squares_recover_a_line_and_how_well_it_is_known():
+    """y = a x + b with noise: textbook deviations and correlation; the third parameter does nothing."""
+    rng, x = np.random.default_rng(0), np.linspace(0.0, 1.0, 200)
+    noise = rng.normal(0.0, 0.1, 200)
+
+    def residuals(rows):
+        return (rows[:, :1] - 4.0) * x + (rows[:, 2:] - 0.3) - noise
+
+    box = space.make({"mass": [0.0, 10.0], "track": [0.0, 1.0], "wheelbase": [-1.0, 1.0]})
+    found = fit.refine(residuals, box, np.array([9.0, 0.5, -0.5]), step=1e-3, rounds=20, effective=200)
+    design = np.stack([x, np.ones(200)], axis=1)
+    exact = np.linalg.lstsq(design, 4.0 * x + 0.3 + noise, rcond=None)[0]
+    np.testing.assert_allclose(found.best[[0, 2]], exact, rtol=1e-4)
+    sigma = 0.1 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+    np.testing.assert_allclose(found.deviation[[0, 2]], sigma, rtol=0.15)
+    assert found.correlation[0, 2] == pytest.approx(-0.87, abs=0.03) and not found.at_bound.any()
+    outside = fit.refine(lambda rows: rows - 20.0, box, np.array([9.0, 0.5, 0.5]), step=1e-3, rounds=20, effective=200)
+    assert outside.at_bound.all()
+
+
+# ---- the car
+
+
+def manoeuvre(name, steer, frames=24):
+    controls = np.zeros((frames, 3))
+    controls[:, 0], controls[:, 1] = 0.6, steer
+    controls[frames // 2 :] = [0.0, steer, 0.5]
+    return Manoeuvre(name, "some", 6.0, controls, np.array([1.0]), np.array([0, 1]), np.array([0, 2]))
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load("sysid")
+
+
+@pytest.fixture(scope="module")
+def lesson(config):
+    """What the default car does, as if it had been the teacher; the second manoeuvre is shorter."""
+    where = space.make({"drive_torque": [300.0, 900.0], "friction_wet": [0.01, 1.0]})
+    replay = student.make(config["dynamics"], where, [1.0, 0.7, 0.5], physics_hz=120.0)
+    begin = space.start(where, command.numbers(config["dynamics"]), [1.0, 0.7, 0.5])
+    plans = [manoeuvre("left", 0.3), manoeuvre("straight", 0.0, frames=18)]
+    empty = [Recording(m, *(np.zeros((len(m.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ()))) for m in plans]
+    path = traced(replay, begin, student.suite(empty))
+    own = []
+    for index, plan in enumerate(plans):
+        frames = len(plan.controls)
+        cut = jax.tree.map(lambda leaf, i=index, n=frames: leaf[i, :n], path)
+        flat = np.zeros(frames)
+        own.append(Recording(plan, cut.position, cut.yaw, cut.pace, cut.yaw_rate, cut.wheel_spin, cut.steer.mean(-1), flat, flat))
+    return replay, begin, own
+
+
+def traced(replay, row, plan):
+    index = np.arange(len(plan.frames))
+    rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float), replay.trace(rows, jnp.asarray(index), plan))
+
+
+def test_a_car_that_replays_itself_makes_no_error_and_another_does(lesson, config):
+    replay, begin, own = lesson
+    weights = config["sysid"]["weights"]
+    score = student.scorer(replay, student.suite(own), width=3)
+    rows = np.stack([begin, begin + np.array([100.0, 0.0]), begin + np.array([0.0, -0.65])])
+    losses = fit.losses(score(rows, [0, 1]), weights)
+    assert losses[0] < 1e-6 and (losses[1:] > 1e-3).all()
+    only = fit.losses(score(rows, [1]), weights)
+    assert only[0] < 1e-6 and only[1] > 5e-4, "pairs go to the candidates and manoeuvres that they are of"
+
+
+def test_residuals_square_to_the_loss(lesson, config):
+    replay, begin, own = lesson
+    weights, plan = config["sysid"]["weights"], student.suite(own)
+    row = begin + np.array([80.0, -0.2])
+    path = traced(replay, row, plan)
+    square = (student.residuals(path, plan, [0, 1], fit.weight_row(weights)) ** 2).sum()
+    assert square == pytest.approx(fit.losses(student.scorer(replay, plan, width=3)(row[None], [0, 1]), weights)[0], rel=1e-3)
+
+
+def test_strips_of_road_have_their_own_grip(lesson):
+    """Beyond one metre the left wheels are on the wet, the right ones on gravel: those that grip push first, then brake."""
+    replay, begin, own = lesson
+    plan = student.suite(own)
+    even, split = (traced(replay, np.array([begin[0], wet]), plan).yaw_rate[1] for wet in (0.5, 0.05))
+    assert np.abs(even).max() < 1e-4, "wet is as good as gravel"
+    assert split[8] > 1e-3 and split[17] < split[8] - 1e-3
+
+
+# ---- measures
+
+
+def test_measures_of_a_car_that_is_one_metre_off():
+    frames = 120
+    controls = np.zeros((frames, 3))
+    controls[60:, 2] = 1.0
+    speed = np.concatenate([np.full(60, 6.0), np.maximum(6.0 - 6.0 * np.arange(1, 61) / 60.0, 0.0)])
+    x = np.cumsum(speed) / 60.0
+    zero, turn = np.zeros(frames), 0.1 * np.sin(np.arange(frames))
+    plan = Manoeuvre("stop", "some", 6.0, controls, np.zeros(0), np.array([0]), np.array([0]))
+    teacher = Recording(plan, np.stack([x, zero], 1), zero, speed, turn, np.zeros((frames, 4)), zero, zero, zero)
+    off = student.Path(np.stack([x, zero + 1.0], 1)[None], zero[None], 1.1 * speed[None], 1.1 * turn[None], np.zeros((1, frames, 4)),
+                       np.zeros((1, frames, 2)), np.zeros((1, frames, 4)), np.zeros((1, frames, 4)))  # fmt: skip
+    found = measure.measure(off, [teacher])
+    assert found.end_m[0] == pytest.approx(1.0) and found.way_m[0] == pytest.approx(8.95, abs=0.1)
+    assert found.yaw_rate_nrmse[0] == pytest.approx(0.1 / np.sqrt(2.0), rel=0.02) and found.stop_share[0] == pytest.approx(0.0, abs=0.02)
+    assert np.isnan(measure.stopping_m(np.zeros((frames, 3)), teacher.position, speed))
+    rolls = measure.stopping_m(controls[:90], teacher.position[:90], speed[:90])
+    assert np.isnan(rolls), "still at 3 m/s"
+    ends = measure.stopping_m(controls[:110], teacher.position[:110], speed[:110])
+    assert ends == pytest.approx(measure.stopping_m(controls, teacher.position, speed), rel=0.02)
