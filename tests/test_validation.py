@@ -67,6 +67,18 @@ def test_single_cars_agree(driven, drives):
         assert equivalence.overlap(histogram) > 0.97, name
 
 
+def test_cars_with_rolling_resistance_drag_and_slip_angles_agree(entry):
+    """The three laws that the shipped car has switched off."""
+    law = {**entry, "car": {**entry["car"], "rolling_torque": 30.0, "air_drag": 1.0, "tyre_slip_speed": 4.0, "tyre_slip_damping": 15.0}}
+    some = sequences.draw(5, count=6, **DRIVES)
+    reference = engines.drive_c(law, some, friction_scale=1.0, **TIMING, **ROAD, **CONVERGED)
+    found = equivalence.compare(engines.drive(law, some, **TIMING, **ROAD), reference, **BOUND)
+    assert found.within.all(), sequences.describe(some, int(found.worst[0]))
+    assert np.percentile(found.final["position"], 50) < 2e-3 and found.final["yaw"].max() < 0.02
+    off = engines.drive_c(entry, some, friction_scale=1.0, **TIMING, **ROAD, **CONVERGED)
+    assert np.median(equivalence.compare(off, reference, **BOUND).final["position"]) > 0.1
+
+
 def test_friction_is_what_the_case_says(driven, drives):
     mu = np.asarray(engines.wheel_friction(jnp.asarray(drives.friction), jnp.asarray(drives.pattern), **ROAD))
     assert (drives.pattern > 0).any()

@@ -47,6 +47,7 @@ class CarParameters:
     wheel_mass: float  # of what spins, kg
     wheel_inertia: tuple[float, float] | list[float]  # of what spins, about and across the spin axis, kg m^2
     wheel_damping: float  # rolling drag of a wheel's bearing, N m s/rad
+    rolling_torque: float  # rolling resistance of a wheel, Coulomb: coefficient x load x radius, N m; friction brakes only
     carrier_mass: float  # of what moves with a wheel and does not spin, kg
     carrier_inertia: float  # of the same, about any axis, kg m^2
     knuckle_mass: float  # of a steering knuckle, front only, kg
@@ -70,9 +71,11 @@ class CarParameters:
     body_friction: float  # of the same, Coulomb coefficient
     lateral_damping: float  # force against sideways speed of the chassis, N s/m
     yaw_damping: float  # torque against yaw rate of the chassis, N m s/rad
+    air_drag: float  # force over speed squared against the chassis' way in the plane, 1/2 density x drag area, N s^2/m^2
     tyre_time_constant: float  # of the contact with the ground (MuJoCo solref), s
     tyre_impedance: float  # of that contact (solimp), 0..1: 0.5 lets the tyre sink in 2 cm under its load, 0.95 makes it a rigid wheel
     tyre_slip_damping: float  # how fast friction removes sliding (solreffriction), 1/s: friction saturates at about 1 m/s of slip
+    tyre_slip_speed: float  # above it that falls with 1/speed, so that slip angles count, not velocities (`slip_damping`), m/s
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -122,7 +125,7 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
         wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1]).damping = _linear(car.steering_friction)
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
     spin.damping = _linear(car.wheel_damping)
-    spin.frictionloss = LATENT_FRICTION if brake_rows else 0.0
+    spin.frictionloss = max(car.rolling_torque, LATENT_FRICTION) if brake_rows else 0.0
     spin.solimp_friction = [car.brake_impedance, car.brake_impedance, 1e-3, 0.5, 2.0]
     about, across = car.wheel_inertia
     still = car.carrier_inertia + (car.knuckle_inertia if front else 0.0)
@@ -222,7 +225,7 @@ def add_ground_pairs(model: mujoco.MjSpec, car: CarParameters, *, ground: str, p
         pair.friction = [1.0, 1.0, 0.005, 1e-4, 1e-4]
         pair.solref = [car.tyre_time_constant, 1.0]
         pair.solimp = [car.tyre_impedance, car.tyre_impedance, 1e-3, 0.5, 2.0]
-        pair.solreffriction = [-1e-3, -car.tyre_slip_damping]  # direct form; friction has no position for the first number to act on
+        pair.solreffriction = [-1e-3, -car.tyre_slip_damping]  # direct form, at rest; friction has no position for the first to act on
 
 
 def set_options(model: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> None:

@@ -110,7 +110,7 @@ FORCES = (
     "mass", "inertia", "wheel_mass", "wheel_inertia", "wheel_damping", "carrier_mass", "carrier_inertia", "knuckle_mass", "knuckle_inertia",
     "suspension_stiffness", "suspension_damping", "stop_stiffness", "steering_stiffness", "steering_damping", "steering_torque",
     "steering_friction", "drive_torque", "brake_torque_front", "brake_torque_rear", "body_stiffness", "body_damping", "lateral_damping",
-    "yaw_damping",
+    "yaw_damping", "rolling_torque", "air_drag",
 )  # fmt: skip
 
 
@@ -192,6 +192,7 @@ def fit(model: mjx.Model, at: Places, fleet: Fleet) -> dict[str, Array]:
         .set(jnp.stack([across, about * pair, across], axis=-1)),
         "body_invweight0": model.body_invweight0.at[at.wheel, 0].set(fleet.wheel_weight),
         "dof_invweight0": model.dof_invweight0.at[at.spin_v].set(fleet.spin_weight),
+        "dof_frictionloss": model.dof_frictionloss.at[at.spin_v].set(jnp.maximum(car.rolling_torque, cars.LATENT_FRICTION)),
         "dof_damping": damping.at[at.steer_v].set(car.steering_friction),
         "dof_solimp": model.dof_solimp.at[at.spin_v, :2].set(car.brake_impedance),
         "jnt_stiffness": model.jnt_stiffness.at[at.suspension].set(car.suspension_stiffness),

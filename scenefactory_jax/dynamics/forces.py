@@ -1,4 +1,7 @@
-"""What acts on an articulated car besides gravity and its tyres, as generalised forces: servo, engine, bump stops, dampings, other cars."""
+"""What acts on an articulated car besides gravity and its tyres, as generalised forces: servo, engine, bump stops, dampings, air, other cars.
+
+And how far its tyres yield.
+"""
 
 from typing import NamedTuple
 
@@ -54,7 +57,8 @@ def generalised(
 
     rotation = matrix(qpos[3:7])
     sideways = -car.lateral_damping * (qvel[:3] @ rotation[:, 1]) * rotation[:, 1]
-    force = sideways + jnp.concatenate([command.force, jnp.zeros(1)])
+    air = -car.air_drag * norm(qvel[:2]) * qvel[:2]
+    force = sideways + jnp.concatenate([command.force + air, jnp.zeros(1)])
     # the free joint's torque is about the box's centre and in the body's frame; forces act at the centre of mass below it
     arm = jnp.stack([jnp.asarray(x, jnp.float32) for x in (car.mass_forward, 0.0, car.mass_height)])
     torque = command.torque * rotation[2] + jnp.cross(arm, force @ rotation)
@@ -80,6 +84,19 @@ def scrape(
     share = jnp.minimum(1.0, car.body_friction * push / jnp.maximum(norm(drag), 1.0))
     force = jnp.concatenate([share[:, None] * drag, push[:, None]], axis=1)
     return force.sum(0), jnp.cross(arm, force @ rotation).sum(0)
+
+
+def slip_damping(car: CarParameters, qvel: Float[Array, "16"]) -> Float[Array, ""]:
+    """Damping of the tyres' friction reference at the car's speed, 1/s: `tyre_slip_damping` up to `tyre_slip_speed`, then as 1/speed.
+
+    MuJoCo's friction below the cone obeys R f = b u - a: u the slip velocity, b = damping / impedance, R the contact's regularisation and
+    a the acceleration of the contact row. When braking steadily a is 0; in a steady turn a is the centripetal acceleration f / m, m the mass
+    on the wheel, because the row does not see that the rolling direction turns. So f = b u / R along the wheel, and f = b u / (R + 1/m)
+    across. A tyre's force is a stiffness times slip angle or slip ratio, u / speed (Pacejka, Tyre and Vehicle Dynamics, linear range);
+    b ~ 1/speed makes it so: the cornering stiffness is b speed / (R + 1/m), the same at every speed above `tyre_slip_speed`. Below, slip
+    ratios lose their meaning and the tyre is the damper that it was.
+    """
+    return car.tyre_slip_damping / jnp.maximum(norm(qvel[:2]) / car.tyre_slip_speed, 1.0)
 
 
 def matrix(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -2,8 +2,8 @@
 # (the compiled parts of mujoco carry no types)
 """Articulated cars on MJX: one car is one MJX model, `vmap` runs the cars of a world, `contact` lets them meet.
 
-What changes per car and per step is written into the model inside `advance`: the friction of each tyre's contact pair and the brakes, which
-are friction losses of the wheels' joints. Everything else that acts on a car is a generalised force. Only what the next step needs is
+What changes per car and per step is written into the model inside `advance`: friction and slip damping of each tyre's contact pair, and the
+brakes and the rolling resistance, which are friction losses of the wheels' joints. Everything else that acts on a car is a generalised force. Only what the next step needs is
 carried: positions, velocities and the solver's warm start, not MJX's whole `Data`.
 """
 
@@ -25,7 +25,7 @@ from scenefactory_jax.dynamics import solve
 from scenefactory_jax.dynamics.car import CarParameters, Places, Solver
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.dynamics.fleet import AHEAD, LEFT, Fleet, enlist, fit, standing
-from scenefactory_jax.dynamics.forces import Command, generalised, matrix, wanted
+from scenefactory_jax.dynamics.forces import Command, generalised, matrix, slip_damping, wanted
 from scenefactory_jax.geometry import heading, norm
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
@@ -122,9 +122,14 @@ def compiled(
     """The car as MJX wants it; all cars are this one until `vary` says otherwise.
 
     Raises:
-        ConfigError: a spring too stiff for the time step, or time steps that do not fit.
+        ConfigError: a spring too stiff for the time step, time steps that do not fit, a slip speed that is not above 0, or rolling
+            resistance with latched brakes, which have no dry friction.
     """
     cars.stable_limits(car, physics_dt=physics_dt, where="dynamics.car")
+    if car.tyre_slip_speed <= 0.0:
+        raise ConfigError(f"dynamics.car.tyre_slip_speed: {car.tyre_slip_speed:g} m/s; it must be above 0, 1e3 switches it off")
+    if brakes == "latched" and car.rolling_torque != 0.0:
+        raise ConfigError(f"dynamics.car.rolling_torque: {car.rolling_torque:g} N m; it must be 0 with latched brakes, or dynamics.brakes friction")
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
@@ -229,21 +234,25 @@ def move(plant: Plant, car: CarParameters, fields: dict[str, Array], now: Single
     sign = jnp.where(jnp.abs(spin) > 1e-4, jnp.sign(spin), now.spin_sign)
     turn = command.drive * jnp.array([1.0, 1.0, 0.0, 0.0]) - (command.brake * sign if plant.latched else 0.0)
     applied = generalised(car, plant.places, now.qpos, now.qvel, command, turn)
-    model = plant.model.replace(**fields, pair_friction=plant.model.pair_friction.at[:, :2].set(command.mu[:, None]))
+    model = plant.model.replace(**fields)
+    yields = model.pair_solreffriction.at[:, 1].set(-slip_damping(car, now.qvel))
+    model = model.replace(pair_friction=model.pair_friction.at[:, :2].set(command.mu[:, None]), pair_solreffriction=yields)
+    loss = command.brake + jnp.maximum(car.rolling_torque, cars.LATENT_FRICTION)
     if not plant.latched:
-        loss = model.dof_frictionloss.at[plant.places.spin_v].set(command.brake + cars.LATENT_FRICTION)
-        model = model.replace(dof_frictionloss=loss)
+        model = model.replace(dof_frictionloss=model.dof_frictionloss.at[plant.places.spin_v].set(loss))
     data = plant.data.replace(qpos=now.qpos, qvel=now.qvel, qacc_warmstart=now.qacc_warmstart, qfrc_applied=applied)
     if plant.solver.algorithm == "arrow":
-        data, force = _step(plant, model, data, command)
+        data, force = _step(plant, model, data, command.mu, loss)
     else:
         data = mjx.step(model, data)
         force = data._impl.efc_force[plant.layout.contact]
     return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(plant, data, force, now.qvel, command.mu)
 
 
-def _step(plant: Plant, model: mjx.Model, data: mjx.Data, command: Command) -> tuple[mjx.Data, Float[Array, "4 3"]]:
-    """`mjx.step` with the solver made for this tree; also the forces of the tyres' contacts."""
+def _step(
+    plant: Plant, model: mjx.Model, data: mjx.Data, mu: Float[Array, "4"], loss: Float[Array, "4"]
+) -> tuple[mjx.Data, Float[Array, "4 3"]]:
+    """`mjx.step` with the solver made for this tree; also the forces of the tyres' contacts. `loss` is the wheels' dry friction, N m."""
     for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
         data = stage(model, data)
     rows = data._impl
@@ -253,8 +262,8 @@ def _step(plant: Plant, model: mjx.Model, data: mjx.Data, command: Command) -> t
         rows.efc_J,
         rows.efc_aref,
         rows.efc_D,
-        command.mu,
-        command.brake + cars.LATENT_FRICTION,
+        mu,
+        loss,
         data.qacc_warmstart,
         layout=plant.layout,
         friction_ratio=plant.solver.friction_ratio,

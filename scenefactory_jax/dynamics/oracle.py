@@ -274,24 +274,29 @@ def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "
     loss = rig.model.dof_frictionloss.reshape(-1, 16)
     rig.applied[:, rig.spin[:2]] = (throttle * car.drive_torque)[:, None]
     strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
-    loss[:, rig.spin] = brake[:, None] * strongest + cars.LATENT_FRICTION
+    loss[:, rig.spin] = brake[:, None] * strongest + max(car.rolling_torque, cars.LATENT_FRICTION)
     return car.steering_limit * steer
 
 
 def _push(rig: Rig, wanted: Float[np.ndarray, " N"]) -> None:
-    """What changes with every physics step: servo, bump stops and dampings."""
+    """What changes with every physics step: servo, bump stops, dampings, air drag, and how far the tyres yield."""
     car, qpos, qvel = rig.car, rig.qpos, rig.qvel
     travel = qpos[:, rig.suspension_q]
     within = np.minimum(np.maximum(travel, -car.suspension_travel), car.suspension_travel)
     rig.applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
     torque = car.steering_stiffness * (wanted[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
     rig.applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)
+    speed = np.hypot(qvel[:, 0], qvel[:, 1])
+    slip_damping = car.tyre_slip_damping * car.tyre_slip_speed / np.maximum(speed, car.tyre_slip_speed)
+    rig.model.pair_solreffriction[rig.pairs, 1] = -slip_damping[:, None]
     turn = np.empty(9)
     for slot, wrench in enumerate(rig.wrenches):
         mujoco.mju_quat2Mat(turn, qpos[slot, 3:7])
+        wrench[:3] = 0.0
         if car.lateral_damping:
             left = turn[1::3]
             wrench[:3] = -car.lateral_damping * (qvel[slot, :3] @ left) * left
+        wrench[:2] -= car.air_drag * speed[slot] * qvel[slot, :2]
         wrench[3:] = (-car.yaw_damping * qvel[slot, 5]) * turn[2::3]
 
 

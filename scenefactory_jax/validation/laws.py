@@ -139,12 +139,14 @@ def grip_limit_m(speed: float, friction: Any) -> Any:
 def brake_limit_m(car: CarParameters, speed: float) -> float:
     """The way to a halt if all wheels roll and the brakes give all they have.
 
-    v dv/dx = -(a + c v), with a from the brakes' torques, c from the bearings, and the wheels' inertia in the mass.
+    v dv/dx = -(a + c v + k v^2), with a from the torques of brakes and rolling resistance, c from the bearings, k from the air, and the
+    wheels' inertia in the mass.
     """
     inertia = mass(car) + 4.0 * car.wheel_inertia[0] / car.wheel_radius**2
-    a = 2.0 * (car.brake_torque_front + car.brake_torque_rear) / car.wheel_radius / inertia
+    a = (2.0 * (car.brake_torque_front + car.brake_torque_rear) + 4.0 * car.rolling_torque) / car.wheel_radius / inertia
     c = 4.0 * car.wheel_damping / car.wheel_radius**2 / inertia
-    return float(speed / c - a / c**2 * np.log1p(c * speed / a)) if c > 0.0 else speed**2 / (2.0 * a)
+    v = np.linspace(0.0, speed, 1001)
+    return float(np.trapezoid(v / (a + c * v + car.air_drag / inertia * v**2), v))
 
 
 def mass(car: CarParameters) -> float:
