@@ -44,7 +44,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     out, settings = Path(config["out"]), config["sysid"]
     (out / "stages").mkdir(parents=True, exist_ok=True)
     known = recorded(config, out)
-    lessons = known["training"][:: settings["every"]]
+    lessons = [*known["training"], *known["extra"]][:: settings["every"]]
     where = space.make(settings["space"])
     replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=config["physics_hz"])
     plan = student.suite(lessons)
@@ -94,9 +94,9 @@ def published(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
-    """What the teacher did on the manoeuvres of the fit and on those kept out of it: from files that fit these settings, or driven now."""
+    """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files that fit these settings, or driven now."""
     instructor = build(config["teacher"], builtins=multibody, where="teacher")(numbers(config["dynamics"]))
-    suites = {"training": manoeuvres.training, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
+    suites = {"training": manoeuvres.training, "extra": manoeuvres.extra, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
     found = {}
     with contextlib.ExitStack() as stack:
         for name, suite in suites.items():

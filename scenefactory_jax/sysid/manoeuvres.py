@@ -17,8 +17,9 @@ TRAINING = (
     "straight_accel", "straight_brake", "ramp_throttle", "step_steer", "const_steer", "trail_brake", "sine_steer", "chirp_steer",
     "surface_transition",
 )  # fmt: skip
+LIMIT = ("limit",)
 HELDOUT = ("steady_circle", "iso_step_steer", "brake_in_turn", "sine_with_dwell", "straight_stop", "split_stop", "lane_change")
-FAMILIES = TRAINING + HELDOUT
+FAMILIES = TRAINING + LIMIT + HELDOUT
 RATE_HZ = 60.0  # of commands and records
 SIDES = (("left", 1.0), ("right", -1.0))
 Segment = tuple[float | int, ...]  # s, throttle, steer, brake
@@ -57,6 +58,11 @@ def training(entries: Mapping[str, Mapping[str, Any]]) -> list[Manoeuvre]:
         ConfigError: an entry that cannot be built, or two manoeuvres of one name.
     """
     return suite(entries, builtins=__name__, where="sysid.manoeuvres.training")
+
+
+def extra(entries: Mapping[str, Mapping[str, Any]]) -> list[Manoeuvre]:
+    """Those that are fitted beside the published ones, from the entries under `extra`."""
+    return suite(entries, builtins=__name__, where="sysid.manoeuvres.extra")
 
 
 def suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str, **context: Any) -> list[Manoeuvre]:
@@ -241,6 +247,20 @@ def chirp_steer(
         return on_one_surface(f"chirp_steer_{throttle:g}", "chirp_steer", legs)
 
     return [one(throttle) for throttle in throttles]
+
+
+def limit(
+    *, speeds: list[float], surfaces: list[str], straight_s: float, ramp_s: float, level_s: float, hold_s: float, stop_s: float
+) -> list[Manoeuvre]:  # fmt: skip
+    """Ours: steering that grows to full lock at speed, then full brakes: what the published suite, which hardly passes 8 m/s, does not say of
+    the tyres' grip on every surface."""
+
+    def one(speed: float, surface: str, side: str, sign: float) -> Manoeuvre:
+        ramp = [(level_s, 0, sign * steer, 0) for steer in np.linspace(0.0, 1.0, round(ramp_s / level_s))]
+        legs = [(straight_s, 0, 0, 0), *ramp, (hold_s, 0, sign, 0), (stop_s, 0, 0, 1.0)]
+        return on_one_surface(f"limit_{speed:g}_{surface}_{side}", "limit", legs, speed=speed, surface=surface_id(surface))
+
+    return [one(speed, surface, *side) for speed in speeds for surface in surfaces for side in SIDES]
 
 
 def surface_transition(*, segments: list[list[float]], edges: list[float], surfaces: list[str]) -> list[Manoeuvre]:
