@@ -160,7 +160,7 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "strong": settings["strong"],
         "locked_c_m": _locked_in_c(config, spread),
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
-        "backends": {name: _obeys(settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
+        "backends": {name: _obeys(name, settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
         "patches": on_patches(config["dynamics"], config["weather"]["grip"]),
     }
 
@@ -174,17 +174,21 @@ def whole_episodes(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     return {"seconds": own["seconds"], "rows": [row._asdict() for row in rows]}
 
 
-def _obeys(settings: Mapping[str, Any], entry: Mapping[str, Any], rates: Mapping[str, float], *, wheelbase: float) -> dict[str, Any]:
-    """All experiments that make sense for one backend."""
+def _obeys(
+    name: str, settings: Mapping[str, Any], entry: Mapping[str, Any], rates: Mapping[str, float], *, wheelbase: float
+) -> dict[str, Any]:  # fmt: skip
+    """All experiments that make sense for one backend; those with locked wheels need a compilation of their own."""
     look = {**rates, "slippery": settings["slippery"], "width": settings["width"]}
     context = {"control_hz": rates["control_hz"], "wheelbase": wheelbase}
-    experiment = lambda name: bound(settings[name], laws, name, f"validation.laws.{name}", **context)  # noqa: E731
+    experiment = lambda law: bound(settings[law], laws, law, f"validation.laws.{law}", **context)  # noqa: E731
     drive = laws.driver(entry, **look)
-    found: dict[str, Any] = {name: experiment(name)(drive) for name in ("stopping", "standing", "cornering")}
+    found: dict[str, Any] = {law: experiment(law)(drive) for law in ("stopping", "standing", "cornering")}
     if "car" not in entry:
         return found
     car, _ = engines.numbers(entry)
     found |= {"split": experiment("split")(drive), "ride": experiment("ride")(drive, car), "rolling": experiment("rolling")(drive, entry)}
+    if name not in settings["locked"]:
+        return found
     return found | {"locked": experiment("stopping")(laws.driver(_locking(settings, entry), **look))}
 
 
