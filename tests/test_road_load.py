@@ -135,15 +135,16 @@ def test_gradients_are_finite_at_rest():
         qpos = jnp.zeros(17).at[3].set(1.0)
         return forces.generalised(law, at, qpos, qvel, command, jnp.zeros(4)).sum() + forces.slip_damping(law, qvel)
 
+    slope = jax.jit(jax.grad(load))
     for speed in (0.0, 3.0, 10.0):
-        assert np.isfinite(jax.grad(load)(jnp.zeros(16).at[0].set(speed))).all()
+        assert np.isfinite(slope(jnp.zeros(16).at[0].set(speed))).all()
 
 
 def test_each_car_has_its_own_and_drives_as_in_the_c_engine():
     rng = np.random.default_rng(2)
     several = []
     for _ in range(8):
-        rolls, drags, yields = rng.uniform(10, 60), rng.uniform(0.3, 2.0), np.exp(rng.uniform(0.0, np.log(30.0)))
+        rolls, drags, yields = rng.uniform(10, 60), rng.uniform(0.3, 2.0), rng.uniform(1.0, 4.0)
         own = dict(rolling_torque=rolls, air_drag=drags, tyre_slip_speed=yields, tyre_slip_damping=rng.uniform(4, 20))
         several.append(dataclasses.replace(CAR, **{name: float(number) for name, number in own.items()}))
     speed, action = np.linspace(16, 4, 8), random_controls(11, 3, 15)
@@ -154,7 +155,7 @@ def test_each_car_has_its_own_and_drives_as_in_the_c_engine():
         case = {"mu": np.full(4, float(MU[i])), "speed": float(speed[i]), **converged}
         truth = oracle.simulate(car, newton, action[:, i], **case)
         apart = (body.qpos[:, i] - truth.qpos)[:, :2] - [0.0, LANES[i]]
-        assert np.linalg.norm(apart, axis=1).max() < 0.1, i
+        assert np.linalg.norm(apart, axis=1).max() < 0.01, i
         for name in ON:  # each of them matters, so each would be missed
             other = dataclasses.replace(car, **{name: getattr(CAR, name)})
             without = oracle.simulate(other, newton, action[:, i], **case)

@@ -1,6 +1,6 @@
-"""What acts on an articulated car besides gravity and its tyres, as generalised forces: servo, engine, bump stops, dampings, air, other cars.
+"""What acts on an articulated car besides gravity and its tyres, as generalised forces: servo, engine, bump stops, dampings, air, others.
 
-And how far its tyres yield.
+And how much its tyres yield.
 """
 
 from typing import NamedTuple
@@ -90,11 +90,11 @@ def slip_damping(car: CarParameters, qvel: Float[Array, "16"]) -> Float[Array, "
     """Damping of the tyres' friction reference at the car's speed, 1/s: `tyre_slip_damping` up to `tyre_slip_speed`, then as 1/speed.
 
     MuJoCo's friction below the cone obeys R f = b u - a: u the slip velocity, b = damping / impedance, R the contact's regularisation and
-    a the acceleration of the contact row. When braking steadily a is 0; in a steady turn a is the centripetal acceleration f / m, m the mass
-    on the wheel, because the row does not see that the rolling direction turns. So f = b u / R along the wheel, and f = b u / (R + 1/m)
-    across. A tyre's force is a stiffness times slip angle or slip ratio, u / speed (Pacejka, Tyre and Vehicle Dynamics, linear range);
+    a the acceleration of its row, J qacc. Under steady braking a is 0. In a steady turn it is the centripetal acceleration f / m, m the
+    mass on the wheel: the row does not see that the rolling direction turns. So f = b u / R along the wheel and f = b u / (R + 1/m) across.
+    A tyre's force is a stiffness times slip angle or slip ratio, which are u / speed (Pacejka, Tyre and Vehicle Dynamics, linear range).
     b ~ 1/speed makes it so: the cornering stiffness is b speed / (R + 1/m), the same at every speed above `tyre_slip_speed`. Below, slip
-    ratios lose their meaning and the tyre is the damper that it was.
+    ratios lose their meaning and the tyre is a damper.
     """
     return car.tyre_slip_damping / jnp.maximum(norm(qvel[:2]) / car.tyre_slip_speed, 1.0)
 

@@ -2,9 +2,9 @@
 # (the compiled parts of mujoco carry no types)
 """Articulated cars on MJX: one car is one MJX model, `vmap` runs the cars of a world, `contact` lets them meet.
 
-What changes per car and per step is written into the model inside `advance`: friction and slip damping of each tyre's contact pair, and the
-brakes and the rolling resistance, which are friction losses of the wheels' joints. Everything else that acts on a car is a generalised force. Only what the next step needs is
-carried: positions, velocities and the solver's warm start, not MJX's whole `Data`.
+What changes per car and per step is written into the model inside `advance`: friction and slip damping of each tyre's contact pair, and
+the brakes and the rolling resistance, which are friction losses of the wheels' joints. Everything else that acts on a car is a generalised
+force. Only what the next step needs is carried: positions, velocities and the solver's warm start, not MJX's whole `Data`.
 """
 
 import functools
@@ -129,7 +129,8 @@ def compiled(
     if car.tyre_slip_speed <= 0.0:
         raise ConfigError(f"dynamics.car.tyre_slip_speed: {car.tyre_slip_speed:g} m/s; it must be above 0, 1e3 switches it off")
     if brakes == "latched" and car.rolling_torque != 0.0:
-        raise ConfigError(f"dynamics.car.rolling_torque: {car.rolling_torque:g} N m; it must be 0 with latched brakes, or dynamics.brakes friction")
+        torque = f"dynamics.car.rolling_torque: {car.rolling_torque:g} N m"
+        raise ConfigError(f"{torque}; it must be 0 with latched brakes, or dynamics.brakes must be friction")
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
