@@ -94,7 +94,7 @@ def published(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
-    """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files that fit these settings, or driven now."""
+    """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files of these settings, or now."""
     instructor = build(config["teacher"], builtins=multibody, where="teacher")(numbers(config["dynamics"]))
     suites = {"training": manoeuvres.training, "extra": manoeuvres.extra, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
     found = {}

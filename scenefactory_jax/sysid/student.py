@@ -4,6 +4,7 @@ A pair (parameters, manoeuvre) is one world with one car. Errors are squared and
 what happened.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -130,47 +131,51 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         return backend.init(jax.random.key(0), scene), step
 
-    def errors(path: Path, index: Array, frame: Array, plan: Suite) -> Array:
-        """Squared errors of a frame, TERMS without the last two."""
-        gap = path.position - plan.position[index, frame]
-        turn = path.yaw - plan.yaw[index, frame]
-        spin, steer = path.wheel_spin - plan.wheel_spin[index, frame], path.steer - plan.steer[index, frame]  # of both front wheels
-        pace, rate = path.pace - plan.pace[index, frame], path.yaw_rate - plan.yaw_rate[index, frame]
-        turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
-        return jnp.stack([(gap**2).sum(), turn**2, pace**2, rate**2, (spin**2).mean(), (steer**2).mean()])
+    return Replay(jax.jit(functools.partial(_terms, driver)), jax.jit(functools.partial(_trace, driver)))
 
-    @jax.jit
-    def terms(rows: Array, index: Array, plan: Suite, frames: Array) -> Array:
-        """Up to `frames`, the longest of these manoeuvres."""
 
-        def begin(row: Array, index: Array) -> Any:
-            return driver(row, index, plan)[0]
+Driver = Callable[[Array, Array, Suite], tuple[Any, Callable[[Any, Array], tuple[Any, Path]]]]  # -> (body at the start, step)
 
-        def step(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
-            body, path = driver(row, index, plan)[1](body, frame)
-            now = errors(path, index, frame, plan)
-            count = plan.frames[index]
-            end = jnp.where(frame == count - 1, 1.0, 0.0)
-            share = jnp.where(frame < count, 1.0 / count, 0.0)
-            total = total + jnp.where(frame < count, jnp.concatenate([share * now, end * now[jnp.array([0, 2])]]), 0.0)
-            return body, total
 
-        def once(frame: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
-            body, total = carry
-            return jax.vmap(step, in_axes=(0, 0, 0, 0, None))(rows, index, body, total, frame)
+def _terms(driver: Driver, rows: Array, index: Array, plan: Suite, frames: Array) -> Array:
+    """Squared errors of all pairs, up to `frames`, the longest of their manoeuvres."""
 
-        bodies = jax.vmap(begin)(rows, index)
-        return jax.lax.fori_loop(0, frames, once, (bodies, jnp.zeros((len(rows), len(TERMS)), jnp.float32)))[1]
+    def begin(row: Array, index: Array) -> Any:
+        return driver(row, index, plan)[0]
 
-    @jax.jit
-    def trace(rows: Array, index: Array, plan: Suite) -> Path:
-        def one(row: Array, index: Array) -> Path:
-            body, step = driver(row, index, plan)
-            return jax.lax.scan(step, body, jnp.arange(plan.yaw.shape[1]))[1]
+    def step(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
+        body, path = driver(row, index, plan)[1](body, frame)
+        now, count = _errors(path, index, frame, plan), plan.frames[index]
+        end, share = jnp.where(frame == count - 1, 1.0, 0.0), 1.0 / count
+        now = jnp.concatenate([share * now, end * now[jnp.array([0, 2])]])
+        return body, total + jnp.where(frame < count, now, 0.0)
 
-        return jax.vmap(one)(rows, index)
+    def once(frame: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
+        body, total = carry
+        return jax.vmap(step, in_axes=(0, 0, 0, 0, None))(rows, index, body, total, frame)
 
-    return Replay(terms, trace)
+    bodies = jax.vmap(begin)(rows, index)
+    return jax.lax.fori_loop(0, frames, once, (bodies, jnp.zeros((len(rows), len(TERMS)), jnp.float32)))[1]
+
+
+def _trace(driver: Driver, rows: Array, index: Array, plan: Suite) -> Path:
+    """What all pairs do in every frame."""
+
+    def one(row: Array, index: Array) -> Path:
+        body, step = driver(row, index, plan)
+        return jax.lax.scan(step, body, jnp.arange(plan.yaw.shape[1]))[1]
+
+    return jax.vmap(one)(rows, index)
+
+
+def _errors(path: Path, index: Array, frame: Array, plan: Suite) -> Array:
+    """Squared errors of a frame, TERMS without the last two."""
+    gap = path.position - plan.position[index, frame]
+    turn = path.yaw - plan.yaw[index, frame]
+    spin, steer = path.wheel_spin - plan.wheel_spin[index, frame], path.steer - plan.steer[index, frame]  # of both front wheels
+    pace, rate = path.pace - plan.pace[index, frame], path.yaw_rate - plan.yaw_rate[index, frame]
+    turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+    return jnp.stack([(gap**2).sum(), turn**2, pace**2, rate**2, (spin**2).mean(), (steer**2).mean()])
 
 
 def scorer(replay: Replay, plan: Suite, *, width: int) -> Callable[[np.ndarray, Sequence[int]], Float[np.ndarray, "N M 8"]]:
