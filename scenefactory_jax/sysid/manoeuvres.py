@@ -252,7 +252,7 @@ def chirp_steer(
 def limit(
     *, speeds: list[float], surfaces: list[str], straight_s: float, ramp_s: float, level_s: float, hold_s: float, stop_s: float
 ) -> list[Manoeuvre]:  # fmt: skip
-    """Ours: steering that grows to full lock at speed, then full brakes: what the published suite, which hardly passes 8 m/s, leaves open of
+    """Ours: steering that grows to full lock at speed, then full brakes: what the published suite, which hardly passes 8 m/s, says not of
     the tyres' grip on every surface."""
 
     def one(speed: float, surface: str, side: str, sign: float) -> Manoeuvre:
