@@ -92,14 +92,14 @@ def test_least_squares_recover_a_line_and_how_well_it_is_known():
         return (rows[:, :1] - 4.0) * x + (rows[:, 2:] - 0.3) - noise
 
     box = space.make({"mass": [0.0, 10.0], "track": [0.0, 1.0], "wheelbase": [-1.0, 1.0]})
-    found = fit.refine(residuals, box, np.array([9.0, 0.5, -0.5]), step=1e-3, rounds=20, effective=200)
+    found = fit.refine(residuals, box, np.array([9.0, 0.5, -0.5]), step=1e-3, rounds=20, effective=200, clock=lambda: 0.0)
     design = np.stack([x, np.ones(200)], axis=1)
     exact = np.linalg.lstsq(design, 4.0 * x + 0.3 + noise, rcond=None)[0]
     np.testing.assert_allclose(found.best[[0, 2]], exact, rtol=1e-4)
     sigma = 0.1 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
     np.testing.assert_allclose(found.deviation[[0, 2]], sigma, rtol=0.15)
     assert found.correlation[0, 2] == pytest.approx(-0.87, abs=0.03) and not found.at_bound.any()
-    outside = fit.refine(lambda rows: rows - 20.0, box, np.array([9.0, 0.5, 0.5]), step=1e-3, rounds=20, effective=200)
+    outside = fit.refine(lambda rows: rows - 20.0, box, np.array([9.0, 0.5, 0.5]), step=1e-3, rounds=20, effective=200, clock=lambda: 0.0)
     assert outside.at_bound.all()
 
 

@@ -20,6 +20,8 @@ import numpy as np
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.report import sysid as report
+from scenefactory_jax.report import verdicts
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, sources
 from scenefactory_jax.sysid import fit, heldout, manoeuvres, measure, multibody, space, student, teacher
@@ -53,7 +55,8 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     outcomes = stages(config, out, lessons, where, score, begin)
     refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
     places, along = fit.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
-    rows = {"fitted": refined.best, "default": begin}
+    cars = {"fitted": (replay, where, refined.best), "default": (replay, where, begin), "published": published(config)}
+    judged = {name: judge(known, *car, weights=settings["weights"], samples=settings["samples"]) for name, car in cars.items()}
     result = {
         "command": configs.command("sysid"),
         "versions": configs.versions(),
@@ -63,34 +66,70 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
         "stages": outcomes,
         "refined": refined,
         "slices": {"place": places, "loss": along},
-        "cars": {name: judged(config, known, where, replay, row) for name, row in rows.items()} | {"published": published(config, known)},
+        "seconds": sum(outcome.seconds for outcome in outcomes) + refined.seconds,
+        "cars": {name: suites for name, (suites, _) in judged.items()},
+        "samples": shown(known, settings["samples"], {name: traces for name, (_, traces) in judged.items()}),
     }
     _write(out / "result.json", result)
+    result = json.loads((out / "result.json").read_text())
+    found = report.verdicts(result, settings["targets"])
+    print(f"{report.write(out, result, settings['targets'])}\n{verdicts.text(found)}", flush=True)
     return result
 
 
-def judged(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]], where: Space, replay: Replay, row: np.ndarray) -> Any:
-    """How one car drives the manoeuvres of the fit and those kept out of it: a row a manoeuvre."""
-    weights, found = fit.weight_row(config["sysid"]["weights"]), {}
+def judge(
+    known: Mapping[str, Sequence[Recording]],
+    replay: Replay,
+    where: Space,
+    row: np.ndarray,
+    *,
+    weights: Mapping[str, float],
+    samples: Sequence[str],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """How one car drives the manoeuvres of the fit and those kept out of it: measures of every manoeuvre, and traces of the samples."""
+    del where
+    found, traces = {}, {}
     for name, recordings in known.items():
         plan, index = student.suite(recordings), np.arange(len(recordings))
         rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
         path = jax.tree.map(np.asarray, replay.trace(rows, jnp.asarray(index), plan))
-        squares = [student.residuals(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], path), plan, index[i : i + 1], weights) for i in index]
+        one = lambda i, path=path: jax.tree.map(lambda leaf: leaf[i : i + 1], path)  # noqa: E731
+        squares = [student.residuals(one(i), plan, index[i : i + 1], fit.weight_row(weights)) for i in index]
         found[name] = {
             "name": [recording.manoeuvre.name for recording in recordings],
             "family": [recording.manoeuvre.family for recording in recordings],
             "loss": [float((square**2).sum()) for square in squares],
             **measure.measure(path, recordings)._asdict(),
         }
-    return found
+        named = [(i, name) for i, name in enumerate(found[name]["name"]) if name in samples]
+        traces |= {name: jax.tree.map(lambda leaf, i=i: leaf[i], path) for i, name in named}
+    return found, traces
 
 
-def published(config: Mapping[str, Any], known: Mapping[str, Sequence[Recording]]) -> Any:
+def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], traces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The samples of the report, ten times a second: sample -> teacher and cars -> time, position, speed, yaw rate."""
+    stride = round(manoeuvres.RATE_HZ / 10.0)
+    taught = {recording.manoeuvre.name: recording for recordings in known.values() for recording in recordings}
+
+    def every(position: Any, speed: Any, yaw_rate: Any, frames: int) -> dict[str, Any]:
+        time_s = np.arange(1, frames + 1) / manoeuvres.RATE_HZ
+        columns = {"time_s": time_s, "position": position, "speed": speed, "yaw_rate": yaw_rate}
+        return {name: np.round(np.asarray(column, float)[:frames:stride], 4) for name, column in columns.items()}
+
+    def sample(name: str) -> dict[str, Any]:
+        teacher = taught[name]
+        frames = len(teacher.yaw)
+        cars = {car: every(own[name].position, own[name].pace, own[name].yaw_rate, frames) for car, own in traces.items()}
+        return {"teacher": every(teacher.position, teacher.speed, teacher.yaw_rate, frames), **cars}
+
+    return {name: sample(name) for name in samples if name in taught}
+
+
+def published(config: Mapping[str, Any]) -> tuple[Replay, Space, np.ndarray]:
     """The published car, with its own friction of the surfaces and nothing left open."""
     nothing = space.make({})
     replay = student.make(config["others"]["published"], nothing, config["sysid"]["published_friction"], physics_hz=config["physics_hz"])
-    return judged(config, known, nothing, replay, np.zeros(0))
+    return replay, nothing, np.zeros(0)
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
@@ -188,7 +227,7 @@ def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Repla
             pieces = [np.resize(rows[i : i + together], (together, rows.shape[1])) for i in range(0, len(rows), together)]
             return np.stack([row for some in pieces for row in piece(some)][: len(rows)])
 
-        found = fit.refine(residuals, where, begin, **settings["refine"])
+        found = fit.refine(residuals, where, begin, **settings["refine"], clock=time.perf_counter)
         _write(path, {"made": made, **found._asdict()})
     print(f"least squares: {found.start_loss:.4f} -> {found.loss:.4f}, {found.evaluations} candidates", flush=True)
     return found
@@ -223,11 +262,13 @@ def _kept(path: Path, made: str, kind: type) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Arrays and tuples as lists, for JSON."""
+    """Arrays and tuples as lists, what is not a number as null, for JSON."""
     if isinstance(value, Mapping):
         return {str(key): plain(one) for key, one in value.items()}
     if hasattr(value, "_asdict"):
         return plain(value._asdict())
     if isinstance(value, (list, tuple)):
         return [plain(one) for one in value]
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value

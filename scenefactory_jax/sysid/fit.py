@@ -134,6 +134,7 @@ class Refined(NamedTuple):
     deviation: Float[np.ndarray, " P"]  # standard deviation of each parameter, in its own unit; see `refine`
     correlation: Float[np.ndarray, "P P"]
     at_bound: Bool[np.ndarray, " P"]
+    seconds: float
 
 
 def refine(
@@ -144,6 +145,7 @@ def refine(
     step: float,
     rounds: int,
     effective: int,
+    clock: Callable[[], float],
 ) -> Refined:
     """Least squares within the ranges (scipy's dogleg in a box), Jacobian by central differences, all in one batch.
 
@@ -155,7 +157,7 @@ def refine(
         step: of the differences, as a share of a range.
         rounds: most function evaluations.
     """
-    count, last = [0], {}
+    begun, count = clock(), [0]
 
     def at(place: np.ndarray) -> np.ndarray:
         count[0] += 1
@@ -166,8 +168,7 @@ def refine(
         found = residuals(values(space, np.concatenate([up, down])))
         count[0] += len(found)
         half = len(place)
-        last["jacobian"] = ((found[:half] - found[half:]) / np.diag(up - down)[:, None]).T
-        return last["jacobian"]
+        return ((found[:half] - found[half:]) / np.diag(up - down)[:, None]).T
 
     place = np.clip(unit(space, begin), 1e-4, 1.0 - 1e-4)
     start_loss = float((at(place) ** 2).sum())
@@ -186,6 +187,7 @@ def refine(
         deviation=(ends[1] - ends[0]) / 2.0,
         correlation=inverse / scale[:, None] / scale[None],
         at_bound=(found.x < 0.01) | (found.x > 0.99),
+        seconds=clock() - begun,
     )
 
 
