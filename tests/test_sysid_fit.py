@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import sysid as command
 from scenefactory_jax.run.config import load
 from scenefactory_jax.sysid import fit, measure, space, student
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, Recording
@@ -14,7 +13,19 @@ from scenefactory_jax.sysid.student import TERMS
 
 WEIGHTS = {name: 1.0 for name in TERMS}
 SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, tell=lambda line: None)
-BOX = space.make({"mass": [0.0, 10.0], "track": {"range": [0.1, 10.0], "scale": "log"}, "wheelbase": [-1.0, 1.0]})
+
+
+def between(least, most, *, start, scale="linear"):
+    return {"range": [least, most], "scale": scale, "start": start}
+
+
+BOX = space.make(
+    {
+        "mass": between(0.0, 10.0, start=1.0),
+        "track": between(0.1, 10.0, start=5.0, scale="log"),
+        "wheelbase": between(-1.0, 1.0, start=0.9),
+    }
+)
 
 
 # ---- the space
@@ -31,11 +42,13 @@ def test_values_and_places_are_inverse():
 @pytest.mark.parametrize(
     "entry, message",
     [
-        ({"mas": [0.0, 1.0]}, r"sysid.space.mas: unknown parameter; valid: length.*friction_gravel"),
-        ({"mass": [1.0, 1.0]}, r"sysid.space.mass: \[1, 1\] is no range"),
-        ({"mass": {"range": [0.0, 1.0], "scale": "log"}}, r"sysid.space.mass: \[0, 1\] is no range"),
-        ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass: .*write \[least, most\]"),
-        ({"mass": [2.0, 1.0]}, r"sysid.space.mass: \[2.0, 1.0\]; wanted is \[least, most\]"),
+        ({"mas": between(0.0, 1.0, start=0.5)}, r"sysid.space.mas: unknown parameter; valid: length.*friction_gravel"),
+        ({"mass": between(1.0, 1.0, start=1.0)}, r"sysid.space.mass: \[1, 1\] is no range"),
+        ({"mass": between(0.0, 1.0, start=0.5, scale="log")}, r"sysid.space.mass: \[0, 1\] is no range"),
+        ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass: .*write {range: \[least, most\]"),
+        ({"mass": [0.5, 1.0]}, r"sysid.space.mass: .*write {range: \[least, most\]"),
+        ({"mass": between(2.0, 1.0, start=1.5)}, r"sysid.space.mass: \[2.0, 1.0\]; wanted is \[least, most\]"),
+        ({"mass": between(0.5, 1.0, start=2.0)}, r"sysid.space.mass.start: 2.0; it must be in \[0.5, 1\]"),
     ],
 )
 def test_bad_spaces_are_refused(entry, message):
@@ -54,7 +67,7 @@ def bowl(rows, manoeuvres):
     return terms[:, list(manoeuvres)]
 
 
-def searched(stage, manoeuvres, begin=(1.0, 5.0, 0.9), **changes):
+def searched(stage, manoeuvres, begin=BOX.start, **changes):
     return fit.search(bowl, BOX, np.array(begin), stage, manoeuvres, seed=1, weights=WEIGHTS, **{**SEARCH, **changes})
 
 
@@ -91,8 +104,9 @@ def test_least_squares_recover_a_line_and_how_well_it_is_known():
     def residuals(rows):
         return (rows[:, :1] - 4.0) * x + (rows[:, 2:] - 0.3) - noise
 
-    box = space.make({"mass": [0.0, 10.0], "track": [0.0, 1.0], "wheelbase": [-1.0, 1.0]})
-    found = fit.refine(residuals, box, np.array([9.0, 0.5, -0.5]), step=1e-3, rounds=20, effective=200, clock=lambda: 0.0)
+    ranges = {"mass": between(0.0, 10.0, start=9.0), "track": between(0.0, 1.0, start=0.5), "wheelbase": between(-1.0, 1.0, start=-0.5)}
+    box = space.make(ranges)
+    found = fit.refine(residuals, box, box.start, step=1e-3, rounds=20, effective=200, clock=lambda: 0.0)
     design = np.stack([x, np.ones(200)], axis=1)
     exact = np.linalg.lstsq(design, 4.0 * x + 0.3 + noise, rcond=None)[0]
     np.testing.assert_allclose(found.best[[0, 2]], exact, rtol=1e-4)
@@ -121,9 +135,9 @@ def config():
 @pytest.fixture(scope="module")
 def lesson(config):
     """What the default car does, as if it had been the teacher; the second manoeuvre is shorter."""
-    where = space.make({"drive_torque": [300.0, 900.0], "friction_wet": [0.01, 1.0]})
+    where = space.make({"drive_torque": between(300.0, 900.0, start=567.4), "friction_wet": between(0.01, 1.0, start=0.7)})
     replay = student.make(config["dynamics"], where, [1.0, 0.7, 0.5], physics_hz=120.0)
-    begin = space.start(where, command.numbers(config["dynamics"]), [1.0, 0.7, 0.5])
+    begin = where.start
     plans = [manoeuvre("left", 0.3), manoeuvre("straight", 0.0, frames=18)]
     empty = [Recording(m, *(np.zeros((len(m.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ()))) for m in plans]
     path = traced(replay, begin, student.suite(empty))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.report import validation as report
 from scenefactory_jax.report import verdicts
 from scenefactory_jax.run import config as configs
@@ -34,7 +35,7 @@ def entry():
 
 @pytest.fixture(scope="module")
 def car(entry):
-    return engines.numbers(entry)[0]
+    return cars.numbers(entry)[0]
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,7 @@ def test_the_car_rides_on_its_springs(drive, car):
 def test_the_published_car_rides_on_its_stops():
     published = entry_of("mjx_published")
     hard = laws.driver(published, slippery=1.0, width=4, **RATES)
-    lying = laws.ride(hard, engines.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
+    lying = laws.ride(hard, cars.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
     assert 0.03 < lying["on_springs"] < 0.06 and lying["travel_m"].min() > lying["room_m"]
     assert lying["load_sum"] == pytest.approx(1.0, abs=5e-3)
 

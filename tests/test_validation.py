@@ -139,7 +139,7 @@ def test_a_contact_of_another_stiffness_shows(entry, met, meetings):
 
 
 def head_on(entry, impedance, *, position, speed=(10.0, 0.0), yaw=(0.0, 0.0), friction=0.5):
-    car, solver = engines.numbers(entry)
+    car, solver = cars.numbers(entry)
     contact = engines.touch(entry, impedance=impedance)
     options = dict(physics_dt=1 / 1920, substeps=64, iterations=100, line_search=50)
     arrays = {"position": np.array(position, float), "speed": np.array(speed, float), "yaw": np.array(yaw, float)}
@@ -174,7 +174,7 @@ def test_near_misses_and_hits_are_told_apart(entry):
 
 
 def test_mechanics_are_those_of_rigid_bodies(entry):
-    car, solver = engines.numbers(entry)
+    car, solver = cars.numbers(entry)
     rig = oracle.meeting(car, solver, engines.touch(entry, impedance=0.5), physics_dt=1 / 120, iterations=1, line_search=1)
     oracle.place(rig, rig.model.qpos0[:17], np.array([[0.0, 3.0], [0.0, -2.0]]), np.zeros(2), np.array([10.0, 4.0]))
     found = oracle.mechanics(rig, rig.qpos.copy(), rig.qvel.copy())

@@ -13,12 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.build import build
+from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.geometry import heading, norm, wrap_angle
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
-
-GRAVITY = 9.81
 
 
 @struct

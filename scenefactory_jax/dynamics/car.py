@@ -8,13 +8,13 @@ faster. What does not spin adds to the wheel body's mass, and to its inertia abo
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
-from scenefactory_jax.build import ConfigError
+from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.struct import pytree
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
@@ -88,6 +88,17 @@ class Solver:
     line_search: int  # iterations
     tolerance: float
     friction_ratio: float  # impedance of friction over that of the normal force (MuJoCo impratio)
+
+
+def numbers(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
+    """Car and solver of a config's `dynamics`.
+
+    Raises:
+        ConfigError: an unknown, missing or wrong number, by name.
+    """
+    kinds = {"car": "CarParameters", "solver": "Solver"}
+    car, solver = (build({**entry[k], "_target_": t}, builtins=__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
+    return car, solver
 
 
 def spec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:

@@ -106,8 +106,7 @@ def make(
     Raises:
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
-    parameters: CarParameters = build({**car, "_target_": "CarParameters"}, builtins=cars.__name__, where="dynamics.car")()
-    settings: Solver = build({**solver, "_target_": "Solver"}, builtins=cars.__name__, where="dynamics.solver")()
+    parameters, settings = cars.numbers({"car": car, "solver": solver})
     entry = {**contact, "_target_": "make"}
     meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
     plant = compiled(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)

@@ -1,6 +1,6 @@
 """sysid.md: what the fit found, how well it is known, and how each car drives what it has not been fitted to; from `result.json` alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ def verdicts(result: Result, targets: Mapping[str, float]) -> list[Verdict]:
     found = []
     own = result["cars"]["fitted"]["heldout"]
     for key, what in MEASURES.items():
-        values = np.abs(numbers(own[key]))
+        values = np.abs(own[key])
         middle, count = float(np.nanmedian(values)), int(np.isfinite(values).sum())
         aim = f"< {100 * targets[key]:g} %"
         found.append(Verdict(f"Held out: {what}, median of {count}", aim, f"{100 * middle:.2g} %", middle < targets[key]))
@@ -50,11 +50,6 @@ def verdicts(result: Result, targets: Mapping[str, float]) -> list[Verdict]:
     found.append(Verdict("Parameters at a bound of their range", "0", ", ".join(bound) or "0", not bound))
     minutes, most = result["seconds"] / 60, targets["minutes"]
     return [*found, Verdict("Whole fit, compilation included", f"< {most:g} min", f"{minutes:.1f} min", minutes < most)]
-
-
-def numbers(column: Sequence[float | None]) -> np.ndarray:
-    """A column of JSON, in which NaN is null."""
-    return np.array([np.nan if value is None else value for value in column], float)
 
 
 def _made(result: Result) -> str:
@@ -94,7 +89,7 @@ def _parameters(result: Result) -> list[str]:
     rows = []
     for i, name in enumerate(space["names"]):
         partner = int(correlation[i].argmax())
-        rows.append([name, f"{space['low'][i]:g} to {space['high'][i]:g}", f"{result['default'][i]:.4g}", f"{refined['best'][i]:.5g}",
+        rows.append([name, f"{space['low'][i]:g} to {space['high'][i]:g}", f"{space['start'][i]:.4g}", f"{refined['best'][i]:.5g}",
                      f"{refined['deviation'][i]:.2g}", f"{space['names'][partner]} {refined['correlation'][i][partner]:+.2f}",
                      "**yes**" if refined["at_bound"][i] else ""])  # fmt: skip
     words = (
@@ -115,7 +110,7 @@ def _families(result: Result, suite: str) -> list[str]:
         rows_of = [i for i, own in enumerate(first["family"]) if family in (own, "all")]
         cells: list[object] = [family, len(rows_of)]
         for key in MEASURES:
-            cells += [_median(numbers(known[key])[rows_of]) for known in cars.values()]
+            cells += [_median(np.array(known[key], float)[rows_of]) for known in cars.values()]
         rows.append(cells)
     header = ["Family", "n", *(f"{what}: {name}" for what in MEASURES.values() for name in cars)]
     return [f"Medians, {suite}. Stopping distances are absolute differences.", tables.grid(header, rows)]

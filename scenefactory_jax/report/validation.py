@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.report import plots, robustness, tables, verdicts
 from scenefactory_jax.report import validation_figures as figures
 from scenefactory_jax.report.validation_figures import NAMES
@@ -271,7 +272,7 @@ def _standing(result: Result) -> Sequence[str]:
 def _cornering(result: Result) -> Sequence[str]:
     rows = []
     for name, found in _rows(result, "cornering").items():
-        limit = found["friction"][:, None] * figures.GRAVITY
+        limit = found["friction"][:, None] * GRAVITY
         use, need = found["lateral"] / limit, found["demand"] / limit
         rolls, slides = need < 0.5, need > 2.0
         cell = lambda values: f"{values.min():.3f} to {values.max():.3f}" if values.size else "no case"  # noqa: E731

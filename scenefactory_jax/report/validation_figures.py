@@ -8,13 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.report.plots import COLOURS, STYLE
 
 Result = Mapping[str, Any]
 BATCHED, REFERENCE, GREY = COLOURS[0], COLOURS[1], "#777777"
 MARKERS = "osD^vP*X"
 NAMES = {"mjx_car": "mjx_car", "latched": "mjx_car, latched brakes", "published": "mjx_published", "bicycle": "bicycle"}
-GRAVITY = 9.81
 
 
 def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.report import tables
 
 
@@ -85,7 +86,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     stop = np.abs(locked["distance_m"] / np.array(result["grip_limit_m"]) - 1.0)
     worst = locked["friction"][stop.argmax()]
     other = np.abs(locked["distance_m"] / np.array(result["locked_c_m"]) - 1.0).max()
-    limit = corner["friction"][:, None] * 9.81
+    limit = corner["friction"][:, None] * GRAVITY
     use = corner["lateral"] / limit
     slides = corner["demand"] > 2.0 * limit
     under = 1.0 - use[slides].min() if slides.any() else 0.0

@@ -42,7 +42,7 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     """A command's config as a plain dict: `load("train", "experiment=demo", "worlds=8")`.
 
     Args:
-        name: a top-level config: train, evaluate, convert, scenes, render, bench, validate, or task (the environment alone).
+        name: a top-level config: train, evaluate, convert, scenes, render, bench, validate, sysid, or task (the environment alone).
         overrides: as on the command line.
 
     Raises:

@@ -3,32 +3,31 @@
 Every stage writes `out/stages/NAME.json` as soon as it is done; with `resume=true` a stage is kept if it was made with the same settings.
 """
 
-import contextlib
 import functools
-import hashlib
-import json
-import multiprocessing
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import yaml
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.report import sysid as report
 from scenefactory_jax.report import verdicts
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, sources
+from scenefactory_jax.run import keys, results, sources
+from scenefactory_jax.run.workers import mapping
 from scenefactory_jax.sysid import fit, heldout, manoeuvres, measure, multibody, space, student, teacher
 from scenefactory_jax.sysid.fit import Outcome, Refined, Score, Stage
 from scenefactory_jax.sysid.manoeuvres import Recording
 from scenefactory_jax.sysid.space import Space
 from scenefactory_jax.sysid.student import Replay, Suite
+
+DIGITS = 7  # of the numbers in result.json
 
 
 def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,18 +50,16 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=config["physics_hz"])
     plan = student.suite(lessons)
     score = student.scorer(replay, plan, width=settings["width"])
-    begin = space.start(where, numbers(config["dynamics"]), settings["friction"])
-    outcomes = stages(config, out, lessons, where, score, begin)
+    outcomes = stages(config, out, lessons, where, score)
     refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
     places, along = fit.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
-    cars = {"fitted": (replay, where, refined.best), "default": (replay, where, begin), "published": published(config)}
-    judged = {name: judge(known, *car, weights=settings["weights"], samples=settings["samples"]) for name, car in cars.items()}
+    drivers = {"fitted": (replay, refined.best), "default": (replay, where.start), "published": published(config)}
+    judged = {name: judge(known, *car, weights=settings["weights"], samples=settings["samples"]) for name, car in drivers.items()}
     result = {
         "command": configs.command("sysid"),
         "versions": configs.versions(),
         "manoeuvres": {name: len(recordings) for name, recordings in {"fit": lessons, **known}.items()},
         "space": where._asdict(),
-        "default": begin,
         "stages": outcomes,
         "refined": refined,
         "slices": {"place": places, "loss": along},
@@ -70,8 +67,9 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
         "cars": {name: suites for name, (suites, _) in judged.items()},
         "samples": shown(known, settings["samples"], {name: traces for name, (_, traces) in judged.items()}),
     }
-    _write(out / "result.json", result)
-    result = json.loads((out / "result.json").read_text())
+    results.write(out / "result.json", result, digits=DIGITS)
+    (out / "fitted.yaml").write_text(yaml.safe_dump(results.plain(fitted(where, refined.best), digits=5), sort_keys=False))
+    result = results.read(out / "result.json")
     found = report.verdicts(result, settings["targets"])
     print(f"{report.write(out, result, settings['targets'])}\n{verdicts.text(found)}", flush=True)
     return result
@@ -80,14 +78,12 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
 def judge(
     known: Mapping[str, Sequence[Recording]],
     replay: Replay,
-    where: Space,
     row: np.ndarray,
     *,
     weights: Mapping[str, float],
     samples: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """How one car drives the manoeuvres of the fit and those kept out of it: measures of every manoeuvre, and traces of the samples."""
-    del where
     found, traces = {}, {}
     for name, recordings in known.items():
         plan, index = student.suite(recordings), np.arange(len(recordings))
@@ -125,22 +121,29 @@ def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], trac
     return {name: sample(name) for name in samples if name in taught}
 
 
-def published(config: Mapping[str, Any]) -> tuple[Replay, Space, np.ndarray]:
+def published(config: Mapping[str, Any]) -> tuple[Replay, np.ndarray]:
     """The published car, with its own friction of the surfaces and nothing left open."""
-    nothing = space.make({})
-    replay = student.make(config["others"]["published"], nothing, config["sysid"]["published_friction"], physics_hz=config["physics_hz"])
-    return replay, nothing, np.zeros(0)
+    friction = config["sysid"]["published_friction"]
+    return student.make(config["others"]["published"], space.make({}), friction, physics_hz=config["physics_hz"]), np.zeros(0)
+
+
+def fitted(where: Space, row: np.ndarray) -> dict[str, Any]:
+    """Values by name: those of `dynamics.car`, and the surfaces' friction."""
+    found = dict(zip(where.names, row.tolist(), strict=True))
+    return {"car": {name: value for name, value in found.items() if name not in space.FRICTION},
+            "friction": {name: found[name] for name in space.FRICTION if name in found}}  # fmt: skip
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
     """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files of these settings, or now."""
-    instructor = build(config["teacher"], builtins=multibody, where="teacher")(numbers(config["dynamics"]))
+    instructor = build(config["teacher"], builtins=multibody, where="teacher")(cars.numbers(config["dynamics"])[0])
     suites = {"training": manoeuvres.training, "extra": manoeuvres.extra, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
+    masses = {name: config["dynamics"]["car"][name] for name in multibody.READS}
     found = {}
-    with contextlib.ExitStack() as stack:
+    with mapping(config["workers"]) as each:
         for name, suite in suites.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
-            made = _digest({"car": config["dynamics"]["car"], "teacher": config["teacher"], "manoeuvres": entries})
+            made = results.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries})
             if path.is_file():
                 try:
                     found[name] = teacher.load(path, digest=made)
@@ -148,38 +151,24 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]
                 except ConfigError:
                     print(f"{path}: of other settings, recorded anew", flush=True)
             begun = time.perf_counter()
-            drive = functools.partial(teacher.record, teacher=instructor)
-            found[name] = list(_mapping(config["workers"], stack)(drive, suite(entries)))
+            found[name] = list(each(functools.partial(teacher.record, teacher=instructor), suite(entries)))
             teacher.save(path, found[name], digest=made)
             print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found
 
 
-def _mapping(workers: int, stack: contextlib.ExitStack) -> Any:
-    """`map`, in this process or over several."""
-    if workers == 1:
-        return map
-    return stack.enter_context(ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))).map
-
-
-def numbers(dynamics: Mapping[str, Any]) -> cars.CarParameters:
-    """The car of a config's dynamics."""
-    return build({**dynamics["car"], "_target_": "CarParameters"}, builtins=cars.__name__, where="dynamics.car")()
-
-
-def stages(
-    config: Mapping[str, Any], out: Path, lessons: Sequence[Recording], where: Space, score: Score, begin: np.ndarray
-) -> list[Outcome]:  # fmt: skip
+def stages(config: Mapping[str, Any], out: Path, lessons: Sequence[Recording], where: Space, score: Score) -> list[Outcome]:
     """The search, each stage from where the one before ended."""
     settings = config["sysid"]
     found: dict[str, Outcome] = {}
+    begin = where.start
     for place, (name, entry) in enumerate(settings["stages"].items()):
         stage, rows = _stage(name, entry, settings, where, lessons)
         start = begin.copy()
         if entry["restores"] is not None:  # the published fifth stage: what the first found for its parameters, once more
             tuned = [where.names.index(parameter) for parameter in stage.tuned]
             start[tuned] = found[entry["restores"]].best[tuned]
-        made = _digest({"stage": entry, "budget": settings["budget"][name], "start": start.tolist(), "settings": _shared(config)})
+        made = results.digest({"stage": entry, "budget": settings["budget"][name], "start": start.tolist(), "settings": _shared(config)})
         path = out / "stages" / f"{place + 1}_{name}.json"
         outcome = _kept(path, made, Outcome) if config["resume"] else None
         if outcome is None:
@@ -187,7 +176,7 @@ def stages(
                 score, where, start, stage, rows, seed=settings["seed"] + place + 1, weights=settings["weights"], **settings["search"],
                 clock=time.perf_counter, tell=lambda line: print(line, flush=True),
             )  # fmt: skip
-            _write(path, {"made": made, **outcome._asdict()})
+            results.write(path, {"made": made, **outcome._asdict()}, digits=None)
         print(f"{name}: {outcome.start_loss:.4f} -> {outcome.loss:.4f}, {outcome.evaluations} candidates on {len(rows)} manoeuvres, "
               f"{outcome.seconds:.0f} s", flush=True)  # fmt: skip
         found[name], begin = outcome, outcome.best
@@ -211,7 +200,8 @@ def _stage(
 def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: Suite, begin: np.ndarray) -> Refined:
     """Least squares on all manoeuvres."""
     settings = config["sysid"]
-    path, made = out / "stages" / "refine.json", _digest({"refine": settings["refine"], "start": begin.tolist(), "shared": _shared(config)})
+    made = results.digest({"refine": settings["refine"], "start": begin.tolist(), "shared": _shared(config)})
+    path = out / "stages" / "refine.json"
     found = _kept(path, made, Refined) if config["resume"] else None
     if found is None:
         weights, index = fit.weight_row(settings["weights"]), np.arange(len(plan.frames))
@@ -228,7 +218,7 @@ def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Repla
             return np.stack([row for some in pieces for row in piece(some)][: len(rows)])
 
         found = fit.refine(residuals, where, begin, **settings["refine"], clock=time.perf_counter)
-        _write(path, {"made": made, **found._asdict()})
+        results.write(path, {"made": made, **found._asdict()}, digits=None)
     print(f"least squares: {found.start_loss:.4f} -> {found.loss:.4f}, {found.evaluations} candidates", flush=True)
     return found
 
@@ -236,39 +226,16 @@ def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Repla
 def _shared(config: Mapping[str, Any]) -> dict[str, Any]:
     """What every stage depends on."""
     names = ("seed", "friction", "weights", "space", "search", "every")
-    rest = {name: config[name] for name in ("dynamics", "teacher", "manoeuvres", "physics_hz")}
-    return {**rest, **{name: config["sysid"][name] for name in names}}
-
-
-def _digest(settings: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    """All of it or nothing."""
-    half = path.with_suffix(".part")
-    half.write_text(json.dumps(plain(content)) + "\n")
-    half.replace(path)
+    rest = {name: config[name] for name in ("teacher", "manoeuvres", "physics_hz")}
+    left = {name: value for name, value in config["dynamics"]["car"].items() if name not in config["sysid"]["space"]}
+    return {**rest, "dynamics": {**config["dynamics"], "car": left}, **{name: config["sysid"][name] for name in names}}
 
 
 def _kept(path: Path, made: str, kind: type) -> Any:
     """What an earlier run left, if it was made with these settings."""
     if not path.is_file():
         return None
-    content = json.loads(path.read_text())
+    content = results.read(path)
     if content.pop("made") != made:
         return None
     return kind(**{name: np.array(value) if isinstance(value, list) else value for name, value in content.items()})
-
-
-def plain(value: Any) -> Any:
-    """Arrays and tuples as lists, what is not a number as null, for JSON."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
-    if hasattr(value, "_asdict"):
-        return plain(value._asdict())
-    if isinstance(value, (list, tuple)):
-        return [plain(one) for one in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -4,23 +4,21 @@ Every part writes its numbers to `out/results/PART.json` as soon as they are the
 alone, so a part can be measured again, or elsewhere, without the others.
 """
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import validation as report
 from scenefactory_jax.report import verdicts
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, sources, task_parts
+from scenefactory_jax.run import keys, results, sources, task_parts
 from scenefactory_jax.run.workers import spreading
 from scenefactory_jax.validation import parts
 from scenefactory_jax.validation.parts import Spread
+
+DIGITS = 5  # more than anybody reads
 
 
 class Part(NamedTuple):
@@ -60,20 +58,19 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     with spreading(config["workers"]) as spread:
         for name in (name for name in PARTS if name in config["parts"]):
             _measure(name, config, out, spread)
-    results = read(out)
-    if results:
-        written = report.write(out, results, config["validation"]["targets"])
-        print(f"{written}\n{verdicts.text(verdicts.of(results, config['validation']['targets']))}", flush=True)
-    return results
+    found, targets = read(out), config["validation"]["targets"]
+    if found:
+        print(f"{report.write(out, found, targets)}\n{verdicts.text(verdicts.of(found, targets))}", flush=True)
+    return found
 
 
 def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) -> None:
     """One part, unless its result is there already."""
     path, part = out / "results" / f"{name}.json", PARTS[name]
     read = subset(config, part.reads)
-    made = {"settings": _digest(read), "versions": configs.versions()}
+    made = {"settings": results.digest(read), "versions": configs.versions()}
     if config["resume"] and path.is_file():
-        before = json.loads(path.read_text())
+        before = results.read(path)
         if all(before[key] == value for key, value in made.items()):
             print(f"{name}: kept", flush=True)
             return
@@ -81,15 +78,15 @@ def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) ->
     print(f"{name} ...", flush=True)
     result = part.run(read, spread)
     seconds = time.perf_counter() - begun
-    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": configs.command("validate"), "result": _plain(result)}
-    path.write_text(json.dumps(whole, separators=(",", ":")) + "\n")
+    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": configs.command("validate"), "result": result}
+    results.write(path, whole, digits=DIGITS)
     print(f"{name}: {seconds:.0f} s", flush=True)
 
 
 def read(out: Path) -> dict[str, Any]:
     """The results in a folder by part, in the order of `PARTS`; others that lie there follow."""
     files = {path.stem: path for path in sorted((out / "results").glob("*.json"))}
-    return {name: json.loads(files[name].read_text()) for name in (*PARTS, *sorted(set(files) - set(PARTS))) if name in files}
+    return {name: results.read(files[name]) for name in (*PARTS, *sorted(set(files) - set(PARTS))) if name in files}
 
 
 def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
@@ -102,20 +99,3 @@ def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
             source, target = source[name], target.setdefault(name, {})
         target[last] = source[last]
     return found
-
-
-def _digest(config: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as lists, and numbers with as many digits as anybody reads."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return float(f"{value:.5g}") if isinstance(value, float) else value

@@ -4,7 +4,7 @@ Source: M. Althoff, G. Wuersching, "CommonRoad: Vehicle Models" (2020), package 
 of the US DOT (R. W. Allen et al. 1992): sprung mass and two axles with compliant joints, Pacejka tyres with combined slip, 29 states.
 Vehicle 2 is a BMW 320i. What is ours and what is scaled from it:
 
-    mass, inertia, axles, CoM height,  ours. p.m is the whole car, m_s the chassis, m_uf and m_ur an axle's wheels, carriers, knuckles;
+    mass, inertia, axles,              ours. p.m is the whole car, m_s the chassis, m_uf and m_ur an axle's wheels, carriers, knuckles;
     wheel radius and inertia           I_z is the whole car's: the chassis' and the wheels' share
     K_sf, K_sdf, K_sr, K_sdr           x sprung mass on the axle: ride frequencies and damping ratios stay
     K_tsf, K_tsr                       x the same x track^2: so does the share of roll stiffness
@@ -53,6 +53,10 @@ X, Y, STEER, FORWARD, YAW, YAW_RATE, ROLL, PITCH, SIDEWAYS, HEIGHT = 0, 1, 2, 3,
 SIDEWAYS_FRONT, HEIGHT_FRONT, SIDEWAYS_REAR, HEIGHT_REAR, SPIN = 15, 16, 20, 21, slice(23, 27)
 PLANAR = (FORWARD, YAW_RATE, SIDEWAYS, *range(23, 27))
 STATES = 29
+READS = (  # all that the teacher takes from our car
+    "mass", "inertia", "mass_forward", "wheelbase", "track", "wheel_radius", "wheel_mass", "wheel_inertia", "carrier_mass",
+    "carrier_inertia", "knuckle_mass", "knuckle_inertia",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,6 +64,7 @@ class Teacher:
     """The teacher's numbers: `conf/sysid/teacher.yaml`, and the car whose masses it has. Plain data, may cross processes."""
 
     car: CarParameters
+    sprung_height: float
     drive_torque: float
     brake_torque_front: float
     brake_torque_rear: float
@@ -80,6 +85,7 @@ class Teacher:
 def make(
     car: CarParameters,
     *,
+    sprung_height: float,
     drive_torque: float,
     brake_torque_front: float,
     brake_torque_rear: float,
@@ -99,6 +105,7 @@ def make(
     """A teacher with the masses of `car`.
 
     Args:
+        sprung_height: of the sprung mass's centre above the ground at rest, m.
         drive_torque: of each front wheel at full throttle, N m.
         brake_torque_front: of each front wheel at full brake, N m; `brake_torque_rear` of each rear wheel.
         rolling_resistance: force over load.
@@ -119,10 +126,10 @@ def make(
         if value <= 0.0:
             raise ConfigError(f"sysid.teacher.{name}: {value}; must be above 0")
     return Teacher(
-        car=car, drive_torque=drive_torque, brake_torque_front=brake_torque_front, brake_torque_rear=brake_torque_rear,
-        rolling_resistance=rolling_resistance, drag_area=drag_area, air_density=air_density, steering_lock=steering_lock,
-        steering_lag_s=steering_lag_s, steering_rate_max=steering_rate_max, grip=tuple(grip), contact_m=contact_m, stop_speed=stop_speed,
-        lock_spin=lock_spin, settle_s=settle_s, tolerance=tolerance,
+        car=car, sprung_height=sprung_height, drive_torque=drive_torque, brake_torque_front=brake_torque_front,
+        brake_torque_rear=brake_torque_rear, rolling_resistance=rolling_resistance, drag_area=drag_area, air_density=air_density,
+        steering_lock=steering_lock, steering_lag_s=steering_lag_s, steering_rate_max=steering_rate_max, grip=tuple(grip),
+        contact_m=contact_m, stop_speed=stop_speed, lock_spin=lock_spin, settle_s=settle_s, tolerance=tolerance,
     )  # fmt: skip
 
 
@@ -144,7 +151,7 @@ class Vehicle:
     def __init__(self, teacher: Teacher) -> None:
         self.teacher = teacher
         self.model, bmw = _commonroad()
-        self.body = body(teacher.car, bmw)
+        self.body = body(teacher.car, bmw, sprung_height=teacher.sprung_height)
         self.peak = (bmw.tire.p_dx1, bmw.tire.p_dy1)
         car = teacher.car
         self.load = self.body.m * GRAVITY / 4
@@ -171,7 +178,7 @@ def _commonroad() -> tuple[Callable[..., Any], Any]:
     return vehicle_dynamics_mb, parameters_vehicle2()
 
 
-def body(car: CarParameters, bmw: Any) -> Body:
+def body(car: CarParameters, bmw: Any, *, sprung_height: float) -> Body:
     """Parameters of the model: see the table above."""
     front, rear = (2 * (car.wheel_mass + car.carrier_mass) + extra for extra in (2 * car.knuckle_mass, 0.0))
     a, b = car.wheelbase / 2 - car.mass_forward, car.wheelbase / 2 + car.mass_forward
@@ -190,7 +197,7 @@ def body(car: CarParameters, bmw: Any) -> Body:
     return Body(
         m=whole, m_s=car.mass, m_uf=front, m_ur=rear, a=a, b=b,
         I_Phi_s=car.inertia[0], I_y_s=car.inertia[1], I_z=car.inertia[2] + wheels_yaw, I_xz_s=bmw.I_xz_s,
-        h_s=car.wheel_radius - car.wheel_height + car.mass_height, R_w=car.wheel_radius, I_y_w=car.wheel_inertia[0],
+        h_s=sprung_height, R_w=car.wheel_radius, I_y_w=car.wheel_inertia[0],
         T_f=car.track, T_r=car.track,
         K_sf=bmw.K_sf * on_front, K_sdf=bmw.K_sdf * on_front, K_sr=bmw.K_sr * on_rear, K_sdr=bmw.K_sdr * on_rear,
         K_tsf=bmw.K_tsf * on_front * wider_f**2, K_tsr=bmw.K_tsr * on_rear * wider_r**2,

@@ -22,27 +22,31 @@ class Space(NamedTuple):
     low: Float[np.ndarray, " P"]
     high: Float[np.ndarray, " P"]
     logarithmic: np.ndarray  # bool [P]
+    start: Float[np.ndarray, " P"]  # where a search begins
 
 
 def make(ranges: Mapping[str, Any]) -> Space:
-    """From a config: name -> [least, most], or {range: [least, most], scale: log}.
+    """From a config: name -> {range: [least, most], scale: linear or log, start: where a search begins}.
 
     Raises:
-        ConfigError: a name that is neither a number of the car nor a surface's friction, a bad range, or a logarithm of zero.
+        ConfigError: a name that is neither a number of the car nor a surface's friction, a bad range, a logarithm of zero, or a start
+            outside the range.
     """
     valid = [name for name in CarParameters.__dataclass_fields__ if name not in ("inertia", "wheel_inertia")]
-    low, high, logarithmic = [], [], []
+    low, high, logarithmic, starts = [], [], [], []
     for name, entry in ranges.items():
         if name not in valid and name not in FRICTION:
             raise ConfigError(f"sysid.space.{name}: unknown parameter; valid: {', '.join((*valid, *FRICTION))}")
-        entry = entry if isinstance(entry, Mapping) else {"range": entry, "scale": "linear"}
-        if set(entry) != {"range", "scale"} or entry["scale"] not in ("linear", "log"):
-            raise ConfigError(f"sysid.space.{name}: {dict(entry)}; write [least, most] or {{range: [least, most], scale: log}}")
+        if not isinstance(entry, Mapping) or set(entry) != {"range", "scale", "start"} or entry["scale"] not in ("linear", "log"):
+            raise ConfigError(f"sysid.space.{name}: {entry}; write {{range: [least, most], scale: linear or log, start: a number}}")
         least, most = check_range(entry["range"], where=f"sysid.space.{name}", least=None)
         if not least < most or (entry["scale"] == "log" and least <= 0.0):
             raise ConfigError(f"sysid.space.{name}: [{least:g}, {most:g}] is no range to search")
+        if not least <= entry["start"] <= most:
+            raise ConfigError(f"sysid.space.{name}.start: {entry['start']}; it must be in [{least:g}, {most:g}]")
         low, high, logarithmic = [*low, least], [*high, most], [*logarithmic, entry["scale"] == "log"]
-    return Space(tuple(ranges), np.array(low, float), np.array(high, float), np.array(logarithmic, bool))
+        starts.append(float(entry["start"]))
+    return Space(tuple(ranges), np.array(low, float), np.array(high, float), np.array(logarithmic, bool), np.array(starts, float))
 
 
 def unit(space: Space, values: Float[np.ndarray, "*n P"]) -> Float[np.ndarray, "*n P"]:
@@ -60,12 +64,6 @@ def values(space: Space, places: Float[np.ndarray, "*n P"]) -> Float[np.ndarray,
 
 def _log(space: Space, x: Float[np.ndarray, "*n P"]) -> Float[np.ndarray, "*n P"]:
     return np.where(space.logarithmic, np.log(np.where(space.logarithmic, np.maximum(x, 1e-12), 1.0)), x)
-
-
-def start(space: Space, car: CarParameters, friction: Sequence[float]) -> Float[np.ndarray, " P"]:
-    """The values of a car and of the surfaces' frictions, in the order of the space."""
-    known = {**{name: getattr(car, name) for name in vars(car)}, **dict(zip(FRICTION, friction, strict=True))}
-    return np.array([known[name] for name in space.names], float)
 
 
 def apply(

@@ -102,8 +102,7 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
         dynamics: of the articulated car; its fleet is replaced.
         friction: of the surfaces, where the space leaves them alone.
     """
-    kinds = {"car": "CarParameters", "solver": "Solver"}
-    car, solver = (build({**dynamics[k], "_target_": t}, builtins=cars, where=f"dynamics.{k}")() for k, t in kinds.items())
+    car, solver = cars.numbers(dynamics)
     plant = mjx_car.compiled(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
     meet = build({**dynamics["contact"], "_target_": "make"}, builtins=contact, where="dynamics.contact", height=car.height)()
     empty = _ground(car)

@@ -1,10 +1,7 @@
 """The teacher drives manoeuvres: records of what it did, in memory and in one file."""
 
-import hashlib
-import json
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -108,12 +105,6 @@ def recording(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, vehicl
         lateral=np.array(sideways_rates) + yaw_rate * forward,
         roll=-states[:, multibody.ROLL],
     )
-
-
-def digest(teacher: Teacher, manoeuvres: Sequence[Manoeuvre]) -> str:
-    """Of all that a set of recordings follows from but the code."""
-    text = json.dumps([asdict(teacher), [(m.name, m.family, m.speed, *(a.tolist() for a in m[3:])) for m in manoeuvres]], default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def save(path: Any, recordings: Sequence[Recording], *, digest: str) -> None:

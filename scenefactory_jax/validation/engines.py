@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int
 from scenefactory_jax.build import build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import oracle
-from scenefactory_jax.dynamics.car import CarParameters, Solver
 from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Dynamics, Log, Road, Scene, Weather
 from scenefactory_jax.validation.encounters import Encounters
@@ -31,13 +30,6 @@ class Run(NamedTuple):
     tangent: Float[np.ndarray, "N T A 4"]  # N
     slip: Float[np.ndarray, "N T A 4"]  # m/s
     contact_force: Float[np.ndarray, "N T"]  # between the cars, largest of the control step, N
-
-
-def numbers(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
-    """Car and solver of a config's dynamics, checked by name."""
-    kinds = {"car": "CarParameters", "solver": "Solver"}
-    car, solver = (build({**entry[k], "_target_": t}, builtins=cars.__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
-    return car, solver
 
 
 def wheel_friction(
@@ -125,7 +117,7 @@ def drive(
     entry: Mapping[str, Any], cases: Sequences, *, physics_hz: float, control_hz: float, slippery: float, friction_min: float
 ) -> Run:
     """Single cars on the batched path."""
-    car, _ = numbers(entry)
+    car, _ = cars.numbers(entry)
     backend = dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, slippery=slippery, friction_min=friction_min)
     count = len(cases.speed)
     zero = np.zeros((count, 1), np.float32)
@@ -136,7 +128,7 @@ def drive(
 
 def meet(entry: Mapping[str, Any], cases: Encounters, *, physics_hz: float, control_hz: float) -> Run:
     """Encounters on the batched path."""
-    car, _ = numbers(entry)
+    car, _ = cars.numbers(entry)
     backend = dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, slippery=1.0, friction_min=0.0)
     even = np.zeros(len(cases.kind), np.int32)
     worlds = scenes(cases.position, cases.yaw, cases.speed, cases.friction, even, size=(car.length, car.width))
@@ -163,7 +155,7 @@ def drive_c(
         nudge: added to the start speed, m/s; two runs that differ in it tell how sensitive the drives themselves are.
         iterations: of the solver, and `line_search`: enough to converge, or as few as a setting has.
     """
-    car, solver = numbers(entry)
+    car, solver = cars.numbers(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
     rig = oracle.single(car, dataclasses.replace(solver, algorithm="Newton"), **settings)
     still, substeps = cars.rest(rig.model, car), round(physics_hz / control_hz)
@@ -194,7 +186,7 @@ def meet_c(
         impedance: of the contact between the cars, see `oracle.meeting`.
         nudge: added to both cars' start speeds, m/s.
     """
-    car, solver = numbers(entry)
+    car, solver = cars.numbers(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
     newton = dataclasses.replace(solver, algorithm="Newton")
     rig = oracle.meeting(car, newton, touch(entry, impedance=impedance), **settings)

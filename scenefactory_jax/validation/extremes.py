@@ -113,7 +113,7 @@ def run(
             height at rest), of the ground over `lowest`, of `acceleration` (m/s^2) and of `gain`.
     """
     crowd = [*cases, *(Case(f"heap of {heap} cars at one place") for _ in range(heap))]
-    car, _ = engines.numbers(entry)
+    car, _ = cars.numbers(entry)
     backend = _backend(entry, crowd, car, physics_hz=physics_hz, control_hz=control_hz)
     scene, start, lanes = _begin(backend, crowd, car, heap=heap, wall_m=wall_m)
     qpos, qvel = _drive(backend, scene, start, _actions(crowd, round(seconds * control_hz), round(hold_s * control_hz)))

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import oracle
+from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.validation import engines
 from scenefactory_jax.validation.engines import Run
 from scenefactory_jax.validation.equivalence import errors
-
-GRAVITY = 9.81  # m/s^2
 
 
 class Events(NamedTuple):
@@ -149,7 +149,7 @@ def balance(
     control_hz: float,
 ) -> Balance:
     """Momentum and energy that the two cars together gained or lost between two control steps."""
-    car, solver = engines.numbers(entry)
+    car, solver = cars.numbers(entry)
     touch = engines.touch(entry, impedance=0.5)  # no contact force enters here
     rig = oracle.meeting(car, solver, touch, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mass = float(rig.model.body_subtreemass[0])

@@ -255,7 +255,7 @@ def rolling(
     drive: Drive, entry: Mapping[str, Any], *, control_hz: float, frictions: list[float], steers: list[float], speed: float, seconds: float
 ) -> dict[str, np.ndarray]:
     """Rolling without engine: energy over time, and the largest rise between any two times, as shares of the start's kinetic energy."""
-    car, solver = engines.numbers(entry)
+    car, solver = cars.numbers(entry)
     rig = oracle.single(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mu, steer = (x.ravel() for x in np.meshgrid(frictions, steers, indexing="ij"))
     cases = held(mu, speed, COAST, steps=round(seconds * control_hz))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.build import build
+from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.validation import encounters as meetings
 from scenefactory_jax.validation import engines, equivalence, extremes, ground, impacts, laws, sequences
 from scenefactory_jax.validation.engines import Run
@@ -149,7 +150,7 @@ def _impacts(seen: impacts.Impacts, cases: meetings.Encounters, most: int) -> di
 def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Every backend against the laws that it is meant to obey, and the car on patches of the real weather."""
     settings, rates = config["validation"]["laws"], _rates(config)
-    car, _ = engines.numbers(config["dynamics"])
+    car, _ = cars.numbers(config["dynamics"])
     speed = settings["stopping"]["speed"]
     on_patches = bound(settings["patches"], ground, "patches", "validation.laws.patches", **rates)
     return {
@@ -185,7 +186,7 @@ def _obeys(
     found: dict[str, Any] = {law: experiment(law)(drive) for law in ("stopping", "standing", "cornering")}
     if "car" not in entry:
         return found
-    car, _ = engines.numbers(entry)
+    car, _ = cars.numbers(entry)
     found |= {"split": experiment("split")(drive), "ride": experiment("ride")(drive, car), "rolling": experiment("rolling")(drive, entry)}
     if name not in settings["locked"]:
         return found

@@ -1,0 +1,55 @@
+"""Results as JSON: written whole or not at all, with a digest of the settings that made them."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def digest(settings: Mapping[str, Any]) -> str:
+    """Tells whether a result was made with these settings; 16 hexadecimal digits."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write(path: Path, content: Mapping[str, Any], *, digits: int | None) -> None:
+    """One JSON file, complete or as it was before.
+
+    Args:
+        digits: significant ones that numbers keep; None keeps all.
+    """
+    half = path.with_suffix(".part")
+    half.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
+    half.replace(path)
+
+
+def plain(value: Any, *, digits: int | None) -> Any:
+    """Arrays, tuples and records as lists and dicts; what is no number (NaN, infinity) as null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(one, digits=digits) for key, one in value.items()}
+    if hasattr(value, "_asdict"):
+        return plain(value._asdict(), digits=digits)
+    if isinstance(value, (list, tuple)):
+        return [plain(one, digits=digits) for one in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist(), digits=digits)
+    if not isinstance(value, float):
+        return value
+    if not np.isfinite(value):
+        return None
+    return value if digits is None else float(f"{value:.{digits}g}")
+
+
+def read(path: Path) -> Any:
+    """What `write` wrote; null is NaN again."""
+    return _numbers(json.loads(path.read_text()))
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _numbers(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_numbers(one) for one in value]
+    return float("nan") if value is None else value
