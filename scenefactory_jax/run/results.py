@@ -43,7 +43,7 @@ def plain(value: Any, *, digits: int | None) -> Any:
 
 
 def read(path: Path) -> Any:
-    """What `write` wrote; null is NaN again."""
+    """What `write` wrote; null in a list is NaN again."""
     return _numbers(json.loads(path.read_text()))
 
 
@@ -51,5 +51,5 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _numbers(one) for key, one in value.items()}
     if isinstance(value, list):
-        return [_numbers(one) for one in value]
-    return float("nan") if value is None else value
+        return [float("nan") if one is None else _numbers(one) for one in value]
+    return value

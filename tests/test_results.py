@@ -1,0 +1,32 @@
+"""Results come back from their files as they were."""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from scenefactory_jax.run import results
+
+
+class Row(NamedTuple):
+    name: str
+    error: np.ndarray
+
+
+def test_results_come_back(tmp_path):
+    path = tmp_path / "a.json"
+    content = {"row": Row("b", np.array([1.0, np.nan, np.inf])), "refused": None, 3: (np.float32(0.5), True, np.int64(7)), "all": 12345678}
+    results.write(path, content, digits=None)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
+    found = results.read(path)
+    np.testing.assert_array_equal(found["row"]["error"], [1.0, np.nan, np.nan])
+    assert found["refused"] is None and found["3"] == [0.5, True, 7] and found["all"] == 12345678
+    json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+
+
+def test_digits_and_digests(tmp_path):
+    results.write(tmp_path / "a.json", {"x": [1.23456789, 1e-9 / 3.0]}, digits=5)
+    assert (tmp_path / "a.json").read_text() == '{"x":[1.2346,3.3333e-10]}\n'
+    one, other = results.digest({"a": 1, "b": [2.0]}), results.digest({"b": [2.0], "a": 1})
+    assert one == other != results.digest({"a": 1, "b": [2.1]}) and len(one) == 16
