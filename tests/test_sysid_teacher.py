@@ -229,6 +229,22 @@ def test_recordings_come_back_from_their_file(tmp_path, teacher, left_turn):
         load(tmp_path / "r.npz", digest=other)
 
 
+def test_the_teacher_takes_from_the_car_what_its_recordings_are_known_by(car, teacher):
+    """`READS`, from which the digest of the recordings is made: each of these numbers changes the teacher, no other does."""
+
+    def numbers(own):
+        vehicle = multibody.Vehicle(dataclasses.replace(teacher, car=own))
+        return [*(value for value in vars(vehicle.body).values() if isinstance(value, float)), vehicle.rolling_mass,
+                *multibody.start(vehicle, 5.0)]  # fmt: skip
+
+    own = numbers(car)
+    for field in dataclasses.fields(car):
+        value = getattr(car, field.name)
+        other = [1.1 * x for x in value] if isinstance(value, (list, tuple)) else 1.1 * value + 0.1
+        changed = numbers(dataclasses.replace(car, **{field.name: other})) != own
+        assert changed == (field.name in multibody.READS), field.name
+
+
 def test_wrong_settings_are_named(monkeypatch, car, teacher, entries):
     with pytest.raises(ConfigError, match="steering_lag_s: 0"):
         build({**conf("sysid/teacher"), "steering_lag_s": 0.0}, builtins=multibody, where="sysid.teacher")(car)

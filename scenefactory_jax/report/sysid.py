@@ -18,7 +18,7 @@ PUBLISHED = {  # facts sheet 3.4 (the paper's Table 8): candidates and best loss
     "refinement": (65, 150.204),
     "brake_preservation": (49, 3.6938),
 }
-MEASURES = {"end_share": "Final position / path", "yaw_rate_nrmse": "Yaw rate, NRMSE", "stop_share": "Stopping distance"}
+MEASURES = {key: what[0].upper() + what[1:] for key, what in figures.MEASURES.items()}
 
 
 def write(folder: Path, result: Result, targets: Mapping[str, float]) -> Path:

@@ -11,6 +11,7 @@ from scenefactory_jax.report.plots import COLOURS, STYLE
 
 Result = Mapping[str, Any]
 GREY = "#777777"
+MEASURES = {"end_share": "final position / path", "yaw_rate_nrmse": "yaw rate, NRMSE", "stop_share": "stopping distance"}
 CARS = {"fitted": COLOURS[0], "default": COLOURS[1], "published": COLOURS[3]}
 
 
@@ -52,13 +53,12 @@ def slices(result: Result) -> Figure:
 
 def spread(result: Result) -> Figure:
     """Share of the held-out manoeuvres whose error is below a value, for each car."""
-    shown = {"end_share": "final position / path", "yaw_rate_nrmse": "yaw rate, NRMSE", "stop_share": "stopping distance"}
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 2.9), layout="constrained")
-        for axes, (key, title) in zip(figure.subplots(1, 3), shown.items(), strict=True):
+        for axes, (key, title) in zip(figure.subplots(1, len(MEASURES)), MEASURES.items(), strict=True):
             for name, suites in result["cars"].items():
-                values = np.array([value for value in suites["heldout"][key] if value is not None], float)
-                values = np.sort(100 * np.abs(values[np.isfinite(values)]))
+                values = np.abs(suites["heldout"][key])
+                values = np.sort(100 * values[np.isfinite(values)])
                 axes.step(values, 100 * np.arange(1, len(values) + 1) / len(values), where="post", color=CARS.get(name, GREY), label=name)
             axes.set(xscale="log", xlim=(0.1, 200), ylim=(0, 100), title=title, xlabel="error, %", ylabel="manoeuvres below, %")
         figure.axes[0].legend()

@@ -67,8 +67,7 @@ def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
     dynamics = config["dynamics"]
     if "car" not in dynamics or "solver" not in dynamics:
         raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: mjx_car, mjx_published")
-    make = lambda name, key: build({**dynamics[key], "_target_": name}, builtins=cars.__name__, where=f"dynamics.{key}")()  # noqa: E731
-    parameters, solver = make("CarParameters", "car"), make("Solver", "solver")
+    parameters, solver = cars.numbers(dynamics)
     car = cars.spec(parameters, visual=True, brake_rows=False)
     spec = mjcf.world(scene, car, box_m=config["scenes"]["pack"]["box_m"], **config["world"])
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):

@@ -84,13 +84,13 @@ def judge(
     samples: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """How one car drives the manoeuvres of the fit and those kept out of it: measures of every manoeuvre, and traces of the samples."""
-    found, traces = {}, {}
+    row_of_weights, found, traces = fit.weight_row(weights), {}, {}
     for name, recordings in known.items():
         plan, index = student.suite(recordings), np.arange(len(recordings))
         rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
         path = jax.tree.map(np.asarray, replay.trace(rows, jnp.asarray(index), plan))
         one = lambda i, path=path: jax.tree.map(lambda leaf: leaf[i : i + 1], path)  # noqa: E731
-        squares = [student.residuals(one(i), plan, index[i : i + 1], fit.weight_row(weights)) for i in index]
+        squares = [student.residuals(one(i), plan, index[i : i + 1], row_of_weights) for i in index]
         found[name] = {
             "name": [recording.manoeuvre.name for recording in recordings],
             "family": [recording.manoeuvre.family for recording in recordings],
