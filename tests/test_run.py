@@ -270,7 +270,7 @@ def test_a_wrong_value_ends_as_one_line():
         (["evaluate"], "error: Missing mandatory value: run"),
         (["evaluate", "run=/nowhere"], "error: /nowhere is no run"),
         (["convert", "source=/nowhere"], "error: out: missing"),
-        (["convert", "source=/nowhere", "out=/tmp/x"], "error: /nowhere: no such file or folder"),
+        (["convert", "source=/nowhere", "out=x"], "error: /nowhere: no such file or folder"),
         (["drive-away"], "unknown command 'drive-away'; valid: train, evaluate"),
     ],
 )
