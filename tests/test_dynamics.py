@@ -21,6 +21,7 @@ from scenefactory_jax.run.config import load
 from scenefactory_jax.struct import replace
 
 G, WHEELBASE = 9.81, 2.6
+LOCK, AIR = 0.55654, 0.42 / 1980.0  # rad; the air's deceleration over speed squared, 1/m
 MU = np.array([0.86, 0.05, 0.1, 0.3, 0.5, 0.7, 1.0, 1.1], np.float32)
 LANES = 500.0 * np.arange(8)
 EVERYONE = jnp.ones(8, bool)
@@ -103,11 +104,11 @@ def braking():
 def test_braking_distance_is_the_tyres_limit_or_the_brakes(braking):
     _, (_, motion) = braking
     stop = motion.position[-1, :, 0]
-    limit = 15.0**2 / (2 * MU * G)
-    locked = (MU <= 0.5) & (MU >= 0.1)
+    limit = np.log(1.0 + AIR * 15.0**2 / (MU * G)) / (2 * AIR)
+    locked = (MU <= 0.3) & (MU >= 0.1)
     np.testing.assert_allclose(stop[locked], limit[locked], rtol=0.01)
-    # 2 x (1030 + 926) N m / 0.35 m over 2062 kg, and the bearings' drag: 5.42 m/s^2 and more
-    np.testing.assert_allclose(stop[MU > 0.8], 15.0**2 / (2 * 5.70), rtol=0.02)
+    # 2 x (1055 + 814) N m / 0.35 m over 2062 kg, and what rolls and drags: 5.18 + 0.15 m/s^2
+    np.testing.assert_allclose(stop[MU > 0.8], 15.0**2 / (2 * 5.33), rtol=0.02)
     by_grip = stop[np.argsort(MU)]
     assert (np.diff(by_grip) < 0.05).all() and by_grip[0] > by_grip[1] > by_grip[2] + 50
     assert np.abs(motion.position[-1, :, 1] - LANES).max() < 0.1
@@ -129,7 +130,7 @@ def test_tyres_use_no_more_than_their_grip(braking):
     np.testing.assert_allclose(sliding, 1.0, atol=0.01)
     slip = motion.slip[:, np.isclose(MU, 0.1)]
     assert slip[CHUNK] > 12.0 and slip[-1] < 0.01
-    assert (acceleration(motion) < 1.08 * MU * G).all()  # locked wheels hop, and what hops presses harder for a while
+    assert (acceleration(motion) < 1.1 * MU * G + AIR * 15.0**2).all()  # locked wheels hop, and what hops presses harder for a while
 
 
 @pytest.mark.parametrize("steer", [0.25, -0.5])
@@ -140,8 +141,8 @@ def test_yaw_rate_is_that_of_a_rolling_car_at_low_speed(steer):
     beta = np.arctan(np.tan(motion.steer[-1]) / 2)
     wanted = speed * np.cos(beta) * np.tan(motion.steer[-1]) / WHEELBASE
     grips = MU >= 0.5
-    np.testing.assert_allclose(motion.yaw_rate[-1, grips], wanted[grips], rtol=0.03)
-    np.testing.assert_allclose(motion.steer[-1, grips], 0.45 * steer, rtol=0.1)
+    np.testing.assert_allclose(motion.yaw_rate[-1, grips], wanted[grips], rtol=0.1)  # tyres that yield: at the front more than behind
+    np.testing.assert_allclose(motion.steer[-1, grips], LOCK * steer, rtol=0.1)
 
 
 def random_controls(seed, seconds, hold):
@@ -170,14 +171,14 @@ def test_trajectories_agree_with_the_c_engine():
 
 
 def test_locked_stops_reach_the_tyre_limit_in_the_c_engine():
-    """With brakes four times as strong, so that wheels lock at any friction: from 15 m/s, within a percent of v^2 / (2 mu g)."""
+    """With brakes four times as strong, so that wheels lock at any friction: from 15 m/s, within 3 % of v^2 / (2 mu g) less the air."""
     car, solver = numbers_of("mjx_car")
     strong = dataclasses.replace(car, brake_torque_front=4 * car.brake_torque_front, brake_torque_rear=4 * car.brake_torque_rear)
     for mu in (0.3, 0.86, 1.1):
         action = np.tile(np.array([0.0, 0.0, 1.0]), (240, 1))
         options = {"physics_dt": 1 / 120, "substeps": 4, "iterations": solver.iterations, "line_search": solver.line_search}
         path = oracle.simulate(strong, solver, action, np.full(4, mu), speed=15.0, **options)
-        assert path.qpos[-1, 0] == pytest.approx(15.0**2 / (2 * mu * G), rel=0.01)
+        assert path.qpos[-1, 0] == pytest.approx(np.log(1.0 + AIR * 15.0**2 / (mu * G)) / (2 * AIR), rel=0.03)
         assert np.linalg.norm(path.qvel[-1]) < 1e-3
 
 
@@ -187,7 +188,7 @@ def test_a_whole_episode_of_random_driving_stays_finite_and_upright():
     assert motion.upright.min() > 0.97
     height = motion.position[..., 2]
     assert height.min() > 0.65 and height.max() < 0.85
-    assert np.linalg.norm(motion.velocity, axis=-1).max() < 25 and np.abs(motion.steer).max() < 0.5
+    assert np.linalg.norm(motion.velocity, axis=-1).max() < 25 and np.abs(motion.steer).max() < 1.05 * LOCK
     assert motion.grip_use.max() < 1.01
 
 
@@ -195,7 +196,7 @@ def test_a_hard_turn_on_the_best_road_slides_and_does_not_roll_over():
     _, (_, motion) = drive("mjx_car", scene_for(speed=20.0), constant(throttle=1.0, steer=1.0, seconds=3))
     assert motion.upright.min() > 0.97
     assert (acceleration(motion) < 1.05 * MU * G).all()
-    assert (acceleration(motion) > 0.9 * MU * G)[MU >= 0.3].all()
+    assert (acceleration(motion) > 0.8 * MU * G)[MU >= 0.3].all()
 
 
 def rear_end(offset):
@@ -292,10 +293,10 @@ def test_cars_start_at_rest_height_with_turning_wheels():
 
 def test_bicycle_circle_closes_and_braking_stops():
     steer, speed = 0.5, 6.0
-    free = make("bicycle", drag=0.0)
+    free = make("bicycle", rolling=0.0, drag=0.0, air_drag=0.0)
     scene = scene_for(speed=speed)
-    beta = np.arctan(0.5 * np.tan(0.45 * steer))
-    period = 2 * np.pi / (speed * np.cos(beta) * np.tan(0.45 * steer) / WHEELBASE)
+    beta = np.arctan(0.5 * np.tan(LOCK * steer))
+    period = 2 * np.pi / (speed * np.cos(beta) * np.tan(LOCK * steer) / WHEELBASE)
     steps = round(period * 30)
     run = jax.jit(lambda body: jax.lax.scan(lambda b, a: (b := free.advance(scene, b, a, EVERYONE), free.read(b)), body, turn))
     turn = jnp.tile(jnp.array([0.0, steer, 0.0]), (steps, 8, 1))
@@ -307,7 +308,7 @@ def test_bicycle_circle_closes_and_braking_stops():
     np.testing.assert_allclose(across, 2 * speed * period / (2 * np.pi), rtol=0.01)
     _, (body, motion) = drive("bicycle", scene_for(speed=5.0), constant(brake=1.0, seconds=2))
     assert (body.speed[-1] == 0).all() and (np.diff(body.speed, axis=0) <= 0).all()
-    assert motion.position[-1, 0, 0] == pytest.approx(5.0**2 / (2 * 5.45), rel=0.02)
+    assert motion.position[-1, 0, 0] == pytest.approx(5.0**2 / (2 * 5.29), rel=0.02)
 
 
 def test_bicycle_and_car_share_limits():
@@ -318,7 +319,13 @@ def test_bicycle_and_car_share_limits():
     per_torque = 2 / car["wheel_radius"] / mass
     assert bicycle["acceleration"] == pytest.approx(car["drive_torque"] * per_torque, rel=1e-3)
     assert bicycle["deceleration"] == pytest.approx((car["brake_torque_front"] + car["brake_torque_rear"]) * per_torque, rel=1e-3)
+    assert bicycle["rolling"] == pytest.approx(4 * car["rolling_torque"] / car["wheel_radius"] / mass, rel=1e-3)
     assert bicycle["drag"] == pytest.approx(4 * car["wheel_damping"] / car["wheel_radius"] ** 2 / mass, rel=1e-2)
+    assert bicycle["air_drag"] == pytest.approx(car["air_drag"] / mass, rel=1e-2)
+    top = bicycle["speed_limit"]
+    drags = bicycle["rolling"] + (bicycle["drag"] + bicycle["air_drag"] * top) * top
+    left = (car["spin_limit"] - top / car["wheel_radius"]) / (0.1 * car["spin_limit"])
+    assert bicycle["acceleration"] * left == pytest.approx(drags, rel=1e-2)
 
 
 def test_bicycle_reports_contact_and_keeps_going():
@@ -350,7 +357,8 @@ def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
         ({"contact": {"bounce": 1.0}}, "dynamics.contact.bounce"),
         ({"brakes": "drum"}, "dynamics.brakes"),
         ({"car": {"stop_stiffness": 1e7}}, "suspension and stop"),
-        ({"car": {"steering_damping": 1e3}}, "steering cannot be integrated"),
+        ({"car": {"steering_damping": 3e3}}, "steering cannot be integrated"),
+        ({"car": {"tyre_slip_damping": 130.0}}, "tyre_slip_damping dt / tyre_impedance is 2.17 at physics_dt 0.00833"),
     ],
 )
 def test_refuses_by_name(changes, named):

@@ -14,7 +14,9 @@ from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import fleet, forces, oracle
 from scenefactory_jax.validation import laws
 
-FREE = dataclasses.replace(CAR, wheel_damping=0.0, yaw_damping=0.0)  # nothing else slows it
+FREE = dataclasses.replace(  # nothing else slows it
+    CAR, wheel_damping=0.0, yaw_damping=0.0, rolling_torque=0.0, air_drag=0.0, tyre_slip_damping=5.0, tyre_slip_speed=1e3
+)
 SPIN = [8, 11, 13, 15]
 ON = dict(rolling_torque=40.0, air_drag=1.5, tyre_slip_speed=3.0, tyre_slip_damping=15.0)
 
@@ -52,14 +54,14 @@ def test_rolling_resistance_slows_a_car_evenly_and_then_holds_it():
 
 
 def test_an_engine_below_the_rolling_resistance_does_not_move_the_car():
-    """Two wheels drive, four resist. The dry friction creeps, as brakes do (`brake_impedance`): millimetres a second."""
+    """Two wheels drive, four resist: what the front wheels have left has to move the rear ones."""
     share = np.array([0.0, 0.25, 0.5, 0.5, 0.75, 1.5, 2.0, 3.0])
     action = constant(seconds=3)
     action[..., 0] = share * 2 * 60.0 / FREE.drive_torque
     body, motion = go(crew("rolling_torque", np.full(8, 60.0)), action)
     _, mass = rolling(body)
     held = share < 1.0
-    assert np.abs(motion.velocity[-1, held, 0]).max() < 0.02 and motion.position[-1, 1, 0] < 0.01
+    assert np.abs(motion.velocity[-1, held, 0]).max() < 0.05 and motion.position[-1, 1, 0] < 1e-4  # the rear wheels' friction is soft
     free = 4 * 60.0 * (share[~held] - 1.0) / (0.346 * mass[~held])
     np.testing.assert_allclose(motion.velocity[-1, ~held, 0] / 3.0, free, rtol=0.06)
 
@@ -99,7 +101,7 @@ def cornering(several, speed, lateral):
 
 
 def test_a_lateral_force_needs_the_same_slip_angle_at_every_speed():
-    """And the slip angle is that of `forces.slip_damping`: speed x damping / impedance over R + 1/m, R of the contact."""
+    """And the slip angle is that of `forces.slip_damping`: speed x damping / impedance over the contact's R."""
     law = dataclasses.replace(FREE, tyre_slip_speed=2.5, tyre_slip_damping=20.0)
     grips = np.flatnonzero(MU >= 0.5)  # lanes 0, 4, 5, 6, 7
     speed, lateral = np.full(8, 10.0), np.full(8, 1.0)
@@ -113,7 +115,7 @@ def test_a_lateral_force_needs_the_same_slip_angle_at_every_speed():
     assert old_slow > 2.5 * old_fast  # slip velocity: three times the angle at a third of the speed
     weight = fleet.enlist(jax.tree.map(jnp.float32, law)).wheel_weight[2]
     d = law.tyre_impedance
-    yields = float(weight) * (1 - d) / d / SOLVER.friction_ratio + 4 / laws.mass(law)
+    yields = float(weight) * (1 - d) / d / SOLVER.friction_ratio
     assert fast == pytest.approx(laws.mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
 
 
@@ -123,7 +125,7 @@ def test_below_the_slip_speed_nothing_changes():
     law = dataclasses.replace(FREE, tyre_slip_speed=2.5, tyre_slip_damping=20.0)
     found = jax.vmap(lambda v: forces.slip_damping(law, v))(qvel)
     np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 10.0, 2.0], rtol=1e-6)
-    np.testing.assert_array_equal(jax.vmap(lambda v: forces.slip_damping(CAR, v))(qvel), np.float32(CAR.tyre_slip_damping))
+    np.testing.assert_array_equal(jax.vmap(lambda v: forces.slip_damping(FREE, v))(qvel), np.float32(FREE.tyre_slip_damping))
 
 
 def test_gradients_are_finite_at_rest():

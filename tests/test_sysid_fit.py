@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import sysid as command
 from scenefactory_jax.run.config import load
 from scenefactory_jax.sysid import fit, measure, space, student
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, Recording
@@ -183,6 +185,84 @@ def test_strips_of_road_have_their_own_grip(lesson):
     even, split = (traced(replay, np.array([begin[0], wet]), plan).yaw_rate[1] for wet in (0.5, 0.05))
     assert np.abs(even).max() < 1e-4, "wet is as good as gravel"
     assert split[8] > 1e-3 and split[17] < split[8] - 1e-3
+
+
+# ---- the command
+
+
+FAMILIES = ("straight_brake", "step_steer", "limit", "surface_transition")
+
+
+def stand_ins():
+    """Manoeuvres that nobody drives, one a family."""
+    plans = [manoeuvre(family, 0.0)._replace(family=family) for family in FAMILIES]
+    zeros = lambda plan: [np.zeros((len(plan.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ())]  # noqa: E731
+    return [Recording(plan, *zeros(plan)) for plan in plans]
+
+
+def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
+    budget = {name: [4, 2] for name in ("longitudinal", "steering", "surface", "refinement", "brake_preservation")}
+    config = load("sysid", f"sysid.budget={budget}".replace("'", ""), "resume=true")
+    where, asked = space.make(config["sysid"]["space"]), []
+    target = where.low + 0.4 * (where.high - where.low)
+
+    def score(rows, manoeuvres):
+        asked.append((len(rows), tuple(manoeuvres)))
+        terms = np.zeros((len(rows), len(manoeuvres), len(TERMS)))
+        terms[..., 0] = ((space.unit(where, rows) - space.unit(where, target)) ** 2).sum(-1)[:, None]
+        return terms
+
+    (tmp_path / "stages").mkdir()
+    found = command.stages(config, tmp_path, stand_ins(), where, score)
+    assert [outcome.name for outcome in found] == list(config["sysid"]["stages"])
+    losses = [loss for outcome in found[:4] for loss in (outcome.start_loss, outcome.loss)]
+    assert (np.diff(losses) <= 1e-12).all() and losses[-1] < losses[0]
+    tuned = [name for name, a, b in zip(where.names, where.start, found[0].best, strict=True) if a != b]
+    assert set(tuned) <= set(config["sysid"]["stages"]["longitudinal"]["tuned"]) and tuned
+    assert asked[0] == (1, (0,)) and asked[3] == (1, (1,)) and asked[6] == (1, (2, 3)) and asked[9] == (1, (0, 1, 2, 3))
+    restored = [where.names.index(name) for name in config["sysid"]["stages"]["brake_preservation"]["tuned"]]
+    again = found[3].best.copy()
+    again[restored] = found[0].best[restored]
+    assert found[4].start_loss == pytest.approx(((space.unit(where, again) - space.unit(where, target)) ** 2).sum())
+
+    asked.clear()
+    kept = command.stages(config, tmp_path, stand_ins(), where, score)
+    assert not asked and all(np.array_equal(a.best, b.best) and a.loss == b.loss for a, b in zip(found, kept, strict=True))
+    other = {**config, "sysid": {**config["sysid"], "budget": {**budget, "surface": [4, 3]}}}
+    command.stages(other, tmp_path, stand_ins(), where, score)
+    assert asked[0] == (1, (2, 3)), "the first two stages stay, the third is searched anew"
+    assert len(list((tmp_path / "stages").iterdir())) == 5
+
+
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        ("sysid.stages.steering.tuned=[sterring_limit]", r"sysid.stages.steering.tuned: 'sterring_limit'; valid: drive_torque"),
+        ("sysid.stages.surface.families=[ice]", r"sysid.stages.surface.families: \['ice'\]; sysid.every=16 leaves none"),
+    ],
+)
+def test_stages_that_cannot_be_are_refused(tmp_path, override, message):
+    config = load("sysid", override, "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1]}")
+    where = space.make(config["sysid"]["space"])
+    (tmp_path / "stages").mkdir()
+    with pytest.raises(ConfigError, match=message):
+        command.stages(config, tmp_path, stand_ins(), where, lambda rows, manoeuvres: np.ones((len(rows), len(manoeuvres), len(TERMS))))
+
+
+@pytest.mark.slow
+def test_the_whole_command(tmp_path):
+    budget = "{longitudinal: [2,1], steering: [2,1], surface: [2,1], refinement: [2,1], brake_preservation: [2,1]}"
+    config = load("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
+    found = command.sysid(config)
+    written = {path.name for path in tmp_path.iterdir()}
+    figures = {"search.png", "slices.png", "heldout.png", "paths.png"}
+    assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
+    assert found["refined"]["loss"] <= found["stages"][-1]["loss"] * 1.01 and set(found["cars"]) == {"fitted", "default", "published"}
+    car = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["car"]
+    fitted = load("train", *(f"dynamics.car.{name}={value}" for name, value in car.items()))["dynamics"]["car"]
+    assert all(fitted[name] == value for name, value in car.items()), "what was fitted is a car"
+    text = (tmp_path / "sysid.md").read_text()
+    assert "steering_limit" in text and "steady_circle" in text
 
 
 # ---- measures

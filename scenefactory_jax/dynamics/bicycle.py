@@ -44,7 +44,9 @@ def make(
     steering_limit: float,
     acceleration: float,
     deceleration: float,
+    rolling: float,
     drag: float,
+    air_drag: float,
     speed_limit: float,
     contact: dict[str, Any],
     grip: Callable[..., Any],
@@ -60,7 +62,8 @@ def make(
         steering_limit: rad; steering follows the command at once.
         acceleration: at full throttle, m/s^2.
         deceleration: at full brake, m/s^2; it stops the car and never reverses it.
-        drag: deceleration per speed, 1/s.
+        rolling: deceleration of rolling resistance, m/s^2.
+        drag: deceleration per speed, 1/s; `air_drag` per speed squared, 1/m.
         speed_limit: m/s.
         contact: numbers of `contact.make`.
         grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `grip_use` is the acceleration over friction times
@@ -71,7 +74,7 @@ def make(
     """
     entry = {**contact, "_target_": "make"}
     meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)()
-    limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, drag, speed_limit)
+    limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         moved = roll(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
@@ -95,7 +98,9 @@ class Limits(NamedTuple):
     steering: float
     acceleration: float
     deceleration: float
+    rolling: float
     drag: float
+    air_drag: float
     speed: float
 
 
@@ -109,7 +114,8 @@ def init(key: PRNGKeyArray, scene: Scene) -> Body:
 def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:
     """One integration of throttle, steer and brake over `dt` seconds."""
     throttle, brake = jnp.maximum(action[:, 0], 0.0), jnp.maximum(action[:, 2], 0.0)
-    push = limits.acceleration * throttle - limits.deceleration * brake - limits.drag * body.speed
+    push = limits.acceleration * throttle - limits.deceleration * brake
+    push = push - limits.rolling - (limits.drag + limits.air_drag * body.speed) * body.speed
     speed = jnp.clip(body.speed + push * dt, 0.0, limits.speed)
     mean = 0.5 * (body.speed + speed)
     steer = limits.steering * action[:, 1]

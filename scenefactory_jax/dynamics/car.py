@@ -19,6 +19,7 @@ from scenefactory_jax.struct import pytree
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
 FRONT = WHEELS[:2]
+AHEAD, LEFT = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0])  # signs of their places
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
 GRAVITY = 9.81  # m/s^2, MuJoCo's default
 LATENT_FRICTION = 1e-3  # N m; the brakes' solver rows exist only if the model is compiled with a positive friction loss
@@ -62,7 +63,9 @@ class CarParameters:
     steering_damping: float  # of the steering servo, N m s/rad
     steering_torque: float  # largest, of the steering servo, N m
     steering_friction: float  # viscous, of the steering joint, N m s/rad
+    steering_inertia: float  # of steering wheel, rack and motor as a front wheel's joint feels it, kg m^2
     drive_torque: float  # of each front wheel at full throttle, N m
+    spin_limit: float  # above 0.9 of it the drive torque falls, to nothing at it, rad/s
     brake_torque_front: float  # of each front wheel at full brake, N m
     brake_torque_rear: float  # of each rear wheel at full brake, N m
     brake_impedance: float  # of the brakes' friction (solimp), 0..1: a held wheel creeps by torque x (1 - impedance) / impedance
@@ -133,7 +136,8 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
     spring.stiffness, spring.damping = _linear(car.suspension_stiffness), _linear(car.suspension_damping)
     spring.springref = -corner_load(car, front=front) * car.suspension_preload / car.suspension_stiffness
     if front:
-        wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1]).damping = _linear(car.steering_friction)
+        steer = wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1], armature=car.steering_inertia)
+        steer.damping = _linear(car.steering_friction)
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
     spin.damping = _linear(car.wheel_damping)
     spin.frictionloss = max(car.rolling_torque, LATENT_FRICTION) if brake_rows else 0.0
@@ -266,13 +270,14 @@ def standalone(car: CarParameters, solver: Solver, *, physics_dt: float, visual:
 def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
     """Refuse springs and dampings that the explicit integrator cannot carry.
 
-    A mass m on an explicit spring k and damper c is stable under semi-implicit Euler if k dt^2 / m + 2 c dt / m < 4.
+    A mass m on an explicit spring k and damper c is stable under semi-implicit Euler if k dt^2 / m + 2 c dt / m < 4. The slip of a tyre
+    falls by damping dt / impedance of itself in a step, and grows if that is 2 or more.
 
     Raises:
         ConfigError: naming `where`, the spring, the sum and the bound; or a mass of zero.
     """
     unsprung = car.wheel_mass + car.carrier_mass
-    about_steer = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia
+    about_steer = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia + car.steering_inertia
     springs = {
         "suspension and stop": (unsprung, car.suspension_stiffness + car.stop_stiffness, car.suspension_damping),
         "steering": (about_steer, car.steering_stiffness, car.steering_damping + car.steering_friction),
@@ -280,6 +285,9 @@ def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
         "lateral damping": (car.mass, 0.0, car.lateral_damping),
         "yaw damping": (car.inertia[2], 0.0, car.yaw_damping),
     }
+    if (share := car.tyre_slip_damping * physics_dt / car.tyre_impedance) >= 2.0:
+        message = f"tyre_slip_damping dt / tyre_impedance is {share:.2f} at physics_dt {physics_dt:.5f}; it must stay below 2"
+        raise ConfigError(f"{where}: the tyres' slip cannot be integrated: {message}")
     for name, (mass, stiffness, damping) in springs.items():
         _check_spring(name, mass, stiffness, damping, physics_dt=physics_dt, where=where)
     _check_spring("body on the ground", light_corner(car), car.body_stiffness, car.body_damping, physics_dt=physics_dt, where=where)

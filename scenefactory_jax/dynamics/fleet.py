@@ -18,11 +18,10 @@ from mujoco import mjx
 from scenefactory_jax.build import ConfigError, check_range
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import solve
-from scenefactory_jax.dynamics.car import CarParameters, Places
+from scenefactory_jax.dynamics.car import AHEAD, LEFT, CarParameters, Places
 from scenefactory_jax.struct import struct
 from scenefactory_jax.types import Scene
 
-AHEAD, LEFT = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0])  # of `car.WHEELS`
 FRONT = AHEAD > 0
 
 
@@ -109,8 +108,8 @@ def worst(car: CarParameters, scale: Mapping[str, tuple[float, float]]) -> CarPa
 FORCES = (
     "mass", "inertia", "wheel_mass", "wheel_inertia", "wheel_damping", "carrier_mass", "carrier_inertia", "knuckle_mass", "knuckle_inertia",
     "suspension_stiffness", "suspension_damping", "stop_stiffness", "steering_stiffness", "steering_damping", "steering_torque",
-    "steering_friction", "drive_torque", "brake_torque_front", "brake_torque_rear", "body_stiffness", "body_damping", "lateral_damping",
-    "yaw_damping", "rolling_torque", "air_drag",
+    "steering_friction", "steering_inertia", "drive_torque", "brake_torque_front", "brake_torque_rear", "body_stiffness", "body_damping",
+    "lateral_damping", "yaw_damping", "rolling_torque", "air_drag",
 )  # fmt: skip
 
 
@@ -150,7 +149,8 @@ def enlist(car: CarParameters) -> Fleet:
     slide = jnp.stack([zero, zero, one, y, -x, zero], axis=-1)  # chassis motion -> motion of a wheel's centre along its slide
     total = total - jnp.einsum("w,wi,wj->ij", mass, slide, slide)
     total = total - jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])) * 4 * about
-    total = total - jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])) * jnp.where(FRONT, across, 0.0).sum()
+    steered = jnp.where(FRONT, across**2 / (across + car.steering_inertia), 0.0)
+    total = total - jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])) * steered.sum()
     inverse = solve.inverse(total)
     forward = jnp.stack([one, zero, zero, zero, h, -y], axis=-1)  # velocity of a wheel's centre along x, and along y
     aside = jnp.stack([zero, one, zero, -h, zero, x], axis=-1)
@@ -193,6 +193,7 @@ def fit(model: mjx.Model, at: Places, fleet: Fleet) -> dict[str, Array]:
         "body_invweight0": model.body_invweight0.at[at.wheel, 0].set(fleet.wheel_weight),
         "dof_invweight0": model.dof_invweight0.at[at.spin_v].set(fleet.spin_weight),
         "dof_frictionloss": model.dof_frictionloss.at[at.spin_v].set(jnp.maximum(car.rolling_torque, cars.LATENT_FRICTION)),
+        "dof_armature": model.dof_armature.at[at.steer_v].set(car.steering_inertia),
         "dof_damping": damping.at[at.steer_v].set(car.steering_friction),
         "dof_solimp": model.dof_solimp.at[at.spin_v, :2].set(car.brake_impedance),
         "jnt_stiffness": model.jnt_stiffness.at[at.suspension].set(car.suspension_stiffness),

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from scenefactory_jax.dynamics.car import CarParameters, Places
+from scenefactory_jax.dynamics.car import AHEAD, LATENT_FRICTION, LEFT, CarParameters, Places
 from scenefactory_jax.geometry import norm
 
+ROLLS_BACK = 0.5  # rad/s
+FADES = 0.1  # of the spin limit, over which the engine's torque ends
 CORNERS = np.array([[x, y, z] for x in (0.5, -0.5) for y in (0.5, -0.5) for z in (0.5, -0.5)])  # of a box of size one
 
 
@@ -68,6 +70,25 @@ def generalised(
     return applied.at[at.suspension_v].set(stop).at[at.steer_v].set(servo).at[at.spin_v].set(wheel_torque)
 
 
+def pulling(car: CarParameters, drive: Float[Array, ""], spin: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Torque of the engine on each wheel, N m: on the front ones, less from 0.9 of `spin_limit` on. So a wheel in the air stays finite."""
+    left = jnp.clip((car.spin_limit - spin) / (FADES * car.spin_limit), 0.0, 1.0)
+    return drive * left * jnp.array([1.0, 1.0, 0.0, 0.0])
+
+
+def held(
+    engine: Float[Array, "4"], friction: Float[Array, "4"], spin: Float[Array, "4"]
+) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+    """Torque and dry friction of each wheel, N m, with what one takes of the other taken off.
+
+    A wheel that turns forward moves by engine - friction: the same whichever way it is written. But MuJoCo's dry friction is soft: a joint
+    that holds a torque yields at a rate in proportion to it, and a car would creep against its brakes. Less the part of the engine that the
+    friction takes up, nothing is left to yield to. A wheel that rolls back is slowed by engine and friction: there both stay.
+    """
+    taken = jnp.where(spin > -ROLLS_BACK, jnp.minimum(engine, friction), 0.0)
+    return engine - taken, jnp.maximum(friction - taken, LATENT_FRICTION)
+
+
 def scrape(
     car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"], rotation: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -86,15 +107,39 @@ def scrape(
     return force.sum(0), jnp.cross(arm, force @ rotation).sum(0)
 
 
+def turning(
+    car: CarParameters, at: Places, qpos: Float[Array, "17"], qvel: Float[Array, "16"], arm: Float[Array, "4 3"]
+) -> Float[Array, "4 3"]:
+    """Part of the slip's acceleration at each tyre's contact that J qacc leaves out, in the world's axes, m/s^2.
+
+    A contact's slip u = J qvel changes by J qacc + dJ/dt qvel. MuJoCo's reference leaves the second term out. A wheel that rolls through a
+    bend has u constant, J qacc the centripetal acceleration, and dJ/dt qvel its opposite, from the axle that turns with the car: without
+    it, the tyre would be softer in a bend than along the wheel, by the car's mass (see `slip_damping`).
+
+    The contact stays below the hub: it is no point of the wheel, and the wheel's spin does not carry it round.
+
+    Args:
+        arm: from each hub to its contact, in the world's axes, m.
+    """
+    rotation = matrix(qpos[3:7])
+    up, whirl = rotation[:, 2], rotation @ qvel[3:6]
+    angle, rate = (jnp.concatenate([x, jnp.zeros(2)]) for x in (qpos[at.steer_q], qvel[at.steer_v]))
+    place = jnp.stack([AHEAD * car.wheelbase / 2, LEFT * car.track / 2, car.wheel_height + qpos[at.suspension_q]], axis=-1) @ rotation.T
+    axle = jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros(4)], axis=-1) @ rotation.T
+    hub = jnp.cross(whirl, jnp.cross(whirl, place) + 2.0 * qvel[at.suspension_v][:, None] * up)
+    steered = rate[:, None] * up
+    spun = jnp.cross(whirl, steered) + jnp.cross(whirl + steered, qvel[at.spin_v][:, None] * axle)
+    return hub + jnp.cross(spun, arm)
+
+
 def slip_damping(car: CarParameters, qvel: Float[Array, "16"]) -> Float[Array, ""]:
     """Damping of the tyres' friction reference at the car's speed, 1/s: `tyre_slip_damping` up to `tyre_slip_speed`, then as 1/speed.
 
     MuJoCo's friction below the cone obeys R f = b u - a: u the slip velocity, b = damping / impedance, R the contact's regularisation and
-    a the acceleration of its row, J qacc. Under steady braking a is 0. In a steady turn it is the centripetal acceleration f / m, m the
-    mass on the wheel: the row does not see that the rolling direction turns. So f = b u / R along the wheel and f = b u / (R + 1/m) across.
+    a the slip's acceleration, 0 in steady braking and, with `turning`, in a steady turn: f = b u / R along the wheel and across.
     A tyre's force is a stiffness times slip angle or slip ratio, which are u / speed (Pacejka, Tyre and Vehicle Dynamics, linear range).
-    b ~ 1/speed makes it so: the cornering stiffness is b speed / (R + 1/m), the same at every speed above `tyre_slip_speed`. Below, slip
-    ratios lose their meaning and the tyre is a damper.
+    b ~ 1/speed makes it so: the stiffness is b speed / R, the same at every speed above `tyre_slip_speed`. Below, slip ratios lose their
+    meaning and the tyre is a damper.
     """
     return car.tyre_slip_damping / jnp.maximum(norm(qvel[:2]) / car.tyre_slip_speed, 1.0)
 

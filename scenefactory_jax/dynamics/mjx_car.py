@@ -22,10 +22,10 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import fleet as fleets
 from scenefactory_jax.dynamics import solve
-from scenefactory_jax.dynamics.car import CarParameters, Places, Solver
+from scenefactory_jax.dynamics.car import AHEAD, LEFT, CarParameters, Places, Solver
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
-from scenefactory_jax.dynamics.fleet import AHEAD, LEFT, Fleet, enlist, fit, standing
-from scenefactory_jax.dynamics.forces import Command, generalised, matrix, slip_damping, wanted
+from scenefactory_jax.dynamics.fleet import Fleet, enlist, fit, standing
+from scenefactory_jax.dynamics.forces import Command, generalised, held, matrix, pulling, slip_damping, turning, wanted
 from scenefactory_jax.geometry import heading, norm
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
@@ -232,45 +232,44 @@ def move(plant: Plant, car: CarParameters, fields: dict[str, Array], now: Single
     """One physics step of one car, whose own fields of the model are given if it differs from the reference."""
     spin = now.qvel[plant.places.spin_v]
     sign = jnp.where(jnp.abs(spin) > 1e-4, jnp.sign(spin), now.spin_sign)
-    turn = command.drive * jnp.array([1.0, 1.0, 0.0, 0.0]) - (command.brake * sign if plant.latched else 0.0)
+    engine, loss = pulling(car, command.drive, spin), command.brake + car.rolling_torque
+    turn, loss = (engine - command.brake * sign, loss) if plant.latched else held(engine, loss, spin)
     applied = generalised(car, plant.places, now.qpos, now.qvel, command, turn)
     model = plant.model.replace(**fields)
     yields = model.pair_solreffriction.at[:, 1].set(-slip_damping(car, now.qvel))
     model = model.replace(pair_friction=model.pair_friction.at[:, :2].set(command.mu[:, None]), pair_solreffriction=yields)
-    loss = command.brake + jnp.maximum(car.rolling_torque, cars.LATENT_FRICTION)
     if not plant.latched:
         model = model.replace(dof_frictionloss=model.dof_frictionloss.at[plant.places.spin_v].set(loss))
     data = plant.data.replace(qpos=now.qpos, qvel=now.qvel, qacc_warmstart=now.qacc_warmstart, qfrc_applied=applied)
-    if plant.solver.algorithm == "arrow":
-        data, force = _step(plant, model, data, command.mu, loss)
-    else:
-        data = mjx.step(model, data)
-        force = data._impl.efc_force[plant.layout.contact]
+    data, force = _step(plant, model, data, car, command.mu, loss)
     return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(plant, data, force, now.qvel, command.mu)
 
 
 def _step(
-    plant: Plant, model: mjx.Model, data: mjx.Data, mu: Float[Array, "4"], loss: Float[Array, "4"]
+    plant: Plant,
+    model: mjx.Model,
+    data: mjx.Data,
+    car: CarParameters,
+    mu: Float[Array, "4"],
+    loss: Float[Array, "4"],
 ) -> tuple[mjx.Data, Float[Array, "4 3"]]:
-    """`mjx.step` with the solver made for this tree; also the forces of the tyres' contacts. `loss` is the wheels' dry friction, N m."""
+    """`mjx.step` with tyres that turn and with either solver; also the forces of the tyres' contacts.
+
+    Args:
+        loss: the wheels' dry friction, N m.
+    """
     for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
         data = stage(model, data)
-    rows = data._impl
-    acceleration, force = solve.newton(
-        rows.M,
-        data.qfrc_smooth,
-        rows.efc_J,
-        rows.efc_aref,
-        rows.efc_D,
-        mu,
-        loss,
-        data.qacc_warmstart,
-        layout=plant.layout,
-        friction_ratio=plant.solver.friction_ratio,
-        iterations=plant.solver.iterations,
-        line_search=plant.solver.line_search,
-    )
-    return mjx.euler(model, data.replace(qacc=acceleration)), force
+    rows, tyres, solver = data._impl, plant.layout.contact, plant.solver
+    turn = turning(car, plant.places, data.qpos, data.qvel, rows.contact.pos - data.xpos[plant.places.wheel])
+    reference = rows.efc_aref.at[tyres[:, 1:]].add(-jnp.einsum("wij,wj->wi", rows.contact.frame[:, 1:], turn))
+    if solver.algorithm == "arrow":
+        settings = {"friction_ratio": solver.friction_ratio, "iterations": solver.iterations, "line_search": solver.line_search}
+        problem = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, mu, loss, data.qacc_warmstart)
+        acceleration, force = solve.newton(*problem, layout=plant.layout, **settings)
+        return mjx.euler(model, data.replace(qacc=acceleration)), force
+    data = mjx.solve(model, data.replace(_impl=rows.replace(efc_aref=reference)))
+    return (mjx.euler if solver.integrator == "Euler" else mjx.implicit)(model, data), data._impl.efc_force[tyres]
 
 
 def _tyres(plant: Plant, data: mjx.Data, force: Float[Array, "4 3"], qvel: Float[Array, "16"], mu: Float[Array, "4"]) -> Tyres:

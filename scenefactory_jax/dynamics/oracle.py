@@ -105,10 +105,9 @@ def drive(rig: Rig, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, 
     rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows = []
     for control in controls:
-        angle = _command(rig, control)
+        told = _command(rig, control)
         for _ in range(substeps):
-            _push(rig, angle)
-            mujoco.mj_step(rig.model, rig.data)
+            _step(rig, told)
         rows.append(_record(rig))
     return Trajectory(*(np.array(column)[:, 0] for column in zip(*rows, strict=True)))
 
@@ -140,11 +139,10 @@ def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "
     rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows, strongest, first = [], [], np.inf
     for control in controls:
-        angle = _command(rig, control)
+        told = _command(rig, control)
         largest = 0.0
         for _ in range(substeps):
-            _push(rig, angle)
-            mujoco.mj_step(rig.model, rig.data)
+            _step(rig, told)
             largest = max(largest, _between(rig))
             if largest > 0.0 and np.isinf(first):
                 first = rig.data.time
@@ -267,24 +265,49 @@ def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> 
     )
 
 
-def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
-    """What holds for a whole control step: engine torque and brake friction, which are set, and the wanted steering angle."""
+class Told(NamedTuple):
+    """What holds for a whole control step."""
+
+    angle: Float[np.ndarray, " N"]  # wanted, of the front wheels
+    engine: Float[np.ndarray, "N 4"]  # torque below the spin limit, N m
+    friction: Float[np.ndarray, "N 4"]  # of brakes and rolling, N m
+
+
+def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Told:
     car = rig.car
     throttle, steer, brake = np.clip(control[:, 0], 0.0, 1.0), np.clip(control[:, 1], -1.0, 1.0), np.clip(control[:, 2], 0.0, 1.0)
-    loss = rig.model.dof_frictionloss.reshape(-1, 16)
-    rig.applied[:, rig.spin[:2]] = (throttle * car.drive_torque)[:, None]
     strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
-    loss[:, rig.spin] = brake[:, None] * strongest + max(car.rolling_torque, cars.LATENT_FRICTION)
-    return car.steering_limit * steer
+    engine = (throttle * car.drive_torque)[:, None] * np.array([1.0, 1.0, 0.0, 0.0])
+    return Told(car.steering_limit * steer, engine, brake[:, None] * strongest + car.rolling_torque)
 
 
-def _push(rig: Rig, wanted: Float[np.ndarray, " N"]) -> None:
-    """What changes with every physics step: servo, bump stops, dampings, air drag, and how far the tyres yield."""
+def _step(rig: Rig, told: Told) -> None:
+    """One physics step. The tyres' rows are given the part of the slip's acceleration that MuJoCo leaves out: see `forces.turning`."""
+    model, data = rig.model, rig.data
+    _push(rig, told)
+    mujoco.mj_step1(model, data)
+    linear, angular = np.empty((3, model.nv)), np.empty((3, model.nv))
+    for contact in data.contact:
+        if rig.tyre_of[contact.geom[1]] < rig.pairs.size:
+            wheel = model.geom_bodyid[contact.geom[1]]
+            mujoco.mj_jacDot(model, data, linear, angular, data.xpos[wheel], wheel)
+            drift = linear @ data.qvel + np.cross(angular @ data.qvel, contact.pos - data.xpos[wheel])
+            data.efc_aref[contact.efc_address + 1 : contact.efc_address + 3] -= contact.frame[3:].reshape(2, 3) @ drift
+    mujoco.mj_step2(model, data)
+
+
+def _push(rig: Rig, told: Told) -> None:
+    """What changes with every physics step: engine and brakes, servo, bump stops, dampings, air drag, and how far the tyres yield."""
     car, qpos, qvel = rig.car, rig.qpos, rig.qvel
     travel = qpos[:, rig.suspension_q]
     within = np.minimum(np.maximum(travel, -car.suspension_travel), car.suspension_travel)
     rig.applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
-    torque = car.steering_stiffness * (wanted[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
+    torque = car.steering_stiffness * (told.angle[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
+    spin = qvel[:, rig.spin]
+    engine = told.engine * np.minimum(np.maximum(10.0 - 10.0 * spin / car.spin_limit, 0.0), 1.0)
+    taken = np.where(spin > -0.5, np.minimum(engine, told.friction), 0.0)  # of the engine, by the brakes
+    rig.applied[:, rig.spin] = engine - taken
+    rig.model.dof_frictionloss.reshape(-1, 16)[:, rig.spin] = np.maximum(told.friction - taken, cars.LATENT_FRICTION)
     rig.applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)
     speed = np.hypot(qvel[:, 0], qvel[:, 1])
     slip_damping = car.tyre_slip_damping * car.tyre_slip_speed / np.maximum(speed, car.tyre_slip_speed)

@@ -12,11 +12,14 @@ Result = Mapping[str, Any]
 def extremes(result: Result, folder: Path) -> list[str]:
     """What became of states and controls that no driver would choose."""
     del folder
-    rows = [
-        [row["name"], f"{row['speed']:.1f}", f"{row['height']:.2f}", f"{row['lowest']:.2f}", f"{row['acceleration']:.0f}",
-         f"{row['spin']:.1f}", f"{100 * row['gain']:.2g} %", f"{row['end_speed']:.2g}", "yes" if row["passed"] else "**no**"]
-        for row in result["rows"]
-    ]  # fmt: skip
+
+    def numbers(row: Mapping[str, Any]) -> list[str]:
+        if not row["finite"]:
+            return ["not finite"] * 7
+        return [f"{row['speed']:.1f}", f"{row['height']:.2f}", f"{row['lowest']:.2f}", f"{row['acceleration']:.0f}", f"{row['spin']:.1f}",
+                f"{100 * row['gain']:.2g} %", f"{row['end_speed']:.2g}"]  # fmt: skip
+
+    rows = [[row["name"], *numbers(row), "yes" if row["passed"] else "**no**"] for row in result["rows"]]
     header = ["Start and driver", "Largest speed, m/s", "Highest, m", "Lowest, m", "Largest acceleration, m/s²", "Largest spin, rad/s",
               "Gain of energy", "Speed at the end, m/s", "Bounded and finite"]  # fmt: skip
     words = (

@@ -28,8 +28,9 @@ def write(folder: Path, result: Result, targets: Mapping[str, float]) -> Path:
     lines += ["## Parameters", *_parameters(result)]
     lines += [_picture(folder, "slices", "The loss along each parameter alone, the others as fitted", figures.slices(result))]
     lines += ["## Manoeuvres kept out of the fit", *_families(result, "heldout")]
-    lines += [_picture(folder, "heldout", "Errors of every held-out manoeuvre", figures.spread(result))]
-    lines += ["## Manoeuvres of the fit", *_families(result, "training"), *_families(result, "extra")]
+    lines += [_picture(folder, "heldout", "Errors of every held-out manoeuvre", figures.spread(result)), _misses(result, targets)]
+    fitted = [name for name in result["cars"]["fitted"] if name != "heldout"]
+    lines += ["## Manoeuvres of the fit", *(part for name in fitted for part in _families(result, name))]
     lines += [_picture(folder, "paths", "Teacher and cars, one manoeuvre a row", figures.paths(result))]
     path = folder / "sysid.md"
     path.write_text("\n\n".join(line for line in lines if line) + "\n", encoding="utf-8")
@@ -114,6 +115,27 @@ def _families(result: Result, suite: str) -> list[str]:
         rows.append(cells)
     header = ["Family", "n", *(f"{what}: {name}" for what in MEASURES.values() for name in cars)]
     return [f"Medians, {suite}. Stopping distances are absolute differences.", tables.grid(header, rows)]
+
+
+def _misses(result: Result, targets: Mapping[str, float]) -> str:
+    """Families kept out of the fit whose own median misses a target, and what a better tyre would need."""
+    own = result["cars"]["fitted"]["heldout"]
+    families = np.array(own["family"])
+    misses = []
+    for family in dict.fromkeys(own["family"]):
+        for key, what in figures.MEASURES.items():
+            values = np.abs(np.array(own[key], float)[families == family])
+            if np.isfinite(values).any() and np.nanmedian(values) >= targets[key]:
+                misses.append(f"{family} ({what}, {_median(values)})")
+    if not misses:
+        return "No family's own median misses a target."
+    return (
+        f"Families whose own median misses a target: {', '.join(misses)}. They go beyond the tyres' grip. There the teacher's tyre, "
+        "Pacejka's, holds less the more it slides, and the car spins; ours is a Coulomb contact, which holds its whole friction at any "
+        "sliding speed, and the car ploughs on. With a side of the road slippery and wheels that lock, what turns the car is the small "
+        "difference of large forces that both tyres get a little different. A friction coefficient that falls with the slip of each wheel, "
+        "set before every physics step as the weather's is, would do better."
+    )
 
 
 def _median(values: np.ndarray) -> str:

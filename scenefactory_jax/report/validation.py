@@ -210,7 +210,7 @@ def _stopping(result: Result) -> Sequence[str]:
         f"Mean deceleration at friction {friction[dry]:g}: "
         f"{', '.join(f'{name} {_at(one, dry)} m/s²' for name, one in found.items())}."
     )
-    rows = [["v²/(2 μ g)", *(f"{way:.1f}" for way in limit)]]
+    rows = [["v²/(2 μ g), less the air", *(f"{way:.1f}" for way in limit)]]
     for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
         rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
     rows += [[f"C engine, mjx_car, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
@@ -222,7 +222,7 @@ def _hops(result: Result) -> str:
     share = np.array(result["locked_c_m"]) / np.array(result["grip_limit_m"])
     worst, friction = int(share.argmax()), result["backends"]["mjx_car"]["locked"]["friction"]
     return (
-        f"The C engine needs up to {share[worst]:.3f} of v²/(2 μ g), at friction {friction[worst]:g}: "
+        f"The C engine needs up to {share[worst]:.3f} of the way of tyres that slide, at friction {friction[worst]:g}: "
         "wheels that lock so suddenly hop, and the soft contact does not reach the whole friction of a wheel's short landings."
     )
 
@@ -247,8 +247,8 @@ def _brakes(found: Mapping[str, Mapping[str, np.ndarray]], limit: np.ndarray) ->
     own = (pair[0]["distance_m"] / limit)[locks]
     return (
         f"Brakes as joint friction let a locked wheel slide: up to friction {pair[0]['friction'][locks].max():g} the car needs "
-        f"{own.min():.3f} to {own.max():.3f} of v²/(2 μ g). The published latched torque acts against a remembered sign of the wheel's "
-        "rate, which flips with every physics step once the wheel locks: there the car needs "
+        f"{own.min():.3f} to {own.max():.3f} of the way of tyres that slide. The published latched torque acts against a remembered "
+        "sign of the wheel's rate, which flips with every physics step once the wheel locks: there the car needs "
         f"{share[locks].min():.2f} to {share[locks].max():.2f} of it, and {int((~pair[1]['stopped']).sum())} of {len(limit)} cars have "
         "not come to rest when the time is up."
     )
@@ -263,8 +263,8 @@ def _standing(result: Result) -> Sequence[str]:
     ]
     words = (
         f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by friction. "
-        "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion, so a car whose engine pushes "
-        "against its brakes creeps, in the C engine, too."
+        "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion. What the brakes take of the "
+        "engine's torque is therefore taken off before the solver sees it; latched brakes cannot do that."
     )
     return [words, tables.grid(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
 

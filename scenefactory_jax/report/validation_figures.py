@@ -129,7 +129,7 @@ def stopping(result: Result) -> Figure:
         for axes, (kind, title) in zip(grid, titles.items(), strict=True):
             have = [name for name in result["backends"] if kind in result["backends"][name]]
             friction = np.array(result["backends"][have[0]][kind]["friction"])
-            axes.plot(friction, result["grip_limit_m"], color="#000000", linewidth=1.2, label="v²/(2 μ g)")
+            axes.plot(friction, result["grip_limit_m"], color="#000000", linewidth=1.2, label="v²/(2 μ g), less the air")
             if kind == "stopping":
                 axes.axhline(
                     result["brake_limit_m"], color="#000000", linewidth=1.2, linestyle="--", label="brakes' torque, wheels rolling"

@@ -96,7 +96,7 @@ def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     rows = [
         (f"{held}, full brake", "creep_mm", stand["brake_creep_mm"].max(), "mm"),
         (f"{held}, full brake against full throttle", "creep_mm", stand["brake_and_throttle_creep_mm"].max(), "mm"),
-        (f"Stopping with locked wheels against v²/(2 μ g), worst at μ = {worst:g}", "stopping_error", stop.max(), "%"),
+        (f"Stopping with locked wheels against v²/(2 μ g) less the air, worst at μ = {worst:g}", "stopping_error", stop.max(), "%"),
         ("Stopping with locked wheels against the C engine, worst", "stopping_error", other, "%"),
         ("Cornering: lateral acceleration above μ g, worst case", "lateral_over", max(use.max() - 1.0, 0.0), "%"),
         ("Cornering: below μ g where rolling would need more than twice that, worst case", "lateral_under", under, "%"),

@@ -45,7 +45,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     out, settings = Path(config["out"]), config["sysid"]
     (out / "stages").mkdir(parents=True, exist_ok=True)
     known = recorded(config, out)
-    lessons = [*known["training"], *known["extra"]][:: settings["every"]]
+    lessons = [*known["training"], *known["extra"]]
     where = space.make(settings["space"])
     replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=config["physics_hz"])
     plan = student.suite(lessons)
@@ -54,18 +54,19 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
     places, along = fit.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
     drivers = {"fitted": (replay, refined.best), "default": (replay, where.start), "published": published(config)}
-    judged = {name: judge(known, *car, weights=settings["weights"], samples=settings["samples"]) for name, car in drivers.items()}
+    samples = drawn(known, settings["samples"])
+    judged = {name: judge(known, *car, weights=settings["weights"], samples=samples) for name, car in drivers.items()}
     result = {
         "command": configs.command("sysid"),
         "versions": configs.versions(),
-        "manoeuvres": {name: len(recordings) for name, recordings in {"fit": lessons, **known}.items()},
+        "manoeuvres": {name: len(recordings) for name, recordings in known.items()},
         "space": where._asdict(),
         "stages": outcomes,
         "refined": refined,
         "slices": {"place": places, "loss": along},
         "seconds": sum(outcome.seconds for outcome in outcomes) + refined.seconds,
         "cars": {name: suites for name, (suites, _) in judged.items()},
-        "samples": shown(known, settings["samples"], {name: traces for name, (_, traces) in judged.items()}),
+        "samples": shown(known, samples, {name: traces for name, (_, traces) in judged.items()}),
     }
     results.write(out / "result.json", result, digits=DIGITS)
     (out / "fitted.yaml").write_text(yaml.safe_dump(results.plain(fitted(where, refined.best), digits=5), sort_keys=False))
@@ -102,6 +103,12 @@ def judge(
     return found, traces
 
 
+def drawn(known: Mapping[str, Sequence[Recording]], samples: Sequence[str]) -> list[str]:
+    """The samples that the teacher has driven, or the first manoeuvre of each suite."""
+    names = [recording.manoeuvre.name for recordings in known.values() for recording in recordings]
+    return [name for name in samples if name in names] or [recordings[0].manoeuvre.name for recordings in known.values()]
+
+
 def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], traces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The samples of the report, ten times a second: sample -> teacher and cars -> time, position, speed, yaw rate."""
     stride = round(manoeuvres.RATE_HZ / 10.0)
@@ -118,7 +125,7 @@ def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], trac
         cars = {car: every(own[name].position, own[name].pace, own[name].yaw_rate, frames) for car, own in traces.items()}
         return {"teacher": every(teacher.position, teacher.speed, teacher.yaw_rate, frames), **cars}
 
-    return {name: sample(name) for name in samples if name in taught}
+    return {name: sample(name) for name in samples}
 
 
 def published(config: Mapping[str, Any]) -> tuple[Replay, np.ndarray]:
@@ -135,15 +142,18 @@ def fitted(where: Space, row: np.ndarray) -> dict[str, Any]:
 
 
 def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
-    """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files of these settings, or now."""
+    """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files of these settings, or now.
+
+    Of each suite every `sysid.every`-th manoeuvre.
+    """
     instructor = build(config["teacher"], builtins=multibody, where="teacher")(cars.numbers(config["dynamics"])[0])
     suites = {"training": manoeuvres.training, "extra": manoeuvres.extra, "heldout": functools.partial(heldout.heldout, teacher=instructor)}
     masses = {name: config["dynamics"]["car"][name] for name in multibody.READS}
-    found = {}
+    every, found = config["sysid"]["every"], {}
     with mapping(config["workers"]) as each:
         for name, suite in suites.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
-            made = results.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries})
+            made = results.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
             if path.is_file():
                 try:
                     found[name] = teacher.load(path, digest=made)
@@ -151,7 +161,7 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]
                 except ConfigError:
                     print(f"{path}: of other settings, recorded anew", flush=True)
             begun = time.perf_counter()
-            found[name] = list(each(functools.partial(teacher.record, teacher=instructor), suite(entries)))
+            found[name] = list(each(functools.partial(teacher.record, teacher=instructor), suite(entries)[::every]))
             teacher.save(path, found[name], digest=made)
             print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found

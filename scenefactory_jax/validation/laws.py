@@ -131,9 +131,10 @@ def way(position: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, " N"]:
     return np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(1)
 
 
-def grip_limit_m(speed: float, friction: Any) -> Any:
-    """v^2 / (2 mu g): the way to a halt if all tyres slide."""
-    return speed**2 / (2.0 * np.asarray(friction, float) * GRAVITY)
+def grip_limit_m(car: CarParameters, speed: float, friction: Any) -> Any:
+    """The way to a halt if all tyres slide: v^2 / (2 mu g), and a little less for the air, v dv/dx = -(mu g + k v^2)."""
+    k, slides = max(car.air_drag / mass(car), 1e-12), np.asarray(friction, float) * GRAVITY
+    return np.log1p(k * speed**2 / slides) / (2.0 * k)
 
 
 def brake_limit_m(car: CarParameters, speed: float) -> float:

@@ -155,7 +155,7 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     on_patches = bound(settings["patches"], ground, "patches", "validation.laws.patches", **rates)
     return {
         "speed": speed,
-        "grip_limit_m": laws.grip_limit_m(speed, settings["stopping"]["frictions"]),
+        "grip_limit_m": laws.grip_limit_m(car, speed, settings["stopping"]["frictions"]),
         "brake_limit_m": laws.brake_limit_m(car, speed),
         "hold_s": settings["standing"]["hold_s"],
         "strong": settings["strong"],

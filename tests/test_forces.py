@@ -1,0 +1,86 @@
+"""What the car's laws say by themselves: tyres that turn, brakes that hold an engine."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from test_fleet import CAR, SOLVER
+
+from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.dynamics import forces, oracle
+
+
+@pytest.fixture(scope="module")
+def rig():
+    newton = dataclasses.replace(SOLVER, algorithm="Newton")
+    return oracle.single(CAR, newton, physics_dt=1 / 120, iterations=100, line_search=50)
+
+
+def slips(rig, qpos, qvel):
+    """Slip velocity of each tyre over the ground in the world's axes, from the C engine's Jacobian; hub to contact; the engine's state."""
+    rig.data.qpos[:], rig.data.qvel[:] = qpos, qvel
+    mujoco.mj_step1(rig.model, rig.data)
+    rows = rig.data.efc_J.reshape(-1, rig.model.nv) @ rig.data.qvel
+    slip, arm = np.full((4, 3), np.nan), np.full((4, 3), np.nan)
+    for contact in rig.data.contact:
+        wheel = rig.tyre_of[contact.geom[1]]
+        slip[wheel] = contact.frame.reshape(3, 3).T @ rows[contact.efc_address : contact.efc_address + 3]
+        arm[wheel] = contact.pos - rig.data.xpos[rig.model.geom_bodyid[contact.geom[1]]]
+    return slip, arm
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
+    """Against the difference of the slips a moment before and after, of a car that nothing accelerates."""
+    rng, at = np.random.default_rng(seed), cars.places(rig.model)
+    qpos, qvel = cars.rest(rig.model, CAR), np.zeros(16)
+    qpos[3:7] = [np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
+    qpos[at.steer_q], qvel[at.steer_v] = rng.uniform(-0.3, 0.3, 2), rng.uniform(-1.0, 1.0, 2)
+    qvel[:2], qvel[5], qvel[at.spin_v] = rng.uniform(-15.0, 15.0, 2), rng.uniform(-1.0, 1.0), rng.uniform(-50.0, 50.0, 4)
+    _, arm = slips(rig, qpos, qvel)
+    found = forces.turning(jax.tree.map(jnp.float32, CAR), at, jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(arm))
+    ends = []
+    for time in (-1e-4, 1e-4):
+        moved = qpos.copy()
+        mujoco.mj_integratePos(rig.model, moved, qvel, time)
+        ends.append(slips(rig, moved, qvel)[0])
+    wanted = (ends[1] - ends[0]) / 2e-4
+    np.testing.assert_allclose(found[:, :2], wanted[:, :2], rtol=1e-3, atol=1e-2)
+    assert np.abs(wanted[:, :2]).max() > 1.0
+
+
+def test_a_car_that_rolls_through_a_bend_slips_at_a_constant_rate(rig):
+    """Centripetal acceleration of the hubs and the turn of their axles cancel: seen with the car, nothing about it changes."""
+    at, qpos, qvel = cars.places(rig.model), cars.rest(rig.model, CAR), np.zeros(16)
+    rate, radius = 0.5, CAR.wheel_radius
+    qvel[1], qvel[5] = 0.0, rate
+    qvel[0] = 10.0
+    _, arm = slips(rig, qpos, qvel)
+    forward = qvel[0] - rate * cars.LEFT * CAR.track / 2
+    qvel[at.spin_v] = forward / -arm[:, 2]
+    found = forces.turning(jax.tree.map(jnp.float32, CAR), at, jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(arm))
+    centripetal = np.array([0.0, rate * qvel[0], 0.0])  # J qacc of a chassis on its circle
+    np.testing.assert_allclose(found[:, 1] + centripetal[1], 0.0, atol=1e-3)
+    assert radius == pytest.approx(-arm[0, 2], abs=0.01)
+
+
+def test_what_the_brakes_take_of_the_engine_is_taken_off():
+    engine, friction = np.array([600.0, 300.0, 0.0, 0.0]), np.array([400.0, 500.0, 300.0, 0.0])
+    for spin in (20.0, 0.0):
+        torque, left = forces.held(jnp.asarray(engine), jnp.asarray(friction), jnp.full(4, spin))
+        np.testing.assert_allclose(torque, [200.0, 0.0, 0.0, 0.0])
+        np.testing.assert_allclose(left, [cars.LATENT_FRICTION, 200.0, 300.0, cars.LATENT_FRICTION], rtol=1e-6)
+        np.testing.assert_allclose(torque - left, engine - friction, atol=2 * cars.LATENT_FRICTION)
+    torque, left = forces.held(jnp.asarray(engine), jnp.asarray(friction), jnp.full(4, -20.0))
+    np.testing.assert_array_equal(torque, engine)
+    np.testing.assert_allclose(left[:3], friction[:3])
+
+
+def test_the_engine_ends_at_the_spin_limit():
+    car = dataclasses.replace(CAR, spin_limit=100.0)
+    spins = jnp.array([[-50.0, 0.0, 0.0, 0.0], [89.0, 95.0, 0.0, 0.0], [100.0, 400.0, 0.0, 0.0]])
+    torque = jax.vmap(lambda spin: forces.pulling(car, jnp.float32(600.0), spin))(spins)
+    np.testing.assert_allclose(torque, [[600.0, 600.0, 0.0, 0.0], [600.0, 300.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], rtol=1e-5)
