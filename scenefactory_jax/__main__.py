@@ -20,7 +20,7 @@ commands: {", ".join(configs.COMMANDS)}
   convert   scenes -> a bank          source=FILE_OR_FOLDER out=BANK
   scenes    look at scenes            scenes.path=FOLDER_OR_BANK out=FOLDER
   render    scenes as MJCF and images scenes.path=FOLDER_OR_BANK out=FOLDER
-  bench     measure training speed    experiment=published scenes.path=FOLDER_OR_BANK out=FILE
+  bench     measure speed             experiment=published scenes.path=FOLDER_OR_BANK suite=throughput out=FOLDER
   validate  hold the physics to tests validation=reduced|full parts='[drives,laws]' resume=true workers=N out=FOLDER
   sysid     fit the car to a teacher  sysid=reduced|full resume=true workers=N out=FOLDER
 

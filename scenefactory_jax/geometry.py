@@ -32,14 +32,20 @@ def to_frame(vector: Float[Array, "*n 2"], yaw: Float[Array, "*m"]) -> Float[Arr
 
 def norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Euclidean length whose gradient at zero is zero instead of NaN."""
-    squared = jnp.sum(vector * vector, axis=-1)
+    squared = dot(vector, vector)
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:
-    """Inner product over the last axis; leading axes broadcast."""
-    return jnp.sum(a * b, axis=-1)
+    """Inner product over the last axis, which is short; leading axes broadcast.
+
+    Written out: XLA fuses a few products into whatever comes next, but makes every reduction a kernel of its own.
+    """
+    total = a[..., 0] * b[..., 0]
+    for axis in range(1, a.shape[-1]):
+        total = total + a[..., axis] * b[..., axis]
+    return total
 
 
 def cross(a: Float[Array, "*n 2"], b: Float[Array, "*m 2"]) -> Float[Array, "*k"]:

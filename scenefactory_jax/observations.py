@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax import conflict
+from scenefactory_jax import cells, conflict
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
 from scenefactory_jax.patches import condition
@@ -53,12 +53,18 @@ def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[
 def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float) -> Rows:
     """Road segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y.
 
-    Storage order starts with lanes, so a crowded place drops road edges first: the published `road_running` mode.
+    Storage order starts with lanes, so a crowded place drops road edges first: the published `road_running` mode. A scene with cells of at
+    least that radius is looked up there, with the same result.
     """
     position, yaw = state.motion.position[:, :2], state.motion.yaw
-    offset = position[:, None, :] - scene.road.midpoint
-    near = scene.road.valid & (dot(offset, offset) <= radius_m**2)
-    index, mask = first_hits(near, count=count)
+    if scene.cells is not None and scene.cells.radius_m >= radius_m:
+        row, listed = cells.near(scene.cells, position)
+        offset = position[:, None, :] - scene.road.midpoint[row]
+        place, mask = first_hits(listed & (dot(offset, offset) <= radius_m**2), count=count)
+        index = jnp.where(mask, jnp.take_along_axis(row, place, axis=1), 0)
+    else:
+        offset = position[:, None, :] - scene.road.midpoint
+        index, mask = first_hits(scene.road.valid & (dot(offset, offset) <= radius_m**2), count=count)
     frame = yaw[:, None]
     place = to_frame(scene.road.midpoint[index] - position[:, None, :], frame) / radius_m
     kind = scene.road.kind[index][..., None].astype(jnp.float32) / kind_scale

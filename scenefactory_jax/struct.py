@@ -32,6 +32,14 @@ def strong(tree: T) -> T:
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
 
+def unchecked(kind: type[T], /, **fields: Any) -> T:
+    """A struct past its `__init__`, whatever its leaves are: the annotations speak of device arrays, hosts and JAX put others there."""
+    value = object.__new__(kind)
+    for name, field in fields.items():
+        object.__setattr__(value, name, field)
+    return value
+
+
 def static(**options: Any) -> Any:
     """A field that is part of the tree's structure (hashable, no array)."""
     return dataclasses.field(metadata={"static": True}, **options)
@@ -57,12 +65,7 @@ def pytree(cls: type[T]) -> type[T]:
         return [getattr(value, name) for name in data], tuple(getattr(value, name) for name in meta)
 
     def unflatten(aux: Iterable[Any], children: Iterable[Any]) -> T:
-        value = object.__new__(cls)
-        for name, child in zip(data, children, strict=True):
-            object.__setattr__(value, name, child)
-        for name, constant in zip(meta, aux, strict=True):
-            object.__setattr__(value, name, constant)
-        return value
+        return unchecked(cls, **dict(zip(data, children, strict=True)), **dict(zip(meta, aux, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls

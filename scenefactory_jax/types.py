@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from scenefactory_jax.struct import struct
+from scenefactory_jax.struct import static, struct
 
 SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
 
@@ -126,6 +126,22 @@ class Boxes:
 
 
 @struct
+class Cells:
+    """A square grid over the road: for each cell, row after row, the segments within a radius of any of its points, in storage order.
+
+    The cells at the edge list nothing and stand for everything beyond them, too.
+    """
+
+    origin: Float[Array, "2"]  # corner of the first cell
+    first: Int[Array, " N"]  # where each cell's list begins in `rows`, and where the last one ends
+    rows: Int[Array, " M"]  # of the road
+    side: int = static()  # cells
+    size_m: float = static()
+    radius_m: float = static()
+    most: int = static()  # rows of the longest list
+
+
+@struct
 class Scene:
     """One world as the graph sees it: constant in an episode, except for agents and weather, which a reset may redraw, and the boxes.
 
@@ -141,6 +157,7 @@ class Scene:
     weather: Weather
     others: Tracks
     boxes: Boxes  # where the others are now; nobody is there until an environment says so
+    cells: Cells | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
 
 
 @struct

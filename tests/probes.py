@@ -4,6 +4,7 @@ Each is an `Env` of one world whose body is one number an agent, the cue. The la
 """
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,7 @@ NUMBERS = dict(
     normalise_advantage=True,
     initial_phase=False,
     episode_steps=1000,
+    shards=None,
 )
 
 SMALL = dict(
@@ -48,6 +50,7 @@ SMALL = dict(
     log_std_init=-0.7,
     actor_head_scale=0.01,
     dtype="float32",
+    kernels=True,
 )
 
 
@@ -55,6 +58,8 @@ def blank(cls, **known):
     """A struct of zeros wherever a probe has nothing to say."""
 
     def zeros(kind):
+        if isinstance(kind, types.UnionType):  # what a scene may be without
+            return None
         if dataclasses.is_dataclass(kind):
             return blank(kind)
         shape = tuple(int(size) if size.isdigit() else SIZES[size] for size in kind.dim_str.split())

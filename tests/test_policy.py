@@ -20,6 +20,7 @@ TINY = dict(
     log_std_init=-0.5,
     actor_head_scale=1.0,
     dtype="float32",
+    kernels=True,
 )
 W, A, K = 2, 3, 5
 
@@ -93,10 +94,10 @@ def test_gradient_through_the_winners_is_the_plain_gradient(activation, widths):
     ]
 
     def plain(weights, x):
-        return late_fusion.pool(late_fusion.affine(activation, weights, x), road.mask)
+        return late_fusion.pool(late_fusion.affine(activation, "float32", weights, x), road.mask)
 
     def quick(weights, x):
-        return late_fusion.encode_set(activation, weights, x, road.mask)
+        return late_fusion.encode_set(activation, "float32", True, weights, x, road.mask)
 
     direction = jax.random.normal(jax.random.key(4), (W, A, widths[-1]))
     np.testing.assert_allclose(plain(weights, road.features), quick(weights, road.features), atol=1e-6)

@@ -24,7 +24,6 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config, log, sources
 from scenefactory_jax.run import render as rendering
-from scenefactory_jax.run.bench import bench
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
 from scenefactory_jax.run.render import render
@@ -227,13 +226,6 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
             render(config.load("render", "scenes.count=1", f"out={tmp_path}", override))
 
 
-def test_bench_measures_phases(tmp_path, capsys):
-    result = bench(config.load("bench", "experiment=smoke", "worlds=4", "warmup=0", "repeats=1", f"out={tmp_path / 'bench.json'}"))
-    printed = capsys.readouterr().out
-    assert "CASPS" in printed and all(name in printed for name in result["phase_ms_a_control_step"])
-    assert result["slots"] == [4, 4] and result["casps"] > 0 and yaml.safe_load((tmp_path / "bench.json").read_text())["casps"] > 0
-
-
 # ---- command line
 
 
@@ -293,7 +285,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 
 def options():
-    others = ("experiment", "sysid", "validation")
+    others = ("experiment", "suite", "sysid", "validation")
     groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name not in others]
     return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
 

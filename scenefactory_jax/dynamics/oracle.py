@@ -7,6 +7,7 @@ cars meet by MuJoCo's own box-box contact (`meeting`), not by `contact.forces`. 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -152,8 +153,28 @@ def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "
     return Encounter(path, np.array(strongest), float(first))
 
 
-def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: float, iterations: int, line_search: int) -> Rig:
-    """Two cars on the ground whose boxes collide, as a spring-damper with Coulomb friction in MuJoCo's terms.
+def advance(rig: Rig, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int) -> Float[np.ndarray, " N"]:
+    """Drive all cars on for one control step; the largest force of another car on each in any of its physics steps, N."""
+    rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    told, largest = _command(rig, control), np.zeros(len(control))
+    for _ in range(substeps):
+        _step(rig, told)
+        for (one, other), force in _pushes(rig).items():
+            strength = float(np.linalg.norm(force))
+            largest[one], largest[other] = max(largest[one], strength), max(largest[other], strength)
+    return largest
+
+
+def broken(rig: Rig) -> bool:
+    """Whether the engine met a number that is not finite since the cars were placed; it then starts all of them anew at the origin."""
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    return any(rig.data.warning[int(kind)].number for kind in bad)
+
+
+def meeting(
+    car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: float, iterations: int, line_search: int, count: int = 2
+) -> Rig:  # fmt: skip
+    """Cars on the ground whose boxes collide, every pair as a spring-damper with Coulomb friction in MuJoCo's terms.
 
     Of a contact that is r deep and closes at rate v, MuJoCo's force f obeys (A + R) f = (b v + k r) / d, if solref is [-k, -b], the
     impedance is d at any depth, and nothing else accelerates the cars. A is the inverse mass that the contact moves and R = A' (1 - d) / d,
@@ -171,21 +192,22 @@ def meeting(car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: flo
     spec.compiler.autolimits = False
     ground = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name="ground", type=ground, size=[0, 0, 1], contype=0, conaffinity=0)
-    prefixes = ["one/", "two/"]
+    prefixes = [f"{slot}/" for slot in range(count)]
     for prefix in prefixes:
         spec.attach(cars.spec(car, visual=False, brake_rows=True), prefix=prefix, frame=spec.worldbody.add_frame())
         cars.add_ground_pairs(spec, car, ground="ground", prefix=prefix)
     cars.set_options(spec, converged, physics_dt=physics_dt)
-    pair = spec.add_pair(name="cars", geomname1="one/box", geomname2="two/box")
-    pair.condim = 3
-    pair.friction = [touch.friction, touch.friction, 0.005, 1e-4, 1e-4]
+    for one, other in itertools.combinations(prefixes, 2):
+        pair = spec.add_pair(name=f"{one}{other}", geomname1=f"{one}box", geomname2=f"{other}box")
+        pair.condim = 3
+        pair.friction = [touch.friction, touch.friction, 0.005, 1e-4, 1e-4]
     model = spec.compile()
-    chassis = model.body("one/chassis").id
+    chassis = model.body(f"{prefixes[0]}chassis").id
     inverse, at_rest = 2.0 / model.body_subtreemass[chassis], 2.0 * model.body_invweight0[chassis, 0]
     d = touch.impedance
     rigid, soft = inverse * d, at_rest * (1.0 - d) / FACE_POINTS
     normal, sliding = rigid + soft, rigid + soft / converged.friction_ratio
-    index = model.pair("cars").id
+    index = [model.pair(f"{one}{other}").id for one, other in itertools.combinations(prefixes, 2)]
     model.pair_solimp[index] = [d, d, 1e-3, 0.5, 2.0]
     model.pair_solref[index] = [-touch.stiffness * normal, -touch.damping * normal]
     model.pair_solreffriction[index] = [-1e-3, -touch.damping * sliding]
@@ -286,13 +308,17 @@ def _step(rig: Rig, told: Told) -> None:
     model, data = rig.model, rig.data
     _push(rig, told)
     mujoco.mj_step1(model, data)
+    contact = data.contact
+    pressed = np.flatnonzero((rig.tyre_of[contact.geom[:, 1]] < rig.pairs.size) & (contact.efc_address >= 0))
+    wheels = model.geom_bodyid[contact.geom[pressed, 1]]
     linear, angular = np.empty((3, model.nv)), np.empty((3, model.nv))
-    for contact in data.contact:
-        if rig.tyre_of[contact.geom[1]] < rig.pairs.size:
-            wheel = model.geom_bodyid[contact.geom[1]]
-            mujoco.mj_jacDot(model, data, linear, angular, data.xpos[wheel], wheel)
-            drift = linear @ data.qvel + np.cross(angular @ data.qvel, contact.pos - data.xpos[wheel])
-            data.efc_aref[contact.efc_address + 1 : contact.efc_address + 3] -= contact.frame[3:].reshape(2, 3) @ drift
+    hub, turn = np.empty((len(wheels), 3)), np.empty((len(wheels), 3))
+    for row, wheel in enumerate(wheels):
+        mujoco.mj_jacDot(model, data, linear, angular, data.xpos[wheel], wheel)
+        hub[row], turn[row] = linear @ data.qvel, angular @ data.qvel
+    drift = hub + np.cross(turn, contact.pos[pressed] - data.xpos[wheels])
+    across = contact.frame[pressed].reshape(-1, 3, 3)[:, 1:]
+    data.efc_aref[contact.efc_address[pressed, None] + np.arange(1, 3)] -= np.einsum("cij,cj->ci", across, drift)
     mujoco.mj_step2(model, data)
 
 
@@ -340,9 +366,15 @@ def _record(rig: Rig) -> tuple[np.ndarray, ...]:
 
 def _between(rig: Rig) -> float:
     """Force between two cars in the step just taken, N."""
-    contact = rig.data.contact
+    return float(sum(np.linalg.norm(force) for force in _pushes(rig).values()))
+
+
+def _pushes(rig: Rig) -> dict[tuple[int, int], Float[np.ndarray, "3"]]:
+    """Force of each pair of cars that touched in the step just taken, summed over its contact points, N."""
+    contact, found = rig.data.contact, {}
     hits = np.flatnonzero(np.isin(contact.geom, rig.boxes).all(-1) & (contact.efc_address >= 0))
-    if not len(hits):
-        return 0.0
-    rows = rig.data.efc_force[contact.efc_address[hits][:, None] + np.arange(3)]
-    return float(np.linalg.norm(np.einsum("cij,ci->j", contact.frame[hits].reshape(-1, 3, 3), rows)))
+    for hit in hits:
+        one, other = (int(car) for car in np.searchsorted(rig.boxes, contact.geom[hit]))
+        rows = rig.data.efc_force[contact.efc_address[hit] + np.arange(3)]
+        found[one, other] = found.get((one, other), 0.0) + contact.frame[hit].reshape(3, 3).T @ rows
+    return found

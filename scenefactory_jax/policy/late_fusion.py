@@ -5,12 +5,15 @@ encoder; each set of rows goes through its own row encoder and is max-pooled ove
 a config adds is picked up by its kind: a vector joins the vector encoder, rows get an encoder of `rows_default` widths.
 
 Rows are pooled before the last activation, which is the same since activations increase. A pooled channel depends on one row alone, its
-winner, so that the gradient recomputes the winners and keeps no activation of the others: exact, in a fraction of time and memory.
+winner, so that the gradient recomputes the winners and keeps no activation of the others: exact, in a fraction of time and memory. On
+NVIDIA GPUs encoders of two layers run as one kernel (`set_kernel`); the plain JAX here is what that is tested against, and what runs
+elsewhere.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -19,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.policy import set_kernel
 from scenefactory_jax.types import Observation, Policy, Rows
 
 ACTIONS = 3  # throttle, steer, brake
@@ -38,6 +42,7 @@ def make(
     log_std_init: float,
     actor_head_scale: float,
     dtype: Literal["float32", "bfloat16"],
+    kernels: bool,
 ) -> Policy:
     """Two late-fusion towers and a state-independent log standard deviation.
 
@@ -52,7 +57,8 @@ def make(
         actor_head_scale: gain of the orthogonal kernel of the actor's last layer; small, so that the first actions are near zero whatever
             is seen (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's
             default there.
-        dtype: of activations; parameters, means and values stay float32.
+        dtype: of what is multiplied behind the first layer of an encoder; features, sums, parameters, means and values stay float32.
+        kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX everywhere.
 
     Raises:
         ConfigError: a width below one; at `init`, an observation without groups, or widths for a group of rows that it does not have.
@@ -73,6 +79,7 @@ def make(
         log_std_init=float(log_std_init),
         actor_head_scale=float(actor_head_scale),
         dtype=dtype,
+        kernels=kernels,
     )
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
@@ -98,10 +105,11 @@ class ActorCritic(nn.Module):
     log_std_init: float
     actor_head_scale: float
     dtype: str
+    kernels: bool
 
     @nn.compact
     def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
-        shared = {name: getattr(self, name) for name in ("vector", "rows", "rows_default", "trunk", "activation", "dtype")}
+        shared = {name: getattr(self, name) for name in ("vector", "rows", "rows_default", "trunk", "activation", "dtype", "kernels")}
         mean = Tower(**shared, head_bias=self.mean_init, head_scale=self.actor_head_scale, name="actor")(observation)
         value = Tower(**shared, head_bias=(0.0,), head_scale=1.0, name="critic")(observation)
         log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (ACTIONS,), jnp.float32)
@@ -117,6 +125,7 @@ class Tower(nn.Module):
     trunk: tuple[int, ...]
     activation: str
     dtype: str
+    kernels: bool
     head_bias: tuple[float, ...]
     head_scale: float
 
@@ -127,16 +136,17 @@ class Tower(nn.Module):
         vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, Rows)]
         fused = []
         if vectors:
-            layers = Layers(self.vector, self.activation, self.dtype, name="vector")
+            layers = Layers(self.vector, self.activation, self.dtype, self.kernels, name="vector")
             fused.append(activate(layers(jnp.concatenate(vectors, axis=-1))))
         for name, group in sorted(observation.items()):
             if isinstance(group, Rows):
-                layers = Layers(widths.get(name, self.rows_default), self.activation, self.dtype, name=f"{name}_rows")
+                layers = Layers(widths.get(name, self.rows_default), self.activation, self.dtype, self.kernels, name=f"{name}_rows")
                 fused.append(activate(layers(group.features, group.mask)))
-        x = activate(Layers(self.trunk, self.activation, self.dtype, name="trunk")(jnp.concatenate(fused, axis=-1)))
+        trunk = Layers(self.trunk, self.activation, self.dtype, self.kernels, name="trunk")
+        x = activate(trunk(jnp.concatenate(fused, axis=-1).astype(self.dtype)))
         kernel, bias = nn.initializers.orthogonal(self.head_scale), lambda *_: jnp.array(self.head_bias, jnp.float32)
         head = nn.Dense(len(self.head_bias), kernel_init=kernel, bias_init=bias, dtype=jnp.float32, name="head")
-        return head(x.astype(jnp.float32))
+        return head(x)
 
 
 class Layers(nn.Module):
@@ -145,6 +155,7 @@ class Layers(nn.Module):
     widths: tuple[int, ...]
     activation: str
     dtype: str
+    kernels: bool
 
     @nn.compact
     def __call__(self, x: Float[Array, "..."], mask: Bool[Array, "..."] | None = None) -> Float[Array, "..."]:
@@ -152,8 +163,9 @@ class Layers(nn.Module):
         for index, width in enumerate(self.widths):
             weights.append(Affine(inputs, width, name=f"layer_{index}")())
             inputs = width
-        weights, x = jax.tree.map(lambda leaf: leaf.astype(self.dtype), (weights, x))
-        return affine(self.activation, weights, x) if mask is None else encode_set(self.activation, weights, x, mask)
+        if mask is None:
+            return affine(self.activation, self.dtype, weights, x)
+        return encode_set(self.activation, self.dtype, self.kernels, weights, x, mask)
 
 
 class Affine(nn.Module):
@@ -168,20 +180,23 @@ class Affine(nn.Module):
         return kernel, self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32)
 
 
-def affine(activation: str, weights: list, x: Float[Array, "*batch F"]) -> Float[Array, "*batch G"]:
-    """x through dense layers with activations between them."""
+def affine(activation: str, dtype: str, weights: list, x: Float[Array, "*batch F"]) -> Float[Array, "*batch G"]:
+    """x through dense layers with activations between them. The first layer multiplies what it is given, the others numbers of `dtype`."""
     for index, (kernel, bias) in enumerate(weights):
-        x = (ACTIVATIONS[activation](x) if index else x) @ kernel + bias
+        x = ACTIVATIONS[activation](x).astype(dtype) if index else x
+        x = jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.float32) + bias
     return x
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def encode_set(activation: str, weights: list, x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[Array, "*batch G"]:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def encode_set(
+    activation: str, dtype: str, kernels: bool, weights: list, x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]
+) -> Float[Array, "*batch G"]:
     """Rows through `affine`, then the largest value of each channel over the rows that the mask shows; zeros for an empty set.
 
     Of equal rows the first one takes the gradient. Forward-mode differentiation is not defined.
     """
-    return pool(affine(activation, weights, x), mask)
+    return _winners(activation, dtype, kernels, weights, x, mask)[0]
 
 
 def pool(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[Array, "*batch F"]:
@@ -190,25 +205,45 @@ def pool(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[
     return jnp.where(jnp.any(mask, axis=-1)[..., None], largest, 0.0)
 
 
-def _encode_forward(activation: str, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:
-    rows = jnp.where(mask[..., None], affine(activation, weights, x), -jnp.inf)
-    shown = jnp.any(mask, axis=-1)[..., None]
-    winner = jnp.argmax(rows, axis=-2).astype(jnp.int32)
-    return jnp.where(shown, jnp.max(rows, axis=-2), 0.0), (weights, x, winner, shown)
+def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
+    """The pooled channels and the row that each came from."""
+
+    def plain(weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
+        rows = affine(activation, dtype, weights, x)
+        if not mask.shape[-1]:
+            return pool(rows, mask), jnp.zeros((*mask.shape[:-1], rows.shape[-1]), jnp.int32)
+        return pool(rows, mask), jnp.argmax(jnp.where(mask[..., None], rows, -jnp.inf), axis=-2).astype(jnp.int32)
+
+    return _on(kernels and set_kernel.fits(weights), functools.partial(set_kernel.encode, activation, dtype), plain, weights, x, mask)
 
 
-def _encode_backward(activation: str, kept: tuple, cotangent: Array) -> tuple[list, Array, None]:
+def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
+    return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain) if kernel else plain(*arguments)
+
+
+def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:
+    pooled, winner = _winners(activation, dtype, kernels, weights, x, mask)
+    return pooled, (weights, x, winner, jnp.any(mask, axis=-1)[..., None])
+
+
+def _encode_backward(activation: str, dtype: str, kernels: bool, kept: tuple, cotangent: Array) -> tuple[list, Array, None]:
     weights, x, winner, shown = kept
+    cotangent = jnp.where(shown, cotangent, 0.0)
 
     def at_winners(weights: list, x: Array) -> Array:
         rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the row that each channel took
         kernel, bias = weights[-1]
         if len(weights) > 1:
-            rows = ACTIVATIONS[activation](affine(activation, weights[:-1], rows))
-        return jnp.where(shown, jnp.einsum("...gh,hg->...g", rows, kernel) + bias, 0.0)
+            rows = ACTIVATIONS[activation](affine(activation, dtype, weights[:-1], rows)).astype(dtype)
+        return jnp.einsum("...gh,hg->...g", rows, kernel.astype(rows.dtype), preferred_element_type=jnp.float32) + bias
 
-    _, pull = jax.vjp(at_winners, weights, x)
-    return (*pull(cotangent), None)
+    def plain(weights: list, x: Array, winner: Array, cotangent: Array) -> list:
+        return jax.vjp(lambda weights: at_winners(weights, x), weights)[1](cotangent)[0]
+
+    quick = functools.partial(set_kernel.gradient, activation, dtype)
+    of_weights = _on(kernels and set_kernel.fits(weights), quick, plain, weights, x, winner, cotangent)
+    [of_rows] = jax.vjp(lambda x: at_winners(weights, x), x)[1](cotangent)  # the compiler leaves it out where nobody asks for it
+    return of_weights, of_rows, None
 
 
 encode_set.defvjp(_encode_forward, _encode_backward)

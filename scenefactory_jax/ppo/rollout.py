@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from scenefactory_jax.ppo import across
 from scenefactory_jax.ppo.loss import log_probability
 from scenefactory_jax.struct import choose, struct
 from scenefactory_jax.types import Env, Observation, Outcome, Policy, Scene, State
@@ -35,7 +36,7 @@ class Sample:
 
 
 Tally = dict[str, Array]
-"""Sums over worlds and agents of one step: what metrics are made of."""
+"""Sums over worlds, agents and time: what metrics are made of."""
 
 
 def collect(
@@ -49,18 +50,23 @@ def collect(
     key: PRNGKeyArray,
     *,
     horizon: int,
+    axis: str | None = None,
 ) -> tuple[State, Observation, Lives, Sample, Tally]:
     """Act for `horizon` steps in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
 
+    Args:
+        axis: of the devices that share the worlds, see `across`.
+
     Returns:
-        worlds and observation to go on from, lives, samples `[T, W, A]`, and tallies summed over time.
+        worlds and observation to go on from, lives, samples `[T, W, A]`, and the tally of all steps.
     """
 
     def step(carry: tuple[State, Observation, Lives], key: PRNGKeyArray) -> tuple[tuple[State, Observation, Lives], tuple[Sample, Tally]]:
         worlds, observation, lives = carry
         action_key, start_key = jax.random.split(key)
         mean, log_std, value = policy.apply(parameters, observation)
-        action = mean + jnp.exp(log_std) * jax.random.normal(action_key, mean.shape, mean.dtype)
+        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(across.keys(action_key, len(mean), axis))
+        action = mean + jnp.exp(log_std) * noise
         after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
         truncated = outcome.truncated[:, None] & worlds.active & ~outcome.done
         sample = Sample(
@@ -75,12 +81,12 @@ def collect(
             truncated=truncated,
         )
         lives, counts = _tally(worlds, outcome, sample, lives)
-        fresh = jax.vmap(env.start)(jax.random.split(start_key, outcome.over.shape[0]), scenes)
+        fresh = jax.vmap(env.start)(across.keys(start_key, len(outcome.over), axis), scenes)
         worlds = choose(outcome.over, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
-    return worlds, observation, lives, samples, jax.tree.map(lambda x: jnp.sum(x, axis=0), counts)
+    return worlds, observation, lives, samples, jax.tree.map(jnp.sum, counts)
 
 
 def no_lives(worlds: State) -> Lives:
@@ -89,15 +95,18 @@ def no_lives(worlds: State) -> Lives:
 
 
 def _tally(worlds: State, outcome: Outcome, sample: Sample, lives: Lives) -> tuple[Lives, Tally]:
-    """Carry lives on, and sum up the step. Float32 holds sums of up to 16.7 million agent steps exactly."""
+    """Carry lives on, and sum the step up for each world: all of them would be one long sum, for which a GPU waits at every step.
+
+    Float32 holds sums of up to 16.7 million agent steps exactly.
+    """
 
     def total(x: Array, where: Array) -> Array:
-        return jnp.sum(jnp.where(where, x, 0), dtype=jnp.float32)
+        return jnp.sum(jnp.where(where, x, 0), axis=1, dtype=jnp.float32)
 
     active, ended = sample.active, sample.done | sample.truncated
     lives = Lives(lives.returns + sample.reward, lives.steps + active)
     counts = {
-        "spawned": jnp.sum(worlds.agents.present, dtype=jnp.int32),
+        "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
         "reward": total(sample.reward, active),
         "speed": total(outcome.facts.speed, active),

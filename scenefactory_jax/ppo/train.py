@@ -4,7 +4,8 @@
     train_state = trainer.init(key, scenes)                         # scenes: worlds stacked along the first axis
     train_state, metrics = trainer.iterate(train_state, scenes)     # `train_state` is donated: use the returned one
 
-Scenes are an argument of the compiled functions, never a constant in them.
+Scenes are an argument of the compiled functions, never a constant in them. On several devices each acts in its own worlds and learns from
+its own samples; sums over samples, and with them gradients, are added up over the devices.
 """
 
 import functools
@@ -14,10 +15,11 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.ppo import gae, loss, rollout, update
+from scenefactory_jax.ppo import across, gae, loss, rollout, update
 from scenefactory_jax.struct import replace, strong, struct
 from scenefactory_jax.types import Env, Observation, Policy, Scene, State
 
@@ -70,6 +72,8 @@ def make(
     normalise_advantage: bool,
     initial_phase: bool,
     episode_steps: int,
+    shards: int | None,
+    mesh: Mesh | None = None,
 ) -> Trainer:
     """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
 
@@ -88,27 +92,72 @@ def make(
         normalise_advantage: over the active samples of the whole rollout.
         initial_phase: worlds start at a random time of their episode, so that they do not all run out of time together.
         episode_steps: control steps of an episode.
+        shards: groups of worlds whose samples are shuffled on their own; each gives every minibatch an equal part. None: one a device.
+            With the same number of groups any number of devices learns the same, up to rounding.
+        mesh: of devices with the one axis `across.AXIS`, whose scenes lie on them by their first axis; None: one device.
 
     Raises:
         ConfigError: a number out of range; at `init`, samples that the minibatches do not divide.
     """
     _check(locals())
+    axis, own, everybody = _groups(shards, mesh)
     adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
-    objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value)
+    objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis)
     rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max)
-    each = permutation == "each_epoch"
-    learn = functools.partial(
-        update.learn, loss=objective, optimiser=adam, rate=rate, epochs=epochs, minibatches=minibatches, permute_each_epoch=each
-    )
+    each, passes = permutation == "each_epoch", {"epochs": epochs, "minibatches": minibatches, "groups": own, "axis": axis}
+    learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, permute_each_epoch=each, **passes)
     start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
-    act = functools.partial(rollout.collect, env, policy, horizon=horizon)
+    act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage)
+    prepare = functools.partial(prepare, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
+    init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=functools.partial(size, groups=everybody))
+    size = functools.partial(size, groups=own)
+    iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis)
+    return _compiled(init, iterate, functools.partial(_restart, start=start), mesh)
+
+
+def _groups(shards: int | None, mesh: Mesh | None) -> tuple[str | None, int, int]:
+    """The axis of the devices, how many groups of worlds each of them has, and how many there are in all."""
+    axis, devices = (None, 1) if mesh is None else (across.AXIS, mesh.size)
+    shards = devices if shards is None else shards
+    if shards < 1 or shards % devices:
+        raise ConfigError(f"ppo.shards: {shards}; wanted is a multiple of the {devices} devices")
+    return axis, shards // devices, shards
+
+
+def _compiled(init: Callable, iterate: Callable, restart: Callable, mesh: Mesh | None) -> Trainer:
+    """Under `jit`; on a mesh, every device runs `iterate` in its own worlds."""
+    if mesh is None:
+        return Trainer(jax.jit(init), jax.jit(iterate, donate_argnums=0), jax.jit(restart, donate_argnums=0))
+
+    def placed(train_state: TrainState) -> TrainState:
+        shardings = jax.tree.map(functools.partial(NamedSharding, mesh), _places(train_state))
+        return jax.lax.with_sharding_constraint(train_state, shardings)
+
+    def spread(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
+        places, worlds = _places(train_state), PartitionSpec(across.AXIS)
+        run = jax.shard_map(iterate, mesh=mesh, in_specs=(places, worlds), out_specs=(places, PartitionSpec()), check_vma=False)
+        return run(train_state, scenes)
+
     return Trainer(
-        init=jax.jit(functools.partial(_init, policy=policy, optimiser=adam, start=start, size=size)),
-        iterate=jax.jit(functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size), donate_argnums=0),
-        restart=jax.jit(functools.partial(_restart, start=start), donate_argnums=0),
+        init=jax.jit(lambda key, scenes: placed(init(key, scenes))),
+        iterate=jax.jit(spread, donate_argnums=0),
+        restart=jax.jit(lambda train_state, scenes: placed(restart(train_state, scenes)), donate_argnums=0),
     )
+
+
+def _places(train_state: TrainState) -> Any:
+    """Where the leaves of a train state lie: worlds apart, what is learnt on every device."""
+    apart = ("worlds", "observation", "lives")
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: PartitionSpec(across.AXIS) if path[0].name in apart else PartitionSpec(), train_state
+    )
+
+
+def parameters_of(train_state: TrainState) -> Any:
+    """What the policy has learnt, on one device."""
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), train_state.parameters)
 
 
 def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[State, Observation]:
@@ -129,7 +178,7 @@ def _init(
     policy_key, start_key, key = jax.random.split(key, 3)
     worlds, observation = start(start_key, scenes)
     size(worlds)
-    parameters = policy.init(policy_key, observation)
+    parameters = policy.init(policy_key, jax.tree.map(lambda leaf: leaf[:1], observation))
     train_state = TrainState(
         parameters=parameters,
         optimiser=optimiser.init(parameters),
@@ -150,7 +199,15 @@ def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> Trai
 
 
 def _iterate(
-    train_state: TrainState, scenes: Scene, *, policy: Policy, act: Callable, prepare: Callable, learn: Callable, size: Callable
+    train_state: TrainState,
+    scenes: Scene,
+    *,
+    policy: Policy,
+    act: Callable,
+    prepare: Callable,
+    learn: Callable,
+    size: Callable,
+    axis: str | None,
 ) -> tuple[TrainState, Metrics]:
     """Rollout, advantages, updates."""
     act_key, learn_key, key = jax.random.split(train_state.key, 3)
@@ -159,7 +216,8 @@ def _iterate(
     _, log_std, bootstrap = policy.apply(train_state.parameters, observation)
     batch = prepare(samples, bootstrap)
     parameters, optimiser, facts = learn(train_state.parameters, train_state.optimiser, batch, log_std, learn_key, size=size(worlds))
-    facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight)
+    facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
+    tally = across.total(tally, axis)
     following = TrainState(
         parameters=parameters,
         optimiser=optimiser,
@@ -173,7 +231,7 @@ def _iterate(
     return strong(following), measure(tally, facts)
 
 
-def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float) -> int:
+def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float, groups: int = 1) -> int:
     """Samples in a minibatch.
 
     Raises:
@@ -181,10 +239,13 @@ def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_shar
     """
     count, agents = worlds.active.shape
     samples = horizon * count * agents
-    size = int(samples * sample_share) // minibatches
-    if size < 1 or (sample_share == 1.0 and samples % minibatches):
+    if count % groups:
+        raise ConfigError(f"worlds: {count} do not divide into {groups} shards")
+    size = int(samples // groups * sample_share) // minibatches * groups
+    if size < 1 or (sample_share == 1.0 and samples % (minibatches * groups)):
         counted = f"horizon {horizon} x {count} worlds x {agents} agents = {samples} samples"
-        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_share}) do not divide into {minibatches} minibatches")
+        parts = f"{minibatches} minibatches" + (f" of {groups} shards" if groups > 1 else "")
+        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_share}) do not divide into {parts}")
     return size
 
 
@@ -221,27 +282,41 @@ def measure(tally: rollout.Tally, facts: dict[str, Array]) -> Metrics:
     }
 
 
-def _batch(samples: rollout.Sample, bootstrap: Array, *, gamma: float, gae_lambda: float, normalise_advantage: bool) -> loss.Batch:
-    """Samples [T, W, A] with their advantages, as one flat batch. Only active agents whose time did not run out carry weight."""
+def _batch(
+    samples: rollout.Sample,
+    bootstrap: Array,
+    *,
+    gamma: float,
+    gae_lambda: float,
+    normalise_advantage: bool,
+    groups: int,
+    axis: str | None,
+) -> loss.Batch:
+    """Samples [T, W, A] with their advantages, as one flat batch, one group of worlds after the other.
+
+    Only active agents whose time did not run out carry weight.
+    """
+    flat = functools.partial(_flat, groups=groups)
     advantage, returns = gae.estimate(
         samples.reward, samples.value, bootstrap, samples.active, samples.done, samples.truncated, gamma=gamma, gae_lambda=gae_lambda
     )
     weight = (samples.active & ~samples.truncated).astype(jnp.float32)
     batch = loss.Batch(
-        observation=jax.tree.map(_flat, samples.observation),
-        action=_flat(samples.action),
-        mean=_flat(samples.mean),
-        log_probability=_flat(samples.log_probability),
-        value=_flat(samples.value),
-        advantage=_flat(advantage),
-        returns=_flat(returns),
-        weight=_flat(weight),
+        observation=jax.tree.map(flat, samples.observation),
+        action=flat(samples.action),
+        mean=flat(samples.mean),
+        log_probability=flat(samples.log_probability),
+        value=flat(samples.value),
+        advantage=flat(advantage),
+        returns=flat(returns),
+        weight=flat(weight),
     )
-    return replace(batch, advantage=loss.normalise(batch.advantage, batch.weight)) if normalise_advantage else batch
+    return replace(batch, advantage=loss.normalise(batch.advantage, batch.weight, axis=axis)) if normalise_advantage else batch
 
 
-def _flat(x: Array) -> Array:
-    return x.reshape(-1, *x.shape[3:])
+def _flat(x: Array, *, groups: int) -> Array:
+    time, worlds, *rest = x.shape
+    return x.reshape(time, groups, worlds // groups, *rest).swapaxes(0, 1).reshape(-1, *rest[1:])
 
 
 def _add(steps: Array, more: Array) -> Array:

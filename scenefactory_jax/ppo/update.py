@@ -10,6 +10,7 @@ import optax
 from brax.training.agents.ppo.optimizer import adaptive_kl_learning_rate
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from scenefactory_jax.ppo import across
 from scenefactory_jax.ppo.loss import Batch
 
 Loss = Callable[[Any, Batch, Float[Array, " 3"]], tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
@@ -43,38 +44,54 @@ def learn(
     minibatches: int,
     size: int,
     permute_each_epoch: bool,
+    groups: int = 1,
+    axis: str | None = None,
 ) -> tuple[Any, optax.OptState, dict[str, Float[Array, ""]]]:
     """Pass `epochs` times over the batch in `minibatches` of `size` samples each.
+
+    Args:
+        groups: equal stretches of the batch that are shuffled on their own and give every minibatch an equal part.
+        axis: of the devices that share the samples: `batch`, `size` and `groups` are one device's, everything else is the same on all.
 
     Returns:
         parameters, optimiser state, and what the loss reports as means over the minibatches that moved the parameters; `skipped` counts
         those whose loss or gradient was not finite, `left_out` is the share of samples with weight that no minibatch holds.
     """
-    step = functools.partial(_minibatch, loss=loss, optimiser=optimiser, rate=rate, batch=batch, log_std_old=log_std_old)
+    step = functools.partial(_minibatch, loss=loss, optimiser=optimiser, rate=rate, batch=batch, log_std_old=log_std_old, axis=axis)
+    deal = functools.partial(split, weight=batch.weight, minibatches=minibatches, size=size, groups=groups, axis=axis)
 
     def epoch(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
-        return jax.lax.scan(step, carry, split(key, batch.weight, minibatches=minibatches, size=size))
+        return jax.lax.scan(step, carry, deal(key))
 
     keys = jax.random.split(key, epochs) if permute_each_epoch else jnp.broadcast_to(key, (epochs,))
     (parameters, optimiser_state), facts = jax.lax.scan(epoch, (parameters, optimiser_state), keys)
     moved, broken = facts.pop("moved"), facts.pop("broken")
     means = {name: jnp.sum(jnp.where(moved, fact, 0.0)) / jnp.maximum(jnp.sum(moved), 1) for name, fact in facts.items()}
+    weight, dealt = across.total((jnp.sum(batch.weight), jnp.float32(size)), axis)
     counted = {
         "skipped": jnp.sum(broken, dtype=jnp.float32),
         "learning_rate": optimiser_state[-1].hyperparams["learning_rate"],  # pyright: ignore
-        "left_out": jnp.maximum(1.0 - minibatches * size / jnp.maximum(jnp.sum(batch.weight), 1.0), 0.0),
+        "left_out": jnp.maximum(1.0 - minibatches * dealt / jnp.maximum(weight, 1.0), 0.0),
     }
     return parameters, optimiser_state, {**means, **counted}
 
 
-def split(key: PRNGKeyArray, weight: Float[Array, " N"], *, minibatches: int, size: int) -> Int[Array, "minibatches size"]:
-    """Random, disjoint minibatches that share the samples with weight evenly (to one).
+def split(
+    key: PRNGKeyArray, weight: Float[Array, " N"], *, minibatches: int, size: int, groups: int = 1, axis: str | None = None
+) -> Int[Array, "minibatches size"]:
+    """Random, disjoint minibatches that share the samples with weight evenly (to one for each group).
 
-    Samples with weight come first in a random order and are dealt out like cards; if `minibatches * size` is smaller than the batch,
-    samples without weight are the ones left out, then random others.
+    In each group samples with weight come first in a random order and are dealt out like cards; if `minibatches * size` is smaller than
+    the batch, samples without weight are the ones left out, then random others.
     """
-    order = jnp.argsort(jax.random.uniform(key, weight.shape) + (weight <= 0.0))
-    return order[: minibatches * size].reshape(size, minibatches).T
+    each, part = len(weight) // groups, size // groups
+
+    def deal(key: PRNGKeyArray, weight: Float[Array, " n"]) -> Int[Array, "minibatches part"]:
+        order = jnp.argsort(jax.random.uniform(key, weight.shape) + (weight <= 0.0))
+        return order[: minibatches * part].reshape(part, minibatches).T
+
+    dealt = jax.vmap(deal)(across.keys(key, groups, axis), weight.reshape(groups, each)) + each * jnp.arange(groups)[:, None, None]
+    return dealt.swapaxes(0, 1).reshape(minibatches, size)
 
 
 def _minibatch(
@@ -86,11 +103,12 @@ def _minibatch(
     rate: AdaptiveRate,
     batch: Batch,
     log_std_old: Float[Array, " 3"],
+    axis: str | None,
 ) -> tuple[tuple[Any, optax.OptState], dict[str, Array]]:
     """One gradient step; where it is not finite, or no sample has weight, everything stays as it was."""
     parameters, state = carry
     part = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), batch)
-    (total, facts), gradient = jax.value_and_grad(loss, has_aux=True)(parameters, part, log_std_old)
+    (total, facts), gradient = across.total(jax.value_and_grad(loss, has_aux=True)(parameters, part, log_std_old), axis)
     norm = optax.global_norm(gradient)
     adapted = jax.tree.map(lambda x: x, state)  # Brax writes into the state's dict
     if rate.desired_kl is not None:
@@ -99,6 +117,6 @@ def _minibatch(
     stepped = optax.apply_updates(parameters, updates)
 
     finite = jnp.isfinite(total) & jnp.isfinite(norm)
-    moved = finite & (jnp.sum(part.weight) > 0.0)
+    moved = finite & (across.total(jnp.sum(part.weight), axis) > 0.0)
     carry = jax.tree.map(lambda new, old: jnp.where(moved, new, old), (stepped, adapted), (parameters, state))
     return carry, {**facts, "gradient_norm": norm, "broken": ~finite, "moved": moved}

@@ -1,155 +1,160 @@
-"""`bench`: how fast a training configuration runs, and where the time of a control step goes.
+"""`bench`: how fast a configuration runs, where the time of a control step goes, and how that scales.
 
-CASPS, controlled-agent steps per second, counts the steps of spawned slots (30 Hz ticks) with PPO in the loop, after warm-up. Phases are
-measured one by one as scans over the rollout's horizon, so fusion across phases is lost and their sum need not be the whole: both are
-printed.
+CASPS, controlled-agent steps per second, counts the steps of spawned slots (30 Hz ticks) in steady state, with PPO in the loop if the scope
+is `training`. Beside it stands what all slots would make, and the share of spawned steps whose car was still driving.
 """
 
-import json
-import statistics
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 
 from scenefactory_jax import world
-from scenefactory_jax.ppo import rollout
-from scenefactory_jax.report import tables
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ppo import across, rollout
+from scenefactory_jax.report import throughput as report
+from scenefactory_jax.run import baseline, keys, phases, results, sources
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, sources
+from scenefactory_jax.run.phases import Timed
 from scenefactory_jax.run.train import make_policy, make_trainer
-from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Env, Scene
+
+SCOPES = {"training": "update", "environment": "observation", "physics": "physics"}  # and the last level of each
+DIGITS = 6
 
 
 def bench(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure a training config (`load("bench", "experiment=published", ...)`); medians over `repeats`.
+    """Measure a config (`load("bench", "experiment=published", ...)`) or each of its variants; medians over `repeats`.
 
     Returns:
-        The figures, which are also printed and, with `out`, written as JSON.
+        The rows, which are also printed and, with `out`, written there as bench.json and throughput.md.
+
+    Raises:
+        ConfigError: a key that does not fit, also one of a variant, by name.
     """
     keys.check(config, keys.BENCH)
+    variants = config["variants"] or {config["name"]: {}}
+    tasks = {name: changed(config, changes, where=f"variants.{name}") for name, changes in variants.items()}
+    for task in tasks.values():
+        keys.check(task, keys.BENCH)
+    if config["baseline"] is not None:
+        keys.check(config["baseline"], keys.BASELINE, where="baseline")
     sources.use_compilation_cache()
-    loaded = sources.training(config["scenes"])
-    worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"])
-    print(chosen, flush=True)
-    env, policy = world.make(config), make_policy(config)
-    trainer = make_trainer(config, env, policy)
-    state = trainer.init(jax.random.key(config["seed"]), worlds)
-    begun = time.perf_counter()
-    iterate = trainer.iterate.lower(state, worlds).compile()  # pyright: ignore[reportFunctionMemberAccess]
-    compiled = time.perf_counter() - begun
-
-    horizon, repeats = config["ppo"]["horizon"], config["repeats"]
-    seconds, metrics = [], {}
-    for _ in range(config["warmup"] + repeats):
-        begun = time.perf_counter()
-        state, metrics = iterate(state, worlds)
-        metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        seconds.append(time.perf_counter() - begun)
-    seconds = seconds[config["warmup"] :]
-    whole = statistics.median(seconds)
-    spawned = metrics["steps/spawned"]
-    phases = _phases(config, env, policy, state, worlds, horizon=horizon, repeats=repeats)
-    phases["update (iteration - rollout)"] = whole - phases["rollout"]
-    stats = jax.devices()[0].memory_stats() or {}
-    result = {
-        "casps": spawned / whole,
-        "casps_range": [spawned / max(seconds), spawned / min(seconds)],
-        "slots_per_s": state.worlds.active.size * horizon / whole,
-        "active_share": metrics["share/active"],
-        "iteration_s": whole,
-        "compile_s": compiled,
-        "peak_memory_gib": stats.get("peak_bytes_in_use", 0) / 2**30,
-        "phase_ms_a_control_step": {name: 1e3 * value / horizon for name, value in phases.items()},
-        "slots": list(state.worlds.active.shape),
-        "horizon": horizon,
-        "repeats": repeats,
-        "versions": configs.versions(),
-    }
-    print(describe(result), flush=True)
+    mesh, rows, loaded = across.mesh(config["devices"]), [], {}
+    for name, task in tasks.items():
+        source = results.digest(task["scenes"])
+        if source not in loaded:
+            loaded[source] = sources.training(task["scenes"])
+        worlds, chosen = sources.assign(loaded[source], task["worlds"], seed=task["seed"], mesh=mesh)
+        print(f"{name}: {chosen}", flush=True)
+        rows.append({"name": name, "changes": variants[name], **measure(task, worlds, mesh=mesh)})
+        print(report.line(rows[-1]), flush=True)
+    plain = None
+    if config["baseline"] is not None:
+        first = next(iter(tasks.values()))
+        plain = unvectorised(first, loaded[results.digest(first["scenes"])], config["baseline"])
+    result = {"command": configs.command("bench"), "versions": configs.versions(), "rows": rows, "baseline": plain}
+    result = results.plain(result, digits=DIGITS)
+    print(report.text(result), flush=True)
     if config["out"] is not None:
-        Path(config["out"]).parent.mkdir(parents=True, exist_ok=True)
-        Path(config["out"]).write_text(json.dumps(result, indent=2))
+        out = Path(config["out"])
+        out.mkdir(parents=True, exist_ok=True)
+        results.write(out / "bench.json", result, digits=DIGITS)
+        print(report.write(out, result))
     return result
 
 
-def _phases(config, env, policy, state, worlds, *, horizon: int, repeats: int) -> dict[str, float]:
-    """Seconds for `horizon` control steps of each part, the others left out."""
-    dynamics = world.parts_of(config).dynamics
-    shape = (*state.worlds.active.shape, 3)
+def changed(config: Mapping[str, Any], changes: Mapping[str, Any], *, where: str) -> dict[str, Any]:
+    """A config with some values replaced; a mapping with a `_target_` replaces the whole entry.
 
-    def acting(key):
-        return jax.random.uniform(key, shape, jnp.float32, -1.0, 1.0)
+    Raises:
+        ConfigError: a key that the config does not have, with those that it has.
+    """
+    found = dict(config)
+    for name, value in changes.items():
+        if name not in config:
+            raise ConfigError(f"{where}.{name}: unknown; valid: {', '.join(config)}")
+        whole = not isinstance(value, Mapping) or "_target_" in value or not isinstance(config[name], Mapping)
+        found[name] = value if whole else changed(config[name], value, where=f"{where}.{name}")
+    return found
 
-    def advance(scene, state, action):
-        return replace(state, body=dynamics.advance(env.now(scene, state), state.body, action, state.active))
 
-    def physics(states, key):
-        after = jax.vmap(advance)(worlds, states, acting(key))
-        return after, sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(after.body))
+def unvectorised(config: Mapping[str, Any], scenes: sources.Scenes, numbers: Mapping[str, int]) -> dict[str, Any]:
+    """The same task as loops in Python over the C engine, on the scenes with the most cars; acting only."""
+    fullest = np.argsort(-np.asarray(scenes.scene.agents.present).sum(axis=1), kind="stable")[: numbers["worlds"]]
+    chosen = [scenes[int(index)] for index in fullest]
+    env, policy = world.make(config), make_policy(config)
+    seen = env.reset(jax.random.key(config["seed"]), chosen[0])[1]
+    parameters = policy.init(jax.random.key(config["seed"]), seen)
+    timing = {"steps": numbers["steps"], "repeats": numbers["repeats"], "seed": config["seed"]}
+    return baseline.measure(config, chosen, parameters, **timing)
 
-    def transition(states, key):
-        after, outcome = jax.vmap(env.transition)(worlds, states, acting(key))
-        return after, outcome.reward.sum()
 
-    def observe(states, key):
-        seen = jax.vmap(env.observe)(worlds, _nudged(states, key))
-        return states, sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
+def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = None) -> dict[str, Any]:
+    """One configuration on worlds that are already on the device, or on those of a mesh; phases are measured on one device only."""
+    parts = world.parts_of(config)
+    env, scope, horizon = world.assemble(parts), config["scope"], config["ppo"]["horizon"]
+    slots = worlds.agents.present.shape
+    spawned, active = int(worlds.agents.present.sum()) * horizon, None
+    numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
-    def forward(observation, key):
-        mean, _, value = policy.apply(state.parameters, observation)
-        nudged = jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf + 1e-6 * jax.random.uniform(key), observation)
-        return nudged, mean.sum() + value.sum()
+    def act(level: str) -> Timed:
+        start = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+        run = phases.acting(level, parts, env, steps=horizon)
+        return phases.timed(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
 
-    def collect(carry, key):
-        states, observation, lives = carry
-        after = rollout.collect(env, policy, state.parameters, worlds, states, observation, lives, key, horizon=horizon)
-        return after[:3], sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(after[3]))
-
-    scans: dict[str, tuple[Callable, Any, int]] = {
-        "physics": (physics, state.worlds, horizon),
-        "physics + facts + rewards + ends": (transition, state.worlds, horizon),
-        "observation": (observe, state.worlds, horizon),
-        "policy forward": (forward, state.observation, horizon),
-        "rollout": (collect, (state.worlds, state.observation, state.lives), 1),
+    if scope == "training":
+        whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
+        spawned, active = metrics["steps/spawned"], metrics["share/active"]
+    else:
+        whole, roll = act(SCOPES[scope]), None
+    nested = {}
+    if config["phases"] and mesh is None:
+        levels = phases.ACTING[: phases.ACTING.index(SCOPES[scope])] if roll is None else phases.ACTING
+        nested = {level: act(level).median for level in levels}
+        nested |= {} if roll is None else {"policy": roll().median}
+        nested[SCOPES[scope]] = whole.median
+    ms = 1e3 / horizon
+    return {
+        "scope": scope,
+        "worlds": slots[0],
+        "slots": slots[1],
+        "devices": 1 if mesh is None else mesh.size,
+        "horizon": horizon,
+        "per_s": spawned / whole.median,
+        "per_s_range": [spawned / max(whole.seconds), spawned / min(whole.seconds)],
+        "slots_per_s": slots[0] * slots[1] * horizon / whole.median,
+        "spawned_share": spawned / (slots[0] * slots[1] * horizon),
+        "active_share": active,
+        "ms_a_control_step": ms * whole.median,
+        "phases_ms": {name: ms * seconds for name, seconds in phases.parts_of_the_whole(nested).items()},
+        "compile_s": whole.compile_s,
+        "memory_gib": whole.memory_gib,
+        "repeats": config["repeats"],
     }
-    return {name: _median(step, carry, length, repeats) for name, (step, carry, length) in scans.items()}
 
 
-def _median(step: Callable, carry: Any, length: int, repeats: int) -> float:
-    """Median seconds of a jitted scan after one warm-up."""
-    run = jax.jit(lambda carry, key: jax.lax.scan(step, carry, jax.random.split(key, length))[1].sum())
-    times = []
-    for repeat in range(repeats + 1):
-        begun = time.perf_counter()
-        jax.block_until_ready(run(carry, jax.random.key(repeat)))
-        times.append(time.perf_counter() - begun)
-    return statistics.median(times[1:])
+def _learn(
+    config: Mapping[str, Any], env: Env, worlds: Scene, mesh: Mesh | None, *, warmup: int, repeats: int
+) -> tuple[Timed, dict[str, float], Callable[[], Timed]]:
+    """Whole iterations of PPO, the last one's metrics, and a function that times the rollout alone."""
+    policy = make_policy(config)
+    trainer = make_trainer(config, env, policy, mesh=mesh)
+    state = trainer.init(jax.random.key(config["seed"]), worlds)
+    whole = phases.timed(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
+    state, metrics = whole.left
 
+    def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
+        now, seen, lives = carry
+        acted = rollout.collect(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
+        return acted[:3], acted[3]
 
-def _nudged(states, key):
-    """Cars moved a little, so that nothing can be hoisted out of the scan."""
-    shift = 0.01 * jax.random.normal(key, states.motion.position.shape, jnp.float32)
-    move = lambda one, by: replace(one, motion=replace(one.motion, position=one.motion.position + by))  # noqa: E731
-    return jax.vmap(move)(states, shift)
+    def roll() -> Timed:
+        begin = (state.worlds, state.observation, state.lives)
+        given = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731
+        return phases.timed(collect, begin, given, warmup=warmup, repeats=repeats)
 
-
-def describe(result: Mapping[str, Any]) -> str:
-    """The figures as text; the headline last."""
-    phases = result["phase_ms_a_control_step"]
-    whole = 1e3 * result["iteration_s"] / result["horizon"]
-    rows = [[name, f"{value:.2f}"] for name, value in {**phases, "whole iteration": whole}.items()]
-    low, high = result["casps_range"]
-    size = " x ".join(map(str, result["slots"]))
-    return "\n".join(
-        [
-            tables.grid(["phase", "ms a control step"], rows),
-            "",
-            f"compile {result['compile_s']:.1f} s, peak memory {result['peak_memory_gib']:.1f} GiB, {result['versions']['device']}",
-            f"{result['casps']:,.0f} CASPS ({low:,.0f} to {high:,.0f}, {result['repeats']} repeats) at {size} slots, "
-            f"{result['slots_per_s']:,.0f} slots/s, {100 * result['active_share']:.0f} % of spawned steps active",
-        ]
-    )
+    return whole, {name: float(value) for name, value in jax.device_get(metrics).items()}, roll

@@ -4,16 +4,15 @@ Everything that moves cars is in it (weather, friction under every wheel, others
 rewards or policy.
 """
 
-import statistics
-import time
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from scenefactory_jax import rain, world
+from scenefactory_jax import world
 from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import phases
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Scene, Tracks
 
@@ -62,32 +61,18 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
 
 
 def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, seed: int) -> dict[str, Any]:
-    """One variant: a warm-up that compiles, then the median of several timed scans."""
+    """One variant: compiled, warmed up, and the median of several timed scans."""
     parts = world.parts_of(configs.load("task", *overrides))
     env = world.assemble(parts)
     slots = worlds.agents.present.shape
-
-    def physics(scene, state, action):
-        state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
-        body = parts.dynamics.advance(env.now(scene, state), state.body, action, state.active)
-        return replace(state, body=body, step=state.step + 1)
-
-    def step(states, key):
-        return jax.vmap(physics)(worlds, states, jax.random.uniform(key, (*slots, 3), jnp.float32, -1.0, 1.0)), None
-
-    run = jax.jit(lambda states, key: jax.lax.scan(step, states, jax.random.split(key, steps))[0])
     states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(seed), slots[0]), worlds)
-    seconds = []
-    for repeat in range(repeats + 1):
-        begun = time.perf_counter()
-        states = jax.block_until_ready(run(states, jax.random.key(repeat)))
-        seconds.append(time.perf_counter() - begun)
+    run = phases.acting("physics", parts, env, steps=steps)
+    found = phases.timed(run, states, lambda repeat: (worlds, jax.random.key(repeat)), warmup=1, repeats=repeats)
     done = slots[0] * slots[1] * steps
-    median = statistics.median(seconds[1:])
     return {
-        "per_s": done / median,
-        "per_s_range": [done / max(seconds[1:]), done / min(seconds[1:])],
-        "ms_a_control_step": 1e3 * median / steps,
-        "compile_s": seconds[0] - median,
-        "finite": bool(jnp.isfinite(jax.vmap(parts.dynamics.read)(states.body).position)[worlds.agents.present].all()),
+        "per_s": done / found.median,
+        "per_s_range": [done / max(found.seconds), done / min(found.seconds)],
+        "ms_a_control_step": 1e3 * found.median / steps,
+        "compile_s": found.compile_s,
+        "finite": bool(jnp.isfinite(jax.vmap(parts.dynamics.read)(found.left[0].body).position)[worlds.agents.present].all()),
     }

@@ -24,14 +24,19 @@ VIDEO |= {"panel": Key(int, 120), "trail_s": Key(float, 0), "suffix": Key(Litera
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
 EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
+TRAIN |= {"devices": Key(int | None, 1)}
 TRAIN |= {"minutes": Key(float | None, 0), "checkpoint_every": COUNT, "checkpoints_kept": COUNT, "tensorboard": FLAG, "progress": FLAG}
-BENCH = {"seed": SEED, "worlds": COUNT, "warmup": SEED, "repeats": COUNT, "out": PLACE}
+BENCH = {"seed": SEED, "worlds": COUNT, "warmup": SEED, "repeats": COUNT, "out": PLACE, "phases": FLAG, "name": Key(str)}
+BENCH |= {"scope": Key(Literal["training", "environment", "physics"]), "variants": Key(dict[str, dict])}
+BENCH |= {"devices": Key(int | None, 1), "baseline": Key(dict | None)}
+BASELINE = {"worlds": COUNT, "steps": COUNT, "repeats": COUNT}
 SYSID = {"out": Key(str), "resume": FLAG, "workers": COUNT, "physics_hz": Key(float, 1)}
 VALIDATE = {"out": Key(str), "parts": Key(list[str]), "resume": FLAG, "workers": COUNT}
 RENDER = {"index": SEED, "seed": SEED, "out": Key(str)}
 SCENES = {"op": Key(str), "out": Key(str), "limit": SEED}
 CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG}
 SOURCE = {"path": PLACE, "seed": SEED, "count": COUNT, "workers": COUNT}
+CELLS = {"radius_m": Key(float | None, 0), "size_m": Key(float, 0.1)}
 HELDOUT = {"path": PLACE, "seed": SEED, "count": COUNT}
 
 
@@ -85,3 +90,4 @@ def check_scenes(config: Mapping[str, Any]) -> None:
     """
     check(config, SOURCE, where="scenes")
     check(config["heldout"], HELDOUT, where="scenes.heldout")
+    check(config["cells"], CELLS, where="scenes.cells")

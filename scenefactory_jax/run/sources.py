@@ -9,8 +9,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
+from scenefactory_jax import cells
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.ppo import across
 from scenefactory_jax.run import keys
 from scenefactory_jax.scenes import bank, convert, source
 from scenefactory_jax.scenes.pack import Packed, prepare
@@ -84,7 +87,7 @@ def from_path(config: Mapping[str, Any], path: str | Path) -> Scenes:
         opened = bank.open(path)
         scene, cuts = bank.load(opened, range(len(opened)), capacity=config["capacity"])
         summary = convert.summarise(opened.reports, files=len(opened.reports), rejects=opened.rejects)
-        return Scenes(scene, opened.names, "\n".join([f"bank {path}", *convert.describe(summary), *describe(cuts)]))
+        return Scenes(with_cells(scene, config), opened.names, "\n".join([f"bank {path}", *convert.describe(summary), *describe(cuts)]))
     parts = readers(config)
     packed, rejects = convert.read(path, **parts, workers=config["workers"])
     reports = [scene.report for scene in packed]
@@ -112,12 +115,17 @@ def readers(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def assign(scenes: Scenes, worlds: int, *, seed: int) -> tuple[Scene, str]:
-    """One scene for each world: the whole list shuffled, again and again (facts 4.5, random fill); on the device.
+def assign(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
+    """One scene for each world: the whole list shuffled, again and again (facts 4.5, random fill); on the device, or shared out on several.
 
     Returns:
         Scenes along the first axis, and a line that says how often each is used.
+
+    Raises:
+        ConfigError: worlds that do not divide among the devices.
     """
+    if mesh is not None and worlds % mesh.size:
+        raise ConfigError(f"worlds: {worlds} do not divide among {mesh.size} devices")
     generator = np.random.default_rng(seed)
     order = itertools.chain.from_iterable(generator.permutation(len(scenes)) for _ in range(-(-worlds // len(scenes))))
     chosen = np.fromiter(itertools.islice(order, worlds), int)
@@ -125,7 +133,7 @@ def assign(scenes: Scenes, worlds: int, *, seed: int) -> tuple[Scene, str]:
     spawned = int(np.asarray(scenes.scene.agents.present)[chosen].sum())
     unused = f"; {np.sum(counts == 0)} scenes are not used: raise worlds" if (counts == 0).any() else ""
     text = f"{worlds} worlds of {len(scenes)} scenes, {counts.min()} to {counts.max()} worlds a scene, {spawned} logged agents{unused}"
-    return jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)), text
+    return across.place(jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene), mesh), text
 
 
 def use_compilation_cache() -> None:
@@ -138,4 +146,10 @@ def use_compilation_cache() -> None:
 
 def _stacked(packed: Sequence[Packed], config: Mapping[str, Any], lines: list[str]) -> Scenes:
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
-    return Scenes(scene, tuple(one.report.name for one in packed), "\n".join([*lines, *describe(cuts)]))
+    return Scenes(with_cells(scene, config), tuple(one.report.name for one in packed), "\n".join([*lines, *describe(cuts)]))
+
+
+def with_cells(scene: Scene, config: Mapping[str, Any]) -> Scene:
+    """Stacked scenes with cells for the radius of the road observation, if a config has one."""
+    numbers = config["cells"]
+    return scene if numbers["radius_m"] is None else cells.attach(scene, **numbers)

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.policy import late_fusion
-from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.ppo import across, checkpoint
 from scenefactory_jax.ppo import train as ppo
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, sources
@@ -46,10 +47,10 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
     keys.check_train(config)
     sources.use_compilation_cache()
     folder, resume = _folder(config)
-    env, policy = world.make(config), make_policy(config)
+    env, policy, mesh = world.make(config), make_policy(config), across.mesh(config["devices"])
     loaded = sources.training(config["scenes"])
-    worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"])
-    trainer = make_trainer(config, env, policy)
+    worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"], mesh=mesh)
+    trainer = make_trainer(config, env, policy, mesh=mesh)
     configs.write(folder, config)
     print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
 
@@ -76,11 +77,11 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
     return build(config["policy"], builtins=late_fusion, where="policy")()
 
 
-def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy) -> ppo.Trainer:
-    """PPO with a config's numbers."""
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
+    """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
     entry = {"_target_": "make", **config["ppo"]}
     make = build(entry, builtins=ppo, where="ppo", episode_steps=world.episode_steps(config["timing"]))
-    return make(env, policy)
+    return make(env, policy, mesh=mesh)
 
 
 def _make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> OnIteration | None:
@@ -91,7 +92,7 @@ def _make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | Non
     from scenefactory_jax.run.evaluate import make_watch
 
     watch = make_watch(config, folder, resume_at=resume_at)
-    return lambda state, row: watch(state.parameters, row) if row["iteration"] % every == 0 else None
+    return lambda state, row: watch(ppo.parameters_of(state), row) if row["iteration"] % every == 0 else None
 
 
 def _loop(config, folder: Path, trainer: ppo.Trainer, worlds, state, *, resume: bool, callbacks: list[OnIteration]):

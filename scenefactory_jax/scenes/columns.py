@@ -9,12 +9,14 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from scenefactory_jax.types import DRIVABLE, EDGES, Boxes, Patches, Rain, Road, Scene
+from scenefactory_jax.struct import unchecked
+from scenefactory_jax.types import DRIVABLE, EDGES, Boxes, Cells, Patches, Rain, Road, Scene
 
 T = TypeVar("T")
 
 ROADS = ("road", "lanes", "edges")
 DRAWN = (Patches, Rain, Boxes)  # parts of a scene that resets make: no file holds them, packed scenes have none of them
+DERIVED = Cells | None  # made of the other columns where it is wanted
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 
 
@@ -30,7 +32,7 @@ def _describe(kind: type, prefix: str = "") -> dict[str, Column]:
     found: dict[str, Column] = {}
     for entry in dataclasses.fields(kind):
         name = prefix + entry.name
-        if entry.type in DRAWN:
+        if entry.type in DRAWN or entry.type == DERIVED:
             continue
         if dataclasses.is_dataclass(entry.type):
             found |= _describe(entry.type, f"{name}.")  # pyright: ignore[reportArgumentType]
@@ -49,30 +51,29 @@ COLUMNS: dict[str, Column] = _describe(Scene)
 
 
 def assemble(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> T:
-    """The struct whose leaves have these dotted names.
-
-    Built past `__init__`: the annotations speak of device arrays, and these are numpy's until a program asks for them.
-    """
-    value = object.__new__(kind)
+    """The struct whose leaves have these dotted names; they stay numpy's until a program asks for them."""
+    found: dict[str, Any] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         name = prefix + entry.name
-        if entry.type in DRAWN:
+        if entry.type == DERIVED:
+            leaf = None
+        elif entry.type in DRAWN:
             leaf = _nothing(entry.type, columns["log.dt"].shape)
         elif dataclasses.is_dataclass(entry.type):
             leaf = assemble(entry.type, columns, f"{name}.")  # pyright: ignore[reportArgumentType]
         else:
             leaf = columns[name]
-        object.__setattr__(value, entry.name, leaf)
-    return value
+        found[entry.name] = leaf
+    return unchecked(kind, **found)
 
 
 def _nothing(kind: type[T], worlds: tuple[int, ...]) -> T:
     """A drawn part without rows, for one scene (`worlds` is empty) or a stack of them."""
-    value = object.__new__(kind)
+    found: dict[str, Any] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         shape = tuple(int(axis) if axis.isdigit() else 0 for axis in entry.type.dim_str.split())  # pyright: ignore
-        object.__setattr__(value, entry.name, np.zeros((*worlds, *shape), _dtype(entry.type)))
-    return value
+        found[entry.name] = np.zeros((*worlds, *shape), _dtype(entry.type))
+    return unchecked(kind, **found)
 
 
 def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
@@ -80,7 +81,7 @@ def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for entry in dataclasses.fields(value):
         leaf, name = getattr(value, entry.name), prefix + entry.name
-        if isinstance(leaf, DRAWN):
+        if isinstance(leaf, (*DRAWN, Cells)) or leaf is None:
             continue
         found |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
     return found

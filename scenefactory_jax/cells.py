@@ -1,0 +1,67 @@
+"""Looking road segments up by place: a square grid whose cells list what lies within a radius of any of their points.
+
+A place looks through its cell's list instead of all segments. The lists keep the storage order, so that the segments found are the same,
+in the same order, as by looking through all of them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax.struct import unchecked
+from scenefactory_jax.types import Cells, Scene
+
+SLACK_M = 0.01  # on the radius, so that rounding loses nobody: far above float32's at the coordinates of a scene
+
+
+def near(cells: Cells, position: Float[Array, "A 2"]) -> tuple[Int[Array, "A N"], Bool[Array, "A N"]]:
+    """Segments that may lie within the radius of each position, in storage order, and which entries are any."""
+    place = jnp.floor((position - cells.origin) / cells.size_m).astype(jnp.int32)
+    column, row = jnp.clip(place, 0, cells.side - 1).T
+    cell = row * cells.side + column
+    at = cells.first[cell][:, None] + jnp.arange(cells.most, dtype=jnp.int32)
+    listed = at < cells.first[cell + 1][:, None]
+    return jnp.where(listed, cells.rows[jnp.minimum(at, len(cells.rows) - 1)], 0), listed
+
+
+def attach(scene: Scene, *, radius_m: float, size_m: float) -> Scene:
+    """Stacked scenes (numpy leaves `[W, ...]`) with cells for their roads.
+
+    Args:
+        radius_m: that lookups will ask for.
+        size_m: side of a cell; smaller ones have shorter lists, and more of them.
+    """
+    midpoint, valid = np.asarray(scene.road.midpoint), np.asarray(scene.road.valid)
+    margin = radius_m + size_m  # around the segments: cells at the grid's edge list nothing, and stand for everything beyond
+    shown = [points[seen] if seen.any() else np.zeros((1, 2)) for points, seen in zip(midpoint, valid, strict=True)]
+    origin = np.stack([points.min(axis=0) - margin for points in shown])
+    width = max(float((points.max(axis=0) - points.min(axis=0)).max()) for points in shown) + 2 * margin
+    side = int(np.ceil(width / size_m)) + 1
+    lists = [
+        _lists(points, seen, corner, side=side, radius_m=radius_m, size_m=size_m)
+        for points, seen, corner in zip(midpoint, valid, origin, strict=True)
+    ]
+    first = np.stack([np.concatenate([[0], np.cumsum(count)]) for _, count in lists]).astype(np.int32)
+    rows = np.zeros((len(lists), max(1, *(len(found) for found, _ in lists))), np.int32)
+    for own, (found, _) in zip(rows, lists, strict=True):
+        own[: len(found)] = found
+    most = max(1, *(int(count.max()) for _, count in lists))
+    leaves = {"origin": origin.astype(np.float32), "first": first, "rows": rows}
+    cells = unchecked(Cells, **leaves, side=side, size_m=float(size_m), radius_m=float(radius_m), most=most)
+    return unchecked(Scene, **(vars(scene) | {"cells": cells}))
+
+
+def _lists(
+    midpoint: np.ndarray, valid: np.ndarray, origin: np.ndarray, *, side: int, radius_m: float, size_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Segments of all cells, cell after cell, and how many each has."""
+    reach = int(np.ceil(radius_m / size_m)) + 1
+    window = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="xy"), axis=-1).reshape(-1, 2)
+    number = np.flatnonzero(valid)
+    points = midpoint[number].astype(np.float64) - origin
+    cell = np.floor(points / size_m).astype(int)[:, None] + window
+    beyond = np.maximum(np.maximum(cell * size_m - points[:, None], points[:, None] - (cell + 1) * size_m), 0.0)  # from point to square
+    reached = (np.hypot(beyond[..., 0], beyond[..., 1]) <= radius_m + SLACK_M) & ((cell >= 0) & (cell < side)).all(axis=-1)
+    flat = (cell[..., 1] * side + cell[..., 0])[reached]
+    segment = np.broadcast_to(number[:, None], reached.shape)[reached]  # ascending, and a stable sort keeps it so
+    return segment[np.argsort(flat, kind="stable")].astype(np.int32), np.bincount(flat, minlength=side * side)

@@ -1,0 +1,53 @@
+"""Worlds shared out among devices: where they lie, sums over all of them, and random keys that do not depend on how many there are.
+
+`axis` is the mesh's axis inside `shard_map`, where each device sees its own worlds; None: one device sees them all.
+"""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Key, PRNGKeyArray
+
+from scenefactory_jax.build import ConfigError
+
+AXIS = "worlds"
+Tree = TypeVar("Tree")
+
+
+def total(tree: Tree, axis: str | None) -> Tree:
+    """Sums over the devices, of every leaf."""
+    return tree if axis is None else jax.lax.psum(tree, axis)
+
+
+def keys(key: PRNGKeyArray, count: int, axis: str | None) -> Key[Array, " {count}"]:
+    """A key for each of this device's `count` worlds (or groups of them), by its number among all of them."""
+    first = 0 if axis is None else jax.lax.axis_index(axis) * count
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, first + jnp.arange(count))
+
+
+def mesh(count: int | None = None) -> Mesh | None:
+    """The first `count` devices of all processes (None: all of them) in a row; None for a single one, which needs no mesh.
+
+    Raises:
+        ConfigError: more than there are.
+    """
+    devices = jax.devices()
+    if count is not None and not 1 <= count <= len(devices):
+        raise ConfigError(f"devices: {count}; there are {len(devices)} ({devices[0].device_kind})")
+    chosen = devices[:count]
+    return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
+
+
+def place(scenes: Tree, over: Mesh | None) -> Tree:
+    """Arrays onto the devices, by their first axis; every process holds all of them and gives away its part."""
+    if over is None:
+        return jax.device_put(scenes)
+    sharding = NamedSharding(over, PartitionSpec(AXIS))
+
+    def put(leaf: np.ndarray) -> jax.Array:
+        return jax.make_array_from_callback(leaf.shape, sharding, lambda part: np.asarray(leaf)[part])
+
+    return jax.tree.map(put, scenes)

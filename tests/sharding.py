@@ -1,0 +1,40 @@
+"""Runs in processes of its own: a few iterations of PPO on so many devices in so many shards; prints what was learnt as JSON.
+
+    python sharding.py DEVICES:SHARDS[,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+"""
+
+import itertools
+import json
+import sys
+
+import jax
+
+if len(sys.argv) > 2:
+    jax.distributed.initialize(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+
+import numpy as np
+from probes import NUMBERS, SMALL, probe, scenes
+
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import across, train
+
+WORLDS = 8
+
+
+def learn(devices, shards):
+    """Parameters and metrics after three iterations."""
+    mesh = across.mesh(devices)
+    numbers = {**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 6, "sample_share": 0.75, "shards": shards}
+    trainer = train.make(probe(life=5, episode_steps=6), late_fusion.make(**SMALL), **numbers, mesh=mesh)
+    stage = across.place(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
+    state, history = trainer.init(jax.random.key(3), stage), []
+    for _ in range(3):
+        state, metrics = trainer.iterate(state, stage)
+        history.append({name: float(value) for name, value in metrics.items()})
+    state = trainer.restart(state, stage)
+    learnt = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(train.parameters_of(state))]
+    return {"parameters": [*itertools.chain(*learnt)], "metrics": history, "devices": len(jax.devices()), "processes": jax.process_count()}
+
+
+if __name__ == "__main__":
+    print("RESULT", json.dumps([learn(*map(int, pair.split(":"))) for pair in sys.argv[1].split(",")]), flush=True)

@@ -1,0 +1,78 @@
+"""`bench`: scopes, phases that add up, variants, suites."""
+
+import pytest
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import throughput as report
+from scenefactory_jax.run import bench as command
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import keys, phases, results
+from scenefactory_jax.run.config import load
+
+SMALL = ("experiment=smoke", "worlds=4", "warmup=0", "repeats=1")
+VARIANTS = {"training": {}, "environment": {"scope": "environment"}, "physics": {"scope": "physics", "worlds": 2, "phases": False}}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Every scope once."""
+    folder = tmp_path_factory.mktemp("bench")
+    return folder, command.bench({**load("bench", *SMALL, f"out={folder}"), "variants": VARIANTS})
+
+
+def test_every_scope_is_measured(made):
+    rows = {row["name"]: row for row in made[1]["rows"]}
+    assert list(rows) == list(VARIANTS) and [(row["worlds"], row["slots"]) for row in rows.values()] == [(4, 4), (4, 4), (2, 4)]
+    for row in rows.values():
+        low, high = row["per_s_range"]
+        assert 0 < low <= row["per_s"] <= high and row["compile_s"] > 0 and row["memory_gib"] > 0
+        assert row["per_s"] == pytest.approx(row["slots_per_s"] * row["spawned_share"], rel=1e-4) and 0 < row["spawned_share"] <= 1
+        assert row["ms_a_control_step"] == pytest.approx(1e3 * row["worlds"] * row["slots"] / row["slots_per_s"], rel=1e-4)
+    assert rows["training"]["active_share"] > 0.5 and rows["physics"]["active_share"] is None
+
+
+def test_phases_add_up_to_the_whole(made):
+    rows = {row["name"]: row for row in made[1]["rows"]}
+    assert list(rows["training"]["phases_ms"]) == [*phases.ACTING, "policy", "update"]
+    assert list(rows["environment"]["phases_ms"]) == list(phases.ACTING) and not rows["physics"]["phases_ms"]
+    for name in ("training", "environment"):
+        assert sum(rows[name]["phases_ms"].values()) == pytest.approx(rows[name]["ms_a_control_step"], rel=1e-4)
+    assert phases.parts_of_the_whole({"a": 1.0, "b": 3.0, "c": 2.5}) == {"a": 1.0, "b": 2.0, "c": -0.5}
+
+
+def test_the_report_is_made_of_the_json(made, tmp_path):
+    folder, result = made
+    read = results.read(folder / "bench.json")
+    assert report.write(tmp_path, read).read_text() == (folder / "throughput.md").read_text()
+    text = (folder / "throughput.md").read_text()
+    assert f"| physics | physics | 2 x 4 | 1 | 8 | {result['rows'][2]['per_s']:,.0f} (" in text
+    assert "## training: where the time goes" in text
+
+
+def test_variants_change_values_and_replace_entries():
+    config = load("bench", "experiment=smoke")
+    changes = {"ppo": {"horizon": 5}, "dynamics": {"_target_": "mine", "mass": 1.0}, "worlds": 3}
+    found = command.changed(config, changes, where="variants.mine")
+    assert found["ppo"] == {**config["ppo"], "horizon": 5} and found["worlds"] == 3
+    assert found["dynamics"] == {"_target_": "mine", "mass": 1.0}
+    assert config["worlds"] == 4 and config["ppo"]["horizon"] == 8  # the config itself stays
+    with pytest.raises(ConfigError, match=r"variants\.mine\.ppo\.horizont: unknown; valid: horizon, "):
+        command.changed(config, {"ppo": {"horizont": 5}}, where="variants.mine")
+    with pytest.raises(ConfigError, match=r"scope: 'driving' is of type str"):
+        command.bench({**config, "variants": {"mine": {"scope": "driving"}}})
+
+
+@pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.folder() / "suite").glob("*.yaml")))
+def test_every_variant_of_a_suite_is_a_config(suite):
+    config = load("bench", "experiment=published", f"suite={suite}")
+    for name, changes in config["variants"].items():
+        keys.check(command.changed(config, changes, where=name), keys.BENCH)
+
+
+def test_the_loop_stands_beside_the_first_configuration():
+    phases_ms = {"policy": 1.25, "physics": 2.0, "whole": 3.25}
+    loop = {"agent_steps_per_s": 500.0, "agent_steps_per_s_range": [490.0, 510.0], "phase_ms_a_control_step": phases_ms, "cars": 16.0,
+            "steps": 60, "repeats": 3}  # fmt: skip
+    text = report.beside({"baseline": loop, "rows": [{"name": "256 x 16", "scope": "training", "per_s": 250_000.0}]})
+    assert "500 agent steps/s (490 to 510, 3 repeats of 60 steps, 16 cars a world)" in text and "policy 1.2, physics 2.0." in text
+    assert text.endswith("`256 x 16` (training) makes 500 times as many.")

@@ -1,0 +1,78 @@
+"""The same training on one device, on several, and in several processes; devices are virtual ones of the CPU."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from probes import NUMBERS, SMALL, probe, scenes
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.policy import late_fusion
+from scenefactory_jax.ppo import across, train
+
+HERE = Path(__file__).parent
+
+
+def start(pairs, *more, visible=4):
+    flags = f"--xla_force_host_platform_device_count={visible}"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}"}
+    arguments = [sys.executable, str(HERE / "sharding.py"), pairs, *more]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def result(process):
+    out, error = process.communicate(timeout=240)
+    assert process.returncode == 0, error[-3000:]
+    return json.loads(next(line for line in out.splitlines() if line.startswith("RESULT")).removeprefix("RESULT"))
+
+
+def agree(one, other):
+    np.testing.assert_allclose(one["parameters"], other["parameters"], atol=2e-5)
+    for mine, theirs in zip(one["metrics"], other["metrics"], strict=True):
+        assert mine.keys() == theirs.keys()
+        np.testing.assert_allclose(list(mine.values()), list(theirs.values()), rtol=1e-3, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """(devices, shards) -> what was learnt."""
+    pairs = [(1, 4), (2, 4), (4, 4), (2, 2)]
+    return dict(zip(pairs, result(start(",".join(f"{devices}:{shards}" for devices, shards in pairs))), strict=True))
+
+
+@pytest.mark.parametrize("devices", [2, 4])
+def test_more_devices_learn_the_same(found, devices):
+    assert found[devices, 4]["devices"] == 4
+    agree(found[devices, 4], found[1, 4])
+
+
+def test_two_processes_learn_the_same(found):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        place = f"localhost:{free.getsockname()[1]}"
+    both = [start("2:4", place, "2", str(index), visible=1) for index in range(2)]
+    for [one] in map(result, both):
+        assert (one["devices"], one["processes"]) == (2, 2)
+        agree(one, found[1, 4])
+
+
+def test_other_groups_learn_something_else(found):
+    """Or the comparisons above could not fail."""
+    with pytest.raises(AssertionError):
+        agree(found[2, 2], found[1, 4])
+
+
+def test_mistakes_are_named():
+    env, policy = probe(), late_fusion.make(**SMALL)
+    with pytest.raises(ConfigError, match=r"ppo\.shards: 0"):
+        train.make(env, policy, **{**NUMBERS, "shards": 0})
+    with pytest.raises(ConfigError, match=r"worlds: 8 do not divide into 3 shards"):
+        train.make(env, policy, **{**NUMBERS, "shards": 3}).init(jax.random.key(0), scenes(8))
+    with pytest.raises(ConfigError, match=r"devices: 99; there are \d+"):
+        across.mesh(99)
