@@ -23,6 +23,8 @@ AHEAD, LEFT = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0])
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
 GRAVITY = 9.81  # m/s^2, MuJoCo's default
 LATENT_FRICTION = 1e-3  # N m; the brakes' solver rows exist only if the model is compiled with a positive friction loss
+ROLLS_BACK = 0.5  # rad/s backwards, from which on brakes take nothing of the engine's torque
+FADES = 0.1  # of the spin limit, over which the engine's torque ends
 
 
 @pytree

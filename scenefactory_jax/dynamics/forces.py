@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from scenefactory_jax.dynamics.car import AHEAD, LATENT_FRICTION, LEFT, CarParameters, Places
+from scenefactory_jax.dynamics.car import AHEAD, FADES, LATENT_FRICTION, LEFT, ROLLS_BACK, CarParameters, Places
 from scenefactory_jax.geometry import norm
 
-ROLLS_BACK = 0.5  # rad/s
-FADES = 0.1  # of the spin limit, over which the engine's torque ends
 CORNERS = np.array([[x, y, z] for x in (0.5, -0.5) for y in (0.5, -0.5) for z in (0.5, -0.5)])  # of a box of size one
 
 

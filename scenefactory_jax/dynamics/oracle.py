@@ -330,8 +330,9 @@ def _push(rig: Rig, told: Told) -> None:
     rig.applied[:, rig.suspension] = car.stop_stiffness * (within - travel)
     torque = car.steering_stiffness * (told.angle[:, None] - qpos[:, rig.steer_q]) - car.steering_damping * qvel[:, rig.steer]
     spin = qvel[:, rig.spin]
-    engine = told.engine * np.minimum(np.maximum(10.0 - 10.0 * spin / car.spin_limit, 0.0), 1.0)
-    taken = np.where(spin > -0.5, np.minimum(engine, told.friction), 0.0)  # of the engine, by the brakes
+    left = (car.spin_limit - spin) / (cars.FADES * car.spin_limit)  # `np.clip` takes longer on so few numbers
+    engine = told.engine * np.minimum(np.maximum(left, 0.0), 1.0)
+    taken = np.where(spin > -cars.ROLLS_BACK, np.minimum(engine, told.friction), 0.0)  # of the engine, by the brakes
     rig.applied[:, rig.spin] = engine - taken
     rig.model.dof_frictionloss.reshape(-1, 16)[:, rig.spin] = np.maximum(told.friction - taken, cars.LATENT_FRICTION)
     rig.applied[:, rig.steer] = np.minimum(np.maximum(torque, -car.steering_torque), car.steering_torque)

@@ -7,7 +7,6 @@ from typing import Any
 from scenefactory_jax.report import tables
 
 Row = Mapping[str, Any]
-PUBLISHED = {(256, 16): 19_250, (4096, 1): 41_742}  # SceneFactory (PhysX, torch), worlds x cars, PPO in the loop; its hardware is not ours
 
 
 def line(row: Row) -> str:
@@ -26,7 +25,7 @@ def text(result: Mapping[str, Any]) -> str:
 
 
 def write(folder: Path, result: Mapping[str, Any]) -> Path:
-    """Write `folder`/throughput.md and its figure, and return its path."""
+    """Write `folder`/throughput.md, and return its path."""
     versions = result["versions"]
     made = f"`{result['command']}` on {versions['device']}, jax {versions['jax']}, mujoco {versions['mujoco']}."
     words = (

@@ -81,7 +81,7 @@ def flatten(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for entry in dataclasses.fields(value):
         leaf, name = getattr(value, entry.name), prefix + entry.name
-        if isinstance(leaf, (*DRAWN, Cells)) or leaf is None:
+        if isinstance(leaf, (*DRAWN, DERIVED)):
             continue
         found |= flatten(leaf, f"{name}.") if dataclasses.is_dataclass(leaf) else {name: np.asarray(leaf)}
     return found
