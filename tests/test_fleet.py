@@ -16,7 +16,7 @@ from test_dynamics import CHUNK, EVERYONE, KEY, LANES, MU, G, compile_, constant
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import fleet, oracle
+from scenefactory_jax.dynamics import fleet, mjx_step, oracle
 from scenefactory_jax.run.config import amend, load
 from scenefactory_jax.scenes import checks, pack, source
 from scenefactory_jax.struct import replace
@@ -105,7 +105,7 @@ def test_a_fitted_model_is_the_compiled_one(seed):
     model = cars.standalone(CAR, SOLVER, **COMPILED)
     own = fleet.enlist(jax.tree.map(jnp.float32, other))
     put = functools.partial(mjx.put_model, impl="jax")
-    fitted = put(model).replace(**fleet.fit(put(model), cars.places(model), own))
+    fitted = put(model).replace(**mjx_step.fit(put(model), cars.places(model), own))
     # where a free body starts, its box, what only other solvers, engines or sensors read: no step looks at it
     unread = {"stat", "qpos0", "dof_M0", "geom_aabb", "geom_rbound"}
     partly = {"body_invweight0", "dof_invweight0", "qpos_spring", "geom_size", "body_pos"}  # below

@@ -10,7 +10,9 @@ import pytest
 from test_fleet import CAR, SOLVER
 
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import forces, oracle
+from scenefactory_jax.dynamics import fleet, forces, oracle, tree, tyres
+from scenefactory_jax.dynamics import state as states
+from scenefactory_jax.dynamics.vector import dot as vector_dot
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +34,16 @@ def slips(rig, qpos, qvel):
     return slip, arm
 
 
+def turning(qpos, qvel, arm):
+    """`tyres.turning`, in the world's axes, as the C engine has the arms; the tyres' own arms are those."""
+    own = fleet.enlist(jax.tree.map(jnp.float32, CAR))
+    state = states.seen(own.car, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+    patch = tyres.touch(own, state)
+    world = lambda vector: np.stack([vector_dot(axis, vector) for axis in (state.east, state.north, state.up)], axis=-1)  # noqa: E731
+    np.testing.assert_allclose(world(patch.arm), arm, atol=1e-6)
+    return world(tyres.turning(patch, tree.drift(state)))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
     """Against the difference of the slips a moment before and after, of a car that nothing accelerates."""
@@ -41,7 +53,7 @@ def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
     qpos[at.steer_q], qvel[at.steer_v] = rng.uniform(-0.3, 0.3, 2), rng.uniform(-1.0, 1.0, 2)
     qvel[:2], qvel[5], qvel[at.spin_v] = rng.uniform(-15.0, 15.0, 2), rng.uniform(-1.0, 1.0), rng.uniform(-50.0, 50.0, 4)
     _, arm = slips(rig, qpos, qvel)
-    found = forces.turning(jax.tree.map(jnp.float32, CAR), at, jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(arm))
+    found = turning(qpos, qvel, arm)
     ends = []
     for time in (-1e-4, 1e-4):
         moved = qpos.copy()
@@ -61,7 +73,7 @@ def test_a_car_that_rolls_through_a_bend_slips_at_a_constant_rate(rig):
     _, arm = slips(rig, qpos, qvel)
     forward = qvel[0] - rate * cars.LEFT * CAR.track / 2
     qvel[at.spin_v] = forward / -arm[:, 2]
-    found = forces.turning(jax.tree.map(jnp.float32, CAR), at, jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(arm))
+    found = turning(qpos, qvel, arm)
     centripetal = np.array([0.0, rate * qvel[0], 0.0])  # J qacc of a chassis on its circle
     np.testing.assert_allclose(found[:, 1] + centripetal[1], 0.0, atol=1e-3)
     assert radius == pytest.approx(-arm[0, 2], abs=0.01)

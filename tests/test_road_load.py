@@ -1,6 +1,7 @@
 """Rolling resistance, air drag, and tyres that yield to slip angle: laws of motion, on the eight cars of `test_fleet`."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,8 @@ from test_dynamics import CHUNK, LANES, MU, constant, make, random_controls, sce
 from test_fleet import CAR, SOLVER, drive, started
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import fleet, forces, oracle
+from scenefactory_jax.dynamics import state as states
 from scenefactory_jax.validation import laws
 
 FREE = dataclasses.replace(  # nothing else slows it
@@ -123,19 +124,23 @@ def test_below_the_slip_speed_nothing_changes():
     speed = jnp.array([0.0, 1.0, 2.5, 5.0, 25.0])
     qvel = jnp.zeros((5, 16)).at[:, 1].set(speed)
     law = dataclasses.replace(FREE, tyre_slip_speed=2.5, tyre_slip_damping=20.0)
-    found = jax.vmap(lambda v: forces.slip_damping(law, v))(qvel)
+
+    def damping(of, velocity):
+        return forces.slip_damping(of, states.seen(of, jnp.zeros(17).at[3].set(1.0), velocity))
+
+    found = jax.vmap(functools.partial(damping, law))(qvel)
     np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 10.0, 2.0], rtol=1e-6)
-    np.testing.assert_array_equal(jax.vmap(lambda v: forces.slip_damping(FREE, v))(qvel), np.float32(FREE.tyre_slip_damping))
+    np.testing.assert_array_equal(jax.vmap(functools.partial(damping, FREE))(qvel), np.float32(FREE.tyre_slip_damping))
 
 
 def test_gradients_are_finite_at_rest():
     law = dataclasses.replace(FREE, **ON)
-    at = cars.places(cars.standalone(CAR, SOLVER, physics_dt=1 / 120, visual=False, brake_rows=True))
 
     def load(qvel):
         command = forces.Command(*[jnp.zeros(())] * 2, jnp.zeros(4), jnp.ones(4), jnp.zeros(2), jnp.zeros(()))
-        qpos = jnp.zeros(17).at[3].set(1.0)
-        return forces.generalised(law, at, qpos, qvel, command, jnp.zeros(4)).sum() + forces.slip_damping(law, qvel)
+        state = states.seen(law, jnp.zeros(17).at[3].set(1.0), qvel)
+        pushed = forces.applied(law, state, command, jnp.zeros(4))
+        return sum(jnp.sum(part) for part in jax.tree.leaves(pushed)) + forces.slip_damping(law, state)
 
     slope = jax.jit(jax.grad(load))
     for speed in (0.0, 3.0, 10.0):

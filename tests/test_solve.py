@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mjx_problem import newton
 from mujoco import mjx
 
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import mjx_car, solve
+from scenefactory_jax.dynamics import mjx_step, solve
 from scenefactory_jax.run.config import load
 
 COUNT = 48
@@ -63,8 +64,8 @@ def truth(model, cases):
 @pytest.fixture(scope="module")
 def solved(model, cases):
     """`solve.newton` on the rows that MJX makes, and its problem."""
-    batched, template = mjx.put_model(model[0], impl="jax"), mjx.make_data(model[0], impl="jax")
-    at, layout = cars.places(model[0]), mjx_car.layout(model[0], brake_rows=True)
+    stages = mjx_step.compiled(model[0])
+    batched, template, at = stages.model, stages.data, stages.places
 
     def one(qpos, qvel, push, mu, brake):
         fields = {"pair_friction": batched.pair_friction.at[:, :2].set(mu[:, None])}
@@ -73,21 +74,20 @@ def solved(model, cases):
         for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
             data = stage(own, data)
         rows = data._impl
-        return rows.M, data.qfrc_smooth, rows.efc_J, rows.efc_aref, rows.efc_D, mu, brake, jnp.zeros(16)
+        return rows.M, data.qfrc_smooth, rows.efc_J, rows.efc_aref, rows.efc_D, mu, brake
 
     problem = jax.jit(jax.vmap(one))(*cases)
-    return problem, functools.partial(solve.newton, layout=layout, friction_ratio=RATIO)
+    return problem, functools.partial(newton, stages=stages, friction_ratio=RATIO)
 
 
 def converged(solved):
-    problem, newton = solved
-    return jax.jit(jax.vmap(functools.partial(newton, iterations=20, line_search=10)))(*problem)
+    problem, solver = solved
+    return jax.jit(jax.vmap(functools.partial(solver, iterations=20, line_search=10)))(*problem)
 
 
 def test_places_are_those_of_the_rows(model, solved):
-    """The layout says where MJX puts brakes and tyres."""
-    rows = mjx.make_data(model[0], impl="jax")._impl
-    np.testing.assert_array_equal(np.asarray(rows.contact.efc_address), mjx_car.layout(model[0], brake_rows=True).contact[:, 0])
+    """Four brakes first, then three rows a tyre."""
+    np.testing.assert_array_equal(mjx_step.compiled(model[0]).rows, 4 + np.arange(12).reshape(4, 3))
     assert solved[0][2].shape == (COUNT, 16, 16)
 
 
@@ -122,27 +122,27 @@ def test_newtons_equation_holds(solved):
 
 
 def test_more_iterations_are_nearer(solved, truth):
-    problem, newton = solved
+    problem, solver = solved
     one, four = (
-        np.asarray(jax.jit(jax.vmap(functools.partial(newton, iterations=iterations, line_search=4)))(*problem)[0]) for iterations in (1, 4)
+        np.asarray(jax.jit(jax.vmap(functools.partial(solver, iterations=iterations, line_search=4)))(*problem)[0]) for iterations in (1, 4)
     )
     assert np.median(np.linalg.norm(one - truth[0], axis=1)) > 50 * np.median(np.linalg.norm(four - truth[0], axis=1))
 
 
 def test_rounding_does_not_move_what_has_converged(solved, truth):
     """At the minimum slopes are noise, and a search that follows them walks away: 40 steps must be as near as 20."""
-    problem, newton = solved
+    problem, solver = solved
     scale = np.abs(truth[0]).max(0)
-    long = jax.jit(jax.vmap(functools.partial(newton, iterations=40, line_search=10)))(*problem)[0]
+    long = jax.jit(jax.vmap(functools.partial(solver, iterations=40, line_search=10)))(*problem)[0]
     assert (np.abs(np.asarray(long) - truth[0]) / scale).max() < 2e-3
 
 
 def test_gradients_are_finite(solved):
-    problem, newton = solved
+    problem, solver = solved
 
     def total(smooth):
         rest = (*problem[:1], smooth, *problem[2:])
-        return (jax.vmap(functools.partial(newton, iterations=4, line_search=4))(*rest)[0] ** 2).sum()
+        return (jax.vmap(functools.partial(solver, iterations=4, line_search=4))(*rest)[0] ** 2).sum()
 
     assert np.isfinite(jax.jit(jax.grad(total))(problem[1])).all()
 

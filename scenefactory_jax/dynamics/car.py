@@ -87,7 +87,7 @@ class CarParameters:
 class Solver:
     """How MuJoCo solves contacts and friction. Elliptic cones always: pyramidal ones gave NaN at few iterations."""
 
-    algorithm: Literal["arrow", "Newton", "CG"]  # `solve.newton`, or MJX's own
+    algorithm: Literal["arrow", "Newton", "CG"]  # closed forms and a solver made for the car (`arrow`), or MJX (`mjx_step`)
     integrator: Literal["Euler", "implicitfast"]
     iterations: int
     line_search: int  # iterations

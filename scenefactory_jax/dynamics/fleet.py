@@ -1,7 +1,6 @@
 """Cars that differ: mass, size, torques, tyres and the rest drawn per agent at each reset, in one compiled model.
 
-A `Fleet` carries `CarParameters` with an agent axis and what MuJoCo's compiler derives from them. `fit` writes one car's numbers into the
-MJX model; under `vmap` every car then has its own. Derived constants follow MuJoCo's `mj_setConst`.
+A `Fleet` carries `CarParameters` with an agent axis and what MuJoCo's compiler derives from them, as its `mj_setConst` does.
 """
 
 import functools
@@ -13,21 +12,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from mujoco import mjx
 
 from scenefactory_jax.build import ConfigError, check_range
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import solve
-from scenefactory_jax.dynamics.car import AHEAD, LEFT, CarParameters, Places
+from scenefactory_jax.dynamics import solve, tree
+from scenefactory_jax.dynamics import state as states
+from scenefactory_jax.dynamics.car import CarParameters
+from scenefactory_jax.dynamics.vector import over_wheels
 from scenefactory_jax.struct import struct
 from scenefactory_jax.types import Scene
-
-FRONT = AHEAD > 0
 
 
 @struct
 class Fleet:
-    """The cars of one world; every leaf has the agent axis first."""
+    """The cars of one world, every leaf with the agent axis first; or one car, without it."""
 
     car: CarParameters
     spin_weight: Float[Array, "*cars 4"]  # inverse inertia that a wheel's spin joint feels in the car's rest pose (dof_invweight0)
@@ -136,78 +134,20 @@ def with_numbers(like: CarParameters, numbers: Mapping[str, Any]) -> CarParamete
 def enlist(car: CarParameters) -> Fleet:
     """One car (scalar leaves) with its derived constants; `vmap` for many.
 
-    The rest pose's inverse inertia by elimination: slides, steering and spin joints leave the chassis' 6 x 6.
+    M^-1 of the rest pose: the wheels' own joints eliminated, the inverse of the chassis' 6 x 6 that is left.
     """
-    mass = car.wheel_mass + car.carrier_mass + jnp.where(FRONT, car.knuckle_mass, 0.0)
-    still = car.carrier_inertia + jnp.where(FRONT, car.knuckle_inertia, 0.0)
-    about, across = car.wheel_inertia[0], car.wheel_inertia[1] + still
-    x, y, h = AHEAD * car.wheelbase / 2, LEFT * car.track / 2, jnp.full(4, car.wheel_height, jnp.float32)
-    zero, one = jnp.zeros(4), jnp.ones(4)
-    arm = jnp.stack([x, y, h], axis=-1)
-    total = _inertia(jnp.asarray(car.mass)[None], jnp.stack([_chassis_centre(car)]), jnp.stack(jax.tree.leaves(car.inertia))[None])
-    total = total + _inertia(mass, arm, jnp.stack([across, about * one, across], axis=-1))
-    slide = jnp.stack([zero, zero, one, y, -x, zero], axis=-1)  # chassis motion -> motion of a wheel's centre along its slide
-    total = total - jnp.einsum("w,wi,wj->ij", mass, slide, slide)
-    total = total - jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])) * 4 * about
-    steered = jnp.where(FRONT, across**2 / (across + car.steering_inertia), 0.0)
-    total = total - jnp.diag(jnp.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])) * steered.sum()
-    inverse = solve.inverse(total)
+    rest = states.seen(car, jnp.zeros(17).at[3].set(1.0), jnp.zeros(16))
+    base, across, own = tree.inertia(car, rest)
+    shed = [[sum(row[k] * other[k] / own[k][k] for k in range(solve.OWN)) for other in across] for row in across]
+    left = [[base[i][j] - over_wheels(shed[i][j]) for j in range(solve.BASE)] for i in range(solve.BASE)]
+    inverse = solve.inverse(jnp.stack([jnp.stack(row) for row in left]))
+    zero, one, (x, y, h) = jnp.zeros(4), jnp.ones(4), rest.hub
     forward = jnp.stack([one, zero, zero, zero, h, -y], axis=-1)  # velocity of a wheel's centre along x, and along y
     aside = jnp.stack([zero, one, zero, -h, zero, x], axis=-1)
     along = jnp.stack([forward, aside])[..., :, None] * jnp.stack([forward, aside])[..., None, :]  # [2, wheels, 6, 6]
     flat = (along * inverse).sum((0, -2, -1))  # as sums: XLA's Triton has no kernel for so small a product in deterministic mode
-    return Fleet(car=car, spin_weight=1.0 / about + inverse[4, 4] * one, wheel_weight=(flat + 1.0 / mass) / 3)
-
-
-def _chassis_centre(car: CarParameters) -> Float[Array, "3"]:
-    return jnp.stack([jnp.asarray(n, jnp.float32) for n in (car.mass_forward, 0.0, car.mass_height)])
-
-
-def _inertia(mass: Float[Array, " N"], arm: Float[Array, "N 3"], own: Float[Array, "N 3"]) -> Float[Array, "6 6"]:
-    """Rigid-body inertia about the box's centre of masses at `arm` with diagonal inertias `own`: linear, then angular."""
-    x, y, z = arm.T
-    zero = jnp.zeros_like(x)
-    skew = jnp.stack([jnp.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], -2)  # arm x
-    moment = jnp.einsum("n,nij->ij", mass, skew)
-    turn = jnp.einsum("n,nij,nkj->ik", mass, skew, skew) + jnp.diag(own.sum(0))
-    return jnp.block([[mass.sum() * jnp.eye(3), moment.T], [moment, turn]])
-
-
-def fit(model: mjx.Model, at: Places, fleet: Fleet) -> dict[str, Array]:
-    """The fields of the model that hold the numbers of one car (scalar leaves): `model.replace(**fit(...))`."""
-    car = fleet.car
-    mass = car.wheel_mass + car.carrier_mass + jnp.where(FRONT, car.knuckle_mass, 0.0)
-    about, across = car.wheel_inertia[0], car.wheel_inertia[1] + car.carrier_inertia + jnp.where(FRONT, car.knuckle_inertia, 0.0)
-    place = jnp.stack([AHEAD * car.wheelbase / 2, LEFT * car.track / 2, jnp.full(4, car.wheel_height)], axis=-1)
-    radius, pair = jnp.stack([car.wheel_radius, car.wheel_width / 2, car.wheel_radius]), jnp.ones(4)
-    damping = model.dof_damping.at[at.suspension_v].set(car.suspension_damping).at[at.spin_v].set(car.wheel_damping)
-    return {
-        "body_pos": model.body_pos.at[at.wheel].set(place),
-        "body_ipos": model.body_ipos.at[at.chassis].set(_chassis_centre(car)),
-        "body_mass": model.body_mass.at[at.chassis].set(car.mass).at[at.wheel].set(mass),
-        "body_subtreemass": model.body_subtreemass.at[: at.chassis + 1].set(car.mass + mass.sum()).at[at.wheel].set(mass),
-        "body_inertia": model.body_inertia.at[at.chassis]
-        .set(jnp.stack(jax.tree.leaves(car.inertia)))
-        .at[at.wheel]
-        .set(jnp.stack([across, about * pair, across], axis=-1)),
-        "body_invweight0": model.body_invweight0.at[at.wheel, 0].set(fleet.wheel_weight),
-        "dof_invweight0": model.dof_invweight0.at[at.spin_v].set(fleet.spin_weight),
-        "dof_frictionloss": model.dof_frictionloss.at[at.spin_v].set(jnp.maximum(car.rolling_torque, cars.LATENT_FRICTION)),
-        "dof_armature": model.dof_armature.at[at.steer_v].set(car.steering_inertia),
-        "dof_damping": damping.at[at.steer_v].set(car.steering_friction),
-        "dof_solimp": model.dof_solimp.at[at.spin_v, :2].set(car.brake_impedance),
-        "jnt_stiffness": model.jnt_stiffness.at[at.suspension].set(car.suspension_stiffness),
-        "qpos_spring": model.qpos_spring.at[at.suspension_q].set(-_load(car) * car.suspension_preload / car.suspension_stiffness),
-        "geom_size": model.geom_size.at[at.tyre].set(radius),
-        "pair_solref": model.pair_solref.at[:, 0].set(car.tyre_time_constant),
-        "pair_solimp": model.pair_solimp.at[:, :2].set(car.tyre_impedance),
-        "pair_solreffriction": model.pair_solreffriction.at[:, 1].set(-car.tyre_slip_damping),
-    }
-
-
-def _load(car: CarParameters) -> Float[Array, "4"]:
-    """Weight of the chassis on each wheel at rest, N."""
-    return jnp.asarray(car.mass * cars.GRAVITY / 2 * (0.5 + car.mass_forward / car.wheelbase * AHEAD))
+    wheel = tree.unsprung(car)
+    return Fleet(car=car, spin_weight=1.0 / wheel.about + inverse[4, 4] * one, wheel_weight=(flat + 1.0 / wheel.mass) / 3)
 
 
 def standing(fleet: Fleet, *, physics_dt: float) -> tuple[Float[Array, ""], Float[Array, "4"]]:
@@ -217,11 +157,10 @@ def standing(fleet: Fleet, *, physics_dt: float) -> tuple[Float[Array, ""], Floa
     N w (1 - d) tau^2 for constant impedance d, time constant tau and inverse mass w.
     """
     car = fleet.car
-    rest = _load(car) * (1.0 - car.suspension_preload)
+    rest = tree.load(car) * (1.0 - car.suspension_preload)
     free = rest / car.suspension_stiffness
     beyond = (rest - car.suspension_stiffness * car.suspension_travel) / (car.suspension_stiffness + car.stop_stiffness)
     travel = jnp.where(free > car.suspension_travel, car.suspension_travel + beyond, free)
-    unsprung = car.wheel_mass + car.carrier_mass + jnp.where(FRONT, car.knuckle_mass, 0.0)
     constant = jnp.maximum(car.tyre_time_constant, 2 * physics_dt)
-    depth = (_load(car) + unsprung * cars.GRAVITY) * fleet.wheel_weight * (1.0 - car.tyre_impedance) * constant**2
+    depth = (tree.load(car) + tree.unsprung(car).mass * cars.GRAVITY) * fleet.wheel_weight * (1.0 - car.tyre_impedance) * constant**2
     return (car.wheel_radius - car.wheel_height - depth - travel).mean(), travel

@@ -1,10 +1,6 @@
-# pyright: reportAttributeAccessIssue=false
-# (the compiled parts of mujoco carry no types)
-"""Articulated cars on MJX: one car is one MJX model, `vmap` runs the cars of a world, `contact` lets them meet.
+"""Articulated cars: `arrow` moves one of them, or MJX does, `vmap` runs the cars of a world, `contact` lets them meet.
 
-What changes per car and per step is written into the model inside `advance`: friction and slip damping of each tyre's contact pair, and
-the brakes and the rolling resistance, which are friction losses of the wheels' joints. Everything else that acts on a car is a generalised
-force. Only what the next step needs is carried: positions, velocities and the solver's warm start, not MJX's whole `Data`.
+Only what the next step needs is carried: positions, velocities and the solver's warm start, in MuJoCo's order.
 """
 
 import functools
@@ -13,32 +9,23 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from mujoco import mjx
 
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.dynamics import arrow, mjx_step, tree
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import fleet as fleets
-from scenefactory_jax.dynamics import solve
+from scenefactory_jax.dynamics import state as states
 from scenefactory_jax.dynamics.car import AHEAD, LEFT, CarParameters, Places, Solver
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
-from scenefactory_jax.dynamics.fleet import Fleet, enlist, fit, standing
-from scenefactory_jax.dynamics.forces import Command, generalised, held, matrix, pulling, slip_damping, turning, wanted
+from scenefactory_jax.dynamics.fleet import Fleet, enlist, standing
+from scenefactory_jax.dynamics.forces import Command, Load, applied, held, pulling, slip_damping, wanted
+from scenefactory_jax.dynamics.tyres import Tyres
+from scenefactory_jax.dynamics.vector import Vector, dot
 from scenefactory_jax.geometry import heading, norm
 from scenefactory_jax.struct import choose, replace, struct
 from scenefactory_jax.types import Dynamics, Motion, Scene
-
-
-@struct
-class Tyres:
-    """What the contact patches of a car did in the last physics step, in the order of `car.WHEELS`."""
-
-    mu: Float[Array, "*cars 4"]  # friction coefficient of the road under the wheel
-    normal: Float[Array, "*cars 4"]  # force, N
-    tangent: Float[Array, "*cars 4"]  # force, N
-    slip: Float[Array, "*cars 4"]  # |velocity of the tyre's surface over the ground|, m/s; zero where it is in the air
 
 
 @struct
@@ -57,21 +44,19 @@ class Body:
 class Plant(NamedTuple):
     """The compiled car and all that is constant about it."""
 
-    car: CarParameters  # the reference car
+    own: Fleet  # of one: the reference car
     vary: Callable[..., CarParameters] | None  # (key, scene) -> the cars of an episode
-    model: mjx.Model
-    data: mjx.Data  # a template: MJX wants one, only four of its fields are ever written
+    stages: mjx_step.Stages | None  # of MJX, where its solvers are asked for
     places: Places
     latched: bool
     solver: Solver
-    layout: solve.Layout
     still: np.ndarray  # qpos of the reference car at rest
     physics_dt: float
     substeps: int
 
 
 class Single(NamedTuple):
-    """What MJX carries of one car from step to step."""
+    """What is carried of one car from step to step, in MuJoCo's order."""
 
     qpos: Float[Array, "17"]
     qvel: Float[Array, "16"]
@@ -90,7 +75,7 @@ def make(
     physics_dt: float,
     control_dt: float,
 ) -> Dynamics:
-    """Cars with 10 joints each on MJX.
+    """Cars with 10 joints each.
 
     Args:
         car: numbers of `car.CarParameters`.
@@ -118,7 +103,7 @@ def make(
 def compiled(
     car: CarParameters, solver: Solver, *, brakes: Literal["friction", "latched"], physics_dt: float, control_dt: float
 ) -> Plant:  # fmt: skip
-    """The car as MJX wants it; all cars are this one until `vary` says otherwise.
+    """The car with all that is derived of it; all cars are this one until `vary` says otherwise.
 
     Raises:
         ConfigError: a spring too stiff for the time step, time steps that do not fit, a slip speed that is not above 0, or rolling
@@ -134,15 +119,15 @@ def compiled(
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
     model = cars.standalone(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
+    at = cars.places(model)
+    weights = (model.dof_invweight0[at.spin_v], model.body_invweight0[at.wheel, 0])
     return Plant(
-        car=car,
+        own=Fleet(car, *(jnp.asarray(weight, jnp.float32) for weight in weights)),
         vary=None,
-        model=mjx.put_model(model, impl="jax"),
-        data=mjx.make_data(model, impl="jax"),
-        places=cars.places(model),
+        stages=None if solver.algorithm == "arrow" else mjx_step.compiled(model),
+        places=at,
         latched=brakes == "latched",
         solver=solver,
-        layout=layout(model, brake_rows=brakes == "friction"),
         still=cars.rest(model, car),
         physics_dt=physics_dt,
         substeps=substeps,
@@ -159,15 +144,6 @@ def bind(plant: Plant, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
     return Dynamics(init=functools.partial(start, plant), advance=advance, read=functools.partial(read, plant))
 
 
-def layout(model: mujoco.MjModel, *, brake_rows: bool) -> solve.Layout:
-    """Where `solve` finds the chassis, the wheels and their constraint rows: brakes first, then three rows a tyre."""
-    at = cars.places(model)
-    own = np.full((4, solve.OWN), model.nv)
-    own[:, 0], own[:, solve.SPIN], own[:2, 2] = at.suspension_v, at.spin_v, at.steer_v
-    first = 4 if brake_rows else 0
-    return solve.Layout(own=own, contact=first + np.arange(12).reshape(4, 3), brake=np.arange(4) if brake_rows else None)
-
-
 def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
     """Cars at their starts: at ride height, wheels turning as fast as the road passes under them."""
     agents, at = scene.agents, plant.places
@@ -181,7 +157,7 @@ def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
         qpos = qpos.at[:, 2].set(height).at[:, at.suspension_q].set(travel)
     qpos = qpos.at[:, :2].set(agents.position).at[:, 3:7].set(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1))
     velocity = agents.speed[:, None] * heading(agents.yaw)
-    radius = jnp.broadcast_to(plant.car.wheel_radius if fleet is None else fleet.car.wheel_radius, (count,))
+    radius = jnp.broadcast_to(plant.own.car.wheel_radius if fleet is None else fleet.car.wheel_radius, (count,))
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
     return Body(
         qpos=qpos,
@@ -204,22 +180,24 @@ def _advance(
     active: Bool[Array, " A"],
 ) -> Body:
     """One control step of all cars."""
-    car = plant.car if body.fleet is None else body.fleet.car
-    fields = {} if body.fleet is None else jax.vmap(functools.partial(fit, plant.model, plant.places))(body.fleet)
+    own = plant.own if body.fleet is None else body.fleet
+    car, fields = own.car, {}
+    if plant.stages and body.fleet is not None:
+        fields = jax.vmap(functools.partial(mjx_step.fit, plant.stages.model, plant.places))(body.fleet)
     before = read(plant, body)
     speed = norm(before.velocity[:, :2])
     wheels = wheel_positions(car, before.position[:, :2], before.yaw)
     mu = grip(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
     steer, drive, brake = wanted(car, action)
     one = jax.vmap(functools.partial(move, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
-    mass = fields.get("body_mass", plant.model.body_mass).sum(-1)
+    mass = tree.mass(car)
     near = meet.neighbours(boxes_of(before, scene.agents.size, active, mass), scene.boxes)
 
     def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
         touching = boxes_of(read(plant, now), scene.agents.size, active, mass)
         force, torque, strength = meet.forces(touching, later(near, time))
         command = Command(steer, drive, brake, mu, force, torque)
-        moved, tyres = one(car, fields, Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
+        moved, tyres = one(own, fields, Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
         strongest = jnp.maximum(now.contact_force, strength)
         return replace(now, **moved._asdict(), contact_force=strongest, tyres=tyres), None
 
@@ -228,54 +206,23 @@ def _advance(
     return choose(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
 
 
-def move(plant: Plant, car: CarParameters, fields: dict[str, Array], now: Single, command: Command) -> tuple[Single, Tyres]:
-    """One physics step of one car, whose own fields of the model are given if it differs from the reference."""
-    spin = now.qvel[plant.places.spin_v]
-    sign = jnp.where(jnp.abs(spin) > 1e-4, jnp.sign(spin), now.spin_sign)
-    engine, loss = pulling(car, command.drive, spin), command.brake + car.rolling_torque
-    turn, loss = (engine - command.brake * sign, loss) if plant.latched else held(engine, loss, spin)
-    applied = generalised(car, plant.places, now.qpos, now.qvel, command, turn)
-    model = plant.model.replace(**fields)
-    yields = model.pair_solreffriction.at[:, 1].set(-slip_damping(car, now.qvel))
-    model = model.replace(pair_friction=model.pair_friction.at[:, :2].set(command.mu[:, None]), pair_solreffriction=yields)
-    if not plant.latched:
-        model = model.replace(dof_frictionloss=model.dof_frictionloss.at[plant.places.spin_v].set(loss))
-    data = plant.data.replace(qpos=now.qpos, qvel=now.qvel, qacc_warmstart=now.qacc_warmstart, qfrc_applied=applied)
-    data, force = _step(plant, model, data, car, command.mu, loss)
-    return Single(data.qpos, data.qvel, data.qacc_warmstart, sign), _tyres(plant, data, force, now.qvel, command.mu)
-
-
-def _step(
-    plant: Plant,
-    model: mjx.Model,
-    data: mjx.Data,
-    car: CarParameters,
-    mu: Float[Array, "4"],
-    loss: Float[Array, "4"],
-) -> tuple[mjx.Data, Float[Array, "4 3"]]:
-    """`mjx.step` with tyres that turn and with either solver; also the forces of the tyres' contacts.
+def move(plant: Plant, own: Fleet, fields: dict[str, Array], now: Single, command: Command) -> tuple[Single, Tyres]:
+    """One physics step of one car.
 
     Args:
-        loss: the wheels' dry friction, N m.
+        fields: of MJX's model, if that is used and the car differs from the reference.
     """
-    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
-        data = stage(model, data)
-    rows, tyres, solver = data._impl, plant.layout.contact, plant.solver
-    turn = turning(car, plant.places, data.qpos, data.qvel, rows.contact.pos - data.xpos[plant.places.wheel])
-    reference = rows.efc_aref.at[tyres[:, 1:]].add(-jnp.einsum("wij,wj->wi", rows.contact.frame[:, 1:], turn))
-    if solver.algorithm == "arrow":
-        settings = {"friction_ratio": solver.friction_ratio, "iterations": solver.iterations, "line_search": solver.line_search}
-        problem = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, mu, loss, data.qacc_warmstart)
-        acceleration, force = solve.newton(*problem, layout=plant.layout, **settings)
-        return mjx.euler(model, data.replace(qacc=acceleration)), force
-    data = mjx.solve(model, data.replace(_impl=rows.replace(efc_aref=reference)))
-    return (mjx.euler if solver.integrator == "Euler" else mjx.implicit)(model, data), data._impl.efc_force[tyres]
-
-
-def _tyres(plant: Plant, data: mjx.Data, force: Float[Array, "4 3"], qvel: Float[Array, "16"], mu: Float[Array, "4"]) -> Tyres:
-    """What the contact rows say of the tyres, at the beginning of the step."""
-    slide = (data._impl.efc_J @ qvel)[plant.layout.contact[:, 1:]]
-    return Tyres(mu=mu, normal=force[:, 0], tangent=norm(force[:, 1:]), slip=norm(slide))
+    car, state = own.car, states.seen(own.car, now.qpos, now.qvel)
+    sign = jnp.where(jnp.abs(state.spin) > 1e-4, jnp.sign(state.spin), now.spin_sign)
+    engine, friction = pulling(car, command.drive, state.spin), command.brake + car.rolling_torque
+    turn, friction = (engine - command.brake * sign, None) if plant.latched else held(engine, friction, state.spin)
+    load = Load(applied(car, state, command, turn), command.mu, friction, slip_damping(car, state))
+    body = own, state, load, now.qpos, now.qvel, now.qacc_warmstart
+    if plant.stages is None:
+        qpos, qvel, acceleration, tyres = arrow.step(*body, solver=plant.solver, physics_dt=plant.physics_dt)
+    else:
+        qpos, qvel, acceleration, tyres = mjx_step.step(plant.stages, fields, *body, solver=plant.solver)
+    return Single(qpos, qvel, acceleration, sign), tyres
 
 
 def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Float[Array, " A"]) -> Float[Array, "A 4 2"]:
@@ -288,14 +235,14 @@ def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Floa
 
 def read(plant: Plant, body: Body) -> Motion:
     """What the rest of the system may know of the cars."""
-    rotation = jax.vmap(matrix)(body.qpos[:, 3:7])
+    rotation = states.matrix(body.qpos[:, 3:7].T)
     tyres, loaded = body.tyres, body.tyres.normal > 1.0  # N
     return Motion(
         position=body.qpos[:, :3],
         velocity=body.qvel[:, :3],
-        yaw=jnp.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
-        yaw_rate=(rotation[:, 2] * body.qvel[:, 3:6]).sum(-1),
-        upright=rotation[:, 2, 2],
+        yaw=jnp.arctan2(rotation[1][0], rotation[0][0]),
+        yaw_rate=dot(Vector(*rotation[2]), Vector(*body.qvel[:, 3:6].T)),
+        upright=rotation[2][2],
         steer=body.qpos[:, plant.places.steer_q].mean(-1),
         contact_force=body.contact_force,
         grip=tyres.mu.mean(-1),

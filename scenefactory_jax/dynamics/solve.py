@@ -13,7 +13,7 @@ that XLA fuses it, and the numbers of iterations are fixed, so that nothing wait
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +29,8 @@ ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a sum of a few terms, relat
 Number = Array  # [] for the chassis, [4] for the wheels
 
 
-class Layout(NamedTuple):
-    """Where the numbers of the chassis and the wheels stand in MuJoCo's arrays; all static."""
-
-    own: np.ndarray  # [4, 3] degree of freedom, 16 (one past the last) where a wheel has none
-    contact: np.ndarray  # [4, 3] constraint rows of a tyre: normal, two tangents
-    brake: np.ndarray | None  # [4] constraint rows of the brakes
-
-
 class Problem(NamedTuple):
-    """The convex problem, taken apart into single numbers. Lists of lists are matrices."""
+    """The convex problem as single numbers. Lists of lists are matrices."""
 
     base: list[list[Number]]  # M, chassis rows and columns, [] each
     across: list[list[Number]]  # M, chassis rows, wheels' own columns, [4] each
@@ -62,6 +54,19 @@ class Acceleration(NamedTuple):
     own: list[Number]  # [4] each
 
 
+class Point(NamedTuple):
+    """An acceleration, with all that is linear in it: a step adds to each of them in proportion.
+
+    They are worked out once and then moved along, never anew. Their rounding is then the same for the slope, its derivative and the search,
+    which agree on where the minimum is; worked out in three places, they could differ by more than the search's last step.
+    """
+
+    at: Acceleration
+    rows: list[Number]  # J a - a_ref of the tyres' rows
+    brake: Number  # the same of the brakes'
+    pull: Acceleration  # M a - smooth forces
+
+
 class Contact(NamedTuple):
     """Force of a tyre's contact (3) and the negative of its derivative, a symmetric 3 x 3."""
 
@@ -69,56 +74,28 @@ class Contact(NamedTuple):
     stiffness: list[list[Number]]
 
 
-def newton(
-    mass: Float[Array, "16 16"],
-    force: Float[Array, "16"],
-    jacobian: Float[Array, "rows 16"],
-    reference: Float[Array, " rows"],
-    weight: Float[Array, " rows"],
-    mu: Float[Array, "4"],
-    brake: Float[Array, "4"],
-    start: Float[Array, "16"],
-    *,
-    layout: Layout,
-    friction_ratio: float,
-    iterations: int,
-    line_search: int,
-) -> tuple[Float[Array, "16"], Float[Array, "4 3"]]:
-    """Acceleration of a car and the forces of its tyres' contacts.
+def newton(problem: Problem, start: Acceleration, *, iterations: int, line_search: int) -> tuple[Acceleration, list[Number]]:
+    """Acceleration of a car, and the forces of its tyres' contacts: normal, two tangents.
 
     Args:
-        mass: joint-space inertia matrix M.
-        force: all smooth generalised forces.
-        jacobian, reference, weight: J, a_ref and D of MuJoCo's constraint rows.
-        mu: friction coefficient under each wheel.
-        brake: largest torque of each wheel's brake, N m.
         start: acceleration from which to begin: that of the step before.
-        layout: where the rows and columns stand.
-        friction_ratio: MuJoCo's impratio.
         iterations: Newton steps.
         line_search: steps of the search along each Newton direction.
     """
-    problem = _take_apart(mass, force, jacobian, reference, weight, mu, brake, layout, friction_ratio)
-    padded = jnp.concatenate([start, jnp.zeros(1)])
-    base, own = [start[i] for i in range(BASE)], [padded[layout.own[:, k]] for k in range(OWN)]
-
-    at = _minimise(problem, Acceleration(base, own), iterations, line_search)
-    flat = jnp.concatenate([jnp.stack(at.base), jnp.stack(at.own, axis=-1).reshape(-1)])
-    order = np.concatenate([np.arange(BASE), BASE + np.argsort(layout.own.reshape(-1), kind="stable")[: mass.shape[0] - BASE]])
-    contact = _cone(_rows(problem, at), problem)
-    return flat[order], jnp.stack(contact.force, axis=-1)
+    at = _minimise(problem, start, iterations, line_search)
+    return at, _cone(_point(problem, at).rows, problem).force
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def _minimise(problem: Problem, start: Acceleration, iterations: int, line_search: int) -> Acceleration:
     """Newton's method, a fixed number of steps."""
 
-    def step(at: Acceleration, _: None) -> tuple[Acceleration, None]:
-        along = _direction(problem, at)
-        length = _search(problem, at, along, steps=line_search)
-        return jax.tree.map(lambda a, d: a + length * d, at, along), None
+    def step(here: Point, _: None) -> tuple[Point, None]:
+        along = _linear(problem, _descend(problem, here, _slope(problem, here)))
+        length = _search(problem, here, along, steps=line_search)
+        return jax.tree.map(lambda a, d: a + length * d, here, along), None
 
-    return jax.lax.scan(step, start, length=iterations)[0]
+    return jax.lax.scan(step, _point(problem, start), length=iterations)[0].at
 
 
 @_minimise.defjvp
@@ -127,40 +104,33 @@ def _minimise_jvp(iterations: int, line_search: int, primals: tuple, tangents: t
     instead compiles for minutes, and says the same where they have converged."""
     problem, start = primals
     at = _minimise(problem, start, iterations, line_search)
-    _, change = jax.jvp(lambda changed: _slope(changed, at), (problem,), (tangents[0],))
-    return at, _descend(problem, at, change)
+    _, change = jax.jvp(lambda changed: _slope(changed, _point(changed, at)), (problem,), (tangents[0],))
+    return at, _descend(problem, _point(problem, at), change)
 
 
-def _take_apart(mass, force, jacobian, reference, weight, mu, brake, layout: Layout, friction_ratio: float) -> Problem:
-    """MuJoCo's arrays as single numbers."""
-    count = mass.shape[0]
-    padded = jnp.pad(mass, (0, 1)) + np.diag(np.eye(count + 1)[count])  # the missing joint: one on the diagonal
-    columns = jnp.pad(jacobian, ((0, 0), (0, 1)))
-    own, contact, brakes = layout.own, layout.contact, layout.brake
-    forces = jnp.pad(force, (0, 1))
-    none = jnp.zeros(4)
-    return Problem(
-        base=[[mass[i, j] for j in range(BASE)] for i in range(BASE)],
-        across=[[padded[i, own[:, k]] for k in range(OWN)] for i in range(BASE)],
-        own=[[padded[own[:, j], own[:, k]] for k in range(OWN)] for j in range(OWN)],
-        force_base=[force[i] for i in range(BASE)],
-        force_own=[forces[own[:, k]] for k in range(OWN)],
-        jacobian=[
-            [columns[contact[:, r], i] for i in range(BASE)] + [columns[contact[:, r], own[:, k]] for k in range(OWN)] for r in range(3)
-        ],
-        reference=[reference[contact[:, r]] for r in range(3)],
-        weight=[weight[contact[:, r]] for r in range(3)],
-        mu=mu,
-        cone=mu / friction_ratio**0.5,
-        brake_reference=none if brakes is None else reference[brakes],
-        brake_weight=none if brakes is None else weight[brakes],
-        brake_limit=none if brakes is None else brake,
+def _linear(problem: Problem, along: Acceleration) -> Point:
+    """J d and M d of a direction d."""
+    base, own = along
+    return Point(
+        at=along,
+        rows=[_dot(row, [*base, *own]) for row in problem.jacobian],
+        brake=own[SPIN],
+        pull=Acceleration(
+            [_dot(problem.base[i], base) + _sum(_dot(problem.across[i], own)) for i in range(BASE)],
+            [_dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) for k in range(OWN)],
+        ),
     )
 
 
-def _rows(problem: Problem, at: Acceleration) -> list[Number]:
-    """J a - a_ref of the tyres' rows."""
-    return [_dot(row, [*at.base, *at.own]) - ref for row, ref in zip(problem.jacobian, problem.reference, strict=True)]
+def _point(problem: Problem, at: Acceleration) -> Point:
+    """Where an acceleration stands."""
+    here = _linear(problem, at)
+    return Point(
+        at=at,
+        rows=[row - ref for row, ref in zip(here.rows, problem.reference, strict=True)],
+        brake=here.brake - problem.brake_reference,
+        pull=jax.tree.map(jnp.subtract, here.pull, Acceleration(problem.force_base, problem.force_own)),
+    )
 
 
 def _cone(x: Sequence[Number], problem: Problem) -> Contact:
@@ -197,32 +167,20 @@ def _brake(x: Number, problem: Problem) -> tuple[Number, Number]:
     return torque, jnp.where(holds, problem.brake_weight, 0.0)
 
 
-def _direction(problem: Problem, at: Acceleration) -> Acceleration:
-    """Newton's direction."""
-    return _descend(problem, at, _slope(problem, at))
-
-
-def _slope(problem: Problem, at: Acceleration) -> Acceleration:
+def _slope(problem: Problem, here: Point) -> Acceleration:
     """Gradient of the convex problem: M a less all forces."""
-    base, own = at
-    contact = _cone(_rows(problem, at), problem)
-    torque, _ = _brake(own[SPIN] - problem.brake_reference, problem)
+    contact = _cone(here.rows, problem)
+    torque, _ = _brake(here.brake, problem)
     push = [_dot([row[c] for row in problem.jacobian], contact.force) for c in range(BASE + OWN)]  # J^T f
     push[BASE + SPIN] = push[BASE + SPIN] + torque
-    slope_own = [
-        _dot([problem.across[i][k] for i in range(BASE)], base) + _dot(problem.own[k], own) - problem.force_own[k] - push[BASE + k]
-        for k in range(OWN)
-    ]
-    slope_base = [
-        _dot(problem.base[i], base) - problem.force_base[i] + _sum(_dot(problem.across[i], own) - push[i]) for i in range(BASE)
-    ]
-    return Acceleration(slope_base, slope_own)
+    on_base, on_own = [_sum(part) for part in push[:BASE]], push[BASE:]
+    return jax.tree.map(jnp.subtract, here.pull, Acceleration(on_base, on_own))
 
 
-def _descend(problem: Problem, at: Acceleration, slope: Acceleration) -> Acceleration:
+def _descend(problem: Problem, here: Point, slope: Acceleration) -> Acceleration:
     """The Hessian's inverse times a slope, with opposite sign: the arrow-shaped system, the wheels eliminated first."""
-    contact = _cone(_rows(problem, at), problem)
-    _, hold = _brake(at.own[SPIN] - problem.brake_reference, problem)
+    contact = _cone(here.rows, problem)
+    _, hold = _brake(here.brake, problem)
     jacobian = problem.jacobian
     bent = [[_dot(contact.stiffness[r], [row[c] for row in jacobian]) for c in range(BASE + OWN)] for r in range(3)]  # H J
 
@@ -240,27 +198,19 @@ def _descend(problem: Problem, at: Acceleration, slope: Acceleration) -> Acceler
     return Acceleration(step, [-r - _dot([shed[i][k] for i in range(BASE)], step) for k, r in enumerate(rest)])
 
 
-def _search(problem: Problem, at: Acceleration, along: Acceleration, *, steps: int) -> Number:
+def _search(problem: Problem, here: Point, along: Point, *, steps: int) -> Number:
     """How far to go along a direction: a zero of the slope, by Newton steps kept inside a bracket."""
-    base, own = at
-    along_base, along_own = along
-    x, tight = _rows(problem, at), own[SPIN] - problem.brake_reference
-    y = [_dot(row, [*along_base, *along_own]) for row in problem.jacobian]
-    heavy_base = [_dot(problem.base[i], along_base) + _sum(_dot(problem.across[i], along_own)) for i in range(BASE)]  # M d
-    heavy_own = [_dot([problem.across[i][k] for i in range(BASE)], along_base) + _dot(problem.own[k], along_own) for k in range(OWN)]
-    bend = _dot(along_base, heavy_base) + _sum(_dot(along_own, heavy_own))
-    tilt = _dot(heavy_base, base) - _dot(along_base, problem.force_base)
-    tilt = tilt + _sum(_dot(heavy_own, own) - _dot(along_own, problem.force_own))
-    terms = _size(heavy_base, base) + _size(along_base, problem.force_base)
-    terms = terms + _sum(_size(heavy_own, own) + _size(along_own, problem.force_own))
+    tilt, terms = _inner(along.at, here.pull), _inner(_magnitude(along.at), _magnitude(here.pull))
+    bend = _inner(along.at, along.pull)
 
     def slope(length: Number) -> tuple[Number, Number, Number]:
         """First and second derivative of the cost, and how large rounding makes the first where it should be zero."""
-        contact = _cone([a + length * b for a, b in zip(x, y, strict=True)], problem)
-        torque, hold = _brake(tight + length * along_own[SPIN], problem)
-        first = tilt + length * bend - _sum(_dot(contact.force, y) + torque * along_own[SPIN])
-        second = bend + _sum(_dot([_dot(row, y) for row in contact.stiffness], y) + hold * along_own[SPIN] ** 2)
-        return first, second, ROUNDING * (terms + length * bend + _sum(_size(contact.force, y)))
+        contact = _cone([a + length * b for a, b in zip(here.rows, along.rows, strict=True)], problem)
+        torque, hold = _brake(here.brake + length * along.brake, problem)
+        work = [*(f * b for f, b in zip(contact.force, along.rows, strict=True)), torque * along.brake]
+        first = tilt + length * bend - _sum(functools.reduce(jnp.add, work))
+        second = bend + _sum(_dot([_dot(row, along.rows) for row in contact.stiffness], along.rows) + hold * along.brake**2)
+        return first, second, ROUNDING * (terms + length * bend + _sum(functools.reduce(jnp.add, _magnitude(work))))
 
     low, high, length = jnp.zeros_like(tilt), jnp.full_like(tilt, jnp.inf), jnp.ones_like(tilt)
     for _ in range(steps):
@@ -280,27 +230,32 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _factor(matrix: list[list[Number]]) -> tuple[list[list[Number]], list[Number]]:
-    """L and 1/D of a symmetric positive definite matrix L D L^T; only its lower half is read."""
+    """L and D of a symmetric positive definite matrix L D L^T; only its lower half is read.
+
+    They and the unknowns (`_solve`) are quotients, not products with 1 / D: XLA works cheap sums and products out anew in every loop that
+    needs them, each time with a rounding of its own, but divides once. With factors that differ from one unknown to the next, a stiff
+    system is not solved.
+    """
     lower: list[list[Number]] = []
-    inverse: list[Number] = []
+    diagonal: list[Number] = []
     for i, row in enumerate(matrix):
         scaled: list[Number] = []  # L_ik D_k
         for j in range(i):
             scaled.append(row[j] - _dot(scaled[:j], lower[j][:j]) if j else row[j])
-        entries = [s * inverse[k] for k, s in enumerate(scaled)]
+        entries = [s / diagonal[k] for k, s in enumerate(scaled)]
         lower.append(entries)
-        inverse.append(1.0 / (row[i] - _dot(scaled, entries) if i else row[i]))
-    return lower, inverse
+        diagonal.append(row[i] - _dot(scaled, entries) if i else row[i])
+    return lower, diagonal
 
 
 def _solve(factors: tuple[list[list[Number]], list[Number]], right: Sequence[Number]) -> list[Number]:
     """Solution of L D L^T x = right."""
-    lower, inverse = factors
+    lower, diagonal = factors
     count = len(right)
     y: list[Number] = []
     for i in range(count):
         y.append(right[i] - _dot(lower[i], y) if i else right[i])
-    x: list[Number] = [y[i] * inverse[i] for i in range(count)]
+    x: list[Number] = [y[i] / diagonal[i] for i in range(count)]
     for i in reversed(range(count - 1)):
         x[i] = x[i] - _dot([lower[k][i] for k in range(i + 1, count)], x[i + 1 :])
     return x
@@ -313,9 +268,14 @@ def _dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
     return total
 
 
-def _size(a: Sequence[Number], b: Sequence[Number]) -> Number:
-    """Sum of the products' magnitudes: what rounding errors of their sum are measured by."""
-    return _dot([jnp.abs(one) for one in a], [jnp.abs(other) for other in b])
+def _inner(a: Acceleration, b: Acceleration) -> Number:
+    """Product over all joints."""
+    return _dot(a.base, b.base) + _sum(_dot(a.own, b.own))
+
+
+def _magnitude(numbers: Any) -> Any:
+    """A sum of magnitudes is what rounding errors of a sum are measured by."""
+    return jax.tree.map(jnp.abs, numbers)
 
 
 def _sum(wheels: Number) -> Number:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.build import build
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import fleet
+from scenefactory_jax.dynamics import fleet, tree
 from scenefactory_jax.dynamics.car import CarParameters
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Boxes, Dynamics, Scene
@@ -243,7 +243,7 @@ def _judge(
 
 def energy(car: CarParameters, qpos: Float[np.ndarray, "T 17"], qvel: Float[np.ndarray, "T 16"]) -> Float[np.ndarray, " T"]:
     """Mechanical energy over the ground, J: the whole mass at the box's centre, the chassis' and the wheels' rotation."""
-    mass = car.mass + 4 * (car.wheel_mass + car.carrier_mass) + 2 * car.knuckle_mass
+    mass = tree.mass(car)
     moving = 0.5 * mass * (qvel[:, :3] ** 2).sum(-1) + mass * cars.GRAVITY * qpos[:, 2]
     turning = 0.5 * (np.asarray(car.inertia) * qvel[:, 3:6] ** 2).sum(-1)
     return moving + turning + 0.5 * car.wheel_inertia[0] * (qvel[:, SPIN] ** 2).sum(-1)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import mjx_car, oracle
 from scenefactory_jax.dynamics.car import GRAVITY, CarParameters
+from scenefactory_jax.dynamics.tree import mass
 from scenefactory_jax.types import Dynamics, Scene
 from scenefactory_jax.validation import engines
 from scenefactory_jax.validation.sequences import PATTERN_NAMES, Sequences
@@ -148,11 +149,6 @@ def brake_limit_m(car: CarParameters, speed: float) -> float:
     c = 4.0 * car.wheel_damping / car.wheel_radius**2 / inertia
     v = np.linspace(0.0, speed, 1001)
     return float(np.trapezoid(v / (a + c * v + car.air_drag / inertia * v**2), v))
-
-
-def mass(car: CarParameters) -> float:
-    """Of the whole car, kg."""
-    return car.mass + 4.0 * (car.wheel_mass + car.carrier_mass) + 2.0 * car.knuckle_mass
 
 
 def standing(
