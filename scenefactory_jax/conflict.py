@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -76,16 +77,21 @@ def with_points(
     *,
     range_m: float,
 ) -> Float[Array, " A"]:
-    """TTC (s) with the midpoints of standing road segments ahead and within a range, by closing speed along the line of sight."""
+    """TTC (s) with the midpoints of standing road segments ahead and within a range, by closing speed along the line of sight.
+
+    There are many of them: the soonest is the one with the largest 1 / TTC, one root and one division each.
+    """
     apart = road.midpoint - centres[:, :, None, :]
-    distance = norm(apart)
-    closing = dot(apart, velocity[:, None, None, :]) / jnp.maximum(distance, SMALLEST)
+    squared = dot(apart, apart)
+    inverse = jax.lax.rsqrt(jnp.maximum(squared, SMALLEST**2))
+    distance, closing = squared * inverse, dot(apart, velocity[:, None, None, :]) * inverse
     gap = distance - radius[:, None, None]
-    ahead = dot(apart, heading(yaw)[:, None, None, :]) > 0
-    seen = road.valid & (distance <= range_m) & ahead
-    approaching = seen & (closing > SMALLEST)
-    time = jnp.where(approaching, jnp.maximum(gap, 0.0) / jnp.where(approaching, closing, 1.0), jnp.inf)
-    return jnp.min(jnp.where(seen & (gap <= 0), 0.0, time), axis=(1, 2), initial=jnp.inf)
+    seen = road.valid & (distance <= range_m) & (dot(apart, heading(yaw)[:, None, None, :]) > 0)
+    touches = gap <= 0
+    rate = jnp.where(touches, jnp.inf, closing / jnp.where(touches, 1.0, gap))
+    soonest = jnp.max(jnp.where(seen & (touches | (closing > SMALLEST)), rate, 0.0), axis=(1, 2), initial=0.0)
+    meets = soonest > 0
+    return jnp.where(meets, 1.0 / jnp.where(meets, soonest, 1.0), jnp.inf)
 
 
 def least(ttc: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:

@@ -47,8 +47,7 @@ def measure(
     ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
     lane = _measure_lane(scene, before, position, motion, to_goal)
-    to_edges = distance_to_segments(centres[:cars], scene.edges, half_width_m=edge_half_width_m)
-    edge_gap = jnp.min(to_edges, axis=(1, 2), initial=jnp.inf) - edge_radius_m
+    edge_gap = distance_to_segments(centres[:cars], scene.edges, half_width_m=edge_half_width_m) - edge_radius_m
     edge_ttc = conflict.with_points(centres[:cars], radius[:cars], velocity, motion.yaw, scene.edges, range_m=edge_range_m)
     strayed = norm(position - after.agents.position)
 

@@ -32,7 +32,11 @@ def to_frame(vector: Float[Array, "*n 2"], yaw: Float[Array, "*m"]) -> Float[Arr
 
 def norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Euclidean length whose gradient at zero is zero instead of NaN."""
-    squared = dot(vector, vector)
+    return root(dot(vector, vector))
+
+
+def root(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Square root whose gradient at zero is zero instead of NaN."""
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
@@ -90,12 +94,13 @@ def nearest_segment(position: Float[Array, "A 2"], road: Road) -> tuple[Int[Arra
     return jnp.argmin(squared, axis=1), jnp.any(road.valid)
 
 
-def distance_to_segments(point: Float[Array, "*n 2"], road: Road, *, half_width_m: float) -> Float[Array, "*n P"]:
-    """Distance from points to the rectangles that segments with a half width are; inf for invalid rows."""
-    offset = point[..., None, :] - road.midpoint
+def distance_to_segments(points: Float[Array, "A N 2"], road: Road, *, half_width_m: float) -> Float[Array, " A"]:
+    """Distance from the nearest of each row's points to the rectangles that valid segments with a half width are; inf without any."""
+    offset = points[..., None, :] - road.midpoint
     along = jnp.maximum(jnp.abs(dot(offset, road.direction)) - road.half_length, 0.0)
     across = jnp.maximum(jnp.abs(cross(offset, road.direction)) - half_width_m, 0.0)
-    return jnp.where(road.valid, norm(jnp.stack([along, across], axis=-1)), jnp.inf)
+    squared = jnp.where(road.valid, along * along + across * across, jnp.inf)
+    return root(jnp.min(squared, axis=(1, 2), initial=jnp.inf))
 
 
 def running_length(road: Road) -> Float[Array, " P"]:
