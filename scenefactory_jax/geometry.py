@@ -1,5 +1,7 @@
 """Planar geometry: angles, frames, the three circles that stand for a car, distances to segments, places along lanes."""
 
+import functools
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -95,12 +97,16 @@ def nearest_segment(position: Float[Array, "A 2"], road: Road) -> tuple[Int[Arra
 
 
 def distance_to_segments(points: Float[Array, "A N 2"], road: Road, *, half_width_m: float) -> Float[Array, " A"]:
-    """Distance from the nearest of each row's points to the rectangles that valid segments with a half width are; inf without any."""
-    offset = points[..., None, :] - road.midpoint
-    along = jnp.maximum(jnp.abs(dot(offset, road.direction)) - road.half_length, 0.0)
-    across = jnp.maximum(jnp.abs(cross(offset, road.direction)) - half_width_m, 0.0)
-    squared = jnp.where(road.valid, along * along + across * across, jnp.inf)
-    return root(jnp.min(squared, axis=(1, 2), initial=jnp.inf))
+    """Distance from the nearest of each row's few points to the rectangles that valid segments with a half width are; inf without any."""
+
+    def squared(point: Float[Array, "A 2"]) -> Float[Array, "A P"]:
+        offset = point[:, None] - road.midpoint
+        along = jnp.maximum(jnp.abs(dot(offset, road.direction)) - road.half_length, 0.0)
+        across = jnp.maximum(jnp.abs(cross(offset, road.direction)) - half_width_m, 0.0)
+        return along * along + across * across
+
+    nearest = functools.reduce(jnp.minimum, [squared(points[:, number]) for number in range(points.shape[1])])
+    return root(jnp.min(jnp.where(road.valid, nearest, jnp.inf), axis=1, initial=jnp.inf))
 
 
 def running_length(road: Road) -> Float[Array, " P"]:
