@@ -1,5 +1,7 @@
 """`bench`: scopes, phases that add up, variants, suites."""
 
+from pathlib import Path
+
 import pytest
 
 from scenefactory_jax.build import ConfigError
@@ -9,6 +11,7 @@ from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, phases, results
 from scenefactory_jax.run.config import load
 
+ROOT = Path(__file__).parent.parent
 SMALL = ("experiment=smoke", "worlds=4", "warmup=0", "repeats=1")
 VARIANTS = {"training": {}, "environment": {"scope": "environment"}, "physics": {"scope": "physics", "worlds": 2, "phases": False}}
 
@@ -47,6 +50,24 @@ def test_the_report_is_made_of_the_json(made, tmp_path):
     text = (folder / "throughput.md").read_text()
     assert f"| physics | physics | 2 x 4 | 1 | 8 | {result['rows'][2]['per_s']:,.0f} (" in text
     assert "## training: where the time goes" in text
+
+
+def test_the_readme_shows_what_was_measured():
+    result = results.read(ROOT / "experiments" / "throughput" / "bench.json")
+    assert report.versus(result).count("\n") >= 2 and report.versus(result) in (ROOT / "README.md").read_text()
+
+
+def test_only_the_whole_configuration_stands_beside_published_figures():
+    row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "changes": {}, "per_s": 38500.0}
+    row["per_s_range"] = [38400.0, 38600.0]
+    others = [{"changes": {"policy": {"dtype": "bfloat16"}}}, {"scope": "environment"}, {"devices": 2}, {"worlds": 255}]
+    one = {**row, "worlds": 4096, "slots": 1, "changes": {"worlds": 4096, "scenes": {"pack": {"agents": 1}}, "phases": False}}
+    table = report.versus({"rows": [row, *({**row, **other} for other in others), one], "versions": {"device": "a GPU"}})
+    assert table.splitlines()[2:] == [
+        "| 256 x 16 | 38,500 (38,400 to 38,600) | 19,250 | 2.0 |",
+        "| 4,096 x 1 | 38,500 (38,400 to 38,600) | 41,742 | 0.9 |",
+    ]
+    assert report.versus({"rows": [{**row, **others[0]}], "versions": {"device": "a GPU"}}) == ""
 
 
 def test_variants_change_values_and_replace_entries():

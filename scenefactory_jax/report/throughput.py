@@ -7,6 +7,8 @@ from typing import Any
 from scenefactory_jax.report import tables
 
 Row = Mapping[str, Any]
+PUBLISHED = {(32, 16): 3_870, (256, 16): 19_250, (4096, 1): 41_742}  # SceneFactory, worlds x cars, PPO in the loop (section 4.2)
+PUBLISHED_ON = "one RTX PRO 6000, PhysX, torch"
 
 
 def line(row: Row) -> str:
@@ -34,6 +36,8 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
         "at once."
     )
     lines = ["# Throughput", made, words, rows_of(result["rows"])]
+    if compared := versus(result):
+        lines += ["## Beside the published figures", compared]
     if result["baseline"] is not None:
         lines += ["## Without vectorising", beside(result)]
     for row in result["rows"]:
@@ -42,6 +46,25 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
     path = folder / "throughput.md"
     path.write_text("\n\n".join(lines) + "\n", encoding="utf-8")
     return path
+
+
+def versus(result: Mapping[str, Any]) -> str:
+    """Rows of the whole configuration at sizes that the paper reports, beside its figures; empty without any. README shows this table."""
+    rows = []
+    for row in result["rows"]:
+        theirs = PUBLISHED.get((row["worlds"], row["slots"]))
+        if theirs is not None and row["scope"] == "training" and row["devices"] == 1 and _only_sizes(row["changes"]):
+            low, high = row["per_s_range"]
+            ours = f"{row['per_s']:,.0f} ({low:,.0f} to {high:,.0f})"
+            rows.append([f"{row['worlds']:,} x {row['slots']}", ours, f"{theirs:,}", f"{row['per_s'] / theirs:.1f}"])
+    header = ["Worlds x cars", f"Steps/s on {result['versions']['device']}", f"Published ({PUBLISHED_ON})", "Ratio"]
+    return tables.grid(header, rows) if rows else ""
+
+
+def _only_sizes(changes: Mapping[str, Any]) -> bool:
+    """Whether a variant differs from the configuration in how many worlds and cars there are, and in nothing else."""
+    scenes = changes.get("scenes", {})
+    return set(changes) <= {"worlds", "scenes", "phases"} and set(scenes) <= {"pack"} and set(scenes.get("pack", {})) <= {"agents"}
 
 
 def beside(result: Mapping[str, Any]) -> str:
