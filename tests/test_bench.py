@@ -52,6 +52,24 @@ def test_the_report_is_made_of_the_json(made, tmp_path):
     assert "## training: where the time goes" in text
 
 
+def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
+    folder, before = made
+    config = {**load("bench", *SMALL, f"out={folder}", "resume=true"), "variants": VARIANTS | {"new": {"seed": 1}}}
+    asked, measured = [], {key: before["rows"][0][key] for key in before["rows"][0] if key not in ("name", "changes", "settings")}
+    monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: asked.append(task["seed"]) or measured | {"per_s": 7.0})
+    after = command.bench(config)
+    assert asked == [1] and after["rows"][:3] == before["rows"] and after["rows"][3]["per_s"] == 7.0
+    assert results.read(folder / "bench.json")["rows"][3]["name"] == "new"
+    results.write(folder / "bench.json", before, digits=None)  # for whoever comes next
+    report.write(folder, before)
+
+
+def test_there_must_be_something_to_resume(tmp_path):
+    for out in ("null", str(tmp_path)):
+        with pytest.raises(ConfigError, match=r"resume=true: out=.*no bench\.json to go on with"):
+            command.bench(load("bench", *SMALL, f"out={out}", "resume=true"))
+
+
 def test_the_readme_shows_what_was_measured():
     result = results.read(ROOT / "experiments" / "throughput" / "bench.json")
     assert report.versus(result).count("\n") >= 2 and report.versus(result) in (ROOT / "README.md").read_text()

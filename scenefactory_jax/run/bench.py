@@ -24,6 +24,8 @@ from scenefactory_jax.types import Env, Scene
 
 SCOPES = {"training": "update", "environment": "observation", "physics": "physics"}  # and the last level of each
 DIGITS = 6
+FILE = "bench.json"
+ASIDE = ("out", "resume", "variants", "baseline", "name")  # keys of a bench that change nothing about a row
 
 
 def bench(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,28 +45,57 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     if config["baseline"] is not None:
         keys.check(config["baseline"], keys.BASELINE, where="baseline")
     sources.use_compilation_cache()
-    mesh, rows, loaded = across.mesh(config["devices"]), [], {}
-    for name, task in tasks.items():
+    mesh, loaded, versions = across.mesh(config["devices"]), {}, configs.versions()
+    out = None if config["out"] is None else Path(config["out"])
+    before = _kept(out) if config["resume"] else {"rows": [], "baseline": None}
+    result = {"command": configs.command("bench"), "versions": versions, "rows": [], "baseline": None}
+
+    def scenes_of(task: Mapping[str, Any]) -> sources.Scenes:
         source = results.digest(task["scenes"])
         if source not in loaded:
             loaded[source] = sources.training(task["scenes"])
-        worlds, chosen = sources.assign(loaded[source], task["worlds"], seed=task["seed"], mesh=mesh)
-        print(f"{name}: {chosen}", flush=True)
-        rows.append({"name": name, "changes": variants[name], **measure(task, worlds, mesh=mesh)})
-        print(report.line(rows[-1]), flush=True)
-    plain = None
+        return loaded[source]
+
+    for name, task in tasks.items():
+        settings = results.digest({"versions": versions, **{key: task[key] for key in task if key not in ASIDE}})
+        row = next((row for row in before["rows"] if (row["name"], row["settings"]) == (name, settings)), None)
+        if row is None:
+            worlds, chosen = sources.assign(scenes_of(task), task["worlds"], seed=task["seed"], mesh=mesh)
+            print(f"{name}: {chosen}", flush=True)
+            row = {"name": name, "changes": variants[name], "settings": settings, **measure(task, worlds, mesh=mesh)}
+        print(report.line(row), flush=True)
+        result["rows"].append(results.plain(row, digits=DIGITS))
+        _write(out, result)
     if config["baseline"] is not None:
-        first = next(iter(tasks.values()))
-        plain = unvectorised(first, loaded[results.digest(first["scenes"])], config["baseline"])
-    result = {"command": configs.command("bench"), "versions": configs.versions(), "rows": rows, "baseline": plain}
+        first, loop = next(iter(tasks.values())), before["baseline"]
+        settings = results.digest({"versions": versions, "scenes": first["scenes"], "baseline": config["baseline"]})
+        if loop is None or loop["settings"] != settings:
+            loop = {"settings": settings, **unvectorised(first, scenes_of(first), config["baseline"])}
+        result["baseline"] = loop
     result = results.plain(result, digits=DIGITS)
     print(report.text(result), flush=True)
-    if config["out"] is not None:
-        out = Path(config["out"])
-        out.mkdir(parents=True, exist_ok=True)
-        results.write(out / "bench.json", result, digits=DIGITS)
+    _write(out, result)
+    if out is not None:
         print(report.write(out, result))
     return result
+
+
+def _kept(out: Path | None) -> dict[str, Any]:
+    """What an earlier bench left in the folder.
+
+    Raises:
+        ConfigError: there is no folder, or nothing in it.
+    """
+    if out is None or not (out / FILE).is_file():
+        raise ConfigError(f"resume=true: out={out}: no {FILE} to go on with; give the folder of the bench that was stopped")
+    return results.read(out / FILE)
+
+
+def _write(out: Path | None, result: Mapping[str, Any]) -> None:
+    """After every row, so that a bench that is stopped goes on with `resume=true`."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        results.write(out / FILE, result, digits=DIGITS)
 
 
 def changed(config: Mapping[str, Any], changes: Mapping[str, Any], *, where: str) -> dict[str, Any]:
