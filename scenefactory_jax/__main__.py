@@ -17,6 +17,7 @@ USAGE = f"""usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--he
 commands: {", ".join(configs.COMMANDS)}
   train     train a policy            experiment=demo|quick|published|smoke scenes=womd scenes.path=FOLDER ...
   evaluate  judge a trained run       run=RUN_DIR scenes.path=FOLDER invincible=true|false|both
+  compare   several runs              runs='[runs/A-*,runs/B]' out=FOLDER
   convert   scenes -> a bank          source=FILE_OR_FOLDER out=BANK
   scenes    look at scenes            scenes.path=FOLDER_OR_BANK out=FOLDER
   render    scenes as MJCF and images scenes.path=FOLDER_OR_BANK out=FOLDER

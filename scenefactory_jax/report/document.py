@@ -242,7 +242,7 @@ def _definitions(table: Mapping[str, Summary], measured: Sequence[str]) -> str:
 
 def _setup(config: Mapping[str, Any], versions: Mapping[str, str], key_numbers: Sequence[str]) -> str:
     """Machine, versions, and the config's key numbers."""
-    flat = _flatten(config)
+    flat = flatten(config)
     rows = [[f"`{k}`", _shown(v)] for key in key_numbers for k, v in flat.items() if k == key or k.startswith(key + ".")]
     parts = [
         tables.grid(["Machine and software", ""], [[name, value] for name, value in versions.items()]) if versions else "",
@@ -261,16 +261,16 @@ def _links(folder: Path, files: Mapping[str, Path]) -> str:
 
 def _whole(config: Mapping[str, Any]) -> str:
     """The resolved config, folded."""
-    lines = "\n".join(f"{key}: {_shown(value)}" for key, value in _flatten(config).items())
+    lines = "\n".join(f"{key}: {_shown(value)}" for key, value in flatten(config).items())
     return f"<details><summary>The whole configuration</summary>\n\n```\n{lines}\n```\n\n</details>" if lines else ""
 
 
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted keys of a nested mapping."""
     result = {}
     for key, value in config.items():
         name = f"{prefix}{key}"
-        result.update(_flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value})
+        result.update(flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value})
     return result
 
 

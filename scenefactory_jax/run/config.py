@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
 
-COMMANDS = ("train", "evaluate", "convert", "scenes", "render", "bench", "validate", "sysid")
+COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "bench", "validate", "sysid")
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 
 
@@ -42,7 +42,7 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     """A command's config as a plain dict: `load("train", "experiment=demo", "worlds=8")`.
 
     Args:
-        name: a top-level config: train, evaluate, convert, scenes, render, bench, validate, sysid, or task (the environment alone).
+        name: a top-level config: one of COMMANDS, or task (the environment alone).
         overrides: as on the command line.
 
     Raises:

@@ -1,0 +1,125 @@
+"""`compare`: learning curves and evaluations of several runs side by side, seeds of one setting together."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import comparison as report
+from scenefactory_jax.report import document, tables
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import keys, log, results
+
+STEPS = "steps/total"
+ASIDE = ("seed", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept")  # settings that make no other group
+DIGITS = 6
+
+
+class Read(NamedTuple):
+    """One run, as its folder holds it."""
+
+    folder: Path
+    config: dict[str, Any]
+    settings: dict[str, Any]  # dotted key -> value, without those of ASIDE
+    metrics: list[dict[str, float]]
+    records: dict[str, dict[str, np.ndarray]]  # protocol -> agents of the evaluation at the end
+
+
+def compare(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare runs as a config says (`load("compare", "runs=[...]")`) and write the report in `out`.
+
+    Returns:
+        Group -> what differs, seeds, curves over agent steps and evaluations, as they were written.
+
+    Raises:
+        ConfigError: no such run, a run without metrics, or a metric that one of them lacks, by name.
+    """
+    keys.check(config, keys.COMPARE)
+    runs = [_read(folder) for folder in _find(config["runs"])]
+    for run in runs:
+        if missing := [name for name in (STEPS, *config["metrics"]) if name not in run.metrics[0]]:
+            raise ConfigError(f"metrics: {run.folder / log.FILE} has no column {missing[0]!r}; there are: {', '.join(run.metrics[0])}")
+    differing = _differing(run.settings for run in runs)
+    groups: dict[str, list[Read]] = {}
+    for run in runs:
+        label = ", ".join(f"{key}={_shown(run.settings.get(key))}" for key in differing) or str(run.config["name"])
+        groups.setdefault(label, []).append(run)
+    found = {label: _group(members, config) for label, members in groups.items()}
+    shown = {key: config[key] for key in ("metrics", "window", "last")}
+    result = {"command": configs.command("compare"), "settings": shown, "groups": found}
+    result = results.plain(result, digits=DIGITS)
+    out = Path(config["out"])
+    out.mkdir(parents=True, exist_ok=True)
+    results.write(out / "compare.json", result, digits=DIGITS)
+    print(f"{report.table(result)}\n{report.write(out, result)}", flush=True)
+    return result
+
+
+def _find(patterns: Iterable[str]) -> list[Path]:
+    """Run folders, each once, in the order in which they are named."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        path = Path(pattern)
+        base = Path(path.anchor) if path.is_absolute() else Path()
+        matches = sorted(base.glob(str(path.relative_to(base)))) if any(sign in pattern for sign in "*?[") else [path]
+        if not matches:
+            raise ConfigError(f"runs: nothing matches {pattern!r}; give folders that `train` wrote")
+        found |= dict.fromkeys(matches)
+    if not found:
+        raise ConfigError("runs: none; give folders that `train` wrote")
+    return list(found)
+
+
+def _read(folder: Path) -> Read:
+    config, metrics = configs.read(folder), log.read(folder)
+    if not metrics:
+        raise ConfigError(f"runs: {folder / log.FILE}: no row; the run has not finished an iteration")
+    named = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
+    records = {name: tables.read_csv(path) for name, path in named.items() if not name.endswith("-untrained")}
+    settings = {key: value for key, value in document.flatten(config).items() if key not in ASIDE}
+    return Read(folder, config, settings, metrics, records)
+
+
+def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Keys whose values are not the same in all runs."""
+    first, *others = settings
+    names = dict.fromkeys(name for one in (first, *others) for name in one)
+    return [name for name in names if any(one.get(name) != first.get(name) for one in others)]
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _group(runs: list[Read], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Curves of each seed up to the length of the shortest, and the evaluations of all seeds as one."""
+    length = min(len(run.metrics) for run in runs)
+    tail = max(1, round(config["last"] * length))
+
+    def column(run: Read, name: str) -> np.ndarray:
+        return np.array([row[name] for row in run.metrics[:length]])
+
+    curves = {name: [_running(column(run, name), config["window"]) for run in runs] for name in config["metrics"]}
+    evaluated = {}
+    for name in runs[0].records:
+        if all(name in run.records for run in runs):
+            pooled = {key: np.concatenate([run.records[name][key] for run in runs]) for key in runs[0].records[name]}
+            evaluated[name] = tables.summarise(pooled, bootstrap=config["bootstrap"], seed=config["seed"])
+    return {
+        "runs": [run.folder.name for run in runs],
+        "seeds": [run.config["seed"] for run in runs],
+        "iterations": length,
+        "steps": np.mean([column(run, STEPS) for run in runs], axis=0),
+        "minutes": [run.metrics[length - 1]["minutes"] for run in runs],
+        "casps": [float(np.median(column(run, "casps"))) for run in runs],
+        "curves": curves,
+        "last": {name: [float(np.nanmean(column(run, name)[-tail:])) for run in runs] for name in config["metrics"]},
+        "evaluated": evaluated,
+    }
+
+
+def _running(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of the values up to each one, `window` of them where there are so many."""
+    return np.array([np.nanmean(values[max(0, i + 1 - window) : i + 1]) for i in range(len(values))])
