@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import pytest
 
 from scenefactory_jax.build import ConfigError
@@ -76,7 +77,7 @@ def test_the_readme_shows_what_was_measured():
 
 
 def test_only_the_whole_configuration_stands_beside_published_figures():
-    row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "changes": {}, "per_s": 38500.0}
+    row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "changes": {}, "per_s": 38500.0, "fits": True}
     row["per_s_range"] = [38400.0, 38600.0]
     others = [{"changes": {"policy": {"dtype": "bfloat16"}}}, {"scope": "environment"}, {"devices": 2}, {"worlds": 255}]
     one = {**row, "worlds": 4096, "slots": 1, "changes": {"worlds": 4096, "scenes": {"pack": {"agents": 1}}, "phases": False}}
@@ -86,6 +87,28 @@ def test_only_the_whole_configuration_stands_beside_published_figures():
         "| 4,096 x 1 | 38,500 (38,400 to 38,600) | 41,742 | 0.9 |",
     ]
     assert report.versus({"rows": [{**row, **others[0]}], "versions": {"device": "a GPU"}}) == ""
+
+
+def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
+    def measure(task, worlds, mesh):
+        if task["worlds"] == 4:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate")
+        if task["worlds"] == 3:
+            raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+        numbers = dict.fromkeys(("per_s", "slots_per_s", "memory_gib", "compile_s"), 2.0) | {"spawned_share": 0.5, "active_share": None}
+        size = {"scope": "training", "worlds": task["worlds"], "slots": 4, "devices": 1, "horizon": 8}
+        return size | numbers | {"per_s_range": [1.0, 3.0], "ms_a_control_step": task["worlds"] / 2, "phases_ms": {}, "repeats": 1}
+
+    monkeypatch.setattr(command, "measure", measure)
+    config = {**load("bench", *SMALL, f"out={tmp_path}"), "variants": {str(n): {"worlds": n} for n in (1, 2, 5, 4)}}
+    rows = command.bench(config)["rows"]
+    assert [row["fits"] for row in rows] == [True, True, True, False] and rows[3]["slots"] == 4
+    text = (tmp_path / "throughput.md").read_text()
+    assert "| 4 | training | 4 x 4 | 1 | 8 | does not fit into the device's memory |" in text
+    assert "| 5 x 4 | 2.50 | 500.0 | 2.0 | 409.6 |" in text and "4 x 4 (training) does not fit" in text
+    assert (tmp_path / "scaling.png").stat().st_size > 5_000 and "4: does not fit" in capsys.readouterr().out
+    with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
+        command.bench({**config, "out": None, "variants": {"3": {"worlds": 3}}})
 
 
 def test_variants_change_values_and_replace_entries():

@@ -4,15 +4,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.report import tables
+import matplotlib
+from matplotlib.figure import Figure
+
+from scenefactory_jax.report import plots, tables
 
 Row = Mapping[str, Any]
 PUBLISHED = {(32, 16): 3_870, (256, 16): 19_250, (4096, 1): 41_742}  # SceneFactory, worlds x cars, PPO in the loop (section 4.2)
 PUBLISHED_ON = "one RTX PRO 6000, PhysX, torch"
+TOO_LARGE = "does not fit into the device's memory"
 
 
 def line(row: Row) -> str:
     """One row for the terminal."""
+    if not row["fits"]:
+        return f"{row['name']}: {TOO_LARGE}"
     low, high = row["per_s_range"]
     return (
         f"{row['name']}: {row['per_s']:,.0f} /s ({low:,.0f} to {high:,.0f}, {row['repeats']} repeats), {row['slots_per_s']:,.0f} slots/s, "
@@ -23,7 +29,7 @@ def line(row: Row) -> str:
 def text(result: Mapping[str, Any]) -> str:
     """Everything for the terminal, phases last."""
     loop = [] if result["baseline"] is None else [beside(result)]
-    return "\n\n".join([rows_of(result["rows"]), *loop, *(phases_of(row) for row in result["rows"] if row["phases_ms"])])
+    return "\n\n".join([rows_of(result["rows"]), *loop, *(phases_of(row) for row in _timed(result) if row["phases_ms"])])
 
 
 def write(folder: Path, result: Mapping[str, Any]) -> Path:
@@ -40,7 +46,10 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
         lines += ["## Beside the published figures", compared]
     if result["baseline"] is not None:
         lines += ["## Without vectorising", beside(result)]
-    for row in result["rows"]:
+    if len(sizes := _sizes(result)) > 2:
+        picture = plots.save(figure(sizes), folder / "scaling.png")
+        lines += ["## Against the number of worlds", scaling(result), f"![Time and memory against worlds]({picture.name})"]
+    for row in _timed(result):
         if row["phases_ms"]:
             lines += [f"## {row['name']}: where the time goes", phases_of(row)]
     path = folder / "throughput.md"
@@ -51,9 +60,8 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
 def versus(result: Mapping[str, Any]) -> str:
     """Rows of the whole configuration at sizes that the paper reports, beside its figures; empty without any. README shows this table."""
     rows = []
-    for row in result["rows"]:
-        theirs = PUBLISHED.get((row["worlds"], row["slots"]))
-        if theirs is not None and row["scope"] == "training" and row["devices"] == 1 and _only_sizes(row["changes"]):
+    for row in _sizes(result):
+        if (theirs := PUBLISHED.get((row["worlds"], row["slots"]))) is not None:
             low, high = row["per_s_range"]
             ours = f"{row['per_s']:,.0f} ({low:,.0f} to {high:,.0f})"
             rows.append([f"{row['worlds']:,} x {row['slots']}", ours, f"{theirs:,}", f"{row['per_s'] / theirs:.1f}"])
@@ -61,10 +69,48 @@ def versus(result: Mapping[str, Any]) -> str:
     return tables.grid(header, rows) if rows else ""
 
 
+def _timed(result: Mapping[str, Any]) -> list[Row]:
+    return [row for row in result["rows"] if row["fits"]]
+
+
+def _sizes(result: Mapping[str, Any]) -> list[Row]:
+    """Training on one device, the whole configuration at several sizes."""
+    return [row for row in _timed(result) if row["scope"] == "training" and row["devices"] == 1 and _only_sizes(row["changes"])]
+
+
+def scaling(result: Mapping[str, Any]) -> str:
+    """What a world costs in training at each size; what did not fit is named below."""
+    rows = []
+    for row in sorted(_sizes(result), key=lambda row: (-row["slots"], row["worlds"])):
+        worlds, ms, memory = row["worlds"], row["ms_a_control_step"], row["memory_gib"]
+        each = f"{1e3 * ms / worlds:.1f}", f"{1024 * memory / worlds:.1f}"
+        rows.append([f"{worlds:,} x {row['slots']}", f"{ms:.2f}", each[0], f"{memory:.1f}", each[1]])
+    table = tables.grid(["Worlds x slots", "ms a control step", "us a world", "Memory, GiB", "MiB a world"], rows)
+    large = [f"{row['worlds']:,} x {row['slots']} ({row['scope']}) {TOO_LARGE}." for row in result["rows"] if not row["fits"]]
+    return "\n\n".join([table, *large])
+
+
+def figure(rows: list[Row]) -> Figure:
+    """Time of a control step and memory against worlds, both logarithmic; a dotted line is what each world costs at the largest size."""
+    with matplotlib.rc_context(plots.STYLE):
+        whole = Figure(figsize=(8.0, 3.2), layout="constrained")
+        panels = whole.subplots(1, 2)
+        for axes, (key, title) in zip(panels, {"ms_a_control_step": "ms a control step", "memory_gib": "memory, GiB"}.items(), strict=True):
+            for slots in sorted({row["slots"] for row in rows}, reverse=True):
+                points = sorted((row["worlds"], row[key]) for row in rows if row["slots"] == slots)
+                worlds, values = zip(*points, strict=True)
+                [line] = axes.loglog(worlds, values, "o-", base=2, markersize=4, label=f"{slots} cars a world")
+                axes.loglog(worlds, [values[-1] / worlds[-1] * count for count in worlds], ":", base=2, color=line.get_color(), linewidth=1)
+            axes.set(title=title, xlabel="worlds")
+        panels[0].legend()
+    return whole
+
+
 def _only_sizes(changes: Mapping[str, Any]) -> bool:
     """Whether a variant differs from the configuration in how many worlds and cars there are, and in nothing else."""
     scenes = changes.get("scenes", {})
-    return set(changes) <= {"worlds", "scenes", "phases"} and set(scenes) <= {"pack"} and set(scenes.get("pack", {})) <= {"agents"}
+    sizes = set(changes) <= {"worlds", "scenes", "phases", "repeats", "warmup", "devices"}
+    return sizes and set(scenes) <= {"pack"} and set(scenes.get("pack", {})) <= {"agents"}
 
 
 def beside(result: Mapping[str, Any]) -> str:
@@ -89,6 +135,9 @@ def rows_of(rows: list[Row]) -> str:
 
 
 def _cells(row: Row) -> list[str]:
+    if not row["fits"]:
+        size = f"{row['worlds']:,} x {row['slots']}"
+        return [row["name"], row["scope"], size, str(row["devices"]), f"{row['horizon']}", TOO_LARGE, "", "", "", "", ""]
     low, high = row["per_s_range"]
     share = f"{100 * row['spawned_share']:.0f} %"
     if row["active_share"] is not None:

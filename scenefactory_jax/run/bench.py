@@ -45,7 +45,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     if config["baseline"] is not None:
         keys.check(config["baseline"], keys.BASELINE, where="baseline")
     sources.use_compilation_cache()
-    mesh, loaded, versions = across.mesh(config["devices"]), {}, configs.versions()
+    meshes, loaded, versions = {name: across.mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
     out = None if config["out"] is None else Path(config["out"])
     before = _kept(out) if config["resume"] else {"rows": [], "baseline": None}
     result = {"command": configs.command("bench"), "versions": versions, "rows": [], "baseline": None}
@@ -60,9 +60,9 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
         settings = results.digest({"versions": versions, **{key: task[key] for key in task if key not in ASIDE}})
         row = next((row for row in before["rows"] if (row["name"], row["settings"]) == (name, settings)), None)
         if row is None:
-            worlds, chosen = sources.assign(scenes_of(task), task["worlds"], seed=task["seed"], mesh=mesh)
+            worlds, chosen = sources.assign(scenes_of(task), task["worlds"], seed=task["seed"], mesh=meshes[name])
             print(f"{name}: {chosen}", flush=True)
-            row = {"name": name, "changes": variants[name], "settings": settings, **measure(task, worlds, mesh=mesh)}
+            row = {"name": name, "changes": variants[name], "settings": settings, **_measured(task, worlds, mesh=meshes[name])}
         print(report.line(row), flush=True)
         result["rows"].append(results.plain(row, digits=DIGITS))
         _write(out, result)
@@ -124,6 +124,16 @@ def unvectorised(config: Mapping[str, Any], scenes: sources.Scenes, numbers: Map
     return baseline.measure(config, chosen, parameters, **timing)
 
 
+def _measured(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None) -> dict[str, Any]:
+    """`measure`, or how large the configuration was that did not fit: what fits is one of the things that a bench finds out."""
+    try:
+        return {"fits": True, **measure(config, worlds, mesh=mesh)}
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return {"fits": False, **_size(config, worlds, mesh)}
+
+
 def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = None) -> dict[str, Any]:
     """One configuration on worlds that are already on the device, or on those of a mesh; phases are measured on one device only."""
     parts = world.parts_of(config)
@@ -150,11 +160,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
         nested[SCOPES[scope]] = whole.median
     ms = 1e3 / horizon
     return {
-        "scope": scope,
-        "worlds": slots[0],
-        "slots": slots[1],
-        "devices": 1 if mesh is None else mesh.size,
-        "horizon": horizon,
+        **_size(config, worlds, mesh),
         "per_s": spawned / whole.median,
         "per_s_range": [spawned / max(whole.seconds), spawned / min(whole.seconds)],
         "slots_per_s": slots[0] * slots[1] * horizon / whole.median,
@@ -166,6 +172,13 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
         "memory_gib": whole.memory_gib,
         "repeats": config["repeats"],
     }
+
+
+def _size(config: Mapping[str, Any], worlds: Scene, mesh: Mesh | None) -> dict[str, Any]:
+    """What a row is of."""
+    count, slots = worlds.agents.present.shape
+    devices, horizon = 1 if mesh is None else mesh.size, config["ppo"]["horizon"]
+    return {"scope": config["scope"], "worlds": count, "slots": slots, "devices": devices, "horizon": horizon}
 
 
 def _learn(
