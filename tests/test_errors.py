@@ -107,7 +107,7 @@ def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message
 
 
 def test_an_unknown_config_is_named():
-    with pytest.raises(ConfigError, match=r"no config 'drive'; valid: bench, convert, evaluate, .*train"):
+    with pytest.raises(ConfigError, match=r"no config 'drive'; valid: bench, compare, convert, evaluate, .*train"):
         config.load("drive")
 
 
