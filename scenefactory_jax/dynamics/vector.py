@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from scenefactory_jax.geometry import root
 from scenefactory_jax.struct import struct
 
 Number = Any  # an array, [] of a car or [4] of its wheels; plain where it comes from the reference car alone
@@ -65,6 +66,4 @@ def over_wheels(number: Number) -> Number:
 
 def length(*parts: Number) -> Array:
     """Euclidean length of components; its gradient at zero is zero instead of NaN."""
-    squared = jnp.asarray(sum(part * part for part in parts))
-    positive = squared > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    return root(jnp.asarray(sum(part * part for part in parts)))

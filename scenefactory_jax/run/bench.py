@@ -64,7 +64,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
             print(f"{name}: {chosen}", flush=True)
             row = {"name": name, "changes": variants[name], "settings": settings, **_measured(task, worlds, mesh=meshes[name])}
         print(report.line(row), flush=True)
-        result["rows"].append(results.plain(row, digits=DIGITS))
+        result["rows"].append(row)
         _write(out, result)
     if config["baseline"] is not None:
         first, loop = next(iter(tasks.values())), before["baseline"]
