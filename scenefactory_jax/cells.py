@@ -18,14 +18,19 @@ SIZES = ("side", "rows", "most")  # of a grid: cells along it, entries of all it
 SLACK_M = 0.01  # on the radius, so that rounding loses nobody: far above float32's at the coordinates of a scene
 
 
-def near(cells: Cells, position: Float[Array, "A 2"]) -> tuple[Int[Array, "A N"], Bool[Array, "A N"]]:
-    """Segments that may lie within the radius of each position, in storage order, and which entries are any."""
+def part(cells: Cells, position: Float[Array, "A 2"]) -> tuple[Int[Array, " A"], Int[Array, " A"]]:
+    """Where in `cells.rows` the list of each position's cell begins and ends: segments that may lie within the radius of it."""
     place = jnp.floor((position - cells.origin) / cells.size_m).astype(jnp.int32)
     column, row = jnp.clip(place, 0, cells.side - 1).T
     cell = row * cells.side + column
-    at = cells.first[cell][:, None] + jnp.arange(cells.most, dtype=jnp.int32)
-    listed = at < cells.first[cell + 1][:, None]
-    return jnp.where(listed, cells.rows[jnp.minimum(at, len(cells.rows) - 1)], 0), listed
+    return cells.first[cell], cells.first[cell + 1]
+
+
+def listed(cells: Cells, first: Int[Array, " A"], last: Int[Array, " A"]) -> tuple[Int[Array, "A N"], Bool[Array, "A N"]]:
+    """Segments of lists that begin and end there, in storage order, and which entries are any."""
+    at = first[:, None] + jnp.arange(cells.most, dtype=jnp.int32)
+    there = at < last[:, None]
+    return jnp.where(there, cells.rows[jnp.minimum(at, len(cells.rows) - 1)], 0), there
 
 
 def attach(scene: Scene, *, radius_m: float, size_m: float, capacity: Mapping[str, int] | None = None) -> Scene:

@@ -1,14 +1,12 @@
 """Surrogate safety measures between moving circles: time to collision (TTC) and deceleration rate to avoid a crash (DRAC)."""
 
-import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.geometry import CAR_CIRCLES, dot, heading, norm
-from scenefactory_jax.types import Boxes, Motion, Road
+from scenefactory_jax.geometry import dot, heading, norm
+from scenefactory_jax.types import Boxes, Motion
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
 
@@ -67,39 +65,6 @@ def pairwise(
 
     self_pair = jnp.eye(cars, len(radius), dtype=bool)
     return jnp.where(self_pair, jnp.inf, ttc), jnp.where(self_pair, 0.0, drac)
-
-
-def with_points(
-    centres: Float[Array, "A 3 2"],
-    radius: Float[Array, " A"],
-    velocity: Float[Array, "A 2"],
-    yaw: Float[Array, " A"],
-    road: Road,
-    *,
-    range_m: float,
-) -> Float[Array, " A"]:
-    """TTC (s) with the midpoints of standing road segments ahead and within a range, by closing speed along the line of sight.
-
-    There are many of them: the soonest is the one with the largest 1 / TTC, one root and one division each, and the circles are written
-    out, so that a segment is read once for all of them.
-    """
-    ahead, moves = heading(yaw)[:, None], velocity[:, None]
-
-    def rate(circle: int) -> Float[Array, "A P"]:
-        apart = road.midpoint - centres[:, circle, None]
-        squared = dot(apart, apart)
-        inverse = jax.lax.rsqrt(jnp.maximum(squared, SMALLEST**2))
-        distance, closing = squared * inverse, dot(apart, moves) * inverse
-        gap = distance - radius[:, None]
-        seen = road.valid & (distance <= range_m) & (dot(apart, ahead) > 0)
-        touches = gap <= 0
-        soon = jnp.where(touches, jnp.inf, closing / jnp.where(touches, 1.0, gap))
-        return jnp.where(seen & (touches | (closing > SMALLEST)), soon, 0.0)
-
-    rates = functools.reduce(jnp.maximum, [rate(circle) for circle in range(CAR_CIRCLES)])
-    soonest = jnp.max(rates, axis=1, initial=0.0)
-    meets = soonest > 0
-    return jnp.where(meets, 1.0 / jnp.where(meets, soonest, 1.0), jnp.inf)
 
 
 def least(ttc: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:

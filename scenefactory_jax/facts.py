@@ -6,11 +6,11 @@ reads cost nothing: XLA drops them.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax import conflict
-from scenefactory_jax.geometry import car_circles, cross, distance_to_segments, dot, heading, nearest_segment, norm
-from scenefactory_jax.types import Events, Facts, Motion, Scene, State
+from scenefactory_jax import conflict, roadside
+from scenefactory_jax.geometry import car_circles, cross, dot, heading, norm
+from scenefactory_jax.types import Agents, Events, Facts, Motion, Scene, State
 
 
 def measure(
@@ -34,11 +34,15 @@ def measure(
     off_lane_distance_m: float,
     idle_speed_mps: float,
     drac_gap_floor_m: float,
+    kernels: bool,
 ) -> Facts:
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
     Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
     tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
+
+    Args:
+        kernels: Triton kernels for the road where there is an NVIDIA GPU; False: plain JAX everywhere.
     """
     motion, active, cars, finite = after.motion, before.active, len(before.active), is_finite(after.motion)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
@@ -46,19 +50,16 @@ def measure(
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
-    lane = _measure_lane(scene, before, position, motion, to_goal)
-    edge_gap = distance_to_segments(centres[:cars], scene.edges, half_width_m=edge_half_width_m) - edge_radius_m
-    edge_ttc = conflict.with_points(centres[:cars], radius[:cars], velocity, motion.yaw, scene.edges, range_m=edge_range_m)
+    edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
+    beside = roadside.look(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
+    lane, edge_gap = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
     strayed = norm(position - after.agents.position)
-
-    outside = jnp.max(jnp.abs(position), axis=1) > 0.5 * box_m
-    lost = strayed > jnp.maximum(stray_m, stray_ratio * after.agents.route)
-    fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
+    limits = {"upright_min": upright_min, "height_min_m": height_min_m, "box_m": box_m, "stray_m": stray_m, "stray_ratio": stray_ratio}
     events = Events(
         fault=~finite,
         reached=norm(to_goal) <= goal_radius_m,
         collided=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
-        crashed=fell | outside | lost,
+        crashed=_has_crashed(motion, after.agents, strayed, **limits),
         touched_edge=edge_gap <= 0,
     )
     return Facts(
@@ -66,7 +67,7 @@ def measure(
         goal_distance=norm(to_goal),
         **lane,
         ttc=conflict.least(ttc, everyone.present),
-        edge_ttc=edge_ttc,
+        edge_ttc=beside.edge_ttc,
         edge_gap=edge_gap,
         drac=jnp.max(jnp.where(everyone.present[None], drac, 0.0), axis=1),
         strayed=strayed,
@@ -80,6 +81,15 @@ def measure(
     )
 
 
+def _has_crashed(
+    motion: Motion, agents: Agents, strayed: Float[Array, " A"], *, upright_min, height_min_m, box_m, stray_m, stray_ratio
+) -> Bool[Array, " A"]:
+    """Tipped over or fallen, outside the scene, or further from the start than any way to the goal asks for."""
+    fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
+    outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * box_m
+    return fell | outside | (strayed > jnp.maximum(stray_m, stray_ratio * agents.route))
+
+
 def is_finite(motion: Motion) -> Bool[Array, " A"]:
     """Whether every number of a car's motion is finite."""
     per_leaf = [jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1) for leaf in jax.tree.leaves(motion)]
@@ -87,10 +97,10 @@ def is_finite(motion: Motion) -> Bool[Array, " A"]:
 
 
 def _measure_lane(
-    scene: Scene, before: State, position: Float[Array, "A 2"], motion: Motion, to_goal: Float[Array, "A 2"]
+    scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]
 ) -> dict[str, Array]:
-    """Facts relative to the nearest lane segment; zeros in a world without lanes."""
-    row, any_lane = nearest_segment(position, scene.lanes)
+    """Facts relative to a row of the lanes; zeros in a world without lanes."""
+    any_lane, position = jnp.any(scene.lanes.valid), motion.position[:, :2]
     tangent, midpoint = scene.lanes.direction[row], scene.lanes.midpoint[row]
     tangent = jnp.where((dot(to_goal, tangent) < 0)[:, None], -tangent, tangent)
     offset = position - midpoint

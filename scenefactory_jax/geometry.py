@@ -1,9 +1,7 @@
-"""Planar geometry: angles, frames, the three circles that stand for a car, distances to segments, places along lanes."""
-
-import functools
+"""Planar geometry: angles, frames, the three circles that stand for a car, places along lanes."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.types import Road
 
@@ -87,26 +85,6 @@ def distance_to_boxes(
     """Distance from points to the outlines of oriented boxes; 0 inside."""
     beyond = jnp.abs(to_frame(point[..., None, :] - position, yaw)) - size / 2
     return norm(jnp.maximum(beyond, 0.0))
-
-
-def nearest_segment(position: Float[Array, "A 2"], road: Road) -> tuple[Int[Array, " A"], Bool[Array, ""]]:
-    """Row of the valid segment whose midpoint is nearest, and whether there is any. Ties go to the first in storage order."""
-    offset = position[:, None, :] - road.midpoint
-    squared = jnp.where(road.valid, dot(offset, offset), jnp.inf)
-    return jnp.argmin(squared, axis=1), jnp.any(road.valid)
-
-
-def distance_to_segments(points: Float[Array, "A N 2"], road: Road, *, half_width_m: float) -> Float[Array, " A"]:
-    """Distance from the nearest of each row's few points to the rectangles that valid segments with a half width are; inf without any."""
-
-    def squared(point: Float[Array, "A 2"]) -> Float[Array, "A P"]:
-        offset = point[:, None] - road.midpoint
-        along = jnp.maximum(jnp.abs(dot(offset, road.direction)) - road.half_length, 0.0)
-        across = jnp.maximum(jnp.abs(cross(offset, road.direction)) - half_width_m, 0.0)
-        return along * along + across * across
-
-    nearest = functools.reduce(jnp.minimum, [squared(points[:, number]) for number in range(points.shape[1])])
-    return root(jnp.min(jnp.where(road.valid, nearest, jnp.inf), axis=1, initial=jnp.inf))
 
 
 def running_length(road: Road) -> Float[Array, " P"]:

@@ -10,9 +10,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from scenefactory_jax import cells, conflict
+from scenefactory_jax import conflict, roadside
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
 from scenefactory_jax.patches import condition
@@ -50,26 +50,17 @@ def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
 
 
-def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float) -> Rows:
+def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float, kernels: bool) -> Rows:
     """Road segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y.
 
     Storage order starts with lanes, so a crowded place drops road edges first: the published `road_running` mode. A scene with cells of at
     least that radius is looked up there, with the same result.
+
+    Args:
+        kernels: a Triton kernel where there is an NVIDIA GPU and the scene has cells; False: plain JAX everywhere.
     """
-    position, yaw = state.motion.position[:, :2], state.motion.yaw
-    if scene.cells is not None and scene.cells.radius_m >= radius_m:
-        row, listed = cells.near(scene.cells, position)
-        offset = position[:, None, :] - scene.road.midpoint[row]
-        place, mask = first_hits(listed & (dot(offset, offset) <= radius_m**2), count=count)
-        index = jnp.where(mask, jnp.take_along_axis(row, place, axis=1), 0)
-    else:
-        offset = position[:, None, :] - scene.road.midpoint
-        index, mask = first_hits(scene.road.valid & (dot(offset, offset) <= radius_m**2), count=count)
-    frame = yaw[:, None]
-    place = to_frame(scene.road.midpoint[index] - position[:, None, :], frame) / radius_m
-    kind = scene.road.kind[index][..., None].astype(jnp.float32) / kind_scale
-    features = jnp.concatenate([place, kind, to_frame(scene.road.direction[index], frame)], axis=-1)
-    return Rows(jnp.where(mask[..., None], features, 0.0), mask)
+    numbers = {"count": count, "radius_m": radius_m, "kind_scale": kind_scale, "kernels": kernels}
+    return roadside.around(scene, state.motion.position[:, :2], state.motion.yaw, state.active, **numbers)
 
 
 def neighbours(
@@ -96,18 +87,6 @@ def neighbours(
     features = jnp.where(mask[..., None], jnp.concatenate(columns, axis=-1), 0.0)
     padding = count - rows
     return Rows(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))
-
-
-def first_hits(hits: Bool[Array, "A P"], *, count: int) -> tuple[Int[Array, "A {count}"], Bool[Array, "A {count}"]]:
-    """Columns of the first `count` true entries of each row, in order, and which of them exist.
-
-    The k-th hit is the first column whose running number of hits reaches k, so a binary search finds it: no sort and no scatter.
-    """
-    running = jnp.cumsum(hits, axis=1, dtype=jnp.int32)
-    wanted = jnp.arange(1, count + 1, dtype=jnp.int32)
-    index = jax.vmap(lambda row: jnp.searchsorted(row, wanted, method="scan_unrolled"))(running)
-    mask = wanted <= running[:, -1:]
-    return jnp.where(mask, index, 0), mask
 
 
 def make(entries: Mapping[str, Mapping[str, Any]], *, where: str = "observe", **context: Any) -> dict[str, Group]:

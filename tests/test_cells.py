@@ -49,8 +49,8 @@ def look(count):
             position=jnp.concatenate([position, zeros[:, None]], axis=1), velocity=jnp.zeros((agents, 3)), yaw=0.1 * jnp.arange(agents),
             **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "grip", "grip_use", "slip"), zeros),
         )  # fmt: skip
-        state = type("State", (), {"motion": motion})()
-        return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0)
+        state = type("State", (), {"motion": motion, "active": jnp.ones(agents, bool)})()
+        return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
 
     return jax.jit(at)
 
@@ -78,7 +78,8 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
     bare = unchecked(type(scenes), **(vars(scenes) | {"road": unchecked(type(road), **(vars(road) | {"valid": road.valid & False}))}))
     made = cells.attach(bare, radius_m=10.0, size_m=5.0).cells
     assert not made.first.any() and made.most == 1
-    _, listed = cells.near(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made), jnp.zeros((3, 2)))
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made)
+    _, listed = cells.listed(one, *cells.part(one, jnp.zeros((3, 2))))
     assert not listed.any()
 
 

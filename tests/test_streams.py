@@ -281,7 +281,7 @@ def test_room_for_more_changes_no_look_up():
     seen = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "most": 400}):
         grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).cells)
-        rows, listed = map(np.asarray, cells.near(grid, jnp.asarray(places)))
+        rows, listed = map(np.asarray, cells.listed(grid, *cells.part(grid, jnp.asarray(places))))
         seen.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
     assert seen[0] == seen[1] and any(seen[0])
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import road_of, scene_of
 
 import scenefactory_jax
-from scenefactory_jax import conflict, ends, facts, geometry, observations, others, rewards, spawn, world
+from scenefactory_jax import conflict, ends, facts, geometry, observations, others, rewards, roadside, spawn, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
@@ -136,7 +136,7 @@ def test_parting_cars_never_meet():
 def test_first_hits_keeps_storage_order():
     rng = np.random.default_rng(1)
     hits = rng.random((7, 90)) < 0.2
-    index, mask = observations.first_hits(jnp.asarray(hits), count=12)
+    index, mask = roadside.first_hits(jnp.asarray(hits), count=12)
     for row in range(7):
         expected = np.flatnonzero(hits[row])[:12]
         assert list(np.asarray(index[row])[np.asarray(mask[row])]) == list(expected)

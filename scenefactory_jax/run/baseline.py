@@ -162,7 +162,8 @@ def make(config: Mapping[str, Any]) -> Task:
     """
     _refuse(config)
     bound = functools.partial(build, builtins=one)
-    groups = {name: bound(entry, where=f"observe.{name}") for name, entry in config["observe"].items() if entry is not None}
+    entries = {name: entry for name, entry in config["observe"].items() if entry is not None}
+    groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
     terms = []
     for name, entry in config["reward"].items():
         if entry is not None:
@@ -180,12 +181,17 @@ def make(config: Mapping[str, Any]) -> Task:
         engine=_engine(config),
         draw=jax.jit(draw),
         groups=groups,
-        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
+        measure=bound({"_target_": "measure", **_without_kernels(config["facts"])}, where="facts"),
         judge=bound({"_target_": "judge", **config["ends"]}, where="ends"),
         terms=terms,
         circles=config["facts"]["circles"],
         episode_steps=parts.episode_steps,
     )
+
+
+def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of the vectorised environment for its twin here, which has nothing to choose."""
+    return {key: value for key, value in entry.items() if key != "kernels"}
 
 
 def _refuse(config: Mapping[str, Any]) -> None:
