@@ -68,6 +68,16 @@ def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
     report.write(folder, before)
 
 
+def test_the_whole_configuration_comes_first():
+    """The loops in Python are compared with the first row."""
+    config = load("bench", "experiment=published", "suite=throughput")
+    name, changes = next(iter(config["variants"].items()))
+    assert (name, changes) == ("256 x 16", {"phases": True})
+    full = config["variants"]["bicycle environment 4096 x 16, no empty slots"]
+    assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawn"]["draw"]["_target_"] == "random_pairs"
+    assert next(iter(load("bench", "suite=streaming")["variants"])) == "in memory"
+
+
 def test_there_must_be_something_to_resume(tmp_path):
     for out in ("null", str(tmp_path)):
         with pytest.raises(ConfigError, match=r"resume=true: out=.*no bench\.json to go on with"):

@@ -313,7 +313,7 @@ def test_errors_of_the_loader_surface_by_name_and_never_hang(capsys):
             _, held = flow.exchange(swap, None, held)
             flow.draw()
     assert "left out generated scene 6: street 6: nobody drives here" in capsys.readouterr().out
-    context, swap = flowing(entry("stream.wait_s=0.2", unusable=list(range(4, 99))))
+    context, swap = flowing(entry("stream.wait_s=2.0", unusable=list(range(4, 99))))
     with pytest.raises(SceneError, match="none of 2 scenes to load can be used: generated scene 4: street 4: nobody"), context as flow:
         flow.exchange(swap, None, flow.scenes())
     with pytest.raises(SceneError, match="not one of 4 can be used: street 0: nobody"), flowing(entry(unusable=list(range(9))))[0]:

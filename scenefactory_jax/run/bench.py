@@ -146,7 +146,6 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
     parts = world.parts_of(config)
     env, scope, horizon = world.assemble(parts), config["scope"], config["ppo"]["horizon"]
     slots = worlds.agents.present.shape
-    spawned, active = int(worlds.agents.present.sum()) * horizon, None
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
     def act(level: str) -> Timed:
@@ -158,7 +157,8 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
         whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
         spawned, active = metrics["steps/spawned"], metrics["share/active"]
     else:
-        whole, roll = act(SCOPES[scope]), None
+        whole, roll, active = act(SCOPES[scope]), None, None
+        spawned = int(whole.left[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded
     nested = {}
     if config["phases"] and mesh is None:
         levels = phases.ACTING[: phases.ACTING.index(SCOPES[scope])] if roll is None else phases.ACTING

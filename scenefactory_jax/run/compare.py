@@ -13,7 +13,8 @@ from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, results
 
 STEPS = "steps/total"
-ASIDE = ("seed", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept")  # settings that make no other group
+# settings that make no other group
+ASIDE = ("seed", "name", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept")
 DIGITS = 6
 
 
