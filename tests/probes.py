@@ -36,6 +36,7 @@ NUMBERS = dict(
     max_grad_norm=1.0,
     normalise_advantage=True,
     initial_phase=False,
+    average=None,
     episode_steps=1000,
     shards=None,
 )

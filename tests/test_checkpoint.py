@@ -19,6 +19,7 @@ def fresh():
     """A trainer of its own, as in a new process."""
     env = probe(life=3, episode_steps=20)
     numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 20}
+    numbers["average"] = 0.5
     return train.make(env, late_fusion.make(**SMALL), **numbers)
 
 
@@ -80,9 +81,31 @@ def test_restore_is_exact_in_every_array(saved, trainer):
 def test_parameters_alone_drive_a_policy(saved):
     folder, third, _ = saved
     parameters = checkpoint.restore_parameters(folder)
-    assert_same(parameters, third.parameters)
+    assert_same(parameters, third.averaged)
     mean, _, _ = late_fusion.make(**SMALL).apply(parameters, third.observation)
     assert mean.shape == (STAGE, 3, 3)
+
+
+def test_what_is_judged_is_the_running_mean(saved, trainer):
+    folder, third, fourth = saved
+    second = checkpoint.restore(folder, begin(trainer), 2)
+    for before, after in ((second, third), (third, fourth)):
+        wanted = jax.tree.map(lambda old, new: 0.5 * old + 0.5 * new, before.averaged, after.parameters)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.averaged, wanted)
+        assert any((a != b).any() for a, b in zip(jax.tree.leaves(after.averaged), jax.tree.leaves(after.parameters), strict=True))
+    assert_same(train.parameters_of(fourth), fourth.averaged)
+    alone = dataclasses.replace(third, averaged=None)
+    assert_same(train.parameters_of(alone), third.parameters)
+
+
+def test_a_run_without_a_mean_is_saved_and_restored(saved, tmp_path):
+    folder, third, _ = saved
+    alone = dataclasses.replace(third, averaged=None)
+    checkpoint.save(tmp_path, alone, keep=1)
+    assert_same(checkpoint.restore(tmp_path, alone), alone)
+    assert_same(checkpoint.restore_parameters(tmp_path), third.parameters)
+    with pytest.raises(ConfigError, match=r"has an array averaged/params/actor/.*, config wants none"):
+        checkpoint.restore(folder, alone)
 
 
 def test_an_unfinished_checkpoint_is_not_there(saved):

@@ -17,7 +17,8 @@ from jaxtyping import Array
 
 from scenefactory_jax.build import ConfigError
 
-LEARNT, REST = "parameters", "rest"  # apart, so that an evaluation reads no more than it needs
+LEARNT, AVERAGED, REST = "parameters", "averaged", "rest"  # apart, so that an evaluation reads no more than it needs
+PREFIX = {LEARNT: LEARNT, AVERAGED: AVERAGED, REST: ""}  # of the names of their arrays in a train state
 HOST = "host"  # what the loop around the train state carries
 
 
@@ -35,11 +36,11 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     if keep < 1:
         raise ConfigError(f"keep: {keep} checkpoints; wanted is at least 1")
     iteration = int(train_state.iteration)
-    learnt, rest = _halves(_stored(train_state))
+    parts = _parts(_stored(train_state))
     with _manager(Path(folder), keep=keep) as manager:
         if iteration in manager.all_steps():
             manager.delete(iteration)
-        items: dict[str, Any] = {LEARNT: ocp.args.StandardSave(learnt), REST: ocp.args.StandardSave(rest)}
+        items: dict[str, Any] = {name: ocp.args.StandardSave(part) for name, part in parts.items()}
         items |= {} if host is None else {HOST: ocp.args.JsonSave(dict(host))}
         manager.save(iteration, args=ocp.args.Composite(**items), force=True)
     return Path(folder) / str(iteration)
@@ -68,12 +69,12 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
         step = _find(manager, Path(folder), iteration)
         held = manager.item_metadata(step)
         shapes = {name: (tuple(x.shape), str(x.dtype)) for name, x in wanted.items()}
-        _compare(_shapes(held[LEARNT], LEARNT) | _shapes(held[REST]), shapes, f"{folder}: checkpoint {step}")
-        learnt, rest = _halves(wanted)
-        halves = ocp.args.Composite(parameters=ocp.args.StandardRestore(learnt), rest=ocp.args.StandardRestore(rest))
-        found = manager.restore(step, args=halves)
-    flat = _flat(found[LEARNT], LEARNT) | _flat(found[REST])
-    return _like(flat, like)
+        there = [name for name in (LEARNT, AVERAGED, REST) if name in held]
+        known = {path: what for name in there for path, what in _shapes(held[name], PREFIX[name]).items()}
+        _compare(known, shapes, f"{folder}: checkpoint {step}")
+        parts = {name: ocp.args.StandardRestore(part) for name, part in _parts(wanted).items()}
+        found = manager.restore(step, args=ocp.args.Composite(**parts))
+    return _like({path: leaf for name in parts for path, leaf in _flat(found[name], PREFIX[name]).items()}, like)
 
 
 def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, Any] | None:
@@ -92,20 +93,25 @@ def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, 
 def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
     """Only what the policy learnt, as nested dicts of arrays on the default device: for evaluation, wherever training ran.
 
+    The running mean of the parameters, where training kept one.
+
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
     """
     with _manager(Path(folder)) as manager:
         step = _find(manager, Path(folder), iteration)
-        plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), manager.item_metadata(step)[LEARNT], is_leaf=_is_metadata)
-        found = manager.restore(step, args=ocp.args.Composite(parameters=ocp.args.StandardRestore(plain)))
-    return jax.tree.map(jnp.asarray, found[LEARNT])
+        held = manager.item_metadata(step)
+        name = AVERAGED if AVERAGED in held else LEARNT
+        plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), held[name], is_leaf=_is_metadata)
+        found = manager.restore(step, args=ocp.args.Composite(**{name: ocp.args.StandardRestore(plain)}))
+    return jax.tree.map(jnp.asarray, found[name])
 
 
 @contextlib.contextmanager
 def _manager(folder: Path, *, keep: int | None = None) -> Iterator[ocp.CheckpointManager]:
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=keep is not None, enable_async_checkpointing=False)
-    handlers = {LEARNT: ocp.StandardCheckpointHandler(), REST: ocp.StandardCheckpointHandler(), HOST: ocp.JsonCheckpointHandler()}
+    handlers: dict[str, Any] = {name: ocp.StandardCheckpointHandler() for name in (LEARNT, AVERAGED, REST)}
+    handlers[HOST] = ocp.JsonCheckpointHandler()
     with ocp.CheckpointManager(folder.absolute(), options=options, item_handlers=handlers) as manager:
         yield manager
 
@@ -130,7 +136,7 @@ def _compare(held: dict[str, tuple], wanted: dict[str, tuple], where: str) -> No
     for name in told[:8]:
         there, here = held.get(name), wanted.get(name)
         if there is None or here is None:
-            lines.append(f"checkpoint has {'no' if there is None else 'a'} {name}, config wants {'none' if here is None else 'one'}")
+            lines.append(f"checkpoint has {'no' if there is None else 'an array'} {name}, config wants {'none' if here is None else 'one'}")
         else:
             which = int(there[0] == here[0])  # the shape, or if that is the same, the type
             lines.append(f"checkpoint has {name} {there[which]}, config wants {here[which]}")
@@ -168,11 +174,14 @@ def _like(flat: dict[str, Any], like: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(like), [put(name, leaf) for name, leaf in _named(like)])
 
 
-def _halves(stored: dict[str, Any]) -> tuple[dict, dict]:
-    """(what was learnt, the rest), nested."""
-    prefix = f"{LEARNT}/"
-    learnt = {name.removeprefix(prefix): x for name, x in stored.items() if name.startswith(prefix)}
-    return _nest(learnt), _nest({name: x for name, x in stored.items() if not name.startswith(prefix)})
+def _parts(stored: dict[str, Any]) -> dict[str, dict]:
+    """What was learnt, its mean, the rest: nested, without those that are empty."""
+    parts: dict[str, dict] = {LEARNT: {}, AVERAGED: {}, REST: {}}
+    for path, leaf in stored.items():
+        first, _, below = path.partition("/")
+        name = first if first in (LEARNT, AVERAGED) else REST
+        parts[name][path if name == REST else below] = leaf
+    return {name: _nest(part) for name, part in parts.items() if part}
 
 
 def _nest(flat: dict[str, Any]) -> dict:

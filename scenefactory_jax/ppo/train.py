@@ -33,6 +33,7 @@ class TrainState:
     """All that training carries from one iteration to the next: saving it and going on is the same as going on."""
 
     parameters: Any
+    averaged: Any  # mean of the parameters of the last iterations, which is what is judged; None: nobody asked for one
     optimiser: optax.OptState
     worlds: State  # with the axis W in front
     observation: Observation  # of `worlds`
@@ -78,6 +79,7 @@ def make(
     max_grad_norm: float,
     normalise_advantage: bool,
     initial_phase: bool,
+    average: float | None,
     episode_steps: int,
     shards: int | None,
     mesh: Mesh | None = None,
@@ -85,19 +87,18 @@ def make(
     """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
 
     Args:
-        horizon: control steps of a rollout.
-        epochs, minibatches: passes over a rollout, and gradient steps in each.
-        sample_share: share of a rollout's samples that an epoch visits, active agents first; 1 visits all. Samples without an active agent
-            carry no weight: a larger share than the active one costs only time, a smaller one leaves out random active samples.
+        horizon, epochs, minibatches: control steps of a rollout, passes over it, and gradient steps in each.
+        sample_share: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
+            a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate: of Adam; the first one if `desired_kl` is a number.
         desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
         gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
-        clip: of the probability ratio.
-        value_clip: of the value loss; None leaves it unclipped.
+        clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
         entropy, value: weights of entropy bonus and value loss.
         normalise_advantage: over the active samples of the whole rollout.
-        initial_phase: worlds start at a random time of their episode, so that they do not all run out of time together.
+        initial_phase: worlds start at random times of their episodes, so that they do not run out of time together.
+        average: share of the parameters' running mean that stays at every iteration; the mean is what is judged. None: there is no mean.
         episode_steps: control steps of an episode.
         shards: groups of worlds whose samples are shuffled on their own; each gives every minibatch an equal part. None: one a device.
             With the same number of groups any number of devices learns the same, up to rounding.
@@ -110,17 +111,17 @@ def make(
     axis, own, everybody = _groups(shards, mesh)
     adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
     objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis)
-    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max)
-    each, passes = permutation == "each_epoch", {"epochs": epochs, "minibatches": minibatches, "groups": own, "axis": axis}
+    rate, each = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max), permutation == "each_epoch"
+    passes = {"epochs": epochs, "minibatches": minibatches, "groups": own, "axis": axis}
     learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, permute_each_epoch=each, **passes)
     start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
     act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
-    prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage)
-    prepare = functools.partial(prepare, groups=own, axis=axis)
+    returns = {"gamma": gamma, "gae_lambda": gae_lambda, "normalise_advantage": normalise_advantage}
+    prepare = functools.partial(_batch, **returns, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
     init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=functools.partial(size, groups=everybody))
-    size = functools.partial(size, groups=own)
-    iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis)
+    init, size = functools.partial(init, average=average is not None), functools.partial(size, groups=own)
+    iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis, average=average)
     return _compiled(init, iterate, functools.partial(_restart, start=start), functools.partial(_swap, start=start, axis=axis), mesh)
 
 
@@ -169,8 +170,9 @@ def _places(train_state: TrainState) -> Any:
 
 
 def parameters_of(train_state: TrainState) -> Any:
-    """What the policy has learnt, on one device."""
-    return jax.tree.map(lambda leaf: leaf.addressable_data(0), train_state.parameters)
+    """What the policy has learnt, on one device: the running mean, if there is one."""
+    learnt = train_state.parameters if train_state.averaged is None else train_state.averaged
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), learnt)
 
 
 def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[State, Observation]:
@@ -186,7 +188,14 @@ def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[
 
 
 def _init(
-    key: PRNGKeyArray, scenes: Scene, *, policy: Policy, optimiser: optax.GradientTransformation, start: Callable, size: Callable
+    key: PRNGKeyArray,
+    scenes: Scene,
+    *,
+    policy: Policy,
+    optimiser: optax.GradientTransformation,
+    start: Callable,
+    size: Callable,
+    average: bool,
 ) -> TrainState:
     policy_key, start_key, key = jax.random.split(key, 3)
     worlds, observation = start(start_key, scenes)
@@ -194,6 +203,7 @@ def _init(
     parameters = policy.init(policy_key, jax.tree.map(lambda leaf: leaf[:1], observation))
     train_state = TrainState(
         parameters=parameters,
+        averaged=parameters if average else None,
         optimiser=optimiser.init(parameters),
         worlds=worlds,
         observation=observation,
@@ -239,6 +249,7 @@ def _iterate(
     prepare: Callable,
     learn: Callable,
     size: Callable,
+    average: float | None,
     axis: str | None,
 ) -> tuple[TrainState, Metrics]:
     """Rollout, advantages, updates."""
@@ -252,6 +263,7 @@ def _iterate(
     tally = across.total(tally, axis)
     following = TrainState(
         parameters=parameters,
+        averaged=None if average is None else _mean(train_state.averaged, parameters, train_state.iteration, average),
         optimiser=optimiser,
         worlds=worlds,
         observation=observation,
@@ -262,6 +274,12 @@ def _iterate(
         steps=_add(train_state.steps, tally["spawned"]),
     )
     return strong(following), measure(tally, facts)
+
+
+def _mean(before: Any, now: Any, iteration: Int[Array, ""], stays: float) -> Any:
+    """Running mean of parameters (Polyak and Juditsky 1992): of all so far, then of the last 1 / (1 - stays) iterations or so."""
+    share = jnp.minimum(stays, iteration / (iteration + 1.0))
+    return jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, before, now)
 
 
 def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float, groups: int = 1) -> int:
@@ -370,7 +388,7 @@ def _check(numbers: dict[str, Any]) -> None:
     for name in ("learning_rate", "max_grad_norm", "clip", "sample_share"):
         if not numbers[name] > 0:
             raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number above 0")
-    for name in ("gamma", "gae_lambda", "sample_share"):
+    for name in ("gamma", "gae_lambda", "sample_share", *(() if numbers["average"] is None else ("average",))):
         if not 0 <= numbers[name] <= 1:
             raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number from 0 to 1")
     if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
