@@ -1,12 +1,55 @@
 """Where an episode's cars start and what they must reach: a fresh draw at every reset, a pure function of (key, scene)."""
 
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Agents, Boxes, Scene
+
+Draw = Callable[[PRNGKeyArray, Scene], Agents]
+
+
+def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
+    """A `draw` entry with its numbers bound; those of a mixture are entries of `spawn` themselves, each with a share.
+
+    Raises:
+        ConfigError: a key that does not fit, by name; a mixture without parts, with a share below 0 or parts that begin anew on their own.
+    """
+    if not isinstance(entry, Mapping) or entry.get("_target_") != "mixed":
+        return build(entry, builtins=__name__, where=where)
+    parts = entry.get("parts")
+    if not isinstance(parts, Mapping) or not parts:
+        raise ConfigError(f"{where}.parts: {parts!r}; wanted are entries of `spawn` by name, each with a share")
+    shares, draws = [], []
+    for name, part in parts.items():
+        for key in ("draw", "share"):
+            if key not in part:
+                raise ConfigError(f"{where}.parts.{name}.{key}: missing; a part is an entry of `spawn` and its share")
+        check_type(part["share"], float, where=f"{where}.parts.{name}.share")
+        if not part["share"] > 0:
+            raise ConfigError(f"{where}.parts.{name}.share: {part['share']}; wanted is a number above 0")
+        if part.get("respawn_clear_m") is not None:
+            raise ConfigError(f"{where}.parts.{name}.respawn_clear_m: {part['respawn_clear_m']}; it belongs to the whole `spawn`")
+        shares.append(float(part["share"]))
+        draws.append(make(part["draw"], where=f"{where}.parts.{name}.draw"))
+    return build({"_target_": "mixed"}, builtins=__name__, where=where, shares=shares, draws=draws)
+
+
+def mixed(key: PRNGKeyArray, scene: Scene, *, shares: list[float], draws: list[Draw]) -> Agents:
+    """One of several draws, each as often as its share of all shares says."""
+    which_key, key = jax.random.split(key)
+    which = jax.random.choice(which_key, len(draws), p=jnp.array(shares) / sum(shares))
+    drawn = [draw(key, scene) for draw in draws]
+    return functools.reduce(
+        lambda found, one: jax.tree.map(lambda old, new: jnp.where(which == one[0], new, old), found, one[1]), enumerate(drawn), drawn[0]
+    )
 
 
 def logged(key: PRNGKeyArray, scene: Scene) -> Agents:

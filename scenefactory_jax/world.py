@@ -72,7 +72,7 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
     ends.check(config["ends"].get("ending", []), where="ends")
     return Parts(
         dynamics=dynamics,
-        draw_agents=build(config["spawn"]["draw"], builtins="scenefactory_jax.spawn", where="spawn.draw"),
+        draw_agents=spawn.make(config["spawn"]["draw"]),
         draw_weather=conditions.make(config["weather"]),
         others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
         measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),

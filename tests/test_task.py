@@ -323,6 +323,33 @@ def test_random_pairs_keep_their_promises():
         assert np.all(goal[:, 0] > start[:, 0]), "along the lane's own direction"
 
 
+def test_a_mixture_draws_each_part_as_often_as_its_share():
+    x = np.arange(-60, 60.1, 0.5)
+    scene = scene_of(np.zeros((4, 2)), np.ones((4, 2)), speeds=4 * [3.0])
+    scene = replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))], capacity=300))
+    entry = scenefactory_jax.load("task", "spawn=mixed", "spawn.draw.parts.random.share=1.5")["spawn"]["draw"]
+    agents = jax.jit(jax.vmap(lambda key: spawn.make(entry)(key, scene)))(jax.random.split(jax.random.key(0), 400))
+    recorded = (agents.position == scene.agents.position).all(axis=(1, 2))
+    assert abs(recorded.mean() - 0.25) < 0.07 and not agents.speed.any()
+    np.testing.assert_array_equal(agents.goal[recorded], np.broadcast_to(scene.agents.goal, (recorded.sum(), 4, 2)))
+    assert (agents.route[~recorded] >= 9.9 * agents.present[~recorded]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parts": None}, "spawn.draw.parts: None; wanted are entries"),
+        ({"parts": {"a": {"draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: missing"),
+        ({"parts": {"a": {"share": 0.0, "draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: 0.0; wanted is a number above 0"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "nobody"}}}}, "spawn.draw.parts.a.draw._target_: 'nobody' is not in"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "respawn_clear_m": 5.0}}}, "a.respawn_clear_m: 5.0; it belongs"),
+    ],
+)
+def test_mistakes_in_a_mixture_are_named(change, message):
+    with pytest.raises(ConfigError, match=message):
+        spawn.make({"_target_": "mixed", **change})
+
+
 def test_respawn_starts_finished_cars_again(config):
     env = build_env(config, respawn=10.0)
     scene = scene_of([[0, 0], [40, 0]], [[6, 0], [60, 0]], speeds=[6.0, 0.0])
