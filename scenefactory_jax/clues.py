@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.conflict import bodies
 from scenefactory_jax.dynamics.contact import touch
 from scenefactory_jax.ends import EVENTS
-from scenefactory_jax.geometry import cross, dot, norm, wrap_angle
+from scenefactory_jax.geometry import cross, dot, norm
 from scenefactory_jax.struct import choose, struct
 from scenefactory_jax.types import Boxes, Events, Facts, Road, State
 
@@ -28,7 +28,7 @@ class Moment:
 
 @struct
 class Impact:
-    """An agent's first collision. Both speeds are along the normal of the contact, at its point and before the step in which it happened."""
+    """An agent's first collision. Speeds are along the normal of the contact, at its point and before the step in which it happened."""
 
     partner: Int[Array, " A"]  # who was hit: an agent's number, or that of a box counted on from the last agent
     own: Float[Array, " A"]  # m/s towards the partner; negative: away from it
@@ -43,8 +43,6 @@ class Clues:
     harm: Int[Array, " A"]  # the first of them, an index into HARMS
     first: Moment  # of that event
     speed: Float[Array, " A"]  # before that event
-    yaw: Float[Array, " A"]  # at that event
-    bend: Float[Array, " A"]  # curvature of the way driven up to that event, 1/m, positive to the left
     impact: Impact
     closest_m: Float[Array, " A"]  # to the goal
     closest: Moment
@@ -54,7 +52,6 @@ class Clues:
     against_m: Float[Array, " A"]  # the longest stretch against the lanes
     against_steps: Int[Array, " A"]
     stretch_m: Float[Array, " A"]  # the present one
-    curvature: Float[Array, " A"]  # of the way driven lately
 
 
 def begin(state: State, distance: Float[Array, " A"]) -> Clues:
@@ -63,7 +60,7 @@ def begin(state: State, distance: Float[Array, " A"]) -> Clues:
     zero, none, no = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
     start = Moment(none, state.motion.position[:, :2])
     impact = Impact(none, zero, zero)
-    return Clues(no, none, start, zero, zero, zero, impact, distance, start, start, no, start, zero, none, zero, zero)
+    return Clues(no, none, start, zero, impact, distance, start, start, no, start, zero, none, zero)
 
 
 def note(
@@ -80,7 +77,6 @@ def note(
     against_cos: float,
     wrong_way_m: float,
     rest_m: float,
-    bend_m: float,
 ) -> Clues:
     """One step more, for the agents that are active in `before`.
 
@@ -93,14 +89,11 @@ def note(
         against_cos: it drives against them if even the direction of the one that fits best has a smaller cosine with its velocity.
         wrong_way_m: so much against the lanes without a break is a stretch.
         rest_m: radius of the circle that a car at rest does not leave.
-        bend_m: length over which the way's curvature is averaged.
     """
     active, motion = before.active & ~facts.events.fault, after.motion  # a broken car's facts are no measurements
     place = motion.position[:, :2]
     now = Moment(jnp.broadcast_to(after.step, active.shape), place)
     driven = norm(place - before.motion.position[:, :2])
-    turned = wrap_angle(motion.yaw - before.motion.yaw)
-    curvature = clues.curvature + (turned - clues.curvature * driven) / (bend_m + driven)
 
     harms = jnp.stack([getattr(facts.events, name) for name in HARMS])
     harmed = before.active & harms.any(0) & ~clues.harmed
@@ -111,15 +104,13 @@ def note(
     against = active & (facts.speed >= moving_mps) & (alignment(place, motion.velocity[:, :2], lanes, within_m=lane_m) < against_cos)
     stretch = jnp.where(against, clues.stretch_m + driven, 0.0)
     wrong = against & (stretch >= wrong_way_m) & ~clues.wrong_way
-    seen = (jnp.argmax(harms, axis=0).astype(jnp.int32), now, norm(before.motion.velocity[:, :2]), motion.yaw, curvature)
-    harm, first, speed, yaw, bend = choose(harmed, seen, (clues.harm, clues.first, clues.speed, clues.yaw, clues.bend))
+    seen = (jnp.argmax(harms, axis=0).astype(jnp.int32), now, norm(before.motion.velocity[:, :2]))
+    harm, first, speed = choose(harmed, seen, (clues.harm, clues.first, clues.speed))
     return Clues(
         harmed=clues.harmed | harmed,
         harm=harm,
         first=first,
         speed=speed,
-        yaw=yaw,
-        bend=bend,
         impact=choose(crashed, impact, clues.impact),
         closest_m=jnp.where(closer, facts.goal_distance, clues.closest_m),
         closest=choose(closer, now, clues.closest),
@@ -129,7 +120,6 @@ def note(
         against_m=jnp.maximum(clues.against_m, stretch),
         against_steps=clues.against_steps + against.astype(jnp.int32),
         stretch_m=jnp.where(active, stretch, clues.stretch_m),
-        curvature=jnp.where(active, curvature, clues.curvature),
     )
 
 

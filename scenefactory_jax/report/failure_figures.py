@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Polygon
+from matplotlib.patches import Circle, Polygon, Rectangle
 
 from scenefactory_jax.report import areas, canvas, others
 from scenefactory_jax.report.canvas import INK, QUIET, Colour, Trajectory, View
@@ -56,7 +56,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
                     axes.set_title(_title(case.failure), fontsize=7.5, fontweight="normal", loc="left", pad=3)
         handles = [
             Line2D([], [], color=_rgb(FAILED), linewidth=2.2, label=f"{kind.label}: its way (dashed: afterwards)"),
-            Line2D([], [], color=_rgb(FAILED), marker="x", linestyle="none", markersize=6, markeredgewidth=2, label="where"),
+            Line2D([], [], color=_rgb(INK), marker="s", markerfacecolor="none", linestyle="none", markersize=8, label="where: seen below"),
             Line2D([], [], color=_rgb(GOAL), marker="o", markerfacecolor="none", linestyle="none", markersize=8, label="its goal"),
             Line2D([], [], color=_rgb(CAR), linewidth=1.2, label="other cars"),
         ]
@@ -70,7 +70,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
 def _title(failure: Failure) -> str:
     """Who, where, when, how bad, and what else is true; two lines."""
     kind, name = KINDS[failure.kind], failure.scene
-    name = name if len(name) <= 34 else f"…{name[-33:]}"
+    name = name if len(name) <= 42 else f"…{name[-41:]}"
     also = ", ".join(FLAGS[flag] for flag in failure.flags)
     line = f"{failure.moment_s:.1f} s · {kind.measure} {failure.severity:.1f} {kind.unit}"
     return f"{name} · car {failure.agent}\n{line}" + (f" · also {also}" if also else "")
@@ -120,9 +120,10 @@ def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_
     _draw_car(axes, trajectory, agent, step, FAILED)
     goal = canvas.goal_at(trajectory, step)[agent]
     axes.add_patch(Circle((float(goal[0]), float(goal[1])), canvas.GOAL_RADIUS, fill=False, edgecolor=_rgb(GOAL), linewidth=1.8, zorder=6))
-    x, y = case.failure.place
-    axes.plot([x], [y], marker="x", color=_rgb(FAILED), markersize=9, markeredgewidth=2.0, zorder=8)
-    axes.plot([x], [y], marker="x", color="white", markersize=11, markeredgewidth=3.6, zorder=7)
+    if whole:
+        left, bottom, side = _near(case)
+        look = {"fill": False, "edgecolor": _rgb(INK), "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 7}
+        axes.add_patch(Rectangle((left, bottom), side, side, **look))
 
 
 def _draw_others(axes: Axes, case: Case, step: int, *, partner: int | None) -> None:

@@ -1,18 +1,16 @@
 """Failures by kind: what went wrong first with every agent that did not arrive cleanly, and which were the worst.
 
-Every agent without a clean arrival has one kind; what else is true of it stands in flags. An event (collision, road edge, crash, fault of the
-simulation) comes before everything else, and the first event counts. Without one, the earliest of wrong way, overshoot and stuck counts.
+Every agent without a clean arrival has one kind; what else is true of it stands in flags. An event (collision, road edge, crash, fault of
+the simulation) comes before everything else, and the first event counts. Without one, the earliest of wrong way, overshoot and stuck counts.
 """
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.tables import Records, RecordsError
-from scenefactory_jax.types import Road
 
 NONE = "none"  # the kind of a clean arrival
 
@@ -29,11 +27,11 @@ class Kind(NamedTuple):
 KINDS: dict[str, Kind] = {
     "fault": Kind("fault of the simulation", "the car's state is no longer finite: a bug, no driving error.", "speed before", "m/s"),
     "at_fault": Kind(
-        "collision, at fault", "the first event is a collision into which the car itself drove: it moved towards the other (more than "
-        "`own_mps`, along the normal of the contact) with at least `own_share` of the closing speed. Into a parked or standing car it drives "
-        "with all of it; head on, both are at fault. Who had priority is not known.", "closing speed", "m/s"),
+        "collision, at fault", "the first event is a collision into which the car itself drove: it moved towards the other (by "
+        "`own_mps` or more, along the normal of the contact) with at least `own_share` of the closing speed. Into a parked or standing car "
+        "it drives with all of it; head on, both are at fault. Who had priority is not known.", "closing speed", "m/s"),
     "struck": Kind(
-        "collision, struck", "the first event is any other collision: the other drove into it, or nobody into anybody.",
+        "collision, struck", "the first event is any other collision: the other drove into it.",
         "closing speed", "m/s"),
     "edge": Kind("road edge", "the first event is a touch of a road edge.", "speed at the edge", "m/s"),
     "crash": Kind("crash", "the first event is that it tipped over, left the world or strayed far from its start.", "speed before", "m/s"),
@@ -47,11 +45,6 @@ KINDS: dict[str, Kind] = {
         "stuck", "no event; in the last `stuck_s` or longer it did not leave a circle of `rest_m` about one place.", "stood still", "s"),
     "out_of_time": Kind("out of time", "no event; still under way when time was up.", "left to the goal", "m"),
 }  # fmt: skip
-EDGES = {
-    "inside": "it cut a bend: the edge lay on the side to which its way bent",
-    "outside": "it ran wide: the edge lay on the other side",
-    "straight": "its way was straight",
-}
 FLAGS = {"at_fault": "at fault in a collision", "wrong_way": "wrong way", "overshot": "overshoot", "stuck": "stuck", "reached": "arrived"}
 _HARMS = {"fault": "fault", "crashed": "crash", "touched_edge": "edge"}
 
@@ -71,7 +64,7 @@ class Failure(NamedTuple):
 
 
 def classify(
-    clues: Records, *, own_share: float, own_mps: float, bend_per_m: float, stuck_s: float, near_m: float, away_m: float
+    clues: Records, *, own_share: float, own_mps: float, stuck_s: float, near_m: float, away_m: float
 ) -> dict[str, np.ndarray]:
     """Columns for records: each agent's kind, its moment and severity, the flags, and what was measured for them.
 
@@ -79,16 +72,14 @@ def classify(
         clues: records, and the columns of moments that `run/playing.py` makes of `clues.Clues`: NAME_s, NAME_x_m and NAME_y_m of the first
             event, the closest approach to the goal, the beginning of the last rest, the first stretch against the lanes, and the end.
         own_share, own_mps, stuck_s, near_m, away_m: see `KINDS`.
-        bend_per_m: curvature of the way above which an edge lies inside or outside of a bend, 1/m.
     """
     own, other = np.maximum(clues["own_mps"], 0.0), np.maximum(clues["other_mps"], 0.0)
     at_fault = clues["collided"] & (own >= own_mps) & (own >= own_share * (own + other))
+    closing = np.maximum(clues["own_mps"] + clues["other_mps"], 0.0)
     late = ~clues["reached"]
     stuck = late & (clues["still_s"] >= stuck_s)
     gone = clues["end_distance_m"] - clues["closest_m"]
     overshot = late & (clues["closest_m"] <= near_m) & (gone >= away_m)
-    bend = clues["event_bend_per_m"]
-    edge = np.select([bend > bend_per_m, bend < -bend_per_m], ["inside", "outside"], "straight")
 
     harm = clues["first_event"]
     candidates = {"wrong_way": (clues["wrong_way"], "against"), "overshoot": (overshot, "closest"), "stuck": (stuck, "rest")}
@@ -100,7 +91,7 @@ def classify(
 
     moment = {name: name_of for name, (_, name_of) in candidates.items()} | {"out_of_time": "end", NONE: "end"}
     severity = {
-        "at_fault": own + other, "struck": own + other, "wrong_way": clues["against_m"], "overshoot": gone, "stuck": clues["still_s"],
+        "at_fault": closing, "struck": closing, "wrong_way": clues["against_m"], "overshoot": gone, "stuck": clues["still_s"],
         "out_of_time": clues["end_distance_m"], NONE: np.zeros(len(kind)),
     }  # fmt: skip
     pick = lambda columns: np.select([kind == name for name in columns], list(columns.values()), 0.0)  # noqa: E731
@@ -112,23 +103,10 @@ def classify(
         "at_fault": at_fault,
         "stuck": stuck,
         "overshot": overshot,
-        "edge": np.where(harm == "touched_edge", edge, NONE),
         **{name: clues[name] for name in (
-            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "closest_m", "closest_s", "still_s", "against_m",
-            "against_share")},
+            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "closest_m", "closest_s", "still_s",
+            "against_m", "against_share")},
     }  # fmt: skip
-
-
-def edge_side(edges: Road, place: Float[np.ndarray, "2"], yaw: float) -> int:
-    """On which side of a car the nearest road edge lies: 1 left, -1 right, 0 where there is none."""
-    offset = np.asarray(edges.midpoint) - place
-    along = np.clip(-(offset * edges.direction).sum(-1), -np.asarray(edges.half_length), edges.half_length)
-    nearest = offset + along[:, None] * np.asarray(edges.direction)
-    distance = np.where(edges.valid, np.hypot(*nearest.T), np.inf)
-    if not np.isfinite(distance).any():
-        return 0
-    x, y = nearest[np.argmin(distance)]
-    return 1 if np.cos(yaw) * y - np.sin(yaw) * x > 0 else -1
 
 
 def of(records: Records) -> dict[str, list[Failure]]:
@@ -154,7 +132,7 @@ def check(records: Records) -> None:
         RecordsError: naming the column.
     """
     tables.check(records)
-    wanted = ("failure", "failure_s", "failure_x_m", "failure_y_m", "severity", "edge", *FLAGS)
+    wanted = ("failure", "failure_s", "failure_x_m", "failure_y_m", "severity", *FLAGS)
     for name in wanted:
         if name not in records:
             raise RecordsError(f"records.{name}: column missing; kinds of failures need {', '.join(wanted)}, which `evaluate` writes")
@@ -194,7 +172,6 @@ def as_json(records: Records) -> dict[str, Any]:
             "agents": len(failures),
             "share": len(failures) / agents,
             "flags": flag_counts(failures),
-            **({"edges": _edges(records, failures)} if kind == "edge" else {}),
             "scenes": dict(scenes(failures)),
             "ranked": [{k: v for k, v in failure._asdict().items() if k != "kind"} for failure in failures],
         }
@@ -208,19 +185,12 @@ def flag_counts(failures: list[Failure]) -> dict[str, int]:
     return {name: count for name in FLAGS if (count := sum(name in failure.flags for failure in failures))}
 
 
-def _edges(records: Records, failures: list[Failure]) -> dict[str, int]:
-    sides = [str(records["edge"][failure.row]) for failure in failures]
-    return {name: sides.count(name) for name in EDGES if name in sides}
-
-
 def table(records: Records, *, most: int = 3) -> str:
     """A Markdown table: a row a kind, with counts, shares of all agents, flags, and the scenes that have most of it."""
     agents, clean = len(records["scene"]), int(np.sum(records["clean"]))
     rows = [["arrived cleanly", clean, f"{100 * clean / agents:.1f} %", "", ""]]
     for kind, failures in of(records).items():
         also = [f"{FLAGS[name]} {count}" for name, count in flag_counts(failures).items()]
-        if kind == "edge":
-            also = [*(f"{name} {count}" for name, count in _edges(records, failures).items()), *also]
         most_of = ", ".join(f"{scene} ({count})" for scene, count in scenes(failures)[:most])
         rows.append([KINDS[kind].label, len(failures), f"{100 * len(failures) / agents:.1f} %", ", ".join(also), most_of])
     return tables.grid(["First that went wrong", "Agents", f"Share of {agents}", "Of these also", "Scenes with the most"], rows)
@@ -233,11 +203,8 @@ def numbers(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 def definitions(records: Records, numbers: Mapping[str, float]) -> str:
     """What the kinds in these records mean, a line each, with the numbers in place of their names."""
-    found = of(records)
-    lines = [f"- **{KINDS[kind].label}**: {KINDS[kind].definition} Worst first by: {KINDS[kind].measure}, {KINDS[kind].unit}." for kind in found]
-    if "edge" in found:
-        lines.append("- Road edges: " + "; ".join(f"*{name}*: {text}" for name, text in EDGES.items()) + ".")
-    text = "\n".join(lines)
+    seen = [KINDS[kind] for kind in of(records)]
+    text = "\n".join(f"- **{kind.label}**: {kind.definition} Worst first by: {kind.measure}, {kind.unit}." for kind in seen)
     for name, value in numbers.items():
         unit = next((mark for suffix, mark in (("_mps", " m/s"), ("_s", " s"), ("_m", " m")) if name.endswith(suffix)), "")
         shown = f"{100 * value:g} %" if name.endswith("share") else f"{value:g}{unit}"

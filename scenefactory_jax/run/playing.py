@@ -14,7 +14,7 @@ from scenefactory_jax.report.canvas import Others, Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import sources
 from scenefactory_jax.run.train import make_policy
-from scenefactory_jax.struct import replace
+from scenefactory_jax.struct import replace, unchecked
 from scenefactory_jax.types import SURFACES, Boxes, Scene, State, Weather
 
 Records = dict[str, np.ndarray]
@@ -83,7 +83,7 @@ def make_player(
                 break
         state, tally = jax.device_get((episode.state, episode.tally))
         records = _records(tally, state, present, started, weather, names, seed=settings["seed"], control_hz=control_hz)
-        records |= failures.classify({**records, **_clues(tally, state, present, scenes.scene, index, control_hz)}, **numbers["kinds"])
+        records |= failures.classify({**records, **_clues(tally, state, present, control_hz)}, **numbers["kinds"])
         if not kept:
             return records, None
         frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :steps], *kept)
@@ -125,24 +125,19 @@ def _records(
     }
 
 
-def _clues(tally: evaluation.Tally, state: State, present, scene: Scene, index: np.ndarray, control_hz: float) -> Records:
+def _clues(tally: evaluation.Tally, state: State, present, control_hz: float) -> Records:
     """What `failures.classify` wants to know of every spawned agent."""
     row_world, row_agent = np.nonzero(present)
     of = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[row_world, row_agent], tree)  # noqa: E731
     found, last = of(tally.clues), of(tally.steps)
-    end = clues.Moment(last, of(state.motion.position)[:, :2])
+    end = unchecked(clues.Moment, step=last, place=of(state.motion.position)[:, :2])
     moments = {"event": found.first, "closest": found.closest, "rest": found.rest, "against": found.turned, "end": end}
     first = np.where(found.harmed, np.array(clues.HARMS)[found.harm], failures.NONE)
-    side = np.zeros(len(first))
-    for row in np.flatnonzero(first == "touched_edge"):
-        edges = jax.tree.map(lambda leaf, w=index[row_world[row]]: np.asarray(leaf[w]), scene.edges)
-        side[row] = failures.edge_side(edges, found.first.place[row], found.yaw[row])
     return {
         **{f"{name}_s": moment.step / control_hz for name, moment in moments.items()},
         **{f"{name}_{axis}_m": moment.place[:, i] for name, moment in moments.items() for i, axis in enumerate("xy")},
         "first_event": first,
         "event_mps": found.speed,
-        "event_bend_per_m": found.bend * side,
         "hit": found.impact.partner,
         "own_mps": found.impact.own,
         "other_mps": found.impact.other,

@@ -18,7 +18,7 @@ def write(
     config: Mapping[str, Any],
     run: Path,
     settings: Mapping[str, Any],
-    records: Mapping[str, Mapping[str, np.ndarray]],
+    records: Mapping[str, dict[str, np.ndarray]],
     summary: Mapping[str, Mapping[str, tables.Estimate]],
     trajectories: list[Trajectory],
     failed: Mapping[str, Mapping[str, Path]],
