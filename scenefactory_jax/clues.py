@@ -33,6 +33,8 @@ class Impact:
     partner: Int[Array, " A"]  # who was hit: an agent's number, or that of a box counted on from the last agent
     own: Float[Array, " A"]  # m/s towards the partner; negative: away from it
     other: Float[Array, " A"]  # m/s of the partner towards the agent
+    against: Bool[Array, " A"]  # the agent drove against the lanes
+    other_against: Bool[Array, " A"]  # the partner did; never, if it is a box
 
 
 @struct
@@ -59,7 +61,7 @@ def begin(state: State, distance: Float[Array, " A"]) -> Clues:
     count = state.active.shape[0]
     zero, none, no = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
     start = Moment(none, state.motion.position[:, :2])
-    impact = Impact(none, zero, zero)
+    impact = Impact(none, zero, zero, no, no)
     return Clues(no, none, start, zero, impact, distance, start, start, no, start, zero, none, zero)
 
 
@@ -97,11 +99,11 @@ def note(
 
     harms = jnp.stack([getattr(facts.events, name) for name in HARMS])
     harmed = before.active & harms.any(0) & ~clues.harmed
-    impact = impacts(before, after, boxes)
-    crashed = active & facts.events.collided & ~happened.collided
+    met = active & facts.events.collided & ~happened.collided
     closer = active & (facts.goal_distance < clues.closest_m)
     left = active & (norm(place - clues.rest.place) > rest_m)
     against = active & (facts.speed >= moving_mps) & (alignment(place, motion.velocity[:, :2], lanes, within_m=lane_m) < against_cos)
+    impact = impacts(before, after, boxes, against)
     stretch = jnp.where(against, clues.stretch_m + driven, 0.0)
     wrong = against & (stretch >= wrong_way_m) & ~clues.wrong_way
     seen = (jnp.argmax(harms, axis=0).astype(jnp.int32), now, norm(before.motion.velocity[:, :2]))
@@ -111,7 +113,7 @@ def note(
         harm=harm,
         first=first,
         speed=speed,
-        impact=choose(crashed, impact, clues.impact),
+        impact=choose(met, impact, clues.impact),
         closest_m=jnp.where(closer, facts.goal_distance, clues.closest_m),
         closest=choose(closer, now, clues.closest),
         rest=choose(left, now, clues.rest),
@@ -134,10 +136,10 @@ def alignment(place: Float[Array, "A 2"], velocity: Float[Array, "A 2"], lanes: 
     return jnp.where(jnp.isfinite(best), best / jnp.maximum(speed, 1e-6), 1.0)
 
 
-def impacts(before: State, after: State, boxes: Boxes) -> Impact:
+def impacts(before: State, after: State, boxes: Boxes, against: Bool[Array, " A"]) -> Impact:
     """For each agent, whom it touches most after a step, and how fast each of the two drove towards the other before it.
 
-    The velocities are those before the step: after it, the impact may have changed them.
+    The velocities are those before the step: after it, the impact may have changed them. `against`: who drives against the lanes.
     """
     count = before.active.shape[0]
     everyone = bodies(after.motion, after.agents.size, before.active, boxes)
@@ -160,4 +162,5 @@ def impacts(before: State, after: State, boxes: Boxes) -> Impact:
         at_point = velocity[who] + rate[who][:, None] * jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
         return dot(at_point, normal)
 
-    return Impact(partner, towards(rows), -towards(partner))
+    other_against = jnp.concatenate([against, jnp.zeros(len(half) - count, bool)])[partner]
+    return Impact(partner, towards(rows), -towards(partner), against, other_against)

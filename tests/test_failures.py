@@ -41,6 +41,7 @@ DRIVES = {
     "rear_end": (drive(-30, speed=10), (50, 0), parked(0.0)),
     "slower_ahead": (drive(-30, speed=10), (50, 0), drive(-10, speed=3)),
     "head_on": (drive(-20, speed=6), (50, 0), drive(20, speed=6, yaw=np.pi)),
+    "head_on_off_lane": (drive(-20, -10, speed=7), (50, 0), drive(20, -10, speed=7, yaw=np.pi)),
     "side": (drive(-20, speed=8), (50, 0), drive(0, -6.2, speed=2, yaw=np.pi / 2)),
     "cut_in": (drive(-20, speed=8), (60, 0), drive(-20, 3.5, speed=8, yaw=-0.08)),
     "box": (drive(10, 8.0, speed=8), (50, 8), AWAY),
@@ -105,7 +106,8 @@ def row_of(records, name, agent=0) -> int:
     ("name", "agent", "kind"),
     [
         ("arrives", 0, "none"), ("rear_end", 0, "at_fault"), ("rear_end", 1, "struck"), ("slower_ahead", 0, "at_fault"),
-        ("slower_ahead", 1, "struck"), ("head_on", 0, "at_fault"), ("head_on", 1, "at_fault"), ("side", 0, "at_fault"),
+        ("slower_ahead", 1, "struck"), ("head_on", 0, "struck"), ("head_on", 1, "at_fault"),
+        ("head_on_off_lane", 0, "at_fault"), ("head_on_off_lane", 1, "at_fault"), ("side", 0, "at_fault"),
         ("side", 1, "struck"), ("cut_in", 0, "struck"), ("cut_in", 1, "at_fault"), ("box", 0, "at_fault"), ("edge", 0, "edge"),
         ("crash", 0, "crash"), ("fault", 0, "fault"), ("wrong_way", 0, "wrong_way"), ("wrong_way_into", 0, "at_fault"),
         ("overshoot", 0, "overshoot"), ("overshoot_then_stands", 0, "overshoot"), ("stuck", 0, "stuck"), ("stops_short", 0, "stuck"),
@@ -158,9 +160,9 @@ def test_the_worst_come_first(played):
     found = failures.of(records)
     for ranked in found.values():
         assert [failure.severity for failure in ranked] == sorted((failure.severity for failure in ranked), reverse=True)
-    assert failures.scenes(found["at_fault"])[0] == ("head_on", 2), "most of a kind"
+    assert failures.scenes(found["at_fault"])[0] == ("head_on_off_lane", 2), "most of a kind"
     chosen = failures.worst(found["at_fault"], 3)
-    assert len({failure.scene for failure in chosen}) == 3 and chosen[0].scene == "head_on"
+    assert len({failure.scene for failure in chosen}) == 3 and chosen[0].scene == "head_on_off_lane"
 
 
 def test_records_keep_their_kinds_in_a_file(played, tmp_path):

@@ -44,12 +44,15 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
     """
     kind = KINDS[cases[0].failure.kind]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(_INCHES * len(cases), 2 * _INCHES + 0.75))
+        rows = 1 if len(cases) > 2 else 2 if len(cases) > 1 else 3  # of the legend
+        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.06
+        height = 2 * _INCHES + head + 0.08 + 0.18 * rows
+        figure = Figure(figsize=(_INCHES * len(cases), height))
         for column, case in enumerate(cases):
             case = case._replace(trajectory=canvas.settle(case.trajectory))
             for row, window in enumerate((_whole(case), _near(case))):
-                width, tall = 1 / len(cases), _INCHES / (2 * _INCHES + 0.75)
-                place = (column * width + 0.01 * width, 1 - (row + 1) * tall - 0.42 / (2 * _INCHES + 0.75), 0.98 * width, 0.98 * tall)
+                width, tall = 1 / len(cases), _INCHES / height
+                place = ((column + 0.01) * width, 1 - head / height - (row + 0.99) * tall, 0.98 * width, 0.98 * tall)
                 axes = figure.add_axes(place)
                 _draw(axes, case, window, before_s=before_s, whole=row == 0)
                 if row == 0:
@@ -62,18 +65,17 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
         ]
         if any(case.hit is not None for case in cases):
             handles.insert(2, Line2D([], [], color=_rgb(PARTNER), linewidth=1.6, label="whom it met"))
-        rows = 1 if len(cases) > 2 else 2
         figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // rows), fontsize=7.5, handletextpad=0.5, borderpad=0.0)
     return figure
 
 
 def _title(failure: Failure) -> str:
-    """Who, where, when, how bad, and what else is true; two lines."""
+    """Who, where, when, how bad, and what else is true: a line for what is known of every failure, and one more for the rest."""
     kind, name = KINDS[failure.kind], failure.scene
     name = name if len(name) <= 42 else f"…{name[-41:]}"
     also = ", ".join(FLAGS[flag] for flag in failure.flags)
     line = f"{failure.moment_s:.1f} s · {kind.measure} {failure.severity:.1f} {kind.unit}"
-    return f"{name} · car {failure.agent}\n{line}" + (f" · also {also}" if also else "")
+    return f"{name} · car {failure.agent}\n{line}" + (f"\nalso {also}" if also else "")
 
 
 def _whole(case: Case) -> tuple[float, float, float]:

@@ -1,7 +1,7 @@
 """Failures by kind: what went wrong first with every agent that did not arrive cleanly, and which were the worst.
 
 Every agent without a clean arrival has one kind; what else is true of it stands in flags. An event (collision, road edge, crash, fault of
-the simulation) comes before everything else, and the first event counts. Without one, the earliest of wrong way, overshoot and stuck counts.
+the simulation) comes before everything else, and the first one counts. Without any, the earliest of wrong way, overshoot and stuck counts.
 """
 
 from collections.abc import Mapping
@@ -29,9 +29,10 @@ KINDS: dict[str, Kind] = {
     "at_fault": Kind(
         "collision, at fault", "the first event is a collision into which the car itself drove: it moved towards the other (by "
         "`own_mps` or more, along the normal of the contact) with at least `own_share` of the closing speed. Into a parked or standing car "
-        "it drives with all of it; head on, both are at fault. Who had priority is not known.", "closing speed", "m/s"),
+        "it drives with all of it. Head on, both are at fault, unless just one of them drives against the lanes at that moment. Who had "
+        "priority is not known.", "closing speed", "m/s"),
     "struck": Kind(
-        "collision, struck", "the first event is any other collision: the other drove into it.",
+        "collision, struck", "the first event is any other collision: the other drove into it, or met it head on against the lanes.",
         "closing speed", "m/s"),
     "edge": Kind("road edge", "the first event is a touch of a road edge.", "speed at the edge", "m/s"),
     "crash": Kind("crash", "the first event is that it tipped over, left the world or strayed far from its start.", "speed before", "m/s"),
@@ -74,7 +75,9 @@ def classify(
         own_share, own_mps, stuck_s, near_m, away_m: see `KINDS`.
     """
     own, other = np.maximum(clues["own_mps"], 0.0), np.maximum(clues["other_mps"], 0.0)
-    at_fault = clues["collided"] & (own >= own_mps) & (own >= own_share * (own + other))
+    drove = (own >= own_mps) & (own >= own_share * (own + other))
+    head_on = drove & (other >= own_share * (own + other))
+    at_fault = clues["collided"] & drove & ~(head_on & clues["other_against"] & ~clues["own_against"])
     closing = np.maximum(clues["own_mps"] + clues["other_mps"], 0.0)
     late = ~clues["reached"]
     stuck = late & (clues["still_s"] >= stuck_s)
@@ -104,7 +107,7 @@ def classify(
         "stuck": stuck,
         "overshot": overshot,
         **{name: clues[name] for name in (
-            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "closest_m", "closest_s", "still_s",
+            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "own_against", "other_against", "closest_m", "closest_s", "still_s",
             "against_m", "against_share")},
     }  # fmt: skip
 

@@ -141,6 +141,8 @@ def _clues(tally: evaluation.Tally, state: State, present, control_hz: float) ->
         "hit": found.impact.partner,
         "own_mps": found.impact.own,
         "other_mps": found.impact.other,
+        "own_against": found.impact.against,
+        "other_against": found.impact.other_against,
         "closest_m": found.closest_m,
         "still_s": (last - found.rest.step) / control_hz,
         "wrong_way": found.wrong_way,
