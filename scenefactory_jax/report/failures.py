@@ -107,8 +107,8 @@ def classify(
         "stuck": stuck,
         "overshot": overshot,
         **{name: clues[name] for name in (
-            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "own_against", "other_against", "closest_m", "closest_s", "still_s",
-            "against_m", "against_share")},
+            "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "own_against", "other_against",
+            "closest_m", "closest_s", "still_s", "against_m", "against_share")},
     }  # fmt: skip
 
 
