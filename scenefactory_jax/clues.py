@@ -48,6 +48,7 @@ class Clues:
     impact: Impact
     closest_m: Float[Array, " A"]  # to the goal
     closest: Moment
+    gone_m: Float[Array, " A"]  # further than the closest so far, at most, once it had been near its goal
     rest: Moment  # since when and where the car has stayed within a small circle
     wrong_way: Bool[Array, " A"]  # a whole stretch against the lanes
     turned: Moment  # the end of the first such stretch
@@ -62,7 +63,7 @@ def begin(state: State, distance: Float[Array, " A"]) -> Clues:
     zero, none, no = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
     start = Moment(none, state.motion.position[:, :2])
     impact = Impact(none, zero, zero, no, no)
-    return Clues(no, none, start, zero, impact, distance, start, start, no, start, zero, none, zero)
+    return Clues(no, none, start, zero, impact, distance, start, zero, start, no, start, zero, none, zero)
 
 
 def note(
@@ -79,6 +80,7 @@ def note(
     against_cos: float,
     wrong_way_m: float,
     rest_m: float,
+    near_m: float,
 ) -> Clues:
     """One step more, for the agents that are active in `before`.
 
@@ -91,6 +93,7 @@ def note(
         against_cos: it drives against them if even the direction of the one that fits best has a smaller cosine with its velocity.
         wrong_way_m: so much against the lanes without a break is a stretch.
         rest_m: radius of the circle that a car at rest does not leave.
+        near_m: who has been within this distance of the goal was near it.
     """
     active, motion = before.active & ~facts.events.fault, after.motion  # a broken car's facts are no measurements
     place = motion.position[:, :2]
@@ -101,6 +104,8 @@ def note(
     harmed = before.active & harms.any(0) & ~clues.harmed
     met = active & facts.events.collided & ~happened.collided
     closer = active & (facts.goal_distance < clues.closest_m)
+    closest = jnp.where(closer, facts.goal_distance, clues.closest_m)
+    gone = jnp.where(active & (closest <= near_m), facts.goal_distance - closest, 0.0)
     left = active & (norm(place - clues.rest.place) > rest_m)
     against = active & (facts.speed >= moving_mps) & (alignment(place, motion.velocity[:, :2], lanes, within_m=lane_m) < against_cos)
     impact = impacts(before, after, boxes, against)
@@ -114,8 +119,9 @@ def note(
         first=first,
         speed=speed,
         impact=choose(met, impact, clues.impact),
-        closest_m=jnp.where(closer, facts.goal_distance, clues.closest_m),
+        closest_m=closest,
         closest=choose(closer, now, clues.closest),
+        gone_m=jnp.maximum(clues.gone_m, gone),
         rest=choose(left, now, clues.rest),
         wrong_way=clues.wrong_way | wrong,
         turned=choose(wrong, now, clues.turned),

@@ -29,6 +29,12 @@ def drive(x, y=0.0, *, speed=0.0, yaw=0.0, until=np.inf):
     return x + way * np.cos(yaw), y + way * np.sin(yaw), np.full(len(TIME), yaw)
 
 
+def around(x, y, *, radius, speed):
+    """A track: round and round a point."""
+    angle = TIME * speed / radius
+    return x + radius * np.cos(angle), y + radius * np.sin(angle), angle + np.pi / 2
+
+
 def parked(x, y=0.0, yaw=0.0):
     return drive(x, y, yaw=yaw)
 
@@ -52,6 +58,7 @@ DRIVES = {
     "wrong_way_into": (drive(40, speed=8, yaw=np.pi), FAR, parked(0.0)),
     "overshoot": (drive(-20, speed=5), (0, 5), AWAY),
     "overshoot_then_stands": (drive(-20, speed=10, until=3.0), (-5, 5), AWAY),
+    "circles": (around(0, 0, radius=8.0, speed=6.0), (3, 0), AWAY),
     "stuck": (drive(-30, speed=8, until=1.5), (50, 0), AWAY),
     "stops_short": (drive(-30, speed=8, until=3.0), (0, 0), AWAY),
     "late": (drive(-30, speed=2), (50, 0), AWAY),
@@ -110,8 +117,8 @@ def row_of(records, name, agent=0) -> int:
         ("head_on_off_lane", 0, "at_fault"), ("head_on_off_lane", 1, "at_fault"), ("side", 0, "at_fault"),
         ("side", 1, "struck"), ("cut_in", 0, "struck"), ("cut_in", 1, "at_fault"), ("box", 0, "at_fault"), ("edge", 0, "edge"),
         ("crash", 0, "crash"), ("fault", 0, "fault"), ("wrong_way", 0, "wrong_way"), ("wrong_way_into", 0, "at_fault"),
-        ("overshoot", 0, "overshoot"), ("overshoot_then_stands", 0, "overshoot"), ("stuck", 0, "stuck"), ("stops_short", 0, "stuck"),
-        ("late", 0, "out_of_time"), ("late", 1, "stuck"),
+        ("overshoot", 0, "overshoot"), ("overshoot_then_stands", 0, "overshoot"), ("circles", 0, "overshoot"), ("stuck", 0, "stuck"),
+        ("stops_short", 0, "stuck"), ("late", 0, "out_of_time"), ("late", 1, "stuck"),
     ],
 )  # fmt: skip
 def test_a_scripted_drive_has_its_kind(played, name, agent, kind):
@@ -206,8 +213,8 @@ def test_lanes_that_cross_are_not_driven_against():
 
 def test_settings_are_checked_at_the_door():
     config = configs.load("evaluate", "run=x")
-    del config["failures"]["kinds"]["near_m"]
-    with pytest.raises(ConfigError, match=r"failures\.kinds\.near_m: missing"):
+    del config["failures"]["notes"]["near_m"]
+    with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
         keys.check_evaluate(config)
     with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: 0; wanted is at least 1"):
         keys.check_train(configs.load("train", "evaluation.failures.pictures.panels=0"))

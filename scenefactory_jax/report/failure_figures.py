@@ -45,9 +45,10 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
     kind = KINDS[cases[0].failure.kind]
     with matplotlib.rc_context(STYLE):
         rows = 1 if len(cases) > 2 else 2 if len(cases) > 1 else 3  # of the legend
-        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.06
+        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.28
         height = 2 * _INCHES + head + 0.08 + 0.18 * rows
         figure = Figure(figsize=(_INCHES * len(cases), height))
+        figure.text(0.01 / len(cases), 1 - 0.04 / height, kind.label, fontsize=9, fontweight="bold", va="top")
         for column, case in enumerate(cases):
             case = case._replace(trajectory=canvas.settle(case.trajectory))
             for row, window in enumerate((_whole(case), _near(case))):
@@ -58,7 +59,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
                 if row == 0:
                     axes.set_title(_title(case.failure), fontsize=7.5, fontweight="normal", loc="left", pad=3)
         handles = [
-            Line2D([], [], color=_rgb(FAILED), linewidth=2.2, label=f"{kind.label}: its way (dashed: afterwards)"),
+            Line2D([], [], color=_rgb(FAILED), linewidth=2.2, label="its way (dashed: afterwards)"),
             Line2D([], [], color=_rgb(INK), marker="s", markerfacecolor="none", linestyle="none", markersize=8, label="where: seen below"),
             Line2D([], [], color=_rgb(GOAL), marker="o", markerfacecolor="none", linestyle="none", markersize=8, label="its goal"),
             Line2D([], [], color=_rgb(CAR), linewidth=1.2, label="other cars"),

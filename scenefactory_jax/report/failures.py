@@ -40,7 +40,7 @@ KINDS: dict[str, Kind] = {
         "wrong way", "no event; it drove a stretch of `wrong_way_m` against the direction of every lane within `lane_m` of it.",
         "longest stretch against the lanes", "m"),
     "overshoot": Kind(
-        "overshoot", "no event; it came within `near_m` of its goal, and ended at least `away_m` further from it than it had been.",
+        "overshoot", "no event; it came within `near_m` of its goal, went away again by at least `away_m`, and did not get there.",
         "gone away again", "m"),
     "stuck": Kind(
         "stuck", "no event; in the last `stuck_s` or longer it did not leave a circle of `rest_m` about one place.", "stood still", "s"),
@@ -65,14 +65,14 @@ class Failure(NamedTuple):
 
 
 def classify(
-    clues: Records, *, own_share: float, own_mps: float, stuck_s: float, near_m: float, away_m: float
+    clues: Records, *, own_share: float, own_mps: float, stuck_s: float, away_m: float
 ) -> dict[str, np.ndarray]:
     """Columns for records: each agent's kind, its moment and severity, the flags, and what was measured for them.
 
     Args:
         clues: records, and the columns of moments that `run/playing.py` makes of `clues.Clues`: NAME_s, NAME_x_m and NAME_y_m of the first
             event, the closest approach to the goal, the beginning of the last rest, the first stretch against the lanes, and the end.
-        own_share, own_mps, stuck_s, near_m, away_m: see `KINDS`.
+        own_share, own_mps, stuck_s, away_m: see `KINDS`.
     """
     own, other = np.maximum(clues["own_mps"], 0.0), np.maximum(clues["other_mps"], 0.0)
     drove = (own >= own_mps) & (own >= own_share * (own + other))
@@ -81,8 +81,7 @@ def classify(
     closing = np.maximum(clues["own_mps"] + clues["other_mps"], 0.0)
     late = ~clues["reached"]
     stuck = late & (clues["still_s"] >= stuck_s)
-    gone = clues["end_distance_m"] - clues["closest_m"]
-    overshot = late & (clues["closest_m"] <= near_m) & (gone >= away_m)
+    overshot = late & (clues["gone_m"] >= away_m)
 
     harm = clues["first_event"]
     candidates = {"wrong_way": (clues["wrong_way"], "against"), "overshoot": (overshot, "closest"), "stuck": (stuck, "rest")}
@@ -94,7 +93,7 @@ def classify(
 
     moment = {name: name_of for name, (_, name_of) in candidates.items()} | {"out_of_time": "end", NONE: "end"}
     severity = {
-        "at_fault": closing, "struck": closing, "wrong_way": clues["against_m"], "overshoot": gone, "stuck": clues["still_s"],
+        "at_fault": closing, "struck": closing, "wrong_way": clues["against_m"], "overshoot": clues["gone_m"], "stuck": clues["still_s"],
         "out_of_time": clues["end_distance_m"], NONE: np.zeros(len(kind)),
     }  # fmt: skip
     pick = lambda columns: np.select([kind == name for name in columns], list(columns.values()), 0.0)  # noqa: E731
@@ -108,7 +107,7 @@ def classify(
         "overshot": overshot,
         **{name: clues[name] for name in (
             "wrong_way", "first_event", "event_s", "event_mps", "hit", "own_mps", "other_mps", "own_against", "other_against",
-            "closest_m", "closest_s", "still_s", "against_m", "against_share")},
+            "closest_m", "closest_s", "gone_m", "still_s", "against_m", "against_share")},
     }  # fmt: skip
 
 

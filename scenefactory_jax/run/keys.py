@@ -21,9 +21,9 @@ class Key(NamedTuple):
 COUNT, SEED, FLAG, PLACE = Key(int, 1), Key(int, 0), Key(bool), Key(str | None)
 VIDEO = {"enable": FLAG, "worlds": SEED, "seconds": Key(float, 0.1), "stride": COUNT, "fps": Key(float, 0.1), "columns": COUNT}
 VIDEO |= {"panel": Key(int, 120), "trail_s": Key(float, 0), "suffix": Key(Literal[".gif", ".mp4"])}
-FAILURE_NOTES = {name: Key(float, 0) for name in ("moving_mps", "lane_m", "wrong_way_m", "rest_m")}
+FAILURE_NOTES = {name: Key(float, 0) for name in ("moving_mps", "lane_m", "wrong_way_m", "rest_m", "near_m")}
 FAILURE_NOTES |= {"against_cos": Key(float, -1)}
-FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck_s", "near_m", "away_m")}
+FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck_s", "away_m")}
 FAILURE_PICTURES = {"enable": FLAG, "panels": COUNT, "before_s": Key(float, 0), "video": FLAG}
 FAILURES = {"notes": FAILURE_NOTES, "kinds": FAILURE_KINDS, "pictures": FAILURE_PICTURES}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}

@@ -144,6 +144,7 @@ def _clues(tally: evaluation.Tally, state: State, present, control_hz: float) ->
         "own_against": found.impact.against,
         "other_against": found.impact.other_against,
         "closest_m": found.closest_m,
+        "gone_m": found.gone_m,
         "still_s": (last - found.rest.step) / control_hz,
         "wrong_way": found.wrong_way,
         "against_m": found.against_m,
