@@ -238,7 +238,7 @@ def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path])
         return ""
     shown = [_show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.of(records) if kind in drawn]
     if "film" in drawn:
-        shown.append(_show(folder, f"The worst of each kind, {name}", drawn["film"]))
+        shown.append(_show(folder, f"The worst of each kind, {name}; clocks start where the film does", drawn["film"]))
     return "\n\n".join([f"<details><summary>The worst of each kind, side by side ({name})</summary>", *shown, "</details>"])
 
 

@@ -45,7 +45,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
     kind = KINDS[cases[0].failure.kind]
     with matplotlib.rc_context(STYLE):
         rows = 1 if len(cases) > 2 else 2 if len(cases) > 1 else 3  # of the legend
-        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.28
+        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.22
         height = 2 * _INCHES + head + 0.08 + 0.18 * rows
         figure = Figure(figsize=(_INCHES * len(cases), height))
         figure.text(0.01 / len(cases), 1 - 0.04 / height, kind.label, fontsize=9, fontweight="bold", va="top")
