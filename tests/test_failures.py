@@ -200,6 +200,16 @@ def test_pictures_show_the_place(played, settings, tmp_path):
     assert lower.sum() > 300 and red[1][lower].mean() == pytest.approx(wide / 2, abs=0.2 * wide)
 
 
+def test_a_film_shows_the_seconds_around_each_failure(played, settings, tmp_path):
+    records, recording = played
+    chosen = tables.select(records, np.isin(records["failure"], ["edge", "wrong_way"]))
+    wanted = {**settings["failures"], "pictures": {"enable": True, "panels": 1, "before_s": 1.0, "video": True}}
+    look = {**settings["video"], "stride": 15, "fps": 5.0, "panel": 120}
+    paths = failing.draw(tmp_path, "strict, untrained", chosen, recording, {"failures": wanted, "video": look})
+    assert set(paths) == {"edge", "wrong_way", "film"} and paths["film"].name == "failures-strict-untrained.gif"
+    assert getattr(Image.open(paths["film"]), "n_frames", 1) == 7, "3 s at 30 steps a second, every 15th, and the last"
+
+
 def test_lanes_that_cross_are_not_driven_against():
     """At a junction a car is on several lanes at once, and against them only if it is against all of them."""
     x = np.arange(-30, 30.1, 2.0)

@@ -190,7 +190,8 @@ def flag_counts(failures: list[Failure]) -> dict[str, int]:
 def table(records: Records, *, most: int = 3) -> str:
     """A Markdown table: a row a kind, with counts, shares of all agents, flags, and the scenes that have most of it."""
     agents, clean = len(records["scene"]), int(np.sum(records["clean"]))
-    rows = [["arrived cleanly", clean, f"{100 * clean / agents:.1f} %", "", ""]]
+    astray = int(np.sum(np.asarray(records["clean"], bool) & np.asarray(records["wrong_way"], bool)))
+    rows = [["arrived cleanly", clean, f"{100 * clean / agents:.1f} %", f"{FLAGS['wrong_way']} {astray}" if astray else "", ""]]
     for kind, failures in of(records).items():
         also = [f"{FLAGS[name]} {count}" for name, count in flag_counts(failures).items()]
         most_of = ", ".join(f"{scene} ({count})" for scene, count in scenes(failures)[:most])
