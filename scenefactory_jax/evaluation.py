@@ -4,16 +4,17 @@ Events are counted from the facts, not from the exclusive events that rewards us
 has done both. Nothing is counted after an agent's end or the world's.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax import ends
+from scenefactory_jax import clues, ends
+from scenefactory_jax.clues import Clues
 from scenefactory_jax.struct import replace, struct
-from scenefactory_jax.types import Boxes, Env, Events, Outcome, Scene, State
+from scenefactory_jax.types import Env, Events, Outcome, Scene, State
 
 Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 
@@ -33,11 +34,12 @@ class Tally:
     speed_sum: Float[Array, " A"]
     grip_sum: Float[Array, " A"]
     force_max: Float[Array, " A"]
+    clues: Clues
 
 
 @struct
 class Frame:
-    """What one moment looks like from above."""
+    """What one moment looks like from above; where the others are then follows from the scene and the step alone."""
 
     position: Float[Array, "A 2"]
     yaw: Float[Array, " A"]
@@ -45,7 +47,6 @@ class Frame:
     active: Bool[Array, " A"]
     goal: Float[Array, "A 2"]
     events: Events
-    others: Boxes
 
 
 @struct
@@ -76,35 +77,36 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
         speed_sum=zero,
         grip_sum=zero,
         force_max=zero,
+        clues=clues.begin(state, distance),
     )
     return Episode(state, observation, tally, ~jnp.any(state.active))
 
 
 def play(
-    env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float
+    env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float, notes: Mapping[str, float]
 ) -> tuple[Episode, Frame]:
     """Drive on for that many control steps; frames come back with a leading step axis.
 
     Args:
         ttc_limit_s: TTC above this counts as this in an agent's mean (the published evaluation uses 10 s).
+        notes: numbers of `clues.note`.
     """
 
     def body(episode: Episode, _: None) -> tuple[Episode, Frame]:
         before = replace(episode.state, active=episode.state.active & ~episode.over)
         action = act(parameters, episode.observation)
         state, outcome = env.step(scene, before, action)
-        tally = _note(episode.tally, before.active, outcome, ttc_limit_s=ttc_limit_s)
-        motion = state.motion
-        frame = Frame(
-            motion.position[:, :2], motion.yaw, jnp.linalg.norm(motion.velocity[:, :2], axis=1), before.active, state.agents.goal,
-            outcome.events, env.now(scene, state).boxes
-        )
+        seen, boxes = episode.tally, env.now(scene, state).boxes
+        found = clues.note(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
+        tally = _note(seen, before.active, outcome, found, ttc_limit_s=ttc_limit_s)
+        place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
+        frame = Frame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
         return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
 
     return jax.lax.scan(body, episode, None, length=steps)
 
 
-def _note(tally: Tally, active: Bool[Array, " A"], outcome: Outcome, *, ttc_limit_s: float) -> Tally:
+def _note(tally: Tally, active: Bool[Array, " A"], outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
     facts = outcome.facts
     seen = active & jnp.isfinite(facts.ttc)
     happened = jax.tree.map(lambda old, new: old | (new & active), tally.happened, facts.events)
@@ -121,4 +123,5 @@ def _note(tally: Tally, active: Bool[Array, " A"], outcome: Outcome, *, ttc_limi
         speed_sum=add(tally.speed_sum, facts.speed),
         grip_sum=add(tally.grip_sum, facts.grip),
         force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
+        clues=found,
     )

@@ -1,6 +1,7 @@
 """The whole, from a config to a report: training, going on after a stop, evaluation, conversion, and the other commands."""
 
 import csv
+import json
 import os
 import re
 import subprocess
@@ -21,7 +22,7 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.report import tables
+from scenefactory_jax.report import failures, tables
 from scenefactory_jax.run import config, log, sources
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
@@ -92,6 +93,19 @@ def test_the_report_compares_and_its_files_are_there(whole):
     assert {"video.gif", "learning.png", "comparison-strict.png", "agents-strict.csv", "metrics.csv"} <= set(links)
     assert all((whole.folder / link).is_file() for link in links if "://" not in link and not link.startswith("#"))
     assert len(list(imageio.imiter(whole.folder / "video.gif"))) > 1
+
+
+def test_the_report_shows_the_worst_of_every_kind_of_failure(whole):
+    ranked = failures.of(tables.read_csv(whole.folder / "agents-strict.csv"))
+    told = json.loads((whole.folder / "failures.json").read_text())
+    assert set(told) == {"strict", "strict, untrained"}
+    assert {kind: len(found) for kind, found in ranked.items()} == {k: entry["agents"] for k, entry in told["strict"]["kinds"].items()}
+    assert ranked and sum(map(len, ranked.values())) == told["strict"]["agents"] - told["strict"]["clean"]
+    text = (whole.folder / "report.md").read_text()
+    for kind, entry in told["strict"]["kinds"].items():
+        picture = f"failures-strict-{kind}.png"
+        assert entry["picture"] == picture and f"]({picture})" in text and (whole.folder / picture).is_file()
+        assert f"| {failures.KINDS[kind].label} | {entry['agents']} |" in text and f"- **{failures.KINDS[kind].label}**: " in text
 
 
 def test_every_spawned_agent_has_a_record(whole):

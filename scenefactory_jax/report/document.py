@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.report import plots, tables
+from scenefactory_jax.report import failures, plots, tables
 from scenefactory_jax.report.canvas import MARKS
 from scenefactory_jax.report.tables import METRICS, Estimate, Records
 
@@ -46,6 +46,8 @@ def write(
     files: Mapping[str, Path] | None = None,
     commands: Sequence[str] = (),
     key_numbers: Sequence[str] = KEY_NUMBERS,
+    failed: Mapping[str, Mapping[str, Path]] | None = None,
+    kinds: Mapping[str, float] | None = None,
 ) -> Path:
     """Write `folder`/report.md and return its path. Sections without content are left out.
 
@@ -64,13 +66,16 @@ def write(
         files: what it is -> file, linked at the end (per-agent CSV, metrics).
         commands: how to get these numbers again.
         key_numbers: dotted config keys shown in a table of their own.
+        failed: name of records with kinds of failures -> kind -> picture of the worst; "film" -> their video.
+        kinds: the numbers that the definitions of `failures.KINDS` name.
 
     Raises:
         DocumentError: nothing to report, names that do not match, a file that does not exist.
         RecordsError: see `tables.check`.
     """
     baselines = baselines or {}
-    _check(summary, records, baselines, {**(figures or {}), **(videos or {}), **(files or {})})
+    drawn = {f"{name}, {kind}": path for name, paths in (failed or {}).items() for kind, path in paths.items()}
+    _check(summary, records, baselines, {**(figures or {}), **(videos or {}), **(files or {}), **drawn})
     measured = [name for name in summary if name not in baselines.values()]
     first = measured[0]
     sections = [
@@ -80,7 +85,7 @@ def write(
         _section("Comparison", *(_comparison(n, b, summary, records, bootstrap=bootstrap, seed=seed) for n, b in baselines.items())),
         _section("Video", *(_show(folder, caption, path) for caption, path in (videos or {}).items())),
         _section("By condition", _conditions(records[first], first, breakdowns, bootstrap=bootstrap, seed=seed)),
-        _section("Where it fails", *(_failures(name, records[name]) for name in measured)),
+        _section("Where it fails", *(_failures(folder, n, records[n], (failed or {}).get(n, {}), kinds or {}) for n in measured)),
         _section("Figures", *(_show(folder, caption, path) for caption, path in (figures or {}).items())),
         _section("What the numbers mean", _definitions(summary, measured)),
         _section("Set-up", _setup(config, versions, key_numbers), _commands(commands), _links(folder, files or {}), _whole(config)),
@@ -200,11 +205,16 @@ def _conditions(records: Records, name: str, columns: Sequence[str], *, bootstra
     return "\n\n".join([*parts, _marks(seen)]) if parts else ""
 
 
-def _failures(name: str, records: Records) -> str:
-    """How agents ended, and a list of those that did not reach their goal cleanly."""
-    result = plots.outcomes(records)
-    counts = [[outcome, int(np.sum(result == outcome)), f"{100 * np.mean(result == outcome):.1f} %"] for outcome in plots.OUTCOMES]
-    parts = [f"### {name}", tables.grid(["Outcome", "Agents", "Share"], [row for row in counts if row[1]])]
+def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Path], numbers: Mapping[str, float]) -> str:
+    """How agents ended or failed, the worst of each kind, and a list of those that did not reach their goal cleanly."""
+    parts = [f"### {name}"]
+    if "failure" in records:
+        parts += [failures.table(records), failures.definitions(records, numbers), _worst(folder, name, records, drawn)]
+    else:
+        result = plots.outcomes(records)
+        counts = [[outcome, int(np.sum(result == outcome)), f"{100 * np.mean(result == outcome):.1f} %"] for outcome in plots.OUTCOMES]
+        parts.append(tables.grid(["Outcome", "Agents", "Share"], [row for row in counts if row[1]]))
+    parts = [part for part in parts if part]
     rows = np.flatnonzero(~np.asarray(records["clean"], bool))
     if not len(rows):
         return "\n\n".join([*parts, "Every agent reached its goal without any other event."])
@@ -222,9 +232,23 @@ def _failures(name: str, records: Records) -> str:
     return "\n\n".join([*parts, summary, tables.grid(header, lines), "</details>"])
 
 
+def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path]) -> str:
+    """The pictures of the worst of each kind, folded."""
+    if not drawn:
+        return ""
+    shown = [_show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.of(records) if kind in drawn]
+    if "film" in drawn:
+        shown.append(_show(folder, f"The worst of each kind, {name}; clocks start where the film does", drawn["film"]))
+    return "\n\n".join([f"<details><summary>The worst of each kind, side by side ({name})</summary>", *shown, "</details>"])
+
+
 def _story(records: Records, row: int) -> str:
     """An agent's events in words."""
     happened = [MARKS[event].label for event in MARKS if records[event][row]]
+    if "failure" in records:
+        kind = failures.KINDS[str(records["failure"][row])].label
+        also = [event for event in happened if event not in kind]
+        return kind + (f"; also {', '.join(also)}" if also else "")
     return ", ".join(happened) if happened else "out of time"
 
 

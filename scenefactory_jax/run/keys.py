@@ -21,6 +21,11 @@ class Key(NamedTuple):
 COUNT, SEED, FLAG, PLACE = Key(int, 1), Key(int, 0), Key(bool), Key(str | None)
 VIDEO = {"enable": FLAG, "worlds": SEED, "seconds": Key(float, 0.1), "stride": COUNT, "fps": Key(float, 0.1), "columns": COUNT}
 VIDEO |= {"panel": Key(int, 120), "trail_s": Key(float, 0), "suffix": Key(Literal[".gif", ".mp4"])}
+FAILURE_NOTES = {name: Key(float, 0) for name in ("moving_mps", "lane_m", "wrong_way_m", "rest_m", "near_m")}
+FAILURE_NOTES |= {"against_cos": Key(float, -1)}
+FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck_s", "away_m")}
+FAILURE_PICTURES = {"enable": FLAG, "panels": COUNT, "before_s": Key(float, 0), "video": FLAG}
+FAILURES = {"notes": FAILURE_NOTES, "kinds": FAILURE_KINDS, "pictures": FAILURE_PICTURES}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
 EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
@@ -78,6 +83,7 @@ def check_train(config: Mapping[str, Any]) -> None:
     evaluation = config["evaluation"]
     check(evaluation, EVALUATION, where="evaluation")
     check(evaluation["video"], VIDEO, where="evaluation.video")
+    check_failures(evaluation, where="evaluation.failures")
     known = sorted(path.stem for path in (configs.folder() / "ends").glob("*.yaml"))
     for protocol in evaluation["protocols"] or [None]:
         if protocol not in known:
@@ -92,6 +98,23 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     """
     check(config, {"run": Key(str), "out": PLACE, "overrides": Key(list[str]), **JUDGE})
     check(config["video"], VIDEO, where="video")
+    check_failures(config, where="failures")
+
+
+def check_failures(settings: Mapping[str, Any], *, where: str) -> None:
+    """Every key of the group `failures` in an evaluation's settings.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    if "failures" not in settings:
+        raise ConfigError(f"{where}: missing; an evaluation needs the group `failures`")
+    for name, own in FAILURES.items():
+        if name not in settings["failures"]:
+            raise ConfigError(f"{where}.{name}: missing; {where} needs {', '.join(FAILURES)}")
+        check(settings["failures"][name], own, where=f"{where}.{name}")
+        if unknown := [key for key in settings["failures"][name] if key not in own]:
+            raise ConfigError(f"{where}.{name}.{unknown[0]}: unknown key; valid: {', '.join(own)}")
 
 
 def check_scenes(config: Mapping[str, Any]) -> None:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.report import document, pictures, plots, tables, video
+from scenefactory_jax.report import document, failures, pictures, plots, tables, video
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import log
+from scenefactory_jax.run import failing, log
 
 
 def write(
@@ -18,16 +18,21 @@ def write(
     config: Mapping[str, Any],
     run: Path,
     settings: Mapping[str, Any],
-    records: Mapping[str, Mapping[str, np.ndarray]],
+    records: Mapping[str, dict[str, np.ndarray]],
     summary: Mapping[str, Mapping[str, tables.Estimate]],
     trajectories: list[Trajectory],
+    failed: Mapping[str, Mapping[str, Path]],
 ) -> Path:
-    """Write everything that a reader of the evaluation wants to see to `out`, and return the report's path."""
+    """Write everything that a reader of the evaluation wants to see to `out`, and return the report's path.
+
+    `failed` has the pictures of failures: name of the records -> kind -> picture.
+    """
     metrics = log.read(run)
     baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
     figures = _figures(out, metrics, records, summary, baselines, trajectories)
     videos = _videos(out, trajectories, settings["video"])
     files = {f"Agents, {name}": out / f"agents-{name.replace(', ', '-')}.csv" for name in records}
+    files["Failures, ranked"] = failing.write(out, records, failed)
     if metrics:
         files["Metrics of the training"] = run / log.FILE
     return document.write(
@@ -42,6 +47,8 @@ def write(
         baselines=baselines,
         figures=figures,
         videos=videos,
+        failed=failed,
+        kinds=failures.numbers(settings["failures"]),
         files=files,
         commands=[f"python -m scenefactory_jax evaluate run={run}"],
     )
