@@ -49,6 +49,7 @@ CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG, "features": Key(dict
 BANK = {"shard_scenes": COUNT, "compression": Key(Literal["zstd", "lz4"] | None)}
 SOURCE = {"path": PLACE, "seed": SEED, "count": COUNT, "workers": COUNT}
 CELLS = {"radius_m": Key(float | None, 0), "size_m": Key(float, 0.1)}
+TAKE = {"count": Key(int | None, 1), "seed": SEED}
 HELDOUT = {"path": PLACE, "seed": SEED, "count": COUNT}
 
 
@@ -103,6 +104,7 @@ def check_scenes(config: Mapping[str, Any]) -> None:
     check(config, SOURCE, where="scenes")
     check(config["heldout"], HELDOUT, where="scenes.heldout")
     check(config["cells"], CELLS, where="scenes.cells")
+    check(config.get("take") or {"count": None, "seed": 0}, TAKE, where="scenes.take")
 
 
 def check_operations(config: Mapping[str, Any]) -> None:
