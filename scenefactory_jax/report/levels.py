@@ -23,8 +23,8 @@ OPTIONAL: dict[str, tuple[str, Metric]] = {
         "Friction use", SHARE, "Tyre force over what the road's friction allows: each agent's mean over its steps; mean over agents.",
         lambda records: records["grip_use"], tables._spawned)),
     "stopping_margin_m": ("stopping_margin_m", Metric(
-        "Stopping margin", "m", "Gap to the car ahead less the way to stop on the road's friction: each agent's least; mean over agents with a "
-        "car ahead.", lambda records: records["stopping_margin_m"], lambda records: np.isfinite(records["stopping_margin_m"]))),
+        "Stopping margin", "m", "Gap to the car ahead less the way to stop on the road's friction: each agent's least; mean over agents "
+        "with a car ahead.", lambda records: records["stopping_margin_m"], lambda records: np.isfinite(records["stopping_margin_m"]))),
 }  # fmt: skip
 LEAST_TTC = Metric(
     "Least TTC", "s", "Each agent's least time to collision, clamped to 10 s; mean over the agents that had any.",
@@ -90,7 +90,8 @@ def difference(before: Runs, after: Runs, *, bootstrap: int, seed: int) -> dict[
     for m, (name, metric) in enumerate(metrics.items()):
         one = _estimate(float(new[m] - old[m]), draws[:, m], metric, np.minimum(first.counts, second.counts)[:, :, m] if paired else None)
         if one.method == WILSON:
-            one = _newcombe(float(old[m]), float(new[m]), *(_agents(grid.counts[:, :, m]) for grid in (first, second)), one)
+            agents = [_agents(grid.counts[:, :, m]) for grid in (first, second)]
+            one = _newcombe((float(old[m]), agents[0]), (float(new[m]), agents[1]), like=one)
         result[name] = one
     return result
 
@@ -110,9 +111,10 @@ def _estimate(value: float, draws: np.ndarray, metric: Metric, counts: np.ndarra
     return Estimate(value, low, high, count, metric.unit, LEVELS)
 
 
-def _newcombe(old: float, new: float, before: int, after: int, like: Estimate) -> Estimate:
-    """Newcombe's hybrid score interval of a difference that does not vary between resamples."""
-    (old_low, old_high), (new_low, new_high) = tables.wilson(old, before), tables.wilson(new, after)
+def _newcombe(before: tuple[float, int], after: tuple[float, int], *, like: Estimate) -> Estimate:
+    """Newcombe's hybrid score interval of a difference that does not vary between resamples; (share, agents) of both."""
+    (old, _), (new, _) = before, after
+    (old_low, old_high), (new_low, new_high) = tables.wilson(*before), tables.wilson(*after)
     low, high = new - old - np.hypot(new - new_low, old_high - old), new - old + np.hypot(new_high - new, old - old_low)
     return Estimate(new - old, float(low), float(high), like.count, like.unit, NEWCOMBE)
 

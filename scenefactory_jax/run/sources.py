@@ -64,12 +64,13 @@ def taken(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
         ConfigError: more than there are.
     """
     keys.check_scenes(config)
-    take = config.get("take") or {"count": None}  # runs from before there was a choice have none
-    if take["count"] is None or take["count"] == len(scenes):
+    take: Mapping[str, Any] = config.get("take") or {"count": None}  # runs from before there was a choice have none
+    count = take["count"]
+    if count is None or count == len(scenes):
         return scenes
-    if take["count"] > len(scenes):
-        raise ConfigError(f"scenes.take.count: {take['count']}, but there are {len(scenes)} scenes")
-    chosen = np.sort(np.random.default_rng(take["seed"]).permutation(len(scenes))[: take["count"]])
+    if count > len(scenes):
+        raise ConfigError(f"scenes.take.count: {count}, but there are {len(scenes)} scenes")
+    chosen = np.sort(np.random.default_rng(take["seed"]).permutation(len(scenes))[:count])
     scene = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)
     account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {take['seed']}"
     return Scenes(scene, tuple(scenes.names[index] for index in chosen), account)
