@@ -79,8 +79,8 @@ def _results(result: Result) -> list[str]:
             parts += [f"### {protocol}: {PROTOCOLS.get(protocol, 'see conf/ends')}", _table(rows, RATES), _table(rows, SAFETY)]
     note = (
         "n: seeds x agents. Brackets: 95 % intervals that resample seeds of training, scenes, and agents within a scene; with one seed "
-        "they hold scenes and agents alone, with few they are rather too narrow. †: Wilson's or Newcombe's score interval over distinct agents, "
-        "where a rate does not vary."
+        "they hold scenes and agents alone, with few they are rather too narrow. †: Wilson's or Newcombe's score interval over distinct "
+        "agents, where a rate does not vary."
     )
     return [*parts, note] if parts else []
 
@@ -127,8 +127,8 @@ def _trainings(result: Result) -> list[str]:
     for variant, trained in result["trainings"].items():
         for seed, run in trained["runs"].items():
             scenes = "" if run["scenes"] is None else f"{run['scenes']} ({run['agents']} agents)"
-            took = f"{run['minutes']:.1f}", f"{run['steps'] / 1e6:.1f} M"
-            cells.append([variant, seed, scenes, run["iterations"], took[1], took[0], run["device"], f"`{run['commit']}`"])
+            took = _steps(run["steps"]), f"{run['minutes']:.1f}"
+            cells.append([variant, seed, scenes, run["iterations"], *took, run["device"], f"`{run['commit']}`"])
     if not cells:
         return []
     header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Minutes", "Device", "Commit"]
@@ -145,18 +145,22 @@ def _to_target(result: Result, target: float) -> str:
     for variant, trained in result["trainings"].items():
         for protocol, seeds in trained["held_out"].items():
             for seed, curve in seeds.items():
-                moments = [_moment(curve[name]) for name in ("to_target", "best", "last")]
+                moments = [_moment(curve[name]) for name in ("to_target", "to_final", "last")]
                 cells.append([variant, protocol, seed, *moments])
     if not cells:
         return ""
-    header = ["", "Protocol", "Seed", f"First at {100 * target:.1f} % or more", "Best", "Last"]
+    header = ["", "Protocol", "Seed", f"First at {100 * target:.1f} % or more", "First at its last figure or more", "Last"]
     return "Held-out success while training, under the first condition:\n\n" + tables.grid(header, cells)
 
 
-def _moment(found: Mapping[str, float] | None) -> str:
+def _moment(found: Mapping[str, float | int] | None) -> str:
     if not found:
         return "not reached"
-    return f"{100 * found['success']:.1f} % after {found['minutes']:.1f} min, {found['steps'] / 1e6:.1f} M steps"
+    return f"{100 * found['success']:.1f} % after {found['minutes']:.1f} min, {_steps(found['steps'])} steps"
+
+
+def _steps(count: float | int) -> str:
+    return f"{count / 1e6:.1f} M" if count >= 1e6 else f"{count / 1e3:.1f} k"
 
 
 # ---- what it rests on
@@ -190,7 +194,7 @@ def _again(result: Result) -> list[str]:
     text = ["```", f"python -m scenefactory_jax study study={study['name']} train_scenes=... test_scenes=...", "```"]
     variants = [[name, " ".join(f"`{x}`" for x in trained["overrides"])] for name, trained in result["trainings"].items()]
     conditions = [[name, " ".join(f"`{x}`" for x in [*study["examined"], *own])] for name, own in study["conditions"].items()]
-    floors = [[name, f"untrained, {one['of']} " + " ".join(f"`{x}`" for x in one["overrides"])] for name, one in study["floors"].items()]
+    floors = [[name, " ".join([f"untrained, {one['of']}", *(f"`{x}`" for x in one["overrides"])])] for name, one in study["floors"].items()]
     seeds = sorted({int(seed) for trained in result["trainings"].values() for seed in trained["runs"]})
     told = ", ".join(f"{name} {value}" for name, value in result["settings"]["evaluation"].items())
     return [

@@ -75,21 +75,24 @@ def _rates(result: Result) -> dict[str, tuple[str, Figure]]:
     found = {}
     for protocol in result["study"]["protocols"]:
         conditions = dict.fromkeys(row["condition"] for row in result["rows"])
-        label = (lambda row: row["row"]) if len(conditions) == 1 else (lambda row: f"{row['row']}: {row['condition']}")
-        rows = {label(row): _estimates(row) for row in result["rows"] if row["protocol"] == protocol}
-        if rows:
-            found[f"Rates with 95 % intervals ({protocol})"] = (f"rates-{protocol}", _bars(rows))
+        label = (lambda row: row["row"]) if len(conditions) == 1 else (lambda row: f"{row['condition']}: {row['row']}")
+        shown = [row for row in result["rows"] if row["protocol"] == protocol]
+        names = list(dict.fromkeys(row["row"] for row in shown))
+        colours = {label(row): _colours(len(names))[names.index(row["row"])] for row in shown}
+        if shown:
+            figure = _bars({label(row): _estimates(row) for row in shown}, colours)
+            found[f"Rates with 95 % intervals ({protocol})"] = (f"rates-{protocol}", figure)
     return found
 
 
-def _bars(rows: Mapping[str, Mapping[str, Estimate]]) -> Figure:
+def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]) -> Figure:
     """A panel a rate, a bar a row: names stay readable however many rows there are."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 0.34 * len(rows) + 1.0), layout="constrained")
         panels = figure.subplots(1, len(SHOWN), sharey=True)
         for axes, name in zip(panels, SHOWN, strict=True):
-            for place, (colour, row) in enumerate(zip(_colours(len(rows)), rows.values(), strict=True)):
-                _bar(axes, place, row[name], colour)
+            for place, (label, row) in enumerate(rows.items()):
+                _bar(axes, place, row[name], colours[label])
             axes.set(title=levels.labels([name])[name].label, xlim=(0, 1.12), xticks=[0, 0.5, 1])
             axes.xaxis.set_major_formatter(PercentFormatter(1.0))
             axes.grid(False, axis="y")
@@ -98,13 +101,13 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]]) -> Figure:
     return figure
 
 
-def _bar(axes: Axes, place: float, one: Estimate, colour: str) -> None:
+def _bar(axes: Axes, place: int, one: Estimate, colour: str) -> None:
     if one.value is None:
         return
     low, high = (one.value if end is None else end for end in (one.low, one.high))
     axes.barh(place, one.value, 0.7, color=colour, alpha=0.85)
     axes.errorbar(one.value, place, xerr=[[one.value - low], [high - one.value]], fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2.5)
-    right = high < 0.8
+    right = high < 0.95 or one.value < 0.3
     x, colour = (high + 0.03, "#222222") if right else (0.03, "white")
     axes.text(x, place, f"{100 * one.value:.1f}", va="center", fontsize=7.5, color=colour)
 
@@ -186,7 +189,7 @@ def _trend(result: Result) -> dict[str, tuple[str, Figure]]:
     if trend is None:
         return found
     for protocol in result["study"]["protocols"]:
-        points: dict[str, list[tuple[float, dict[str, Estimate]]]] = {}
+        points: dict[str, list[tuple[float | int, dict[str, Estimate]]]] = {}
         for row in result["rows"]:
             x = _along(row["row"], result)
             if row["protocol"] == protocol and x is not None:
@@ -197,7 +200,7 @@ def _trend(result: Result) -> dict[str, tuple[str, Figure]]:
     return found
 
 
-def _along(row: str, result: Result) -> float | None:
+def _along(row: str, result: Result) -> float | int | None:
     """A variant's place on the axis; null stands for its number of training scenes."""
     values = result["study"]["trend"]["values"]
     if row not in values:
@@ -206,7 +209,7 @@ def _along(row: str, result: Result) -> float | None:
     return values[row] if values[row] is not None else next((run["scenes"] for run in runs if run["scenes"]), None)
 
 
-def _lines(points: Mapping[str, list[tuple[float, dict[str, Estimate]]]], label: str) -> Figure:
+def _lines(points: Mapping[str, list[tuple[float | int, dict[str, Estimate]]]], label: str) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(5.2 * len(points), 3.4), layout="constrained")
         for axes, (condition, found) in zip(figure.subplots(1, len(points), squeeze=False)[0], points.items(), strict=True):
@@ -232,4 +235,5 @@ def _estimates(row: Mapping[str, Any]) -> dict[str, Estimate]:
 
 
 def _colours(count: int) -> list[str]:
-    return [COLOURS[i % len(COLOURS)] for i in range(count)]
+    light = [colour for colour in COLOURS if colour != "#000000"]  # intervals are drawn in black
+    return [light[i % len(light)] for i in range(count)]

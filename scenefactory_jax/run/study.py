@@ -157,7 +157,8 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             begun = time.monotonic()
             prepared = prepared or train.prepare(one.config)
             watch = _watch(one, plan, shared, examiners)
-            _train_one(one, prepared._replace(examiners=watch, scenes=_scenes_of(one, shared)), begun)
+            programs = {judging.protocol: judging.program for judging in study_plan.watched(plan, one)} if watch else {}
+            _train_one(one, prepared._replace(examiners=watch, scenes=_scenes_of(one, shared)), programs, begun)
             spent[program] = time.monotonic() - begun
     return True
 
@@ -177,21 +178,22 @@ def _estimate(one: Training) -> float:
 
 
 def _watch(one: Training, plan: Plan, shared: Shared, made: dict[str, Examine]) -> dict[str, Examine]:
-    """Protocol -> how to judge a variant while it trains, under its first condition; nothing if the recipe does not ask for it.
+    """Protocol -> how to judge a variant while it trains; nothing if its config does not ask for it.
 
     Args:
         made: program -> examiner, for the seeds that follow.
     """
-    own = [j for j in plan.judgings if j.training.digest == one.digest and j.row == one.variant]
-    if not one.config["evaluation"]["every"] or not own:
-        return {}
-    first = [judging for judging in own if judging.condition == own[0].condition]
+    first = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
     made |= {judging.program: shared.examiner(judging, "curve points") for judging in first if judging.program not in made}
     return {judging.protocol: made[judging.program] for judging in first}
 
 
-def _train_one(one: Training, prepared: train.Prepared, begun: float) -> None:
-    """One run, from its last checkpoint if there is one, and the note that it is whole."""
+def _train_one(one: Training, prepared: train.Prepared, watched: Mapping[str, str], begun: float) -> None:
+    """One run, from its last checkpoint if there is one, and the note that it is whole.
+
+    Args:
+        watched: protocol -> program of the evaluations while it trains.
+    """
     resume = (one.folder / "config.yaml").is_file()
     print(f"training {one.variant}, seed {one.seed}" + (" (goes on)" if resume else ""), flush=True)
     config = {**one.config, "out": str(one.folder), "resume": resume}
@@ -199,7 +201,8 @@ def _train_one(one: Training, prepared: train.Prepared, begun: float) -> None:
     run = train.train(config, prepared=prepared)
     scenes = None if prepared.scenes is None else sources.taken(prepared.scenes, config["scenes"])
     last = run.metrics[-1]
-    note = {"digest": one.digest, "seed": one.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
+    note = {"digest": one.digest, "seed": one.seed, "watched": dict(watched)}
+    note |= {"iterations": int(last["iteration"]), "steps": last["steps/total"]}
     note |= {"minutes": last["minutes"], "session_s": time.monotonic() - begun, "commit": configs.commit(), "versions": configs.versions()}
     if scenes is not None:
         note |= {"scenes": len(scenes), "agents": int(np.asarray(scenes.scene.agents.present).sum())}

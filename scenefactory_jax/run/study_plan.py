@@ -61,7 +61,14 @@ def make(config: Mapping[str, Any]) -> Plan:
     trainings = [one for variant in study["trainings"] for one in _trainings(config, variant, seeds, runs)]
     judgings = [one for training in trainings for one in _judgings(config, training, first=seeds[0])]
     rows = {name: index for index, name in enumerate([*study["trainings"], *study["floors"]])}
-    return Plan(study["name"], trainings, sorted(judgings, key=lambda one: rows[one.row]))
+    places = {name: index for index, name in enumerate(study["conditions"])}
+    return Plan(study["name"], trainings, sorted(judgings, key=lambda one: (places[one.condition], rows[one.row])))
+
+
+def watched(plan: Plan, training: Training) -> list[Judging]:
+    """How a variant is judged while it trains: under its first condition, in every protocol."""
+    own = [one for one in plan.judgings if one.row == training.variant and one.training.seed == training.seed]
+    return [one for one in own if one.condition == own[0].condition]
 
 
 def scenes_key(config: Mapping[str, Any], path: str | None) -> str:
@@ -122,7 +129,7 @@ def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs
     if settings["scenes"]["take"]["count"] is None:
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = results.digest(entry), settings["seed"]
-    known = sorted(runs.glob(f"*-{digest}"))  # another study may have trained it, under a name of its own
+    known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it, under a name of its own
     folder = known[0] if known else runs / f"{_slug(variant)}-{seed}-{digest}"
     program = results.digest({name: settings[name] for name in LEARNER})
     return Training(variant, seed, overrides, settings, folder, digest, program)

@@ -9,7 +9,7 @@ import numpy as np
 from scenefactory_jax.report import levels, tables
 from scenefactory_jax.report import study as report
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import log, results
+from scenefactory_jax.run import log, results, study_plan
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 
 RESULT, TRAINED = "result.json", "trained.json"
@@ -54,7 +54,7 @@ def collect(plan: Plan, config: Mapping[str, Any]) -> dict[str, Any]:
         "missing": missing,
         "rows": rows,
         "differences": _differences(study["compare"], records, resampling),
-        "trainings": {variant: _trained(variant, plan.trainings, study, config["target"]) for variant in study["trainings"]},
+        "trainings": {variant: _trained(variant, plan, config["target"]) for variant in study["trainings"]},
         "made_with": {"commit": configs.commit(), **configs.versions()},
     }
 
@@ -92,19 +92,18 @@ def _differences(
 # ---- trainings
 
 
-def _trained(variant: str, trainings: Iterable[Training], study: Mapping[str, Any], target: float) -> dict[str, Any]:
+def _trained(variant: str, plan: Plan, target: float) -> dict[str, Any]:
     """What the seeds of a variant took, and their curves."""
-    own = [one for one in trainings if one.variant == variant]
+    own = [one for one in plan.trainings if one.variant == variant]
     notes = {one.seed: results.read(one.folder / TRAINED) for one in own if (one.folder / TRAINED).is_file()}
     metrics = {one.seed: log.read(one.folder) for one in own if one.seed in notes}
-    judged = {one.seed: log.read(one.folder, log.EVALUATIONS) for one in own if one.seed in notes}
     keep = ("iterations", "steps", "minutes", "commit", "scenes", "agents")
     return {
         "overrides": [override for override in own[0].overrides if "path=" not in override],  # nobody else's business
         "digests": {one.seed: one.digest for one in own},
         "runs": {seed: {name: note.get(name) for name in keep} | {"device": note["versions"]["device"]} for seed, note in notes.items()},
         "curves": _curves(metrics),
-        "held_out": {protocol: held for protocol in study["protocols"] if (held := _held_out(judged, protocol, target))},
+        "held_out": _held_out([one for one in own if one.seed in notes], plan, notes, target),
     }
 
 
@@ -124,21 +123,31 @@ def _pairs(ends: np.ndarray) -> Iterable[tuple[int, int]]:
     return zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
 
 
-def _held_out(judged: Mapping[int, list[dict[str, float]]], protocol: str, target: float) -> dict[int, dict[str, Any]]:
-    """Held-out success while training, and when it first reached the target: minutes of iterations and agent steps."""
-    name, found = f"{protocol}/success_rate/value", {}
-    for seed, rows in judged.items():
-        if not rows or name not in rows[0]:
-            continue
-        reached = next((row for row in rows if row[name] >= target), None)
-        moment = lambda row: None if row is None else {"minutes": row["minutes"], "steps": row["steps/total"], "success": row[name]}  # noqa: E731
-        best = max(rows, key=lambda row: row[name])
-        found[seed] = {
-            "steps": [row["steps/total"] for row in rows],
-            "success": [row[name] for row in rows],
-            "collisions": [row[f"{protocol}/collision_rate/value"] for row in rows],
-            "to_target": moment(reached),
-            "best": moment(best),
-            "last": moment(rows[-1]),
-        }
+def _held_out(
+    trainings: Iterable[Training], plan: Plan, notes: Mapping[int, Mapping[str, Any]], target: float
+) -> dict[str, dict[int, dict[str, Any]]]:
+    """Protocol -> seed -> held-out success while training, and when it first reached the target, and its own last figure.
+
+    A run that another study watched under another condition tells nothing here.
+    """
+    found: dict[str, dict[int, dict[str, Any]]] = {}
+    for one in trainings:
+        rows = log.read(one.folder, log.EVALUATIONS)
+        for judging in study_plan.watched(plan, one):
+            if rows and notes[one.seed].get("watched", {}).get(judging.protocol) == judging.program:
+                found.setdefault(judging.protocol, {})[one.seed] = _curve(rows, judging.protocol, target)
     return found
+
+
+def _curve(rows: list[dict[str, float]], protocol: str, target: float) -> dict[str, Any]:
+    success = [row[f"{protocol}/success_rate/value"] for row in rows]
+
+    def first(least: float) -> dict[str, float] | None:
+        """The first point that high: minutes of iterations, and agent steps."""
+        at = next((index for index, value in enumerate(success) if value >= least), None)
+        return None if at is None else {"minutes": rows[at]["minutes"], "steps": rows[at]["steps/total"], "success": success[at]}
+
+    last = {"minutes": rows[-1]["minutes"], "steps": rows[-1]["steps/total"], "success": success[-1]}
+    collisions = [row[f"{protocol}/collision_rate/value"] for row in rows]
+    curve = {"steps": [row["steps/total"] for row in rows], "success": success, "collisions": collisions}
+    return {**curve, "to_target": first(target), "to_final": first(success[-1]), "last": last}
