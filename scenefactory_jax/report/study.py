@@ -175,8 +175,9 @@ def _scenes(result: Result) -> list[str]:
     }[cut]
     looks = result["looks"]
     times = {name: sum(look[name] for look in looks if look["cut"] == cut) for name in ("policies", "curve points")}
-    cells = [[look["date"], look["cut"], look["policies"], look["curve points"], f"`{look['command']}`"] for look in looks]
-    table = tables.grid(["Date", "Cut", "Policies judged", "Points of learning curves", "Command"], cells) if cells else ""
+    shown = ("date", "cut", "policies", "curve points")
+    cells = [[*(look[name] for name in shown), f"{look['seconds'] / 60:.1f}", f"`{look['command']}`"] for look in looks]
+    table = tables.grid(["Date", "Cut", "Policies judged", "Points of learning curves", "Minutes", "Command"], cells) if cells else ""
     counted = (
         f"This study looked at them {times['policies']} times to judge a policy (under one condition and protocol) and "
         f"{times['curve points']} times for a point of a learning curve, in all the calls below."

@@ -77,25 +77,29 @@ class Looks:
 
     def __init__(self, file: Path, *, command: str, cut: str):
         self._file, self._entry = file, None
-        self._new = {"date": datetime.date.today().isoformat(), "command": command, "cut": cut, "policies": 0, "curve points": 0}
+        self._new: dict[str, Any] = {"date": datetime.date.today().isoformat(), "command": command, "cut": cut}
+        self._new |= {"policies": 0, "curve points": 0, "seconds": 0.0}
 
     def counted(self, examine: Examine, kind: str) -> Examine:
-        """`examine`, noting each call before it begins."""
+        """`examine`, noting each call before it begins, and what it took."""
 
         @functools.wraps(examine)
         def noted(parameters):
-            self._add(kind)
-            return examine(parameters)
+            self._add(kind, 1)
+            begun = time.monotonic()
+            found = examine(parameters)
+            self._add("seconds", time.monotonic() - begun)
+            return found
 
         return noted
 
-    def _add(self, kind: str) -> None:
+    def _add(self, what: str, much: float | int) -> None:
         result = self.result()
         looks = result.setdefault("looks", [])
         if self._entry is None:
             self._entry = len(looks)
             looks.append(dict(self._new))
-        looks[self._entry][kind] += 1
+        looks[self._entry][what] += much
         self._file.parent.mkdir(parents=True, exist_ok=True)
         results.write(self._file, result, digits=None)
 
@@ -130,11 +134,9 @@ class Shared:
 
     def examiner(self, judging: Judging, kind: str) -> Examine:
         """Plays the held-out scenes under a judging's condition and protocol."""
-        settings = {**self.config["evaluation"], "video": {"seconds": 0.0}}
+        settings = {**judging.config["evaluation"], **self.config["evaluation"]}
         scenes = self.heldout(judging.config)
-        return self.looks.counted(
-            make_examiner(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind
-        )
+        return self.looks.counted(make_examiner(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind)
 
     def wanted(self, variant: str) -> bool:
         return self.config["only"] is None or variant in self.config["only"]
@@ -156,10 +158,15 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
                 return False
             begun = time.monotonic()
             prepared = prepared or train.prepare(one.config)
-            watch = _watch(one, plan, shared, examiners)
-            programs = {judging.protocol: judging.program for judging in study_plan.watched(plan, one)} if watch else {}
-            _train_one(one, prepared._replace(examiners=watch, scenes=_scenes_of(one, shared)), programs, begun)
+            watched = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
+            examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
+            own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
+            note = _train_one(one, own) | {"watched": {j.protocol: j.program for j in watched}}
             spent[program] = time.monotonic() - begun
+            results.write(one.folder / TRAINED, note, digits=None)
+            if shared.config["slim"]:
+                for weights in (study_plan.TRAINED, study_plan.UNTRAINED):
+                    checkpoint.strip(one.folder / weights)
     return True
 
 
@@ -177,36 +184,18 @@ def _estimate(one: Training) -> float:
     return 0.0 if one.config["minutes"] is None else 60.0 * one.config["minutes"] + COMPILING_S
 
 
-def _watch(one: Training, plan: Plan, shared: Shared, made: dict[str, Examine]) -> dict[str, Examine]:
-    """Protocol -> how to judge a variant while it trains; nothing if its config does not ask for it.
-
-    Args:
-        made: program -> examiner, for the seeds that follow.
-    """
-    first = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
-    made |= {judging.program: shared.examiner(judging, "curve points") for judging in first if judging.program not in made}
-    return {judging.protocol: made[judging.program] for judging in first}
-
-
-def _train_one(one: Training, prepared: train.Prepared, watched: Mapping[str, str], begun: float) -> None:
-    """One run, from its last checkpoint if there is one, and the note that it is whole.
-
-    Args:
-        watched: protocol -> program of the evaluations while it trains.
-    """
+def _train_one(one: Training, prepared: train.Prepared) -> dict[str, Any]:
+    """One run, from its last checkpoint if there is one, and what there is to note of it."""
     resume = (one.folder / "config.yaml").is_file()
     print(f"training {one.variant}, seed {one.seed}" + (" (goes on)" if resume else ""), flush=True)
     config = {**one.config, "out": str(one.folder), "resume": resume}
-    config["evaluation"] = {**config["evaluation"], "every": config["evaluation"]["every"] if prepared.examiners else None}
-    run = train.train(config, prepared=prepared)
-    scenes = None if prepared.scenes is None else sources.taken(prepared.scenes, config["scenes"])
-    last = run.metrics[-1]
-    note = {"digest": one.digest, "seed": one.seed, "watched": dict(watched)}
-    note |= {"iterations": int(last["iteration"]), "steps": last["steps/total"]}
-    note |= {"minutes": last["minutes"], "session_s": time.monotonic() - begun, "commit": configs.commit(), "versions": configs.versions()}
-    if scenes is not None:
+    last = train.train(config, prepared=prepared).metrics[-1]
+    note = {"digest": one.digest, "seed": one.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
+    note |= {"minutes": last["minutes"], "commit": configs.commit(), "versions": configs.versions()}
+    if prepared.scenes is not None:
+        scenes = sources.taken(prepared.scenes, config["scenes"])
         note |= {"scenes": len(scenes), "agents": int(np.asarray(scenes.scene.agents.present).sum())}
-    results.write(one.folder / TRAINED, note, digits=None)
+    return note
 
 
 # ---- judging
