@@ -90,10 +90,12 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 0.34 * len(rows) + 1.0), layout="constrained")
         panels = figure.subplots(1, len(SHOWN), sharey=True)
+        failed = max([0.1, *((row[name].high or 0.0) for row in rows.values() for name in SHOWN[2:])])  # few per cent should show, too
         for axes, name in zip(panels, SHOWN, strict=True):
+            top = 1.0 if name in SHOWN[:2] else min(failed, 1.0)
             for place, (label, row) in enumerate(rows.items()):
-                _bar(axes, place, row[name], colours[label])
-            axes.set(title=levels.labels([name])[name].label, xlim=(0, 1.12), xticks=[0, 0.5, 1])
+                _bar(axes, place, row[name], colours[label], top)
+            axes.set(title=levels.labels([name])[name].label, xlim=(0, 1.2 * top), xticks=[0, 0.5, 1] if top == 1.0 else [0, round(top, 2)])
             axes.xaxis.set_major_formatter(PercentFormatter(1.0))
             axes.grid(False, axis="y")
         panels[0].set_yticks(range(len(rows)), list(rows))
@@ -101,14 +103,14 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]
     return figure
 
 
-def _bar(axes: Axes, place: int, one: Estimate, colour: str) -> None:
+def _bar(axes: Axes, place: int, one: Estimate, colour: str, top: float) -> None:
     if one.value is None:
         return
     low, high = (one.value if end is None else end for end in (one.low, one.high))
     axes.barh(place, one.value, 0.7, color=colour, alpha=0.85)
     axes.errorbar(one.value, place, xerr=[[one.value - low], [high - one.value]], fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2.5)
-    right = high < 0.95 or one.value < 0.3
-    x, colour = (high + 0.03, "#222222") if right else (0.03, "white")
+    right = high < 0.95 * top or one.value < 0.3 * top
+    x, colour = (high + 0.03 * top, "#222222") if right else (0.03 * top, "white")
     axes.text(x, place, f"{100 * one.value:.1f}", va="center", fontsize=7.5, color=colour)
 
 
@@ -132,6 +134,8 @@ def _heat_maps(cells: Mapping[tuple[str, str], Mapping[str, Estimate]], rows: Se
         panels = figure.subplots(len(shown), 1, sharex=True)
         for axes, name in zip(panels, shown, strict=True):
             values = np.full((len(rows), len(columns)), np.nan)
+            told = [cells[key][name].value for key in cells if key[0] in rows]
+            top = 1.0 if name in shown[:2] else max([0.1, *(value for value in told if value is not None)])
             for r, row in enumerate(rows):
                 for c, column in enumerate(columns):
                     one = cells.get((row, column), {}).get(name)
@@ -139,9 +143,9 @@ def _heat_maps(cells: Mapping[tuple[str, str], Mapping[str, Estimate]], rows: Se
                         continue
                     values[r, c] = one.value
                     ends = "" if one.low is None or one.high is None else f"\n[{100 * one.low:.1f}, {100 * one.high:.1f}]"
-                    ink = "white" if one.value > 0.6 else "black"
+                    ink = "white" if one.value > 0.6 * top else "black"
                     axes.text(c, r, f"{100 * one.value:.1f}{ends}", ha="center", va="center", fontsize=7.5, color=ink)
-            axes.imshow(values, vmin=0, vmax=1, cmap="Reds" if name == "collision_rate" else "Blues", aspect="auto")
+            axes.imshow(values, vmin=0, vmax=top, cmap="Reds" if name == "collision_rate" else "Blues", aspect="auto")
             axes.set_yticks(range(len(rows)), rows)
             axes.set_title(levels.labels([name])[name].label)
             for side in axes.spines.values():

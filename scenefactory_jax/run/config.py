@@ -28,7 +28,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 def command(name: str) -> str:
     """How the process was called, for reports; where the files went is nobody else's business."""
-    arguments = [argument for argument in sys.argv[1:] if not argument.startswith("out=")]
+    arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
     return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if name in sys.argv[0] else f"{name}(config)"
 
 
