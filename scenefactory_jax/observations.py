@@ -89,7 +89,7 @@ def neighbours(
     return Rows(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))
 
 
-def make(entries: Mapping[str, Mapping[str, Any]], *, where: str = "observe", **context: Any) -> dict[str, Group]:
+def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "observe", **context: Any) -> dict[str, Group]:
     """Config entries -> name -> group with its numbers bound; an entry of null is left out."""
     return {
         name: build(entry, builtins=__name__, where=f"{where}.{name}", **context) for name, entry in entries.items() if entry is not None

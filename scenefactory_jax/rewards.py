@@ -72,7 +72,7 @@ def _urgency(time: Float[Array, " A"], *, alpha_s: float, limit: float, floor_s:
     return jnp.where(time < floor_s, limit, jnp.minimum(alpha_s / jnp.maximum(time, floor_s), limit))
 
 
-def make(entries: Mapping[str, Mapping[str, Any]], *, where: str = "reward", **context: Any) -> dict[str, tuple[float, Term]]:
+def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "reward", **context: Any) -> dict[str, tuple[float, Term]]:
     """Config entries -> name -> (weight, term with its numbers bound). An entry of null is left out, so that an override can drop a term.
 
     Raises:

@@ -1,6 +1,7 @@
 """Checkpoints: going on from disk is going on, and what does not fit is named."""
 
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -149,3 +150,15 @@ def test_empty_arrays_and_half_precision_survive(saved, tmp_path):
     odd = dataclasses.replace(third, observation={"none": jnp.zeros((STAGE, 3, 0)), "half": jnp.ones((STAGE, 3), jnp.bfloat16)})
     checkpoint.save(tmp_path, odd, keep=1)
     assert_same(checkpoint.restore(tmp_path, odd), odd)
+
+
+def test_a_stripped_checkpoint_drives_but_does_not_go_on(saved, trainer, tmp_path):
+    folder = saved[0]
+    shutil.copytree(folder, tmp_path / "run")
+    whole, before = checkpoint.restore_parameters(folder), sum(file.stat().st_size for file in (tmp_path / "run").rglob("*"))
+    checkpoint.strip(tmp_path / "run")
+    assert checkpoint.latest(tmp_path / "run") == checkpoint.latest(folder)
+    assert sum(file.stat().st_size for file in (tmp_path / "run").rglob("*")) < 0.5 * before
+    assert_same(checkpoint.restore_parameters(tmp_path / "run"), whole)
+    with pytest.raises(ConfigError, match="was stripped to what the policy learnt; training cannot go on"):
+        checkpoint.restore(tmp_path / "run", begin(trainer))

@@ -166,7 +166,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
     for override, message in {
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
-        "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base dry .* mixed .* wet",
+        "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
         "invincible=perhaps": "invincible: 'perhaps'; valid: true, false, both",
     }.items():
         with pytest.raises(ConfigError, match=message):
@@ -318,7 +318,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 
 def options():
-    others = ("experiment", "spread", "suite", "sysid", "validation")
+    others = ("experiment", "spread", "study", "suite", "sysid", "validation")
     groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name not in others]
     return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
 

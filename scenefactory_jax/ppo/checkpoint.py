@@ -5,6 +5,7 @@ stand plain nested dicts of arrays, named as the fields and keys of the train st
 """
 
 import contextlib
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,17 @@ def latest(folder: Path | str) -> int | None:
         return manager.latest_step()
 
 
+def strip(folder: Path | str) -> None:
+    """Leave what the policy learnt, as the newest checkpoint holds it, and remove the rest: for a run that is not to go on."""
+    newest = latest(folder)
+    for place in Path(folder).iterdir():
+        if place.name == str(newest):
+            for item in (REST, HOST):
+                shutil.rmtree(place / item, ignore_errors=True)
+        elif place.name.isdigit():
+            shutil.rmtree(place)
+
+
 def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     """The train state of an iteration (the newest by default), in the structure and on the devices of `like`.
 
@@ -67,6 +79,8 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
     wanted = _stored(like)
     with _manager(Path(folder)) as manager:
         step = _find(manager, Path(folder), iteration)
+        if not (Path(folder) / str(step) / REST).is_dir():
+            raise ConfigError(f"{folder}: checkpoint {step} was stripped to what the policy learnt; training cannot go on from it")
         held = manager.item_metadata(step)
         shapes = {name: (tuple(x.shape), str(x.dtype)) for name, x in wanted.items()}
         there = [name for name in (LEARNT, AVERAGED, REST) if name in held]

@@ -28,7 +28,8 @@ NEAR_MISS_TTC = 2.0  # s
 SHARE = "share"  # the unit of a rate: a fraction of agents, printed in per cent
 
 BOOTSTRAP, WILSON, AGENTS, NEWCOMBE, NONE = "scene bootstrap", "Wilson", "agent bootstrap", "Newcombe", "none"
-MARKS = {BOOTSTRAP: "", WILSON: "†", AGENTS: "‡", NEWCOMBE: "†", NONE: ""}
+LEVELS = "seed, scene and agent bootstrap"  # of several runs: report/levels.py
+MARKS = {BOOTSTRAP: "", LEVELS: "", WILSON: "†", AGENTS: "‡", NEWCOMBE: "†", NONE: ""}
 
 
 class RecordsError(ValueError):

@@ -68,6 +68,9 @@ def open(config: Mapping[str, Any]) -> Source:
         SceneError: nothing at the path.
     """
     keys.check_scenes(config)
+    if (config.get("take") or {}).get("count") is not None:
+        count = config["take"]["count"]
+        raise ConfigError(f"scenes.take.count: {count}; a stream draws from all scenes: `scenes op=sample` makes a smaller bank")
     parts = sources.readers(config)
     ready = functools.partial(prepare, check=parts["check"], pack=parts["pack"])
     path = config["path"]

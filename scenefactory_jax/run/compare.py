@@ -15,6 +15,7 @@ from scenefactory_jax.run import keys, log, results
 STEPS = "steps/total"
 # settings that make no other group
 ASIDE = ("seed", "name", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept")
+ASIDE += ("scenes.take.seed",)  # follows the seed
 DIGITS = 6
 
 

@@ -1,8 +1,10 @@
 """Hydra configs -> plain dicts. Hydra decides nothing but configuration; past this door there are only mappings."""
 
 import copy
+import functools
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import metadata
@@ -19,13 +21,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
 
-COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "bench", "validate", "sysid")
+COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "bench", "validate", "sysid", "study")
+LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined")  # keys whose values are lists of overrides
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 
 
 def command(name: str) -> str:
     """How the process was called, for reports; where the files went is nobody else's business."""
-    arguments = [argument for argument in sys.argv[1:] if not argument.startswith("out=")]
+    arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
     return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if name in sys.argv[0] else f"{name}(config)"
 
 
@@ -48,21 +51,46 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown config, key or option, naming it and what would be valid.
     """
+    return plain(_open(name, overrides))
+
+
+def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> list[dict[str, Any]]:
+    """`load` for each value of one key, at the cost of one.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    opened = _open(name, overrides)
+    found = []
+    for value in values:
+        OmegaConf.update(opened, key, value)
+        found.append(plain(opened))  # what refers to the key follows it
+    return found
+
+
+def _open(name: str, overrides: Sequence[str]) -> Any:
+    """A composed config whose references are not followed yet, but can be.
+
+    Raises:
+        ConfigError: see `load`.
+    """
     known = sorted(path.stem for path in folder().glob("*.yaml"))
     if name not in known:
         raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
     try:
-        return _compose(name, overrides)
+        opened = _compose(name, overrides)
+        plain(opened)
+        return opened
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(name, error)) from None
     except ValueError as error:  # what Hydra says of `timing=null`
         raise ConfigError(f"{' '.join(overrides)}: {error}") from None
 
 
-def _compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def _compose(name: str, overrides: Sequence[str]) -> Any:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(folder()), version_base="1.3"):
-        return plain(hydra_compose(name, overrides=[quoted(override) for override in overrides]))
+        return hydra_compose(name, overrides=[quoted(override) for override in overrides])
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -79,7 +107,7 @@ def _explain(name: str, error: Exception) -> str:
         return text
     path = match.group(1).split(".")
     try:
-        node: Any = _compose(name, [])
+        node: Any = plain(_compose(name, []))
     except (ConfigCompositionException, HydraException, OmegaConfBaseException):
         return text  # the config itself is at fault
     for depth, key in enumerate(path):
@@ -117,7 +145,7 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
             raise ConfigError(f"overrides: {override!r} is no setting; write key=value")
         if not parents and (folder() / last).is_dir():
             *outer, inner = last.split("/")  # `dynamics/fleet=spread`: a group within a group
-            fresh, node = load("task", override), result
+            fresh, node = copy.deepcopy(_task(override)), result
             for name in outer:
                 fresh, node = fresh[name], node[name]
             node[inner] = fresh[inner]
@@ -131,6 +159,12 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
                 node[key] = yaml.safe_load(value)
             node = node[key]
     return result
+
+
+@functools.lru_cache(maxsize=64)
+def _task(override: str) -> dict[str, Any]:
+    """The environment with one other setting; a study asks for the same ones again and again."""
+    return load("task", override)
 
 
 def write(path: Path, config: Mapping[str, Any]) -> None:
@@ -151,6 +185,18 @@ def versions() -> dict[str, str]:
     return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
 
 
+def commit() -> str:
+    """The commit that runs, as `git describe` says it; the package's version where there is no git."""
+    import scenefactory_jax
+
+    place = Path(scenefactory_jax.__file__).resolve().parent
+    asked = ["git", "-C", str(place), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return f"version {scenefactory_jax.__version__}"
+
+
 def _version(name: str) -> str:
     try:
         return metadata.version(name)
@@ -164,10 +210,10 @@ def quoted(override: str) -> str:
     if condition := re.fullmatch(r"filter=(?!null$)([^'\"].*)", override, re.DOTALL):
         escaped = condition.group(1).replace("'", "\\'")
         return f"filter='{escaped}'"
-    match = re.fullmatch(r"overrides=\[([^\[\]{}()'\"\\]+)\]", override)
+    match = re.fullmatch(rf"({'|'.join(LISTS)})=\[([^\[\]{{}}()'\"\\]+)\]", override)
     if not match:
         return override
-    return f"overrides=[{','.join(repr(entry.strip()) for entry in match.group(1).split(','))}]"
+    return f"{match.group(1)}=[{','.join(repr(entry.strip()) for entry in match.group(2).split(','))}]"
 
 
 def as_overrides(arguments: Sequence[str]) -> list[str]:

@@ -52,13 +52,20 @@ def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     return judge(config, folder, scenes, folder, settings=settings, protocols=settings["protocols"])
 
 
-def make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> Callable[[Any, Mapping[str, float | int]], None]:
-    """A function (parameters, metrics row) that adds one row of held-out estimates to `evaluations.csv`: rates against steps."""
+def make_watch(
+    config: Mapping[str, Any], folder: Path, *, resume_at: int | None, examiners: Mapping[str, Callable] | None = None
+) -> Callable[[Any, Mapping[str, float | int]], None]:
+    """A function (parameters, metrics row) that adds one row of held-out estimates to `evaluations.csv`: rates against steps.
+
+    Args:
+        examiners: protocol -> `make_examiner`; None: one episode in each of the config's held-out scenes.
+    """
     settings = {**config["evaluation"], "repeats": 1}
-    scenes = sources.heldout(config["scenes"], path=None)
-    examiners = {
-        protocol: make_examiner(config, scenes, protocol=protocol, settings=settings, film=0) for protocol in settings["protocols"]
-    }
+    if examiners is None:
+        scenes = sources.heldout(config["scenes"], path=None)
+        examiners = {
+            protocol: make_examiner(config, scenes, protocol=protocol, settings=settings, film=0) for protocol in settings["protocols"]
+        }
     file = log.MetricsFile(folder, name=log.EVALUATIONS, resume_at=resume_at)
 
     def watch(parameters: Any, row: Mapping[str, float | int]) -> None:

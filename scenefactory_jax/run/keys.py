@@ -39,6 +39,17 @@ SYSID = {"out": Key(str), "resume": FLAG, "workers": COUNT, "physics_hz": Key(fl
 VALIDATE = {"out": Key(str), "parts": Key(list[str]), "resume": FLAG, "workers": COUNT}
 COMPARE = {"runs": Key(list[str]), "out": Key(str), "metrics": Key(list[str]), "window": COUNT, "last": Key(float, 0), "bootstrap": COUNT}
 COMPARE |= {"seed": SEED}
+EXAMINED = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT}
+STUDY = {"train_scenes": PLACE, "test_scenes": PLACE, "cut": Key(Literal["test", "validation"]), "runs": Key(str), "out": PLACE}
+STUDY |= {"seeds": Key(list[int] | None), "common": Key(list[str]), "only": Key(list[str] | None), "until_s": Key(float | None, 0)}
+STUDY |= {"parts": Key(list[Literal["train", "judge", "report"]]), "target": Key(float, 0), "progress": FLAG, "slim": FLAG}
+STUDIED = {"name": Key(str), "question": Key(str), "base": Key(list[str]), "common": Key(list[str]), "trainings": Key(dict[str, list])}
+STUDIED |= {"seeds": Key(list[int]), "examined": Key(list[str]), "conditions": Key(dict[str, list]), "protocols": Key(list[str])}
+STUDIED |= {"judged": Key(dict[str, list] | None), "floors": Key(dict[str, dict]), "compare": Key(list[list[str]])}
+STUDIED |= {"figures": Key(list[Literal["learning", "rates", "matrix", "differences", "trend"]]), "trend": Key(dict | None)}
+STUDIED |= {"reading": Key(str | None)}
+FLOOR = {"of": Key(str), "overrides": Key(list[str]), "conditions": Key(list[str] | None), "seeds": Key(Literal[1] | None)}
+TREND = {"label": Key(str), "values": Key(dict[str, float | None])}
 RENDER = {"index": SEED, "seed": SEED, "out": Key(str)}
 SCENES = {"op": Key(str), "out": PLACE, "copy": FLAG, "limit": SEED, "seed": SEED, "progress": FLAG, "filter": PLACE}
 INFO, SHEET = {"by": PLACE, "json": FLAG}, {"columns": COUNT, "inches": Key(float, 0.5)}
@@ -54,6 +65,7 @@ CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG, "features": Key(dict
 BANK = {"shard_scenes": COUNT, "compression": Key(Literal["zstd", "lz4"] | None)}
 SOURCE = {"path": PLACE, "seed": SEED, "count": COUNT, "workers": COUNT}
 CELLS = {"radius_m": Key(float | None, 0), "size_m": Key(float, 0.1)}
+TAKE = {"count": Key(int | None, 1), "seed": SEED}
 HELDOUT = {"path": PLACE, "seed": SEED, "count": COUNT}
 
 
@@ -84,10 +96,14 @@ def check_train(config: Mapping[str, Any]) -> None:
     check(evaluation, EVALUATION, where="evaluation")
     check(evaluation["video"], VIDEO, where="evaluation.video")
     check_failures(evaluation, where="evaluation.failures")
+    _check_protocols(evaluation["protocols"], where="evaluation.protocols")
+
+
+def _check_protocols(protocols: list[str], *, where: str) -> None:
     known = sorted(path.stem for path in (configs.folder() / "ends").glob("*.yaml"))
-    for protocol in evaluation["protocols"] or [None]:
+    for protocol in protocols or [None]:
         if protocol not in known:
-            raise ConfigError(f"evaluation.protocols: {evaluation['protocols']}; valid: one or more of {', '.join(known)}")
+            raise ConfigError(f"{where}: {protocols}; valid: one or more of {', '.join(known)}")
 
 
 def check_evaluate(config: Mapping[str, Any]) -> None:
@@ -117,6 +133,30 @@ def check_failures(settings: Mapping[str, Any], *, where: str) -> None:
             raise ConfigError(f"{where}.{name}.{unknown[0]}: unknown key; valid: {', '.join(own)}")
 
 
+def check_study(config: Mapping[str, Any]) -> None:
+    """Every key of `study` and of the study that it names; the names that they use of each other are `study_plan.check`'s.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(config, STUDY)
+    check(config["evaluation"], EXAMINED, where="evaluation")
+    entries = [(config["study"], STUDIED, "study")]
+    check(config["study"], STUDIED, where="study")
+    entries += [(floor, FLOOR, f"study.floors.{name}") for name, floor in config["study"]["floors"].items()]
+    entries += [] if config["study"]["trend"] is None else [(config["study"]["trend"], TREND, "study.trend")]
+    for entry, known, where in entries:
+        check(entry, known, where=where)
+        if unknown := [key for key in entry if key not in known]:
+            raise ConfigError(f"{where}.{unknown[0]}: unknown key; valid: {', '.join(known)}")
+    _check_protocols(config["study"]["protocols"], where="study.protocols")
+    for where, seeds in {"seeds": config["seeds"], "study.seeds": config["study"]["seeds"]}.items():
+        if seeds is not None and (not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds)):
+            raise ConfigError(f"{where}: {seeds}; wanted are one or more different numbers from 0 up")
+    if odd := [pair for pair in config["study"]["compare"] if len(pair) != 2]:
+        raise ConfigError(f"study.compare: {odd[0]}; wanted are pairs, [before, after]")
+
+
 def check_scenes(config: Mapping[str, Any]) -> None:
     """Every key of a scenes config that is no function's own.
 
@@ -126,6 +166,7 @@ def check_scenes(config: Mapping[str, Any]) -> None:
     check(config, SOURCE, where="scenes")
     check(config["heldout"], HELDOUT, where="scenes.heldout")
     check(config["cells"], CELLS, where="scenes.cells")
+    check(config.get("take") or {"count": None, "seed": 0}, TAKE, where="scenes.take")
 
 
 def check_operations(config: Mapping[str, Any]) -> None:

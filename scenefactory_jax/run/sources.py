@@ -40,16 +40,40 @@ class Scenes:
 
 
 def training(config: Mapping[str, Any]) -> Scenes:
-    """The scenes to train on: `scenes.path`, or the generator's.
+    """The scenes to train on: `scenes.path`, or the generator's; of these, what `scenes.take` leaves.
 
     Raises:
         ConfigError: neither is given.
         SceneError: nothing usable at the path, with the reasons.
     """
     keys.check_scenes(config)
+    return taken(everything(config), config)
+
+
+def everything(config: Mapping[str, Any]) -> Scenes:
+    """The scenes that `scenes.take` takes from."""
     if config["path"] is not None:
         return from_path(config, config["path"])
     return generated(config, seed=config["seed"], count=config["count"])
+
+
+def taken(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
+    """`scenes.take.count` scenes at random, in the order in which they lie: of one seed, fewer are always a part of more.
+
+    Raises:
+        ConfigError: more than there are.
+    """
+    keys.check_scenes(config)
+    take: Mapping[str, Any] = config.get("take") or {"count": None}  # runs from before there was a choice have none
+    count = take["count"]
+    if count is None or count == len(scenes):
+        return scenes
+    if count > len(scenes):
+        raise ConfigError(f"scenes.take.count: {count}, but there are {len(scenes)} scenes")
+    chosen = np.sort(np.random.default_rng(take["seed"]).permutation(len(scenes))[:count])
+    scene = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)
+    account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {take['seed']}"
+    return Scenes(scene, tuple(scenes.names[index] for index in chosen), account)
 
 
 def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:

@@ -22,6 +22,21 @@ from scenefactory_jax.types import Env, Policy, Scene
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
 
 
+class Prepared(NamedTuple):
+    """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
+
+    `scenes`: those to train on, before `scenes.take`; None: read anew. `examiners`: protocol -> `evaluate.make_examiner`, for evaluations
+    while training; None: the config's own.
+    """
+
+    env: Env
+    policy: Policy
+    mesh: Mesh | None
+    trainer: ppo.Trainer
+    scenes: sources.Scenes | None = None
+    examiners: Mapping[str, Callable] | None = None
+
+
 class Run(NamedTuple):
     """What `train` hands back in Python."""
 
@@ -33,13 +48,23 @@ class Run(NamedTuple):
     metrics: list[dict[str, float]]
 
 
-def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) -> Run:
+def prepare(config: Mapping[str, Any]) -> Prepared:
+    """Environment, policy and trainer of a config.
+
+    Raises:
+        ConfigError: a key that does not fit, by name.
+    """
+    env, policy, mesh = world.make(config), make_policy(config), across.mesh(config["devices"])
+    return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
+
+
+def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
     """Train as a config says (`load("train", ...)`).
 
     Args:
         on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
-        donated
-            to the next iteration: copy what is to outlive the call.
+            donated to the next iteration: copy what is to outlive the call.
+        prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
 
     Raises:
         ConfigError: a key that does not fit, a run folder that exists, nothing to resume.
@@ -48,16 +73,16 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
     keys.check_train(config)
     sources.use_compilation_cache()
     folder, resume = _folder(config)
-    env, policy, mesh = world.make(config), make_policy(config), across.mesh(config["devices"])
-    trainer = make_trainer(config, env, policy, mesh=mesh)
-    with _scenes(config, folder, mesh=mesh, resume=resume) as (worlds, flow):
+    prepared = prepared or prepare(config)
+    trainer = prepared.trainer
+    with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
             print(f"resumed at iteration {int(state.iteration)}", flush=True)
         elif config["evaluation"]["untrained"]:
             checkpoint.save(folder / "untrained", state, keep=1)  # evaluations compare with the policy before training
-        watch = _make_watch(config, folder, resume_at=int(state.iteration) if resume else None)
+        watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
         callbacks = [c for c in (watch, on_iteration) if c]
         state = _loop(config, folder, trainer, worlds, state, flow, resume=resume, callbacks=callbacks)
     if config["evaluation"]["enable"]:
@@ -67,11 +92,13 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None) ->
             after_training(config, folder)
         else:
             print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
-    return Run(folder, config, env, policy, state, log.read(folder))
+    return Run(folder, config, prepared.env, prepared.policy, state, log.read(folder))
 
 
 @contextlib.contextmanager
-def _scenes(config: Mapping[str, Any], folder: Path, *, mesh: Mesh | None, resume: bool) -> Iterator[tuple[Scene, stream.Flow | None]]:
+def _scenes(
+    config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
+) -> Iterator[tuple[Scene, stream.Flow | None]]:
     """The scenes of all worlds on their devices, and where others come from, if they do not stay. What can be read is a run: its config is
     written."""
     before = checkpoint.restore_host(folder / "checkpoints") if resume else None
@@ -79,13 +106,14 @@ def _scenes(config: Mapping[str, Any], folder: Path, *, mesh: Mesh | None, resum
         began = "scenes that stay, stream=none" if before is None else "a stream of scenes"
         raise ConfigError(f"stream: the run in {folder} began with {began}, and cannot go on otherwise")
     if config["stream"] is None:
-        loaded = sources.training(config["scenes"])
-        worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"], mesh=mesh)
+        given = prepared.scenes
+        loaded = sources.training(config["scenes"]) if given is None else sources.taken(given, config["scenes"])
+        worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
         configs.write(folder, config)
         print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
         yield worlds, None
         return
-    with stream.flowing(config, mesh=mesh, before=before) as flow:
+    with stream.flowing(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
         configs.write(folder, config)
         print(f"run {folder}", flush=True)
@@ -104,14 +132,16 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
     return make(env, policy, mesh=mesh)
 
 
-def _make_watch(config: Mapping[str, Any], folder: Path, *, resume_at: int | None) -> OnIteration | None:
+def _make_watch(
+    config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
+) -> OnIteration | None:
     """Held-out evaluation every so many iterations, if the config asks for it."""
     every = config["evaluation"]["every"]
-    if not every or not config["evaluation"]["enable"]:
+    if not every or (examiners is None and not config["evaluation"]["enable"]):
         return None
     from scenefactory_jax.run.evaluate import make_watch
 
-    watch = make_watch(config, folder, resume_at=resume_at)
+    watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
     return lambda state, row: watch(ppo.parameters_of(state), row) if row["iteration"] % every == 0 else None
 
 

@@ -1,0 +1,242 @@
+"""`study`: an experiment from one config: train what is missing, judge what is missing, report what there is.
+
+A study may be stopped at any moment and called again: a training goes on from its last checkpoint, and what was trained or judged with the
+same settings is not done twice, also not by another study that wants the same.
+"""
+
+import datetime
+import functools
+import itertools
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.report import tables
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import results, sources, study_plan, study_report, train
+from scenefactory_jax.run.evaluate import make_examiner
+from scenefactory_jax.run.study_plan import Judging, Plan, Training
+from scenefactory_jax.run.study_report import RESULT, TRAINED
+
+COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
+
+Examine = Callable[[Any], tuple[dict[str, np.ndarray], list]]
+
+
+def study(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Do a study as a config says (`load("study", "study=navigation", ...)`).
+
+    Returns:
+        What result.json holds: see `study_report.collect`; without the part `report`, what it held before.
+
+    Raises:
+        ConfigError: a key, a name or an override that does not fit, by name.
+        SceneError: scenes that cannot be read.
+    """
+    clock = Clock(config["until_s"])
+    config = _listed(config)
+    plan = study_plan.make(config)
+    sources.use_compilation_cache()
+    out = Path(config["out"] or Path("experiments") / plan.name)
+    shared = Shared(config, Looks(out / RESULT, command=_command(config), cut=config["cut"]))
+    complete = True
+    if "train" in config["parts"]:
+        complete = _train(plan, shared, clock)
+    if "judge" in config["parts"] and complete:
+        complete = _judge(plan, shared, clock)
+    if not complete:
+        print("stopped for want of time; the same command goes on", flush=True)
+    if "report" not in config["parts"]:
+        return shared.looks.result()
+    return study_report.write(plan, config, out, before=shared.looks.result())
+
+
+class Clock:
+    """Time since the command began, and whether something still fits into it."""
+
+    def __init__(self, until_s: float | None):
+        self._begun, self._until_s = time.monotonic(), until_s
+
+    def fits(self, seconds: float, *, what: str) -> bool:
+        """Whether so many seconds are left. What would never fit is begun all the same: it goes on from its checkpoint."""
+        if self._until_s is None:
+            return True
+        left = self._until_s - (time.monotonic() - self._begun)
+        if left <= 0 or (seconds > left and seconds <= self._until_s):
+            print(f"{what}: would take about {seconds:.0f} s, {max(left, 0):.0f} s are left", flush=True)
+            return False
+        return True
+
+
+class Looks:
+    """How often the held-out scenes were judged, kept in result.json as it happens: figures chosen by looking are no test."""
+
+    def __init__(self, file: Path, *, command: str, cut: str):
+        self._file, self._entry = file, None
+        self._new: dict[str, Any] = {"date": datetime.date.today().isoformat(), "command": command, "cut": cut}
+        self._new |= {"policies": 0, "curve points": 0, "seconds": 0.0}
+
+    def counted(self, examine: Examine, kind: str) -> Examine:
+        """`examine`, noting each call before it begins, and what it took."""
+
+        @functools.wraps(examine)
+        def noted(parameters):
+            self._add(kind, 1)
+            begun = time.monotonic()
+            found = examine(parameters)
+            self._add("seconds", time.monotonic() - begun)
+            return found
+
+        return noted
+
+    def _add(self, what: str, much: float | int) -> None:
+        result = self.result()
+        looks = result.setdefault("looks", [])
+        if self._entry is None:
+            self._entry = len(looks)
+            looks.append(dict(self._new))
+        looks[self._entry][what] += much
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        results.write(self._file, result, digits=None)
+
+    def result(self) -> dict[str, Any]:
+        """What the file holds."""
+        return results.read(self._file) if self._file.is_file() else {}
+
+
+class Shared:
+    """What several trainings and judgings use: scenes, each read once, and the count of looks."""
+
+    def __init__(self, config: Mapping[str, Any], looks: Looks):
+        self.config, self.looks = config, looks
+        self._scenes: dict[str, sources.Scenes] = {}
+
+    def training_scenes(self, task: Mapping[str, Any]) -> sources.Scenes:
+        """Before `scenes.take`."""
+        entry = task["scenes"]
+        return self._kept("train " + study_plan.scenes_key(entry, entry["path"]), lambda: sources.everything(entry))
+
+    def heldout(self, task: Mapping[str, Any]) -> sources.Scenes:
+        """Those that policies are judged on."""
+        entry, path = task["scenes"], self.config["test_scenes"]
+        key = study_plan.scenes_key(entry, path) + results.digest(entry["heldout"])
+        return self._kept("test " + key, lambda: sources.heldout(entry, path=path))
+
+    def _kept(self, key: str, load: Callable[[], sources.Scenes]) -> sources.Scenes:
+        if key not in self._scenes:
+            self._scenes[key] = load()
+            print(self._scenes[key].account, flush=True)
+        return self._scenes[key]
+
+    def examiner(self, judging: Judging, kind: str) -> Examine:
+        """Plays the held-out scenes under a judging's condition and protocol."""
+        settings = {**judging.config["evaluation"], **self.config["evaluation"]}
+        scenes = self.heldout(judging.config)
+        return self.looks.counted(make_examiner(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind)
+
+    def wanted(self, variant: str) -> bool:
+        return self.config["only"] is None or variant in self.config["only"]
+
+
+# ---- training
+
+
+def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
+    """Train what is not trained yet, seeds and variants that share their programs one after the other; whether all could be done."""
+    todo = {one.digest: one for one in plan.trainings if shared.wanted(one.variant) and not is_trained(one)}
+    order = {program: index for index, program in enumerate(dict.fromkeys(one.program for one in todo.values()))}
+    spent: dict[str, float] = {}
+    for program, group in itertools.groupby(sorted(todo.values(), key=lambda one: order[one.program]), key=lambda one: one.program):
+        prepared, examiners = None, {}
+        for one in group:
+            needs = spent.get(program, _estimate(one))
+            if not clock.fits(needs, what=f"training {one.variant}, seed {one.seed}"):
+                return False
+            begun = time.monotonic()
+            prepared = prepared or train.prepare(one.config)
+            watched = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
+            examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
+            own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
+            note = _train_one(one, own) | {"watched": {j.protocol: j.program for j in watched}}
+            spent[program] = time.monotonic() - begun
+            results.write(one.folder / TRAINED, note, digits=None)
+            if shared.config["slim"]:
+                for weights in (study_plan.TRAINED, study_plan.UNTRAINED):
+                    checkpoint.strip(one.folder / weights)
+    return True
+
+
+def _scenes_of(one: Training, shared: Shared) -> sources.Scenes | None:
+    return shared.training_scenes(one.config) if one.config["stream"] is None else None
+
+
+def is_trained(one: Training) -> bool:
+    """Whether a run was brought to its end with these settings."""
+    return (one.folder / TRAINED).is_file()
+
+
+def _estimate(one: Training) -> float:
+    """Seconds that a training may take, before one of its kind has told; nothing is known of one without `minutes`."""
+    return 0.0 if one.config["minutes"] is None else 60.0 * one.config["minutes"] + COMPILING_S
+
+
+def _train_one(one: Training, prepared: train.Prepared) -> dict[str, Any]:
+    """One run, from its last checkpoint if there is one, and what there is to note of it."""
+    resume = (one.folder / "config.yaml").is_file()
+    print(f"training {one.variant}, seed {one.seed}" + (" (goes on)" if resume else ""), flush=True)
+    config = {**one.config, "out": str(one.folder), "resume": resume}
+    last = train.train(config, prepared=prepared).metrics[-1]
+    note = {"digest": one.digest, "seed": one.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
+    note |= {"minutes": last["minutes"], "commit": configs.commit(), "versions": configs.versions()}
+    if prepared.scenes is not None:
+        scenes = sources.taken(prepared.scenes, config["scenes"])
+        note |= {"scenes": len(scenes), "agents": int(np.asarray(scenes.scene.agents.present).sum())}
+    return note
+
+
+# ---- judging
+
+
+def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
+    """Judge what is not judged yet, all policies of one program after the other; whether all could be done."""
+    todo = {one.file: one for one in plan.judgings if shared.wanted(one.training.variant) and not one.file.is_file()}
+    ready = [one for one in todo.values() if checkpoint.latest(one.training.folder / one.weights) is not None]
+    ready = [one for one in ready if one.weights == study_plan.UNTRAINED or is_trained(one.training)]
+    order = {program: index for index, program in enumerate(dict.fromkeys(one.program for one in ready))}
+    longest = 0.0
+    for _, group in itertools.groupby(sorted(ready, key=lambda one: order[one.program]), key=lambda one: one.program):
+        begun, examine = time.monotonic(), None
+        for one in group:
+            if not clock.fits(longest, what=f"judging {one.row}, {one.condition}, {one.protocol}"):
+                return False
+            examine = examine or shared.examiner(one, "policies")
+            records, _ = examine(checkpoint.restore_parameters(one.training.folder / one.weights))
+            half = one.file.with_suffix(".part")
+            tables.write_csv(half, records)
+            half.replace(one.file)
+            counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("reached", "clean", "collided")]
+            print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
+        longest = max(longest, time.monotonic() - begun)
+    return True
+
+
+# ---- the command
+
+
+def _listed(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Single values where lists are meant: `parts=train`, `only=rigid`, `seeds=0`."""
+    single = {name: [config[name]] for name in ("parts", "only", "seeds") if isinstance(config[name], (str, int))}
+    return {**config, **single}
+
+
+def _command(config: Mapping[str, Any]) -> str:
+    """How the study was called, without saying where this machine keeps its files."""
+    command = configs.command("study")
+    for name in ("train_scenes", "test_scenes", "runs"):
+        if config[name] is not None:
+            command = command.replace(str(config[name]), Path(config[name]).name)
+    return command

@@ -1,0 +1,153 @@
+"""What a study has found so far, from the folders of its runs: numbers with intervals, durations, and how it can be done again."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.report import levels, tables
+from scenefactory_jax.report import study as report
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import log, results, study_plan
+from scenefactory_jax.run.study_plan import Judging, Plan, Training
+
+RESULT, TRAINED = "result.json", "trained.json"
+CURVES = ("events/reached", "events/collided", "events/touched_edge", "reward")
+POINTS = 120  # of a learning curve
+DIGITS = 5
+
+
+def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect, and write result.json, NAME.md and figures to `out`."""
+    result = collect(plan, config) | {"looks": before.get("looks", [])}
+    result = results.plain(result, digits=DIGITS)
+    out.mkdir(parents=True, exist_ok=True)
+    results.write(out / RESULT, result, digits=DIGITS)
+    print(f"{report.headline(result)}\n\nreport {report.write(out, result)}", flush=True)
+    return result
+
+
+def collect(plan: Plan, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything that the report says, as plain values.
+
+    Returns:
+        study: its config; scenes: names of the sources; missing: what is not trained or judged yet; rows: one for each row, condition and
+        protocol; differences; trainings: variant -> durations, versions and curves.
+    """
+    study, settings = config["study"], config["evaluation"]
+    judged: dict[tuple[str, str, str], dict[int, Judging]] = {}
+    for one in plan.judgings:
+        judged.setdefault((one.row, one.condition, one.protocol), {})[one.training.seed] = one
+    records = {
+        place: {seed: tables.read_csv(one.file) for seed, one in seeds.items() if one.file.is_file()} for place, seeds in judged.items()
+    }
+    missing = [f"judging {row}, {condition}, {protocol}, seed {seed}" for (row, condition, protocol), seeds in judged.items()
+               for seed in seeds if seed not in records[row, condition, protocol]]  # fmt: skip
+    missing = [f"training {one.variant}, seed {one.seed}" for one in plan.trainings if not (one.folder / TRAINED).is_file()] + missing
+    resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
+    rows = [_row(place, runs, resampling) for place, runs in records.items() if runs]
+    return {
+        "study": {name: study[name] for name in study},
+        "settings": {name: config[name] for name in ("seeds", "common", "cut", "target", "evaluation")},
+        "scenes": {name: _named(config[name]) for name in ("train_scenes", "test_scenes")},
+        "missing": missing,
+        "rows": rows,
+        "differences": _differences(study["compare"], records, resampling),
+        "trainings": {variant: _trained(variant, plan, config["target"]) for variant in study["trainings"]},
+        "made_with": {"commit": configs.commit(), **configs.versions()},
+    }
+
+
+def _named(path: str | None) -> str:
+    return "the recipe's own" if path is None else Path(path).name
+
+
+def _row(place: tuple[str, str, str], runs: levels.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
+    row, condition, protocol = place
+    first = next(iter(runs.values()))
+    return {
+        "row": row, "condition": condition, "protocol": protocol, "seeds": list(runs), "agents": len(first["scene"]),
+        "scenes": len(np.unique(first["scene"])), "pooled": levels.summarise(runs, **resampling), "each": levels.per_seed(runs),
+    }  # fmt: skip
+
+
+def _differences(
+    pairs: Iterable[list[str]], records: Mapping[tuple[str, str, str], levels.Runs], resampling: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """Every pair wherever both were judged, on the seeds that both have."""
+    found = []
+    for before, after in pairs:
+        for (row, condition, protocol), runs in records.items():
+            others = records.get((after, condition, protocol), {})
+            if row != before or not runs or not others:
+                continue
+            shared = [seed for seed in runs if seed in others]
+            old, new = ({seed: one[seed] for seed in shared} if shared else one for one in (runs, others))
+            place = {"before": before, "after": after, "condition": condition, "protocol": protocol, "seeds": [len(old), len(new)]}
+            found.append({**place, "change": levels.difference(old, new, **resampling)})
+    return found
+
+
+# ---- trainings
+
+
+def _trained(variant: str, plan: Plan, target: float) -> dict[str, Any]:
+    """What the seeds of a variant took, and their curves."""
+    own = [one for one in plan.trainings if one.variant == variant]
+    notes = {one.seed: results.read(one.folder / TRAINED) for one in own if (one.folder / TRAINED).is_file()}
+    metrics = {one.seed: log.read(one.folder) for one in own if one.seed in notes}
+    keep = ("iterations", "steps", "minutes", "commit", "scenes", "agents")
+    return {
+        "overrides": [override for override in own[0].overrides if "path=" not in override],  # nobody else's business
+        "digests": {one.seed: one.digest for one in own},
+        "runs": {seed: {name: note.get(name) for name in keep} | {"device": note["versions"]["device"]} for seed, note in notes.items()},
+        "curves": _curves(metrics),
+        "held_out": _held_out([one for one in own if one.seed in notes], plan, notes, target),
+    }
+
+
+def _curves(metrics: Mapping[int, list[dict[str, float]]]) -> dict[str, Any]:
+    """Rates against agent steps, each seed's own, at the same iterations, thinned out."""
+    if not metrics:
+        return {}
+    length = min(len(rows) for rows in metrics.values())
+    ends = np.unique(np.linspace(0, length, min(POINTS, length) + 1).round().astype(int))
+    column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows[:length]])  # noqa: E731
+    steps = np.mean([column(rows, "steps/total") for rows in metrics.values()], axis=0)[ends[1:] - 1]
+    thin = lambda values: [float(np.nanmean(values[a:b])) if np.isfinite(values[a:b]).any() else np.nan for a, b in _pairs(ends)]  # noqa: E731
+    return {"steps": steps, "curves": {name: [thin(column(rows, name)) for rows in metrics.values()] for name in CURVES}}
+
+
+def _pairs(ends: np.ndarray) -> Iterable[tuple[int, int]]:
+    return zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+
+
+def _held_out(
+    trainings: Iterable[Training], plan: Plan, notes: Mapping[int, Mapping[str, Any]], target: float
+) -> dict[str, dict[int, dict[str, Any]]]:
+    """Protocol -> seed -> held-out success while training, and when it first reached the target, and its own last figure.
+
+    A run that another study watched under another condition tells nothing here.
+    """
+    found: dict[str, dict[int, dict[str, Any]]] = {}
+    for one in trainings:
+        rows = log.read(one.folder, log.EVALUATIONS)
+        for judging in study_plan.watched(plan, one):
+            if rows and notes[one.seed].get("watched", {}).get(judging.protocol) == judging.program:
+                found.setdefault(judging.protocol, {})[one.seed] = _curve(rows, judging.protocol, target)
+    return found
+
+
+def _curve(rows: list[dict[str, float]], protocol: str, target: float) -> dict[str, Any]:
+    success = [row[f"{protocol}/success_rate/value"] for row in rows]
+
+    def first(least: float) -> dict[str, float] | None:
+        """The first point that high: minutes of iterations, and agent steps."""
+        at = next((index for index, value in enumerate(success) if value >= least), None)
+        return None if at is None else {"minutes": rows[at]["minutes"], "steps": rows[at]["steps/total"], "success": success[at]}
+
+    last = {"minutes": rows[-1]["minutes"], "steps": rows[-1]["steps/total"], "success": success[-1]}
+    collisions = [row[f"{protocol}/collision_rate/value"] for row in rows]
+    curve = {"steps": [row["steps/total"] for row in rows], "success": success, "collisions": collisions}
+    return {**curve, "to_target": first(target), "to_final": first(success[-1]), "last": last}
