@@ -278,7 +278,7 @@ def test_help_lists_the_commands(monkeypatch, capsys):
 def test_a_wrong_key_ends_as_one_line():
     done = shell("train", "ppo.horizn=3")
     assert done.returncode == 2 and not done.stdout and len(done.stderr.splitlines()) == 1
-    assert done.stderr.startswith("error: ppo.horizn: unknown key 'horizn'; ppo has: clip, ") and "horizon" in done.stderr
+    assert done.stderr.startswith("error: ppo.horizn: unknown key 'horizn'; ppo has: average, clip, ") and "horizon" in done.stderr
 
 
 def test_a_wrong_value_ends_as_one_line():
