@@ -24,6 +24,7 @@ commands: {", ".join(configs.COMMANDS)}
   bench     measure speed             experiment=published scenes.path=FOLDER_OR_BANK suite=throughput out=FOLDER
   validate  hold the physics to tests validation=reduced|full parts='[drives,laws]' resume=true workers=N out=FOLDER
   study     an experiment, whole      study=navigation|transfer|friction|... train_scenes=BANK test_scenes=BANK
+  weather   what friction there is    weather=dry|wet|... out=FOLDER
   sysid     fit the car to a teacher  sysid=reduced|full resume=true workers=N out=FOLDER
 
 `COMMAND --help` shows the config of a command, `COMMAND --cfg job` the one that your overrides give."""

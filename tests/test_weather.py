@@ -11,6 +11,9 @@ from conftest import ROOT, SHARED, scene_of
 
 from scenefactory_jax import conditions, weather
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.run import results
+from scenefactory_jax.run import weather as command
+from scenefactory_jax.run.config import load
 from scenefactory_jax.weather import uniform
 
 CONF = ROOT / "conf" / "weather"
@@ -155,3 +158,23 @@ def test_every_shipped_weather_draws_a_drivable_road(name):
     drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
     mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
     assert mu.min() > 0.5 and mu.max() < 1.4
+
+
+def test_the_command_tells_what_the_model_says(tmp_path):
+    found = command.weather(load("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
+    for name, row in PUBLISHED.items():
+        wanted = [mu for film, mu in zip(FILMS, row, strict=True) if film in (0.0, 0.3, 1.0)]
+        np.testing.assert_allclose(found["table"][name]["static"], wanted, atol=1e-3)
+    assert found == results.read(tmp_path / "weather.json") and (tmp_path / "weather.png").is_file()
+    text = (tmp_path / "weather.md").read_text()
+    assert "| AC | 1.105 (1.144) | 0.959 (0.830) | 0.000 (0.000) |" in text and "| SMA | 1.204 / 1.204 | 1.046 / 1.046 |" in text
+    with pytest.raises(ConfigError, match=r"slips: \[0.5, 0.1\]; wanted is \[least, most\]"):
+        command.weather(load("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
+
+
+def test_what_is_committed_is_what_the_model_says(tmp_path):
+    committed = results.read(ROOT / "experiments" / "weather" / "weather.json")
+    found = command.weather(load("weather", f"out={tmp_path}"))
+    for name, row in committed["table"].items():
+        for kind in row:
+            np.testing.assert_allclose(found["table"][name][kind], row[kind], atol=1e-4)
