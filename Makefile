@@ -32,8 +32,8 @@ check: $(STAMP) ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-notebook: $(STAMP) ## run the quickstart notebook and keep its outputs
-	$(BIN)/jupyter execute --inplace notebooks/01_quickstart.ipynb
+notebook: $(STAMP) ## run the notebooks and keep their outputs
+	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 clean: ## remove what was built, not what was trained
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache *.egg-info

@@ -1,4 +1,4 @@
-"""The quickstart notebook runs, and is kept with outputs that can be shown anywhere."""
+"""The notebooks run, and are kept with outputs that can be shown anywhere."""
 
 import os
 import re
@@ -6,28 +6,37 @@ from pathlib import Path
 
 import pytest
 
-NOTEBOOK = Path(__file__).resolve().parent.parent / "notebooks" / "01_quickstart.ipynb"
-ITERATIONS = '"iterations=25"'
+NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "notebooks").glob("*.ipynb"))
+SHORTER = {  # how well it learns is for other tests: notebook -> what a test runs in place of a line, and what must be there in the end
+    "01_quickstart": ({'"iterations=25"': '"iterations=2"'}, "runs/quickstart-*/evaluation/report.md"),
+    "02_scenes": ({"scenes.count=24": "scenes.count=8"}, "outputs/scenes/parts/test/bank.json"),
+}
+FIGURES = {"01_quickstart": 5, "02_scenes": 4}
 
 nbformat = pytest.importorskip("nbformat", reason="needs nbformat: pip install scenefactory_jax[dev]")
 
 
+@pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
+def path(request):
+    return request.param
+
+
 @pytest.fixture
-def notebook():
-    return nbformat.read(NOTEBOOK, as_version=4)
+def notebook(path):
+    return nbformat.read(path, as_version=4)
 
 
 def outputs(notebook):
     return [output for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def test_kept_with_outputs(notebook):
+def test_kept_with_outputs(path, notebook):
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "not run from top to bottom"
-    assert sum("image/png" in output.get("data", {}) for output in outputs(notebook)) >= 5
+    assert sum("image/png" in output.get("data", {}) for output in outputs(notebook)) >= FIGURES[path.stem]
     assert not [output for output in outputs(notebook) if output.output_type == "error" or output.get("name") == "stderr"]
     assert notebook.metadata.kernelspec.name == "python3"
-    assert NOTEBOOK.stat().st_size < 900_000
+    assert path.stat().st_size < 900_000
 
 
 def test_names_no_machine(notebook):
@@ -38,13 +47,15 @@ def test_names_no_machine(notebook):
     assert not found
 
 
-def test_runs(notebook, tmp_path):
+def test_runs(path, notebook, tmp_path):
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient: pip install scenefactory_jax[dev]")
     pytest.importorskip("ipykernel", reason="needs ipykernel: pip install scenefactory_jax[dev]")
+    shorter, left = SHORTER[path.stem]
     sources = "\n".join(cell.source for cell in notebook.cells)
-    assert sources.count(ITERATIONS) == 1
-    for cell in notebook.cells:  # how well it learns is for other tests
-        cell.source = cell.source.replace(ITERATIONS, '"iterations=2"')
+    assert all(sources.count(long) == 1 for long in shorter)
+    for cell in notebook.cells:
+        for long, short in shorter.items():
+            cell.source = cell.source.replace(long, short)
     client = nbclient.NotebookClient(notebook, kernel_name="python3", timeout=600, resources={"metadata": {"path": str(tmp_path)}})
     client.execute(env={**os.environ, "JAX_PLATFORMS": "cpu"})
-    assert list(tmp_path.glob("runs/quickstart-*/evaluation/report.md"))
+    assert list(tmp_path.glob(left))

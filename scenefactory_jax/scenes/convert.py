@@ -265,7 +265,7 @@ def _summary(index: Index) -> Summary:
 def describe(summary: Summary) -> list[str]:
     """The account as lines; the last one is the summary in a sentence."""
     count = lambda table: ", ".join(f"{number} {reason.replace('_', ' ')}" for reason, number in table.items() if number) or "none"  # noqa: E731
-    lines = [f"rejected {reject['source']}{_scene(reject)}: {reject['reason']}" for reject in summary.rejects[:SHOWN]]
+    lines = [f"rejected {_near(reject['source'])}{_scene(reject)}: {reject['reason']}" for reject in summary.rejects[:SHOWN]]
     if len(summary.rejects) > SHOWN:
         lines.append(f"... and {len(summary.rejects) - SHOWN} more, all in bank.json")
     if names := [Path(companion["source"]).name for companion in summary.companions]:
@@ -280,6 +280,12 @@ def describe(summary: Summary) -> list[str]:
         f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected"
     )
     return lines
+
+
+def _near(source: str) -> Path:
+    """A path as one sees it from here."""
+    path, here = Path(source), Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def _scene(reject: Mapping[str, Any]) -> str:

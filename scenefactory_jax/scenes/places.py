@@ -168,7 +168,8 @@ def deal(group: Int[np.ndarray, " N"], shares: Mapping[str, float | int], *, see
     if empty := [name for name, found in rows.items() if not len(found)]:
         sizes = ", ".join(map(str, np.sort(size)[::-1][:5]))
         some = f"{len(group)} scenes in {len(size)} groups that cannot be divided (the largest: {sizes})"
-        raise ConfigError(f"split.shares.{empty[0]}: {shares[empty[0]]} of {some} is none; ask for more, or raise split.least_shared")
+        more = "ask for more, raise split.least_shared, or take no heed of streets (split.by=scene): generated ones all lie about one place"
+        raise ConfigError(f"split.shares.{empty[0]}: {shares[empty[0]]} of {some} is none; {more}")
     return rows
 
 
