@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
@@ -41,10 +40,14 @@ def replay(config: Mapping[str, Any]) -> Path:
         SceneError: no usable scene.
     """
     keys.check(config, keys.REPLAY)
+    if Path(config["out"]).is_dir():
+        raise ConfigError(f"out: {config['out']} is a folder; give the page's own name, such as {Path(config['out']) / 'replay.html'}")
+    if config["run"] is None and config["overrides"]:
+        raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
     sources.use_compilation_cache()
     settings = config if config["run"] is None else _of_run(config)
-    env, (act, parameters) = world.make(settings), _driver(config, settings)
-    shown = _shown(settings["scenes"], count=config["worlds"], skip=config["skip"])
+    env, shown = world.make(settings), _shown(settings["scenes"], count=config["worlds"], skip=config["skip"])
+    act, parameters = _driver(config, settings, slots=shown.scene.agents.yaw.shape[1])
     steps = max(round(min(config["seconds"], settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
     print(f"{len(shown.names)} worlds, {steps} control steps each: {', '.join(shown.names)}", flush=True)
     recording = jax.device_get(record(env, act, parameters, shown.scene, jax.random.key(config["seed"]), steps=steps))
@@ -73,27 +76,15 @@ def _of_run(config: Mapping[str, Any]) -> dict[str, Any]:
     return trained | {"scenes": own | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def _driver(config: Mapping[str, Any], settings: Mapping[str, Any]) -> tuple[Act, Any]:
+def _driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
     """Who drives, and with which parameters."""
     if config["act"] == "policy" and config["run"] is not None:
         policy = make_policy(settings)
-        return lambda parameters, observation, key: policy.apply(parameters, observation)[0], _trained(Path(config["run"]))
-    if config["run"] is None and config["overrides"]:
-        raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
-    slots = settings["scenes"]["pack"]["agents"]
-    if settings["scenes"]["capacity"]["agents"] is not None:
-        slots = settings["scenes"]["capacity"]["agents"]
+        parameters = checkpoint.restore_parameters(Path(config["run"]) / "checkpoints")
+        return lambda parameters, observation, key: policy.apply(parameters, observation)[0], parameters
     if config["act"] == "random":
-        return lambda parameters, observation, key: _random(key, slots), None
+        return lambda parameters, observation, key: jax.random.uniform(key, (slots, 3), jnp.float32, -1.0, 1.0), None
     return lambda parameters, observation, key: jnp.zeros((slots, 3)), None
-
-
-def _random(key: PRNGKeyArray, slots: int) -> Array:
-    return jax.random.uniform(key, (slots, 3), jnp.float32, -1.0, 1.0)
-
-
-def _trained(run: Path) -> Any:
-    return checkpoint.restore_parameters(run / "checkpoints")
 
 
 def _shown(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
@@ -116,9 +107,10 @@ def _shown(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
         posts.append(replay_data.posts(raw, one.report.centre))
         if len(packed) == skip + count:
             break
+    if not packed:
+        raise ConfigError("\n  ".join([f"scenes.path={config['path']}: no usable scene of {len(reasons)}", *reasons[:SHOWN]]))
     if len(packed) <= skip:
-        why = "".join(f"\n  {reason}" for reason in reasons[:SHOWN])
-        raise ConfigError(f"skip: {skip}; {len(packed)} scenes can be used, {len(reasons)} cannot{why}")
+        raise ConfigError(f"skip: {skip}; valid: 0 to {len(packed) - 1}, for {len(packed)} scenes can be used")
     chosen, account = packed[skip:], posts[skip:]
     scene, _ = stack([one.scene for one in chosen], capacity=config["capacity"])
     return Shown(sources.with_cells(scene, config), tuple(one.report.name for one in chosen), tuple(account))

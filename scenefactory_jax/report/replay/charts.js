@@ -21,11 +21,11 @@ function chartsOf(world) {
     },
     { title: "Reward by term", unit: "a step", reward: true },
     {
-      title: "Time to collision", unit: "s", low: 0, high: 10, digits: 2, missing: `> ${replay.ttc_most}`,
+      title: "Time to collision", unit: "s", low: 0, high: 10, cut: true, digits: 2, missing: `> ${replay.ttc_most}`,
       lines: [{ array: "ttc", label: "cars", colour: "#d6569b" }, { array: "edge_ttc", label: "road edge", colour: "#8a5a44" }],
     },
     {
-      title: wheels.length ? "Friction under each wheel" : "Friction, mean of the wheels", unit: "μ", low: 0, least: 0.5, digits: 3,
+      title: wheels.length ? "Friction under each wheel" : "Friction", unit: wheels.length ? "μ" : "μ, mean of the wheels", low: 0, least: 0.5, digits: 3,
       lines: wheels.length ? wheels : grip,
     },
     {
@@ -51,7 +51,10 @@ function makeCharts() {
   $("charts").replaceChildren();
   shown.length = 0;
   if (!car) return;
-  for (const spec of chartsOf(app.world)) {
+  const specs = chartsOf(app.world);
+  const idle = specs.filter(allZero);
+  for (const spec of specs) {
+    if (idle.includes(spec)) continue;
     const figure = element("figure", { className: "chart" });
     const caption = element("figcaption");
     caption.append(titleOf(spec));
@@ -65,7 +68,16 @@ function makeCharts() {
     scrubOn(plot, car);
     shown.push({ plot, picture, cursor, tell, draw: spec.reward ? () => drawReward(picture, car) : () => drawLines(picture, spec, car) });
   }
+  if (idle.length) {
+    const titles = idle.map(({ title }) => title.toLowerCase()).join(", ");
+    $("charts").append(element("p", { className: "idle quiet", textContent: `Zero for every car all the time: ${titles}.` }));
+  }
   drawCharts();
+}
+
+/** Whether nothing of a chart ever leaves zero in this world: a recording has no actions, a quiet world no contact. */
+function allZero({ lines }) {
+  return lines !== undefined && lines.every(({ array }) => app.world.arrays[array].step === undefined && app.world.arrays[array].low === 0);
 }
 
 function titleOf({ title, unit }) {
@@ -185,7 +197,7 @@ function drawLines(picture, spec, car) {
   const plot = begin(picture, car, bounds, ticksOf(...bounds));
   if (spec.rule !== undefined && spec.rule < high) dashedRule(plot, spec.rule);
   plot.brush.lineJoin = "round";
-  for (const line of spec.lines) drawLine(plot, line, car, scale, bounds);
+  for (const line of spec.lines) drawLine(plot, line, car, scale, bounds, spec.cut);
 }
 
 function dashedRule({ brush, up, width }, value) {
@@ -198,7 +210,7 @@ function dashedRule({ brush, up, width }, value) {
   brush.setLineDash([]);
 }
 
-function drawLine({ brush, right, up }, { array, colour, dashed }, car, scale, [low, high]) {
+function drawLine({ brush, right, up }, { array, colour, dashed }, car, scale, [low, high], cut) {
   brush.strokeStyle = colour;
   brush.lineWidth = 1.6;
   brush.setLineDash(dashed ? [5, 3] : []);
@@ -207,7 +219,7 @@ function drawLine({ brush, right, up }, { array, colour, dashed }, car, scale, [
     let going = false;
     for (let step = first; step <= end; step++) {
       const value = read(app.world, array, car.slot, step) * scale;
-      if (Number.isNaN(value)) {
+      if (Number.isNaN(value) || (cut && value > high)) {
         going = false;
         continue;
       }

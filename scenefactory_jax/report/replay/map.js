@@ -1,7 +1,7 @@
 // ---- map: the world from above
 
 const WHEEL_ALONG = 0.31; // of a car's length, from its middle to an axle; of its width to a wheel: for looks only
-const WHEEL_ACROSS = 0.4;
+const WHEEL_ACROSS = 0.47;
 const FLASH_S = 1.2;
 // layer -> [colour, width in metres, thinnest width in pixels, dashes in metres]
 const LINES = {
@@ -366,13 +366,13 @@ function halo(length, width) {
 /** Four wheels, the front ones steered. */
 function drawWheels({ slot, size: [length, width] }) {
   const steer = read(app.world, "steer", slot, now());
-  pen.fillStyle = dark.matches ? "#000" : "#22262b";
+  pen.fillStyle = dark.matches ? "#000" : "#15181c";
   for (const ahead of [1, -1])
     for (const left of [1, -1]) {
       pen.save();
       pen.translate(ahead * WHEEL_ALONG * length, left * WHEEL_ACROSS * width);
       pen.rotate(ahead > 0 ? steer : 0);
-      box(0.72, 0.5, 0.08);
+      box(0.8, 0.34, 0.08);
       pen.fill();
       pen.restore();
     }

@@ -312,7 +312,11 @@ function listen() {
   });
   $("pace").addEventListener("change", () => choosePace(Number($("pace").value)));
   $("world").addEventListener("change", () => chooseWorld(Number($("world").value)));
-  dark.addEventListener("change", () => app.world && (redraw(), showWorld()));
+  dark.addEventListener("change", () => {
+    colours.clear();
+    if (app.world) showWorld();
+    redraw();
+  });
   new ResizeObserver(redraw).observe($("stage"));
   new ResizeObserver(redraw).observe($("panel"));
 }

@@ -4,8 +4,14 @@ const PACES = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 const TRAIL_S = 3;
 const app = { world: null, index: 0, time: 0, playing: false, pace: 1, selected: null, follow: false, view: { x: 0, y: 0, scale: 4 } };
 const $ = (id) => document.getElementById(id);
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const dark = matchMedia("(prefers-color-scheme: dark)");
+const colours = new Map(); // of the style sheet, as long as the scheme stays
+
+/** A colour of the style sheet by name. */
+function css(name) {
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return colours.get(name);
+}
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const rgb = ([red, green, blue], alpha = 1) => `rgb(${red} ${green} ${blue} / ${alpha})`;
 const lighten = (colour, share) => colour.map((part) => Math.round(part + share * (255 - part)));
