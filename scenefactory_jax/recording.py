@@ -70,7 +70,7 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
     key, start = jax.random.split(key)
     state, observation = env.reset(start, scene)
 
-    def body(carry: tuple[State, Observation, Array], key: PRNGKeyArray) -> tuple[tuple[State, Observation, Array], Shot]:
+    def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], Shot]:
         state, observation, over = carry
         before = replace(state, active=state.active & ~over)
         after, outcome = env.step(scene, before, act(parameters, observation, key))

@@ -135,8 +135,8 @@ def _add_cars(packer: Packer, shots: Shot, active: Bool[np.ndarray, "T A"], held
     ever, agents = active.any(axis=0), np.arange(active.shape[1])
     columns = {
         "x": shots.position[..., 0], "y": shots.position[..., 1], "yaw": shots.yaw, "speed": shots.speed, "steer": shots.steer,
-        "throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2], "ttc": _near(shots.ttc),
-        "edge_ttc": _near(shots.edge_ttc), "goal_distance": shots.goal_distance, "grip": shots.grip, "grip_use": shots.grip_use,
+        "throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2], "ttc": _near(np.asarray(shots.ttc)),
+        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip, "grip_use": shots.grip_use,
         "slip": shots.slip, "contact_force": shots.contact_force,
     }  # fmt: skip
     finely = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
@@ -184,19 +184,18 @@ def _events(shots: Shot, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, 
 
 def _add_others(packer: Packer, scene: Scene, shots: Shot) -> list[dict[str, Any]]:
     """Everybody else who is ever there: size, kind, spans, and whether it only stands."""
-    boxes = shots.others
-    whole = canvas.Others(boxes.position, boxes.yaw, boxes.size, boxes.present)
-    seen = np.flatnonzero(boxes.present.any(axis=0))
-    still, held = others.parked(whole), _held(boxes.present)
-    kinds = np.asarray(scene.others.kind) if len(scene.others.kind) == boxes.present.shape[1] else None
+    whole = canvas.Others(*(np.asarray(getattr(shots.others, name)) for name in canvas.Others._fields))
+    seen = np.flatnonzero(whole.present.any(axis=0))
+    still, held = others.parked(whole), _held(whole.present)
+    kinds = np.asarray(scene.others.kind) if len(scene.others.kind) == whole.present.shape[1] else None
     take = lambda leaf: np.stack([leaf[held[:, row], row] for row in seen]) if len(seen) else np.zeros((0, len(held)))  # noqa: E731
-    for name, leaf in {"other:x": boxes.position[..., 0], "other:y": boxes.position[..., 1], "other:yaw": boxes.yaw}.items():
+    for name, leaf in {"other:x": whole.position[..., 0], "other:y": whole.position[..., 1], "other:yaw": whole.yaw}.items():
         packer.add(name, take(leaf), resolution=RESOLUTION[name.removeprefix("other:")])
     found = []
     for row in seen:
-        size = [round(float(side), 2) for side in boxes.size[held[0, row], row]]
+        size = [round(float(side), 2) for side in whole.size[held[0, row], row]]
         kind = "vehicle" if kinds is None else ROAD_USERS[int(kinds[row])]
-        found.append({"size": size, "kind": kind, "spans": spans(boxes.present[:, row]), "parked": bool(still[row])})
+        found.append({"size": size, "kind": kind, "spans": spans(whole.present[:, row]), "parked": bool(still[row])})
     return found
 
 

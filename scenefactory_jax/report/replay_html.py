@@ -65,7 +65,7 @@ def show(recording: Recording, *, height: int = 720, **options: Any) -> "HTML":
 
     page = html.escape(document(recording, **options), quote=True)
     style = f"width:100%;height:{height}px;border:0"
-    return HTML(f'<iframe title="replay" style="{style}" srcdoc="{page}" allow="fullscreen"></iframe>')
+    return HTML(f'<div><iframe title="replay" style="{style}" srcdoc="{page}"></iframe></div>')
 
 
 def document(
