@@ -143,16 +143,20 @@ function drawMap() {
   pen.setTransform(1, 0, 0, 1, 0, 0);
   pen.fillStyle = css("ground");
   pen.fillRect(0, 0, canvas.width, canvas.height);
-  const metres = () => pen.setTransform(ratio * scale, 0, 0, -ratio * scale, canvas.width / 2 - ratio * scale * x, canvas.height / 2 + ratio * scale * y);
-  metres();
+  const metres = [ratio * scale, 0, 0, -ratio * scale, canvas.width / 2 - ratio * scale * x, canvas.height / 2 + ratio * scale * y];
+  const pixels = [ratio, 0, 0, ratio, 0, 0];
+  pen.setTransform(...metres);
   drawRoad();
   drawPosts();
   drawOthers();
   drawGoals();
+  pen.setTransform(...pixels);
+  drawLabels(goalLabel);
+  pen.setTransform(...metres);
   drawTrails();
   app.world.cars.forEach(drawCar);
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  drawLabels();
+  pen.setTransform(...pixels);
+  drawLabels(carLabel);
   drawMarks();
   showScale();
 }
@@ -399,20 +403,23 @@ function drawBrakeLights(length, width) {
 
 // ---- in pixels, on top
 
-function drawLabels() {
+function drawLabels(draw) {
   pen.textAlign = "center";
   pen.textBaseline = "middle";
   pen.lineJoin = "round";
-  for (const car of app.world.cars) {
-    const share = presence(app.world, car, app.time);
-    if (share < 1) continue;
-    const { x, y } = pose(app.world, "", car.slot, app.time);
-    const [left, top] = toScreen(x, y);
-    const chosen = car.slot === app.selected;
-    const [, gx, gy] = goalOf(car, now());
-    label(String(car.slot), left, top - 0.5 * Math.hypot(...car.size) * app.view.scale - (chosen ? 12 : 9), chosen ? 14 : 12, colourOf(car.slot));
-    if (replay.goal_radius * app.view.scale > 7) label(String(car.slot), ...toScreen(gx, gy), 11, colourOf(car.slot));
-  }
+  app.world.cars.filter((car) => presence(app.world, car, app.time) === 1).forEach(draw);
+}
+
+function carLabel(car) {
+  const { x, y } = pose(app.world, "", car.slot, app.time);
+  const [left, top] = toScreen(x, y);
+  const chosen = car.slot === app.selected;
+  label(String(car.slot), left, top - 0.5 * Math.hypot(...car.size) * app.view.scale - (chosen ? 12 : 9), chosen ? 14 : 12, colourOf(car.slot));
+}
+
+function goalLabel(car) {
+  const [, x, y] = goalOf(car, now());
+  if (replay.goal_radius * app.view.scale > 7) label(String(car.slot), ...toScreen(x, y), 11, colourOf(car.slot));
 }
 
 function label(text, left, top, pixels, colour) {
