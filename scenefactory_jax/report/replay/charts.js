@@ -237,17 +237,21 @@ function drawReward(picture, car) {
   const most = rewardBounds(columns, car);
   const plot = begin(picture, car, most, ticksOf(...most));
   const pixels = Math.max(1, Math.floor(plot.inner[0]));
+  plot.brush.beginPath();
+  plot.brush.rect(ROOM.left, 0, plot.inner[0] + ROOM.right, plot.height);
+  plot.brush.clip();
   const perPixel = (plot.end - plot.first + 1) / pixels;
   if (perPixel <= 1) eachOwnStep(car, (step) => stack(plot, car, columns, step, step, most));
   else for (let i = 0; i < pixels; i++) stack(plot, car, columns, Math.floor(plot.first + i * perPixel), Math.floor(plot.first + (i + 1) * perPixel) - 1, most);
   nameSpikes(plot, car, columns, most);
 }
 
-/** Bottom and top of the stack without its spikes: what 97 of 100 steps stay within. */
+/** Bottom and top of the stack without its spikes: what 97 of 100 steps stay within, known events left out. */
 function rewardBounds(columns, car) {
   const [costs, gains] = [[], []];
+  const steady = columns.filter((_, i) => !(app.world.terms[i] in TERM_COLOURS));
   eachOwnStep(car, (step) => {
-    const values = columns.map(({ columns: count, values: all }) => all[car.slot * count + step]);
+    const values = steady.map(({ columns: count, values: all }) => all[car.slot * count + step]);
     costs.push(values.reduce((sum, value) => sum + Math.max(0, -value), 0));
     gains.push(values.reduce((sum, value) => sum + Math.max(0, value), 0));
   });
