@@ -21,7 +21,7 @@ from scenefactory_jax.report.replay_data import Posts
 if TYPE_CHECKING:
     from IPython.display import HTML
 
-SCRIPTS = ("data.js", "state.js", "map.js", "charts.js", "page.js")
+SCRIPTS = ("data.js", "state.js", "view.js", "map.js", "marks.js", "charts.js", "page.js")
 
 
 class ReplayError(ValueError):
