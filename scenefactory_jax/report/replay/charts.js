@@ -10,34 +10,78 @@ const shown = []; // the charts on the page: {plot, canvas, cursor, draw, tell}
 /** What can be drawn of a world: titles, units, lines {array, label, colour, dashed, unit}, and where the axis lies. */
 function chartsOf(world) {
   const wheels = world.wheels.map((wheel) => ({
-    array: `mu:${wheel}`, label: wheel, colour: FRONT_REAR[wheel], dashed: wheel.endsWith("R"),
+    array: `mu:${wheel}`,
+    label: wheel,
+    colour: FRONT_REAR[wheel],
+    dashed: wheel.endsWith("R"),
   }));
   const grip = [{ array: "grip", label: "mean", colour: "#2f7ed8" }];
   return [
     { title: "Speed", unit: "m/s", low: 0, least: 5, digits: 2, lines: [{ array: "speed", label: "", colour: "#2f7ed8" }] },
     {
-      title: "Actions", unit: "", low: -1, high: 1, digits: 2,
+      title: "Actions",
+      unit: "",
+      low: -1,
+      high: 1,
+      digits: 2,
       lines: ["throttle", "turn", "brake"].map((array, i) => ({ array, label: array === "turn" ? "steer" : array, colour: ACTIONS[i] })),
     },
     { title: "Reward by term", unit: "a step", reward: true },
     {
-      title: "Time to collision", unit: "s", low: 0, high: 10, cut: true, digits: 2, missing: `> ${replay.ttc_most}`,
-      lines: [{ array: "ttc", label: "cars", colour: "#d6569b" }, { array: "edge_ttc", label: "road edge", colour: "#8a5a44" }],
+      title: "Time to collision",
+      unit: "s",
+      low: 0,
+      high: 10,
+      cut: true,
+      digits: 2,
+      missing: `> ${replay.ttc_most}`,
+      lines: [
+        { array: "ttc", label: "cars", colour: "#d6569b" },
+        { array: "edge_ttc", label: "road edge", colour: "#8a5a44" },
+      ],
     },
     {
-      title: wheels.length ? "Friction under each wheel" : "Friction", unit: wheels.length ? "μ" : "μ, mean of the wheels", low: 0, least: 0.5, digits: 3,
+      title: wheels.length ? "Friction under each wheel" : "Friction",
+      unit: wheels.length ? "μ" : "μ, mean of the wheels",
+      low: 0,
+      least: 0.5,
+      digits: 3,
       lines: wheels.length ? wheels : grip,
     },
     {
-      title: "Grip in use", unit: "largest wheel, 1 slides", low: 0, least: 1.2, digits: 2, rule: 1,
+      title: "Grip in use",
+      unit: "largest wheel, 1 slides",
+      low: 0,
+      least: 1.2,
+      digits: 2,
+      rule: 1,
       lines: [{ array: "grip_use", label: "", colour: "#1fa5a0" }],
     },
-    { title: "Wheel slip", unit: "m/s, largest wheel", low: 0, least: 1, digits: 2, lines: [{ array: "slip", label: "", colour: "#dd8a1d" }] },
     {
-      title: "Contact force", unit: "kN", low: 0, least: 10, digits: 1, scale: 1e-3,
+      title: "Wheel slip",
+      unit: "m/s, largest wheel",
+      low: 0,
+      least: 1,
+      digits: 2,
+      lines: [{ array: "slip", label: "", colour: "#dd8a1d" }],
+    },
+    {
+      title: "Contact force",
+      unit: "kN",
+      low: 0,
+      least: 10,
+      digits: 1,
+      scale: 1e-3,
       lines: [{ array: "contact_force", label: "", colour: "#d62839" }],
     },
-    { title: "Way to the goal", unit: "m", low: 0, least: 10, digits: 1, lines: [{ array: "goal_distance", label: "", colour: "#12996a" }] },
+    {
+      title: "Way to the goal",
+      unit: "m",
+      low: 0,
+      least: 10,
+      digits: 1,
+      lines: [{ array: "goal_distance", label: "", colour: "#12996a" }],
+    },
   ];
 }
 
@@ -242,7 +286,9 @@ function drawReward(picture, car) {
   plot.brush.clip();
   const perPixel = (plot.end - plot.first + 1) / pixels;
   if (perPixel <= 1) eachOwnStep(car, (step) => stack(plot, car, columns, step, step, most));
-  else for (let i = 0; i < pixels; i++) stack(plot, car, columns, Math.floor(plot.first + i * perPixel), Math.floor(plot.first + (i + 1) * perPixel) - 1, most);
+  else
+    for (let i = 0; i < pixels; i++)
+      stack(plot, car, columns, Math.floor(plot.first + i * perPixel), Math.floor(plot.first + (i + 1) * perPixel) - 1, most);
   nameSpikes(plot, car, columns, most);
 }
 

@@ -154,7 +154,13 @@ function outlineOf(kind, length, width) {
     pen.ellipse(0, 0, length / 2, Math.max(width / 2, 1.5 / app.view.scale), 0, 0, 7);
   } else {
     pen.beginPath();
-    pen.roundRect(-length / 2, -width / 2, length, width, [0.08, 0.35 * width, 0.35 * width, 0.08].map((r) => Math.min(r, length / 2)));
+    pen.roundRect(
+      -length / 2,
+      -width / 2,
+      length,
+      width,
+      [0.08, 0.35 * width, 0.35 * width, 0.08].map((r) => Math.min(r, length / 2)),
+    );
   }
 }
 
@@ -221,7 +227,10 @@ function way(slot, from, to) {
 function drawCar(car) {
   const share = presence(app.world, car, app.time);
   if (share <= 0) return;
-  const { slot, size: [length, width] } = car;
+  const {
+    slot,
+    size: [length, width],
+  } = car;
   const { x, y, yaw } = pose(app.world, "", slot, app.time);
   pen.save();
   pen.globalAlpha = share;
@@ -266,9 +275,27 @@ function drawWheels({ slot, size: [length, width] }) {
 /** Windows: the broad one tells the front. */
 function drawCabin(length, width) {
   pen.fillStyle = "rgb(255 255 255 / .82)";
-  quad([[0.3, 0.34], [0.3, -0.34], [0.1, -0.41], [0.1, 0.41]], length, width);
+  quad(
+    [
+      [0.3, 0.34],
+      [0.3, -0.34],
+      [0.1, -0.41],
+      [0.1, 0.41],
+    ],
+    length,
+    width,
+  );
   pen.fillStyle = "rgb(255 255 255 / .35)";
-  quad([[-0.3, 0.36], [-0.3, -0.36], [-0.4, -0.3], [-0.4, 0.3]], length, width);
+  quad(
+    [
+      [-0.3, 0.36],
+      [-0.3, -0.36],
+      [-0.4, -0.3],
+      [-0.4, 0.3],
+    ],
+    length,
+    width,
+  );
 }
 
 function quad(corners, length, width) {

@@ -13,7 +13,13 @@ function carLabel(car) {
   const { x, y } = pose(app.world, "", car.slot, app.time);
   const [left, top] = toScreen(x, y);
   const chosen = car.slot === app.selected;
-  label(String(car.slot), left, top - 0.5 * Math.hypot(...car.size) * app.view.scale - (chosen ? 12 : 9), chosen ? 14 : 12, colourOf(car.slot));
+  label(
+    String(car.slot),
+    left,
+    top - 0.5 * Math.hypot(...car.size) * app.view.scale - (chosen ? 12 : 9),
+    chosen ? 14 : 12,
+    colourOf(car.slot),
+  );
 }
 
 function goalLabel(car) {
@@ -69,7 +75,10 @@ function glyph(brush, name, x, y, reach, colour) {
       brush.moveTo(x - arm, y - side * arm);
       brush.lineTo(x + arm, y + side * arm);
     }
-    for (const [paint, width] of [[css("panel"), 0.9 * reach], [colour, 0.5 * reach]]) {
+    for (const [paint, width] of [
+      [css("panel"), 0.9 * reach],
+      [colour, 0.5 * reach],
+    ]) {
       brush.strokeStyle = paint;
       brush.lineWidth = width;
       brush.lineCap = "butt";

@@ -1,7 +1,12 @@
 // ---- page: what is around map and charts, and what people do to it
 
 const SURFACES = {
-  AC: "asphalt concrete", SMA: "stone mastic asphalt", OGFC: "open-graded asphalt", GRAVEL: "gravel", SNOW: "snow", ICE: "ice",
+  AC: "asphalt concrete",
+  SMA: "stone mastic asphalt",
+  OGFC: "open-graded asphalt",
+  GRAVEL: "gravel",
+  SNOW: "snow",
+  ICE: "ice",
 };
 
 function draw() {
@@ -183,8 +188,10 @@ function drawTimeline() {
   brush.fill();
   drawSpans(brush, across, middle);
   brush.font = "10px system-ui, sans-serif";
-  for (const event of app.world.events) if (event.car !== app.selected) glyph(brush, event.name, across(event.step), 11, 4, rgb(colourOfMark(event.name), 0.8));
-  for (const event of app.world.events) if (event.car === app.selected) glyph(brush, event.name, across(event.step), 11, 7, rgb(colourOfMark(event.name)));
+  for (const event of app.world.events)
+    if (event.car !== app.selected) glyph(brush, event.name, across(event.step), 11, 4, rgb(colourOfMark(event.name), 0.8));
+  for (const event of app.world.events)
+    if (event.car === app.selected) glyph(brush, event.name, across(event.step), 11, 7, rgb(colourOfMark(event.name)));
 }
 
 /** When the selected car drives. */
@@ -302,7 +309,13 @@ function listen() {
   canvas.addEventListener("wheel", onWheel, { passive: false });
   canvas.addEventListener("dblclick", fit);
   const clicks = {
-    play: KEYS[" "], back: () => nudge(-1), on: () => nudge(1), fit, closer: KEYS["+"], farther: KEYS["-"], help: KEYS["?"],
+    play: KEYS[" "],
+    back: () => nudge(-1),
+    on: () => nudge(1),
+    fit,
+    closer: KEYS["+"],
+    farther: KEYS["-"],
+    help: KEYS["?"],
     follow: () => follow(!app.follow),
   };
   for (const [id, action] of Object.entries(clicks)) $(id).addEventListener("click", action);
@@ -337,7 +350,9 @@ async function start() {
   try {
     await chooseWorld(0);
   } catch (error) {
-    document.querySelector("main").replaceChildren(element("p", { className: "fault", textContent: `This replay cannot be read: ${error.message}` }));
+    document
+      .querySelector("main")
+      .replaceChildren(element("p", { className: "fault", textContent: `This replay cannot be read: ${error.message}` }));
     throw error;
   }
   requestAnimationFrame(tick);
