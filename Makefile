@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed
 CUDA ?= # make install CUDA=1 adds the CUDA build of JAX
 
-.PHONY: help install demo test test-slow check notebook clean
+.PHONY: help install demo test test-slow test-browser check notebook clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -27,6 +27,10 @@ test: $(STAMP) ## the fast tests
 
 test-slow: $(STAMP) ## the tests that take minutes
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow
+
+test-browser: $(STAMP) ## the replay's page in a headless browser; needs Chromium or Chrome
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[browser]'
+	$(BIN)/python -m pytest tests/test_replay_browser.py
 
 check: $(STAMP) ## style and types
 	$(BIN)/ruff check .

@@ -8,7 +8,7 @@
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
     run = sf.train(config)                          # and sf.evaluate(sf.load("evaluate", f"run={run.folder}"))
 
-Everything under `run/` (`train`, `evaluate`, `convert`, `render`) takes such a config.
+Everything under `run/` (`train`, `evaluate`, `replay`, `convert`, `render`) takes such a config.
 """
 
 import contextlib
@@ -27,14 +27,15 @@ from scenefactory_jax.world import Parts, assemble, make
 
 if TYPE_CHECKING:
     from scenefactory_jax.run.evaluate import evaluate
+    from scenefactory_jax.run.replay import replay
     from scenefactory_jax.run.train import train
 
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_scenes", "make", "read", "train"]
+__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_scenes", "make", "read", "replay", "train"]
 
 
 def __getattr__(name: str) -> Any:
-    """`train` and `evaluate` are imported when they are first used: checkpoints and reports take a second to load."""
-    if name not in ("train", "evaluate"):
+    """`train`, `evaluate` and `replay` are imported when they are first used: checkpoints and reports take a second to load."""
+    if name not in ("train", "evaluate", "replay"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"scenefactory_jax.run.{name}"), name)

@@ -28,6 +28,7 @@ from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
 from scenefactory_jax.run.render import render
+from scenefactory_jax.run.replay import replay
 from scenefactory_jax.run.scenes import scenes
 from scenefactory_jax.run.train import make_policy, make_trainer, train
 from scenefactory_jax.scenes import bank
@@ -173,6 +174,23 @@ def test_other_settings_of_a_run(whole, tmp_path):
             judged(whole, tmp_path / "bad", override)
     with pytest.raises(ConfigError, match=r"is no run: it has no config\.yaml"):
         evaluate(config.load("evaluate", f"run={tmp_path}"))
+
+
+def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
+    page = replay(config.load("replay", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
+    head = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))
+    records = tables.read_csv(whole.folder / "agents-strict.csv")
+    assert head["title"] == whole.folder.name and [one["name"] for one in head["worlds"]] == list(dict.fromkeys(records["scene"]))
+    for index, shown in enumerate(head["worlds"]):
+        rows = {int(agent): row for row, agent in enumerate(records["agent"]) if records["world"][row] == index}
+        assert {car["slot"] for car in shown["cars"]} == set(rows)
+        for car in shown["cars"]:
+            steps = sum(last - first + 1 for first, last in car["spans"])
+            assert steps == round(records["time_s"][rows[car["slot"]]] * 30)
+        assert all(records[event["name"]][rows[event["car"]]] for event in shown["events"])
+        assert sum(event["name"] == "reached" for event in shown["events"]) == sum(records["reached"][row] for row in rows.values())
+    with pytest.raises(ConfigError, match=r"dynamics: decided by the run .*; to change it: overrides='\[dynamics=\.\.\.\]'"):
+        replay(config.load("replay", f"run={whole.folder}", "dynamics=mjx_car"))
 
 
 # ---- convert -> bank -> train
