@@ -61,7 +61,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
         row = next((row for row in before["rows"] if (row["name"], row["settings"]) == (name, settings)), None)
         if row is None:
             mesh = meshes[name]
-            measured = _measured(name, task, scenes_of(task), mesh=mesh) if task["stream"] is None else _streamed(task, mesh=mesh)
+            measured = _measured(name, task, scenes_of, mesh=mesh)
             row = {"name": name, "changes": variants[name], "settings": settings, **measured}
         print(report.line(row), flush=True)
         result["rows"].append(row)
@@ -124,21 +124,20 @@ def unvectorised(config: Mapping[str, Any], scenes: sources.Scenes, numbers: Map
     return baseline.measure(config, chosen, parameters, **timing)
 
 
-def _measured(name: str, config: Mapping[str, Any], scenes: sources.Scenes, *, mesh: Mesh | None) -> dict[str, Any]:
+def _measured(
+    name: str, config: Mapping[str, Any], scenes_of: Callable[[Mapping[str, Any]], sources.Scenes], *, mesh: Mesh | None
+) -> dict[str, Any]:
     """`measure`, or how large the configuration was that did not fit: what fits is one of the things that a bench finds out."""
     try:
-        worlds, chosen = sources.assign(scenes, config["worlds"], seed=config["seed"], mesh=mesh)
+        if config["stream"] is not None:
+            return {"fits": True, **streaming.measure(config, mesh=mesh)}
+        worlds, chosen = sources.assign(scenes_of(config), config["worlds"], seed=config["seed"], mesh=mesh)
         print(f"{name}: {chosen}", flush=True)
         return {"fits": True, **measure(config, worlds, mesh=mesh)}
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        return {"fits": False, **_size(config, (config["worlds"], scenes.scene.agents.present.shape[1]), mesh)}
-
-
-def _streamed(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
-    """Training while scenes are exchanged."""
-    return {"fits": True, **streaming.measure(config, mesh=mesh)}
+        return {"fits": False, **_size(config, (config["worlds"], config["scenes"]["pack"]["agents"]), mesh)}
 
 
 def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = None) -> dict[str, Any]:
