@@ -1,0 +1,89 @@
+"""The environment as Gymnasium, PettingZoo, JaxMARL and Brax know one. Each is a thin file over `episodes`, and an extra of the package.
+
+    import gymnasium, scenefactory_jax.adapters.gymnasium                      # pip install 'scenefactory_jax[gymnasium]'
+    env = gymnasium.make("scenefactory_jax/Drive-v0", overrides=["dynamics=bicycle"])
+    envs = gymnasium.make_vec("scenefactory_jax/Drive-v0", num_envs=64, overrides=["dynamics=bicycle"])
+
+    from scenefactory_jax.adapters.pettingzoo import Drive                     # ParallelEnv; also .jaxmarl and .brax
+    env = Drive(overrides=["experiment=demo"])
+
+All take `config` (what `scenefactory_jax.load("train", ...)` gives; by default that), `overrides` of it as on the command line, and
+`scenes` (what `load_scenes` gives; by default the config's). Every episode begins in a scene drawn at random from these. Gymnasium and
+Brax know one agent: the config must say `scenes.pack.agents=1`, and does by default.
+
+What they share:
+
+- An observation is one vector of float32 (`flat`); `layout` says which columns are what. An action is throttle, steer, brake in [-1, 1].
+- *Terminated* is a car that an event has ended (`config["ends"]`); it observes zeros from then on. *Truncated* is a car that was still
+  driving when the time of its world was up (`timing.episode_s`); its last observation is a real one, to bootstrap from.
+- `terms` are the weighted reward terms, which sum to the reward; `events` what happened to the car in this step, for the first time.
+- The same seed gives the same bits, and nothing is compiled again while an environment runs.
+
+**Without an adapter.** For code in the style of purejaxrl, with one `jit` around everything, the functions of the package are all it takes:
+
+    import jax, jax.numpy as jnp, scenefactory_jax as sf
+    from scenefactory_jax.adapters import flat
+    from scenefactory_jax.run.sources import assign
+    from scenefactory_jax.struct import choose
+
+    config = sf.load("train", "experiment=smoke")
+    env = sf.make(config)
+    worlds, _ = assign(sf.load_scenes(config["scenes"]), 8, seed=0)             # a scene for each of 8 worlds, on the device
+
+    def observed(worlds, states):
+        return jax.vmap(lambda world, state: flat(env.observe(world, state)))(worlds, states)                 # [W, A, F]
+
+    def rollout(worlds, key, steps, policy):                                    # policy(observations, key) -> actions [W, A, 3]
+        def step(states, key):
+            act_key, start_key = jax.random.split(key)
+            seen = observed(worlds, states)
+            actions = policy(seen, act_key)
+            after, outcome = jax.vmap(env.transition)(worlds, states, actions)
+            fresh = jax.vmap(env.start)(jax.random.split(start_key, len(states.step)), worlds)
+            return choose(outcome.over, fresh, after), (seen, actions, outcome.reward, outcome.done, states.active)
+        first = jax.vmap(env.start)(jax.random.split(key, len(worlds.agents.present)), worlds)
+        return jax.lax.scan(step, first, jax.random.split(key, steps))
+
+    policy = lambda seen, key: jax.random.uniform(key, (*seen.shape[:2], 3), minval=-1.0, maxval=1.0)
+    states, samples = jax.jit(rollout, static_argnums=(2, 3))(worlds, jax.random.key(0), 64, policy)
+
+Pass the scenes to the jitted function as an argument: what a function closes over becomes a constant of its program. Weight what is learnt by
+`states.active`, for a slot without a driving car earns nothing; `outcome.done` ends a car, `outcome.truncated` a world. `ppo/rollout.py`
+is such a function in full.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.types import Observation, Rows
+
+
+def flat(observation: Observation) -> Float[Array, "..."]:
+    """One vector for each car, [A, F]: the groups in the order of their names, a set as its rows and then its mask.
+
+    Any axes before the last of a vector, and the last two of a set, are kept: [W, A, F] of many worlds.
+    """
+    parts = []
+    for name in sorted(observation):
+        group = observation[name]
+        if isinstance(group, Rows):
+            kept = group.mask.shape[:-1]
+            parts += [jnp.where(group.mask[..., None], group.features, 0.0).reshape(*kept, -1), group.mask.astype(jnp.float32)]
+        else:
+            parts.append(group)
+    return jnp.concatenate(parts, axis=-1)
+
+
+def layout(observation: Observation) -> dict[str, slice]:
+    """Which columns of `flat` hold what: `road` and `road.mask` of a set. Works on shapes, too (`jax.eval_shape`)."""
+    found, at = {}, 0
+    for name in sorted(observation):
+        group = observation[name]
+        if isinstance(group, Rows):
+            rows, features = group.features.shape[-2:]
+            widths = {name: rows * features, f"{name}.mask": rows}
+        else:
+            widths = {name: group.shape[-1]}
+        for key, width in widths.items():
+            found[key], at = slice(at, at + width), at + width
+    return found

@@ -1,0 +1,125 @@
+"""Brax: one car as a `brax.envs.Env`, for its learners.
+
+    from brax.training.agents.ppo import train as ppo
+    from scenefactory_jax.adapters.brax import Drive, wrap
+    env = Drive(overrides=["experiment=demo"])
+    make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
+
+`done` is an event that ended the car. That the time is up is for Brax's EpisodeWrapper to say, which calls it truncation: give it
+`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events (`events/reached`) of the step; what Brax
+reports of them are sums over an episode.
+
+Brax's own `wrap` repeats the first episode of each world for ever, the same scene and start; `wrap` of this module goes on to others.
+
+Scenes are closed over, so `reset` and what `wrap` makes turn them into constants of the program (150 to 250 kB each). Brax compiles its own
+functions, so nothing can be passed to them; hundreds of scenes are fine, for thousands JAX's constants should be arguments:
+`JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS=1` in the environment does it in JAX 0.10, where that is not yet the default.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+from jaxtyping import Array
+
+from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters.episodes import Episode
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ends import EVENTS
+from scenefactory_jax.run import sources
+from scenefactory_jax.struct import choose
+
+
+class Drive(Env):
+    """One car in one world.
+
+    Args:
+        config: as `load("train", ...)` gives it, with `scenes.pack.agents=1`; None: that with its defaults.
+        overrides: of the config, as on the command line.
+        scenes: to draw episodes from; None: the config's.
+
+    Raises:
+        ConfigError: scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
+    """
+
+    def __init__(
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+    ):
+        self.pool = episodes.pool(config, overrides, scenes, alone=True)
+
+    def reset(self, rng: Array) -> State:
+        """A fresh episode."""
+        episode, observation = episodes.begin(self.pool.env, self.pool.scenes, rng)
+        names = [*(f"reward/{name}" for name in self.pool.terms), *(f"events/{name}" for name in EVENTS)]
+        zero = jnp.float32(0.0)
+        return State(episode, observation[0], zero, zero, {name: jnp.float32(0.0) for name in names}, {})  # pyright: ignore
+
+    def step(self, state: State, action: Array) -> State:
+        """One control step."""
+        episode, moment = episodes.advance(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
+        told = {f"reward/{name}": term[0] for name, term in moment.terms.items()}
+        told |= {f"events/{name}": event[0].astype(jnp.float32) for name, event in moment.events.items()}
+        ended = (moment.over & ~moment.truncated[0]).astype(jnp.float32)
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=episode, obs=moment.observation[0], reward=moment.reward[0], done=ended, metrics={**state.metrics, **told}
+        )
+
+    @staticmethod
+    def episode_of(state: State) -> Episode:
+        """The state of the world in Brax's."""
+        return state.pipeline_state  # pyright: ignore[reportReturnType]
+
+    @property
+    def episode_length(self) -> int:
+        """Control steps after which the time is up, for Brax's EpisodeWrapper."""
+        return self.pool.steps
+
+    @property
+    def observation_size(self) -> int:
+        """Columns of an observation."""
+        return self.pool.columns
+
+    @property
+    def action_size(self) -> int:
+        """Throttle, steer, brake."""
+        return 3
+
+    @property
+    def backend(self) -> str:
+        """What Brax calls its physics; this is none of them."""
+        return "scenefactory_jax"
+
+
+class Anew(Wrapper):
+    """Worlds that are done begin their next episode, in another scene; `info["final_obs"]` keeps what was seen last before."""
+
+    def reset(self, rng: Array) -> State:
+        """Fresh episodes."""
+        state = self.env.reset(rng)
+        state.info["final_obs"] = state.obs
+        return state
+
+    def step(self, state: State, action: Array) -> State:
+        """One control step, and what begins anew after it."""
+        state.info["steps"] = jnp.where(state.done > 0, 0.0, state.info["steps"])
+        state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)  # pyright: ignore[reportAttributeAccessIssue]
+        env, scenes, after = self.unwrapped.pool.env, self.unwrapped.pool.scenes, state.pipeline_state  # pyright: ignore
+        fresh = jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key)
+        now = choose(state.done > 0, fresh, after)
+        first = jax.vmap(lambda world: episodes.observe(env, scenes, world))(now)[:, 0]
+        state.info["final_obs"] = state.obs
+        return state.replace(pipeline_state=now, obs=first)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Callable | None = None) -> Wrapper:
+    """What Brax's learners take as `wrap_env_fn`: many worlds, time that is up, episodes one after the other.
+
+    Raises:
+        ConfigError: a randomisation; the config's weather, fleet and spawn are those.
+    """
+    if randomization_fn is not None:
+        raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/fleet=spread, weather=mixed")
+    return Anew(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))

@@ -1,0 +1,159 @@
+"""Episodes of one world after the other, each in a scene drawn from a pool: what all the adapters stand on."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax import world
+from scenefactory_jax.adapters import flat
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run import sources
+from scenefactory_jax.struct import struct
+from scenefactory_jax.types import Env, Scene, State
+
+ALONE = "scenes.pack.agents=1"
+ANY = -1  # in place of a scene's index: draw one
+
+
+class Pool(NamedTuple):
+    """An environment, the scenes that its episodes are drawn from, and the sizes of what it gives."""
+
+    env: Env
+    scenes: Scene  # along the first axis, on the device
+    names: tuple[str, ...]  # of the scenes
+    agents: int  # slots
+    columns: int  # of an observation
+    terms: tuple[str, ...]  # of the reward
+    steps: int  # control steps after which a world's time is up
+    control_hz: float
+
+
+@struct
+class Episode:
+    """What changes while one world runs through its episodes."""
+
+    scene: Int[Array, ""]  # index into the pool
+    state: State
+    key: PRNGKeyArray  # of the episodes to come
+
+
+@struct
+class Moment:
+    """What one step gave the cars of one world. The observation is the one after the step, before anything begins anew."""
+
+    observation: Float[Array, "A F"]
+    reward: Float[Array, " A"]
+    terms: dict[str, Float[Array, " A"]]
+    events: dict[str, Bool[Array, " A"]]
+    terminated: Bool[Array, " A"]  # ended by an event in this step
+    truncated: Bool[Array, " A"]  # driving when the time was up
+    active: Bool[Array, " A"]  # still driving after the step
+    over: Bool[Array, ""]  # nobody drives any more, or the time is up
+
+
+def pool(
+    config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: sources.Scenes | None, *, alone: bool, lives: bool = False
+) -> Pool:
+    """The pool of a config.
+
+    Args:
+        config: as `load("train", ...)` gives it; None: that, with one agent if `alone`.
+        overrides: of the config.
+        scenes: to draw from; None: the config's.
+        alone: one car a world is wanted.
+        lives: cars may begin anew while their world goes on.
+
+    Raises:
+        ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
+    """
+    if config is None:
+        config = configs.load("train", *([ALONE] if alone else []), *overrides)
+    elif overrides:
+        config = configs.amend(config, overrides)
+    if not lives and config["spawn"]["respawn_clear_m"] is not None:
+        raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; here a car that ended stays so: set it to null")
+    if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
+        raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
+    sources.use_compilation_cache()
+    env, found = world.make(config), sources.training(config["scenes"]) if scenes is None else scenes
+    held = jax.device_put(found.scene)
+    slots = held.agents.present.shape[1]
+    if alone and slots != 1:
+        where = "the scenes given" if scenes is not None else f"scenes.capacity.agents={config['scenes']['capacity']['agents']}"
+        raise ConfigError(f"{where}: {slots} slots a scene; this environment drives one car: set {ALONE} scenes.capacity.agents=null")
+    episode, seen = jax.eval_shape(functools.partial(begin, env), held, jax.random.key(0))
+    moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
+    timing = config["timing"]
+    return Pool(env, held, found.names, slots, seen.shape[1], tuple(moment.terms), world.episode_steps(timing), timing["control_hz"])
+
+
+def begin(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
+    """A fresh episode of one world, in a scene drawn from all or in the given one, and what its cars see."""
+    episode = start(env, scenes, key, scene)
+    return episode, observe(env, scenes, episode)
+
+
+def start(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> Episode:
+    """`begin` without the observation."""
+    scene_key, start_key, key = jax.random.split(key, 3)
+    drawn = jax.random.randint(scene_key, (), 0, len(scenes.agents.present))
+    index = jnp.where(jnp.asarray(scene) < 0, drawn, scene).astype(jnp.int32)
+    return Episode(index, env.start(start_key, _one(scenes, index)), key)
+
+
+def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
+    """What the cars of one world see."""
+    return flat(env.observe(_one(scenes, episode.scene), episode.state))
+
+
+def advance(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
+    """One control step of one world, which may end the episode; nothing begins anew."""
+    episode, moment = transition(env, scenes, episode, action)
+    return episode, _seen(moment, observe(env, scenes, episode))
+
+
+def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
+    """`advance` with an empty observation, [A, 0]."""
+    state, outcome = env.transition(_one(scenes, episode.scene), episode.state, action)
+    moment = Moment(
+        observation=jnp.zeros((len(outcome.done), 0), jnp.float32),
+        reward=jnp.where(episode.state.active, outcome.reward, 0.0),
+        terms={name: jnp.where(episode.state.active, term, 0.0) for name, term in outcome.terms.items()},
+        events=dict(vars(outcome.events)),
+        terminated=outcome.done & episode.state.active,
+        truncated=outcome.truncated & episode.state.active & ~outcome.done,
+        active=state.active,
+        over=outcome.over,
+    )
+    return Episode(episode.scene, state, episode.key), moment
+
+
+def _seen(moment: Moment, observation: Float[Array, "A F"]) -> Moment:
+    return Moment(**{**vars(moment), "observation": observation})
+
+
+def _one(scenes: Scene, index: Int[Array, ""]) -> Scene:
+    return jax.tree.map(lambda leaf: leaf[index], scenes)
+
+
+def seeded(seed: int) -> np.ndarray:
+    """A seed of any size as what `jax.random.key` takes on the device."""
+    return np.uint32(seed % 2**32)
+
+
+def chosen(options: Mapping[str, Any] | None, count: int) -> int:
+    """The scene that `options["scene"]` of a `reset` names, or ANY.
+
+    Raises:
+        ConfigError: an index that is none.
+    """
+    index = (options or {}).get("scene", ANY)
+    if index != ANY and not 0 <= index < count:
+        raise ConfigError(f"options['scene']: {index}; valid: 0 to {count - 1}, or {ANY} for any")
+    return int(index)

@@ -1,0 +1,113 @@
+"""JaxMARL: all cars of one world as a `MultiAgentEnv`, for its baselines and wrappers.
+
+    from scenefactory_jax.adapters.jaxmarl import Drive
+    env = LogWrapper(Drive(overrides=["experiment=demo"]))          # jaxmarl.wrappers.baselines
+    observations, state = jax.vmap(env.reset)(keys)
+
+JaxMARL knows no truncation: a car is done once an event has ended it or its world's time is up. It stays done, observes zeros and earns
+nothing until its world begins anew; so does a slot without a car. `info` holds `terms`, `events`, `truncated` and `acted`, [A] each, the
+latter true of a slot whose car drove in this step: the weight of its sample. The observation after a step that ends an episode is the
+first of the next one; the last of the old one is what `step_env` gives.
+
+Scenes are closed over, so a `jit` around `reset` or `step` makes constants of its program of them (150 to 250 kB each). Where that is
+too much, make them an argument: `jax.jit(lambda scenes, key: make_train(env.holding(scenes))(key))(env.scenes, key)`.
+"""
+
+import copy
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters.episodes import Episode, Moment
+from scenefactory_jax.run import sources
+from scenefactory_jax.types import Scene
+
+try:
+    from jaxmarl.environments.multi_agent_env import MultiAgentEnv  # an optional dependency  # pyright: ignore[reportMissingImports]
+    from jaxmarl.environments.spaces import Box  # pyright: ignore[reportMissingImports]
+except ImportError as error:
+    raise ImportError("adapters.jaxmarl needs JaxMARL; `pip install 'scenefactory_jax[jaxmarl]'`") from error
+
+Named = dict[str, Array]
+
+
+class Drive(MultiAgentEnv):
+    """All cars of one world.
+
+    Args:
+        config: as `load("train", ...)` gives it; None: that with its defaults.
+        overrides: of the config, as on the command line.
+        scenes: to draw episodes from; None: the config's.
+
+    Raises:
+        ConfigError: what `scenefactory_jax.make` and `load_scenes` raise.
+    """
+
+    def __init__(
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+    ):
+        self.pool = episodes.pool(config, overrides, scenes, alone=False, lives=True)
+        super().__init__(num_agents=self.pool.agents)
+        self.agents = [f"car_{slot}" for slot in range(self.num_agents)]
+        self.scenes = self.pool.scenes
+        self.observation_spaces = {name: Box(-jnp.inf, jnp.inf, (self.pool.columns,)) for name in self.agents}
+        self.action_spaces = {name: Box(-1.0, 1.0, (3,)) for name in self.agents}
+
+    def holding(self, scenes: Scene) -> "Drive":
+        """The same environment over other scenes of the same shapes, which may be traced."""
+        other = copy.copy(self)
+        other.scenes = scenes
+        return other
+
+    @functools.partial(jax.jit, static_argnums=(0,))
+    def reset(self, key: Array) -> tuple[Named, Episode]:
+        """A fresh episode."""
+        episode, observation = episodes.begin(self.pool.env, self.scenes, key)
+        return self._named(observation), episode
+
+    @functools.partial(jax.jit, static_argnums=(0,))
+    def step(
+        self, key: Array, state: Episode, actions: Named, reset_state: Episode | None = None
+    ) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
+        """One control step; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
+        place of two."""
+        after, moment = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
+        fresh = episodes.start(self.pool.env, self.scenes, key) if reset_state is None else reset_state
+        now = jax.tree.map(lambda new, old: jnp.where(moment.over, new, old), fresh, after)
+        return self.get_obs(now), now, *self._told(state, moment)
+
+    def step_env(self, key: Array, state: Episode, actions: Named) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
+        """One control step, without beginning anew."""
+        del key  # the environment draws nothing in a step
+        after, moment = episodes.advance(self.pool.env, self.scenes, state, self._stacked(actions))
+        return self._named(moment.observation), after, *self._told(state, moment)
+
+    def get_obs(self, state: Episode) -> Named:
+        """What the cars see."""
+        return self._named(episodes.observe(self.pool.env, self.scenes, state))
+
+    @property
+    def name(self) -> str:
+        """Of the environment."""
+        return "scenefactory_jax"
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """All cars are of one kind."""
+        return {"cars": self.agents}
+
+    def _told(self, before: Episode, moment: Moment) -> tuple[Named, Named, dict[str, Any]]:
+        done = ~moment.active | moment.truncated
+        info = {"terms": moment.terms, "events": moment.events, "truncated": moment.truncated, "acted": before.state.active}
+        return self._named(moment.reward), {**self._named(done), "__all__": moment.over}, info
+
+    def _stacked(self, actions: Named) -> Array:
+        return jnp.stack([actions[name] for name in self.agents])
+
+    def _named(self, values: Array) -> Named:
+        return {name: values[slot] for slot, name in enumerate(self.agents)}

@@ -1,0 +1,116 @@
+"""PettingZoo: all cars of one world as a `ParallelEnv`.
+
+    from scenefactory_jax.adapters.pettingzoo import Drive
+    env = Drive(overrides=["experiment=demo"])
+    observations, infos = env.reset(seed=0)
+    while env.agents:
+        observations, rewards, terminations, truncations, infos = env.step({name: env.action_space(name).sample() for name in env.agents})
+
+Agents are the slots, "car_0" and so on; those that hold a car in this episode's scene are in `agents` until they end. What `step` returns is
+about those that were driving before it. `infos[name]` holds `scene`, an index into `names`, and of a step `terms` and `events`.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters.episodes import Episode
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import sources
+
+try:
+    from gymnasium import spaces  # optional dependencies  # pyright: ignore[reportMissingImports]
+    from gymnasium.utils import seeding  # pyright: ignore[reportMissingImports]
+    from pettingzoo import ParallelEnv  # pyright: ignore[reportMissingImports]
+except ImportError as error:
+    raise ImportError("adapters.pettingzoo needs PettingZoo; `pip install 'scenefactory_jax[pettingzoo]'`") from error
+
+
+class Drive(ParallelEnv):
+    """All cars of one world.
+
+    Args:
+        config: as `load("train", ...)` gives it; None: that with its defaults.
+        overrides: of the config, as on the command line.
+        scenes: to draw episodes from; None: the config's.
+
+    Raises:
+        ConfigError: cars that begin anew (`spawn.respawn_clear_m`), or what `scenefactory_jax.make` and `load_scenes` raise.
+    """
+
+    def __init__(
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+    ):
+        self.pool = episodes.pool(config, overrides, scenes, alone=False)
+        self.names, self.render_mode = self.pool.names, None
+        self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.control_hz, "is_parallelizable": True}
+        self.possible_agents = [f"car_{slot}" for slot in range(self.pool.agents)]
+        self.agents: list[str] = []
+        self.observation_spaces = {name: spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32) for name in self.possible_agents}
+        self.action_spaces = {name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in self.possible_agents}
+        self._slot = {name: slot for slot, name in enumerate(self.possible_agents)}
+        self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
+        self._advance = jax.jit(functools.partial(episodes.advance, self.pool.env))
+        self._episode: Episode | None = None
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Of one car; the same object every time."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Throttle, steer and brake of one car; the same object every time."""
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A fresh episode: of the seed, or the next one of the seed before.
+
+        Raises:
+            ConfigError: `options["scene"]` is no scene's index.
+        """
+        scene = episodes.chosen(options, len(self.names))
+        if seed is None and self._episode is not None:
+            key = self._episode.key
+        else:
+            key = jax.random.key(episodes.seeded(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
+        self._episode, observation = self._begin(self.pool.scenes, key, scene)
+        active, seen, scene = jax.device_get((self._episode.state.active, observation, self._episode.scene))
+        self.agents = [name for name in self.possible_agents if active[self._slot[name]]]
+        return {name: seen[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """One control step. Actions of cars that have ended count for nothing.
+
+        Raises:
+            ConfigError: a driving car without an action, or an action of a car that there is not.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        if wrong := [name for name in self.agents if name not in actions] + [name for name in actions if name not in self._slot]:
+            raise ConfigError(f"actions: {wrong[0]!r}: wanted is one of each that drives: {', '.join(self.agents)}")
+        given = np.zeros((self.pool.agents, 3), np.float32)
+        for name in self.agents:
+            given[self._slot[name]] = actions[name]
+        self._episode, moment = self._advance(self.pool.scenes, self._episode, given)
+        moment, scene = jax.device_get((moment, self._episode.scene))
+        slots = {name: self._slot[name] for name in self.agents}
+        told = {"terms": moment.terms, "events": moment.events}
+        infos = {
+            name: {"scene": int(scene), **{key: {one: value[slot].item() for one, value in part.items()} for key, part in told.items()}}
+            for name, slot in slots.items()
+        }
+        observations = {name: moment.observation[slot] for name, slot in slots.items()}
+        rewards = {name: float(moment.reward[slot]) for name, slot in slots.items()}
+        terminations = {name: bool(moment.terminated[slot]) for name, slot in slots.items()}
+        truncations = {name: bool(moment.truncated[slot]) for name, slot in slots.items()}
+        self.agents = [name for name in self.agents if not terminations[name] and not truncations[name]]
+        return observations, rewards, terminations, truncations, infos
+
+    def render(self) -> None:
+        """Nothing: `report.video` draws trajectories."""
+
+    def close(self) -> None:
+        """Nothing to release."""
