@@ -1,9 +1,10 @@
 """Brax: one car as a `brax.envs.Env`, for its learners.
 
     from brax.training.agents.ppo import train as ppo
-    from scenefactory_jax.adapters.brax import Drive, wrap
+    from scenefactory_jax.adapters.brax import Drive, learning, wrap
     env = Drive(overrides=["experiment=demo"])
-    make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
+    with learning():                                                # Brax 0.14 and JAX 0.10 need it to go together
+        make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
 
 `done` is an event that ended the car. That the time is up is for Brax's EpisodeWrapper to say, which calls it truncation: give it
 `episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events (`events/reached`) of the step; what Brax
@@ -16,11 +17,13 @@ functions, so nothing can be passed to them; hundreds of scenes are fine, for th
 `JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS=1` in the environment does it in JAX 0.10, where that is not yet the default.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from jaxtyping import Array
@@ -123,3 +126,26 @@ def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/fleet=spread, weather=mixed")
     return Anew(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+@contextlib.contextmanager
+def learning() -> Iterator[None]:
+    """Brax 0.14's learners call `jax.device_put_replicated`, which JAX 0.10 no longer has (google/brax issue 671); inside they find it.
+
+    Does nothing where JAX has it.
+    """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
+    jax.device_put_replicated = _replicated  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+    """A copy on every device, along a new first axis that is laid out over them."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    laid = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf))), laid), tree)
