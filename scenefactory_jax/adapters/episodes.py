@@ -142,7 +142,7 @@ def _one(scenes: Scene, index: Int[Array, ""]) -> Scene:
     return jax.tree.map(lambda leaf: leaf[index], scenes)
 
 
-def seeded(seed: int) -> np.ndarray:
+def seeded(seed: int) -> np.uint32:
     """A seed of any size as what `jax.random.key` takes on the device."""
     return np.uint32(seed % 2**32)
 

@@ -10,7 +10,7 @@ World `i` of `make_vec(...).reset(seed=s)` runs as `make(...).reset(seed=s + i)`
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +124,7 @@ class DriveVector(VectorEnv):
         overrides: Sequence[str] = (),
         scenes: sources.Scenes | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        arrays: Literal["numpy", "jax"] = "numpy",
+        arrays: str = "numpy",
         render_mode: None = None,
     ):
         if arrays not in ("numpy", "jax"):
@@ -139,7 +139,7 @@ class DriveVector(VectorEnv):
         self._begin = jax.jit(functools.partial(_begin, self.pool.env))
         self._step = jax.jit(functools.partial(_step, self.pool.env, self.mode))
         self._worlds: Episode | None = None
-        self._ended: Any = np.zeros(num_envs, bool)
+        self._ended: Any = (jnp if arrays == "jax" else np).zeros(num_envs, bool)
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict]:
         """Fresh episodes everywhere, or where `options["reset_mask"]` says: of the seeds, or the next ones of those before.

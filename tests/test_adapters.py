@@ -1,0 +1,116 @@
+"""What all adapters stand on: one vector an agent, episodes drawn from a pool, configs that fit, and the functional API of the docs."""
+
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adapting import ALONE, SMOKE, scenes
+from running import quick_compilation
+
+from scenefactory_jax import adapters, world
+from scenefactory_jax.adapters import episodes, flat, layout
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import config
+from scenefactory_jax.types import Rows
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    with quick_compilation():
+        yield
+
+
+def test_a_flat_observation_holds_every_group_where_its_layout_says():
+    rows = Rows(jnp.arange(2 * 3 * 2.0).reshape(2, 3, 2) + 1, jnp.array([[True, False, True], [False, False, False]]))
+    observation = {"zone": jnp.ones((2, 4)), "ego": jnp.full((2, 1), 5.0), "road": rows}
+    vector, columns = flat(observation), layout(observation)
+    assert vector.shape == (2, 1 + 6 + 3 + 4) and list(columns) == ["ego", "road", "road.mask", "zone"]
+    np.testing.assert_array_equal(vector[:, columns["road"]], [[1, 2, 0, 0, 5, 6], [0] * 6])  # what is masked reads zeros
+    np.testing.assert_array_equal(vector[:, columns["road.mask"]], [[1, 0, 1], [0, 0, 0]])
+    np.testing.assert_array_equal(vector[:, columns["ego"]], [[5], [5]])
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), observation)
+    np.testing.assert_array_equal(flat(many), jnp.stack([vector] * 7))
+
+
+def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
+    pool = episodes.pool(None, ALONE, scenes(), alone=True)
+    begin = jax.jit(jax.vmap(lambda key: episodes.begin(pool.env, pool.scenes, key)))
+    keys = jax.random.split(jax.random.key(0), 64)
+    episode, seen = begin(keys)
+    assert set(np.asarray(episode.scene)) == {0, 1, 2, 3} and pool.steps == 60 and len(pool.names) == 4
+    again, same = begin(keys)
+    for one, other in zip(jax.tree.leaves((episode.state.motion, seen)), jax.tree.leaves((again.state.motion, same)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    start = pool.scenes.agents.position[episode.scene]
+    np.testing.assert_allclose(episode.state.motion.position[..., :2], start, atol=1e-5)
+    following = begin(episode.key)[0]
+    assert (np.asarray(following.scene) != np.asarray(episode.scene)).any()
+
+
+def test_a_step_of_an_episode_is_the_environments_own():
+    settings = config.load("train", SMOKE)
+    pool = episodes.pool(settings, (), scenes(agents=4), alone=False)
+    episode, seen = jax.jit(lambda key: episodes.begin(pool.env, pool.scenes, key, 2))(jax.random.key(3))
+    action = jnp.full((4, 3), 0.5)
+    _, moment = jax.jit(lambda given: episodes.advance(pool.env, pool.scenes, given, action))(episode)
+    env, scene = world.make(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
+    after, outcome = jax.jit(env.step)(scene, episode.state, action)
+    assert seen.shape == (4, pool.columns)
+    np.testing.assert_allclose(moment.observation, flat(outcome.observation), atol=1e-5)
+    driving = np.asarray(episode.state.active)
+    assert 0 < driving.sum() < 4  # scene 2 leaves slots empty
+    np.testing.assert_allclose(moment.reward, np.where(driving, outcome.reward, 0), atol=1e-5)
+    np.testing.assert_array_equal(moment.reward[~driving], 0)
+    np.testing.assert_allclose(sum(moment.terms.values()), moment.reward, atol=1e-4)
+    np.testing.assert_array_equal(moment.active, after.active)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("scenes.pack.agents=4", r"scenes\.pack\.agents: 4; this environment drives one car: set scenes\.pack\.agents=1"),
+        ("spawn.respawn_clear_m=5.0", r"spawn\.respawn_clear_m: 5\.0; here a car that ended stays so"),
+        ("dynamics=hover", "Could not find 'dynamics/hover'"),
+        ("timing.control_hz=0", r"timing\.control_hz: 0"),
+    ],
+)
+def test_a_config_that_does_not_fit_says_what_to_set(override, message):
+    with pytest.raises(ConfigError, match=message):
+        episodes.pool(None, [*ALONE, override], None, alone=True)
+    with pytest.raises(ConfigError, match=message):  # and one from Python
+        episodes.pool(config.load("train", *ALONE, override), (), None, alone=True)
+
+
+def test_scenes_and_options_that_do_not_fit_say_so():
+    with pytest.raises(ConfigError, match=r"the scenes given: 4 slots a scene; .* set scenes\.pack\.agents=1"):
+        episodes.pool(None, [SMOKE], scenes(agents=4), alone=True)
+    with pytest.raises(ConfigError, match=r"options\['scene'\]: 4; valid: 0 to 3"):
+        episodes.chosen({"scene": 4}, 4)
+    assert episodes.chosen(None, 4) == episodes.ANY and episodes.chosen({"scene": 3, "other": 1}, 4) == 3
+    changed = episodes.pool(config.load("train", *ALONE), ["timing.episode_s=1"], scenes(), alone=True)
+    assert changed.steps == 30
+
+
+@pytest.mark.parametrize("name", ["gymnasium", "pettingzoo", "jaxmarl"])
+def test_a_missing_extra_is_named(name, monkeypatch):
+    for loaded in [module for module in sys.modules if module.split(".")[0] == name]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, name, None)  # what `import` takes for not installed
+    monkeypatch.delitem(sys.modules, f"scenefactory_jax.adapters.{name}", raising=False)
+    with pytest.raises(ImportError, match=rf"pip install 'scenefactory_jax\[{name}\]'"):
+        __import__(f"scenefactory_jax.adapters.{name}")
+
+
+def test_the_documented_rollout_runs_as_it_stands():
+    text = adapters.__doc__[adapters.__doc__.index("**Without an adapter.**") :]
+    lines = text.splitlines()[2:]
+    code = lines[: next(index for index, line in enumerate(lines) if line and not line.startswith("    "))]
+    place: dict = {}
+    exec(textwrap.dedent("\n".join(code)), place)
+    seen, actions, reward, done, active = place["samples"]
+    assert seen.shape[:3] == (64, 8, 4) and actions.shape == (64, 8, 4, 3) and reward.shape == done.shape == active.shape == (64, 8, 4)
+    assert (np.asarray(place["states"].step) < 64).all()  # of 60 steps: every world has begun anew
+    assert np.isfinite(seen).all() and np.abs(reward[active]).sum() > 0 and active.any()

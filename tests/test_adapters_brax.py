@@ -1,0 +1,90 @@
+"""Brax: its learners run on the environment, and its wrappers find what they expect."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adapting import ALONE, scenes
+from brax.envs.wrappers.training import wrap as repeating
+from brax.training.agents.ppo import train as ppo
+from brax.training.agents.sac import train as sac
+from running import quick_compilation
+
+from scenefactory_jax.adapters.brax import Drive, learning, wrap
+from scenefactory_jax.build import ConfigError
+
+WORLDS = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    with quick_compilation():
+        yield
+
+
+@pytest.fixture(scope="module")
+def env():
+    return Drive(None, ALONE, scenes())
+
+
+def driven(worlds, action, *, steps):
+    """States of all steps, the first one included."""
+    first = jax.jit(worlds.reset)(jax.random.split(jax.random.PRNGKey(0), WORLDS))
+    return jax.jit(lambda first: jax.lax.scan(lambda state, _: (worlds.step(state, action),) * 2, first, None, steps))(first)[1], first
+
+
+def test_a_step_keeps_the_shape_of_the_state_and_says_what_happened(env):
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    assert state.obs.shape == (env.observation_size,) and env.action_size == 3 and env.episode_length == 60
+    for _ in range(60):
+        before, state = state, step(state, jnp.array([1.0, 0.6, -1.0]))
+        assert jax.tree.structure(before) == jax.tree.structure(state)
+        assert [leaf.dtype for leaf in jax.tree.leaves(before)] == [leaf.dtype for leaf in jax.tree.leaves(state)]
+        terms = sum(value for name, value in state.metrics.items() if name.startswith("reward/"))
+        np.testing.assert_allclose(terms, state.reward, atol=1e-4)
+        if state.done:
+            break
+    assert state.done == 1 and state.metrics["events/touched_edge"] == 1 and step._cache_size() == 1
+
+
+@pytest.mark.parametrize("wrapping", [wrap, repeating])
+def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_wrapper(env, wrapping):
+    braking = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (WORLDS, 1))
+    states, first = driven(wrapping(env, episode_length=env.episode_length), braking, steps=62)
+    done, truncated = np.asarray(states.done), np.asarray(states.info["truncation"])
+    assert (done[59] == 1).all() and (truncated[59] == 1).all() and done.sum() == truncated.sum() == WORLDS
+    np.testing.assert_array_equal(states.info["steps"][:, 0], [*range(1, 61), 1, 2])
+    before, after = np.asarray(first.pipeline_state.scene), np.asarray(states.pipeline_state.scene[59])
+    if wrapping is repeating:
+        np.testing.assert_array_equal(before, after)
+        np.testing.assert_array_equal(states.obs[59], first.obs)
+    else:
+        assert (before != after).any()
+        final = np.asarray(states.info["final_obs"])
+        np.testing.assert_array_equal(final[58], states.obs[58])
+        assert final[59].any(axis=-1).all() and (final[59] != np.asarray(states.obs[59])).any(axis=-1).all()
+    np.testing.assert_array_equal(states.pipeline_state.state.step[59:, 0], [0, 1, 2])
+
+
+def test_ppo_and_sac_of_brax_train_on_it(env):
+    sizes = {"num_envs": 4, "num_eval_envs": 2, "episode_length": env.episode_length, "wrap_env_fn": wrap, "max_devices_per_host": 1}
+    shown = []
+    note = {"progress_fn": lambda step, metrics: shown.append((step, metrics))}
+    with learning():
+        plan = {"unroll_length": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "num_evals": 2}
+        act, parameters, metrics = ppo.train(env, 64, **plan, **sizes, **note)
+        action, _ = act(parameters)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
+        assert action.shape == (3,) and np.isfinite(action).all()
+        assert np.isfinite(metrics["eval/episode_reward"]) and 0 < metrics["eval/avg_episode_length"] <= 60
+        assert np.isfinite(shown[-1][1]["training/total_loss"]) and shown[-1][0] >= 64
+        act, parameters, metrics = sac.train(env, 48, min_replay_size=16, max_replay_size=64, batch_size=8, **sizes, **note)
+        action, _ = act(parameters)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
+        assert action.shape == (3,) and np.isfinite(action).all()
+        assert np.isfinite(metrics["eval/episode_reward"]) and np.isfinite(shown[-1][1]["training/critic_loss"])
+    assert not hasattr(jax, "device_put_replicated") or jax.__version_info__ < (0, 10)
+
+
+def test_a_randomisation_of_braxs_kind_is_refused(env):
+    with pytest.raises(ConfigError, match="randomization_fn: unknown here"):
+        wrap(env, 60, randomization_fn=lambda system: (system, system))

@@ -1,0 +1,171 @@
+"""Gymnasium's own checker, and its SyncVectorEnv over single environments as the oracle of the vector environment."""
+
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from adapting import ALONE, actions, scenes
+from running import quick_compilation
+
+gymnasium = pytest.importorskip("gymnasium", reason="the extra [gymnasium] is not installed")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
+
+from scenefactory_jax.adapters.gymnasium import ID, Drive, DriveVector  # noqa: E402
+from scenefactory_jax.build import ConfigError  # noqa: E402
+
+WORLDS, STEPS = 3, 70  # an episode takes 60
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    with quick_compilation():
+        yield
+
+
+@pytest.fixture(scope="module")
+def single():
+    return gymnasium.make(ID, overrides=ALONE)
+
+
+def many(mode=AutoresetMode.SAME_STEP, **options):
+    return DriveVector(WORLDS, None, ALONE, scenes(), mode, **options)
+
+
+def same(ours, theirs, *, where=""):
+    """Infos of one step agree wherever their masks say that they hold something."""
+    for key in theirs:
+        if key.startswith("_"):
+            continue
+        mask = np.asarray(theirs[f"_{key}"])
+        np.testing.assert_array_equal(np.asarray(ours[f"_{key}"]), mask, err_msg=f"{where}_{key}")
+        if isinstance(theirs[key], dict):
+            same(ours[key], theirs[key], where=f"{where}{key}.")
+            continue
+        for index in np.flatnonzero(mask):
+            np.testing.assert_allclose(ours[key][index], theirs[key][index], atol=2e-4, err_msg=f"{where}{key}")
+    for key in ours.keys() - theirs.keys():
+        assert key.startswith("_") or not np.asarray(ours[f"_{key}"]).any(), f"{where}{key} is not Gymnasium's"
+
+
+def test_check_env_passes(single):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*WARN.*")
+        warnings.filterwarnings("ignore", message=".*(minimum|maximum) value is -?infinity")
+        check_env(single.unwrapped)
+
+
+def test_an_episode_ends_by_event_or_by_time_and_says_why(single):
+    single.reset(seed=1, options={"scene": 0})
+    for _ in range(60):
+        observation, reward, terminated, truncated, info = single.step(np.array([1.0, 0.6, -1.0]))
+        assert observation in single.observation_space and sum(info["terms"].values()) == pytest.approx(reward, abs=1e-4)
+        assert any(info["events"].values()) == terminated  # strict: every event ends
+        if terminated:
+            break
+    assert terminated and not truncated and not observation.any()  # a car that ended sees nothing
+    observation, info = single.reset(options={"scene": 2})
+    assert info == {"scene": 2} and observation.any()
+    for step in range(60):
+        observation, _, terminated, truncated, info = single.step(np.array([0.0, 0.0, 1.0]))
+        assert not terminated and truncated == (step == 59)
+    assert observation.any()  # the time is up for a car that still drives: there is something to bootstrap from
+    base = single.unwrapped
+    assert base._advance._cache_size() == base._begin._cache_size() == 1
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_the_vector_environment_is_gymnasiums_own_over_single_ones(mode):
+    envs = many(mode)
+    oracle = SyncVectorEnv([lambda: Drive(None, ALONE, scenes())] * WORLDS, autoreset_mode=mode)
+    assert envs.metadata["autoreset_mode"] is mode
+    for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
+        assert getattr(envs, name) == getattr(oracle, name)
+    (seen, info), (wanted, told) = envs.reset(seed=7), oracle.reset(seed=7)
+    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+    same(info, told)
+    ended = np.zeros(WORLDS, int)
+    for action in actions(STEPS, WORLDS):
+        (seen, *ours, info), (wanted, *theirs, told) = envs.step(action), oracle.step(action)
+        assert seen in envs.observation_space and seen.dtype == np.float32
+        np.testing.assert_allclose(seen, wanted, atol=1e-4)
+        for own, one in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(own, one, atol=1e-4)
+        same(info, told)
+        ended += ours[1] | ours[2]
+    assert (ended >= 1).all() and envs._step._cache_size() == 1 and envs._begin._cache_size() == 1
+    (seen, info), (wanted, told) = envs.reset(), oracle.reset()  # the next episodes of the seeds before
+    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+    same(info, told)
+    (seen, _), (wanted, _) = envs.reset(seed=[3, None, 7]), oracle.reset(seed=[3, None, 7])
+    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_others():
+    envs, runs = many(), []
+    for seed in (5, 5, 6):
+        observation, info = envs.reset(seed=seed)
+        trace = [observation, info["scene"]]
+        for action in actions(STEPS, WORLDS):
+            observation, reward, *_ = envs.step(action)
+            trace += [observation, reward]
+        runs.append(np.concatenate([np.ravel(part) for part in trace]))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert (runs[0] != runs[2]).any()
+
+
+def test_arrays_of_jax_stay_on_the_device_and_hold_what_those_of_numpy_hold():
+    envs, plain = many(arrays="jax"), many()
+    seen, _ = envs.reset(seed=2)
+    plain.reset(seed=2)
+    last = 0
+    for action in actions(STEPS, WORLDS):
+        seen, reward, terminated, truncated, info = envs.step(jax.numpy.asarray(action))
+        wanted, expected, *_, told = plain.step(action)
+        assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((seen, reward, terminated, truncated, info)))
+        np.testing.assert_array_equal(seen, wanted)
+        np.testing.assert_array_equal(reward, expected)
+        assert info["final_obs"].shape == seen.shape and ("final_obs" in told) == bool(info["_final_obs"].any())
+        for index in np.flatnonzero(info["_final_obs"]):
+            np.testing.assert_array_equal(info["final_obs"][index], told["final_obs"][index])
+            last += 1
+    assert last >= WORLDS and envs._step._cache_size() == 1
+
+
+def test_without_autoreset_worlds_begin_anew_where_a_mask_says():
+    envs = many(AutoresetMode.DISABLED)
+    before, _ = envs.reset(seed=0)
+    mask = np.array([False, True, False])
+    after, info = envs.reset(options={"reset_mask": mask, "scene": 1})
+    assert info["_scene"].tolist() == mask.tolist() and info["scene"][1] == 1
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    for action in actions(60, WORLDS):
+        *_, terminated, truncated, _ = envs.step(action)
+        if (ended := terminated | truncated).any():
+            break
+    with pytest.raises(RuntimeError, match=rf"worlds \[{np.flatnonzero(ended)[0]}.*reset_mask"):
+        envs.step(action)
+    envs.reset(options={"reset_mask": ended})
+    assert not (envs.step(action)[2] & ended).any()
+
+
+def test_gymnasium_makes_both_and_its_wrappers_work():
+    envs = RecordEpisodeStatistics(gymnasium.make_vec(ID, num_envs=2, overrides=ALONE, scenes=scenes()))
+    assert isinstance(envs.unwrapped, DriveVector) and envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    envs.reset(seed=0)
+    total, lengths = np.zeros(2), []
+    for _ in range(61):
+        _, reward, terminated, truncated, info = envs.step(np.tile(np.float32([0, 0, 1]), (2, 1)))
+        if (truncated | terminated).any() and not lengths:
+            total += reward
+            np.testing.assert_allclose(info["episode"]["r"], total, atol=1e-3)
+            lengths = info["episode"]["l"].tolist()
+        total += reward
+    assert lengths == [60, 60]
+    with pytest.raises(ConfigError, match="arrays: 'torch'; valid: numpy, jax"):
+        many(arrays="torch")
+    with pytest.raises(ConfigError, match="seed: 2 seeds for 3 worlds"):
+        many().reset(seed=[1, 2])
