@@ -14,6 +14,7 @@ from scenefactory_jax.adapters.brax import Drive, learning, wrap
 from scenefactory_jax.build import ConfigError
 
 WORLDS = 3
+HAD = hasattr(jax, "device_put_replicated")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -34,8 +35,8 @@ def driven(worlds, action, *, steps):
 
 
 def test_a_step_keeps_the_shape_of_the_state_and_says_what_happened(env):
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    step = jax.jit(env.step)
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    state = next(state for seed in range(99) if (state := reset(jax.random.PRNGKey(seed))).pipeline_state.scene == 0)
     assert state.obs.shape == (env.observation_size,) and env.action_size == 3 and env.episode_length == 60
     for _ in range(60):
         before, state = state, step(state, jnp.array([1.0, 0.6, -1.0]))
@@ -67,22 +68,25 @@ def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_
     np.testing.assert_array_equal(states.pipeline_state.state.step[59:, 0], [0, 1, 2])
 
 
-def test_ppo_and_sac_of_brax_train_on_it(env):
-    sizes = {"num_envs": 4, "num_eval_envs": 2, "episode_length": env.episode_length, "wrap_env_fn": wrap, "max_devices_per_host": 1}
+@pytest.mark.parametrize(
+    ("train", "plan", "loss"),
+    [
+        (ppo.train, {"num_timesteps": 64, "unroll_length": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "num_evals": 2}, "total_loss"),
+        (sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss"),
+    ],
+    ids=["ppo", "sac"],
+)
+def test_the_learners_of_brax_train_on_it(train, plan, loss):
+    env = Drive(None, [*ALONE, "~observe.road", "~observe.neighbours"], scenes())  # less to compile
+    sizes = {"num_envs": 4, "num_eval_envs": 2, "batch_size": 4, "episode_length": env.episode_length, "max_devices_per_host": 1}
     shown = []
-    note = {"progress_fn": lambda step, metrics: shown.append((step, metrics))}
     with learning():
-        plan = {"unroll_length": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "num_evals": 2}
-        act, parameters, metrics = ppo.train(env, 64, **plan, **sizes, **note)
-        action, _ = act(parameters)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
-        assert action.shape == (3,) and np.isfinite(action).all()
-        assert np.isfinite(metrics["eval/episode_reward"]) and 0 < metrics["eval/avg_episode_length"] <= 60
-        assert np.isfinite(shown[-1][1]["training/total_loss"]) and shown[-1][0] >= 64
-        act, parameters, metrics = sac.train(env, 48, min_replay_size=16, max_replay_size=64, batch_size=8, **sizes, **note)
-        action, _ = act(parameters)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
-        assert action.shape == (3,) and np.isfinite(action).all()
-        assert np.isfinite(metrics["eval/episode_reward"]) and np.isfinite(shown[-1][1]["training/critic_loss"])
-    assert not hasattr(jax, "device_put_replicated") or jax.__version_info__ < (0, 10)
+        act, parameters, metrics = train(env, **plan, **sizes, wrap_env_fn=wrap, progress_fn=lambda *told: shown.append(told))
+    action, _ = act(parameters)(jnp.zeros(env.observation_size), jax.random.PRNGKey(0))
+    assert action.shape == (3,) and np.isfinite(action).all()
+    assert np.isfinite(metrics["eval/episode_reward"]) and 0 < metrics["eval/avg_episode_length"] <= 60
+    assert np.isfinite(shown[-1][1][f"training/{loss}"]) and shown[-1][0] >= plan["num_timesteps"]
+    assert hasattr(jax, "device_put_replicated") is HAD
 
 
 def test_a_randomisation_of_braxs_kind_is_refused(env):
