@@ -109,11 +109,16 @@ class Anew(Wrapper):
         """One control step, and what begins anew after it."""
         state.info["steps"] = jnp.where(state.done > 0, 0.0, state.info["steps"])
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)  # pyright: ignore[reportAttributeAccessIssue]
-        env, scenes, after = self.unwrapped.pool.env, self.unwrapped.pool.scenes, state.pipeline_state  # pyright: ignore
-        fresh = jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key)
-        now = choose(state.done > 0, fresh, after)
-        first = jax.vmap(lambda world: episodes.observe(env, scenes, world))(now)[:, 0]
-        state.info["final_obs"] = state.obs
+        env, scenes = self.unwrapped.pool.env, self.unwrapped.pool.scenes  # pyright: ignore[reportAttributeAccessIssue]
+        after, last = Drive.episode_of(state), state.obs
+
+        def anew() -> tuple[Episode, Any]:
+            fresh = jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key)
+            now = choose(state.done > 0, fresh, after)
+            return now, jax.vmap(lambda world: episodes.observe(env, scenes, world))(now)[:, 0]
+
+        now, first = jax.lax.cond(jnp.any(state.done > 0), anew, lambda: (after, last))
+        state.info["final_obs"] = last
         return state.replace(pipeline_state=now, obs=first)  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -70,7 +70,7 @@ class Drive(gymnasium.Env):
         self.metadata = {"render_modes": [], "render_fps": self.pool.control_hz}
         self.observation_space, self.action_space = seen(self.pool.columns), acts()
         self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
-        self._advance = jax.jit(functools.partial(episodes.advance, self.pool.env))
+        self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
         self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -90,13 +90,9 @@ class Drive(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control step."""
-        given = np.asarray(action, np.float32)[None]
-        self._episode, moment = self._advance(self.pool.scenes, self._episode, given)
-        moment, scene = jax.device_get((moment, self._episode.scene))
-        truncated = bool(moment.truncated[0])
-        info = {name: {key: value[0].item() for key, value in part.items()} for name, part in _told(moment).items()}
-        over = bool(moment.over) and not truncated
-        return moment.observation[0], float(moment.reward[0]), over, truncated, {"scene": int(scene), **info}
+        self._episode, rows = self._advance(self.pool.scenes, self._episode, np.asarray(action, np.float32)[None])
+        told = episodes.told(self.pool, np.asarray(rows)[0])
+        return told.observation, told.reward, told.over and not told.truncated, told.truncated, told.info
 
 
 class DriveVector(VectorEnv):

@@ -54,7 +54,7 @@ class Drive(ParallelEnv):
         self.action_spaces = {name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in self.possible_agents}
         self._slot = {name: slot for slot, name in enumerate(self.possible_agents)}
         self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
-        self._advance = jax.jit(functools.partial(episodes.advance, self.pool.env))
+        self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
         self._episode: Episode | None = None
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -94,19 +94,12 @@ class Drive(ParallelEnv):
         given = np.zeros((self.pool.agents, 3), np.float32)
         for name in self.agents:
             given[self._slot[name]] = actions[name]
-        self._episode, moment = self._advance(self.pool.scenes, self._episode, given)
-        moment, scene = jax.device_get((moment, self._episode.scene))
-        slots = {name: self._slot[name] for name in self.agents}
-        told = {"terms": moment.terms, "events": moment.events}
-        infos = {
-            name: {"scene": int(scene), **{key: {one: value[slot].item() for one, value in part.items()} for key, part in told.items()}}
-            for name, slot in slots.items()
-        }
-        observations = {name: moment.observation[slot] for name, slot in slots.items()}
-        rewards = {name: float(moment.reward[slot]) for name, slot in slots.items()}
-        terminations = {name: bool(moment.terminated[slot]) for name, slot in slots.items()}
-        truncations = {name: bool(moment.truncated[slot]) for name, slot in slots.items()}
-        self.agents = [name for name in self.agents if not terminations[name] and not truncations[name]]
+        self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
+        rows = np.asarray(rows)
+        told = {name: episodes.told(self.pool, rows[self._slot[name]]) for name in self.agents}
+        self.agents = [name for name, one in told.items() if not one.terminated and not one.truncated]
+        names = ("observation", "reward", "terminated", "truncated", "info")
+        observations, rewards, terminations, truncations, infos = ({car: getattr(one, name) for car, one in told.items()} for name in names)
         return observations, rewards, terminations, truncations, infos
 
     def render(self) -> None:
