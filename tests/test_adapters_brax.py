@@ -14,6 +14,7 @@ from scenefactory_jax.adapters.brax import Drive, learning, wrap
 from scenefactory_jax.build import ConfigError
 
 WORLDS = 3
+EVALS = {"num_evals": 2}  # before and after
 HAD = hasattr(jax, "device_put_replicated")
 
 
@@ -71,7 +72,7 @@ def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_
 @pytest.mark.parametrize(
     ("train", "plan", "loss"),
     [
-        (ppo.train, {"num_timesteps": 64, "unroll_length": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "num_evals": 2}, "total_loss"),
+        (ppo.train, {"num_timesteps": 64, "unroll_length": 4, "num_minibatches": 1, "num_updates_per_batch": 1, **EVALS}, "total_loss"),
         (sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss"),
     ],
     ids=["ppo", "sac"],

@@ -28,7 +28,7 @@ def compiled():
 
 @pytest.fixture(scope="module")
 def single():
-    return gymnasium.make(ID, overrides=ALONE)
+    return gymnasium.make(f"scenefactory_jax.adapters.gymnasium:{ID}", overrides=ALONE)
 
 
 def many(mode=AutoresetMode.SAME_STEP, **options):

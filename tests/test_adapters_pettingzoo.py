@@ -9,10 +9,10 @@ from running import quick_compilation
 
 pytest.importorskip("pettingzoo", reason="the extra [pettingzoo] is not installed")
 
-from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
+from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from scenefactory_jax.adapters.pettingzoo import Drive  # noqa: E402
-from scenefactory_jax.build import ConfigError  # noqa: E402
+from scenefactory_jax.adapters.pettingzoo import Drive
+from scenefactory_jax.build import ConfigError
 
 
 @pytest.fixture(scope="module", autouse=True)

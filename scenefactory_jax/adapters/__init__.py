@@ -47,9 +47,9 @@ What they share:
     policy = lambda seen, key: jax.random.uniform(key, (*seen.shape[:2], 3), minval=-1.0, maxval=1.0)
     states, samples = jax.jit(rollout, static_argnums=(2, 3))(worlds, jax.random.key(0), 64, policy)
 
-Pass the scenes to the jitted function as an argument: what a function closes over becomes a constant of its program. Weight what is learnt by
-`states.active`, for a slot without a driving car earns nothing; `outcome.done` ends a car, `outcome.truncated` a world. `ppo/rollout.py`
-is such a function in full.
+Pass the scenes to the jitted function as an argument: what a function closes over becomes a constant of its program. Weight what is learnt
+by `states.active`, for a slot without a driving car earns nothing; `outcome.done` ends a car, `outcome.truncated` a world.
+`ppo/rollout.py` is such a function in full.
 """
 
 import jax.numpy as jnp

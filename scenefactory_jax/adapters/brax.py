@@ -149,7 +149,7 @@ def learning() -> Iterator[None]:
         del jax.device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """A copy on every device, along a new first axis that is laid out over them."""
     mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
     laid = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))

@@ -90,8 +90,8 @@ def pool(
         raise ConfigError(f"{where}: {slots} slots a scene; this environment drives one car: set {ALONE} scenes.capacity.agents=null")
     episode, seen = jax.eval_shape(functools.partial(begin, env), held, jax.random.key(0))
     moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
-    timing = config["timing"]
-    return Pool(env, held, found.names, slots, seen.shape[1], tuple(sorted(moment.terms)), world.episode_steps(timing), timing["control_hz"])
+    timing, terms = config["timing"], tuple(sorted(moment.terms))
+    return Pool(env, held, found.names, slots, seen.shape[1], terms, world.episode_steps(timing), timing["control_hz"])
 
 
 def begin(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:

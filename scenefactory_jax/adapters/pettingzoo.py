@@ -6,8 +6,8 @@
     while env.agents:
         observations, rewards, terminations, truncations, infos = env.step({name: env.action_space(name).sample() for name in env.agents})
 
-Agents are the slots, "car_0" and so on; those that hold a car in this episode's scene are in `agents` until they end. What `step` returns is
-about those that were driving before it. `infos[name]` holds `scene`, an index into `names`, and of a step `terms` and `events`.
+Agents are the slots, "car_0" and so on; those that hold a car in this episode's scene are in `agents` until they end. What `step` returns
+is about those that were driving before it. `infos[name]` holds `scene`, an index into `names`, and of a step `terms` and `events`.
 """
 
 import functools
@@ -57,11 +57,11 @@ class Drive(ParallelEnv):
         self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
         self._episode: Episode | None = None
 
-    def observation_space(self, agent: str) -> spaces.Box:
+    def observation_space(self, agent: str) -> spaces.Space:
         """Of one car; the same object every time."""
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> spaces.Box:
+    def action_space(self, agent: str) -> spaces.Space:
         """Throttle, steer and brake of one car; the same object every time."""
         return self.action_spaces[agent]
 
@@ -76,8 +76,9 @@ class Drive(ParallelEnv):
             key = self._episode.key
         else:
             key = jax.random.key(episodes.seeded(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
-        self._episode, observation = self._begin(self.pool.scenes, key, scene)
-        active, seen, scene = jax.device_get((self._episode.state.active, observation, self._episode.scene))
+        episode, observation = self._begin(self.pool.scenes, key, scene)
+        self._episode = episode
+        active, seen, scene = jax.device_get((episode.state.active, observation, episode.scene))
         self.agents = [name for name in self.possible_agents if active[self._slot[name]]]
         return {name: seen[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
 

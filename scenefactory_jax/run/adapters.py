@@ -103,7 +103,8 @@ def _cases(config: Mapping[str, Any], scenes: sources.Scenes) -> Iterator[Case]:
         yield Case("PettingZoo", 1, slots, "called", _pettingzoo(module.Drive(config, scenes=scenes), drawn[0], horizon))
     with contextlib.suppress(ImportError):
         module = importlib.import_module("scenefactory_jax.adapters.jaxmarl")
-        yield Case("JaxMARL", worlds, slots, "scanned", _scanned(*_jaxmarl(module.Drive(config, scenes=scenes), drawn, config["seed"]), horizon))
+        stepped = _jaxmarl(module.Drive(config, scenes=scenes), drawn, config["seed"])
+        yield Case("JaxMARL", worlds, slots, "scanned", _scanned(*stepped, horizon))
 
 
 def _own(config: Mapping[str, Any], scenes: sources.Scenes, actions: np.ndarray) -> Stepped:
@@ -127,7 +128,7 @@ def _brax(config: Mapping[str, Any], scenes: sources.Scenes, actions: np.ndarray
     env = Drive(config, scenes=scenes)
     worlds, given = wrap(env, episode_length=env.episode_length), jnp.asarray(actions[:, 0])
 
-    def step(_: None, state: Any) -> tuple[Any, Any]:
+    def step(_: Any, state: Any) -> tuple[Any, Any]:
         state = worlds.step(state, given)
         return state, (state.obs, state.reward)
 
@@ -138,7 +139,7 @@ def _jaxmarl(env: Any, actions: np.ndarray, seed: int) -> Stepped:
     given = {name: jnp.asarray(actions[:, slot]) for slot, name in enumerate(env.agents)}
     key = jax.random.PRNGKey(seed)
 
-    def step(_: None, carry: Any) -> tuple[Any, Any]:
+    def step(_: Any, carry: Any) -> tuple[Any, Any]:
         state, key = carry
         step_key, key = jax.random.split(key)
         seen, state, reward, *_ = jax.vmap(env.step)(jax.random.split(step_key, len(actions)), state, given)

@@ -1,0 +1,191 @@
+"""Gymnasium's vector environment: one car in each of many worlds. `adapters.gymnasium` registers it."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces  # an optional dependency: `adapters.gymnasium` says so  # pyright: ignore[reportMissingImports]
+from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore[reportMissingImports]
+from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
+from jaxtyping import Array, Bool, Float, UInt32
+
+from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters.episodes import Episode
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import sources
+from scenefactory_jax.struct import choose
+from scenefactory_jax.types import Env, Scene
+
+
+class DriveVector(VectorEnv):
+    """One car in each of many worlds; everything but the hand-over of arrays is one compiled program.
+
+    In mode SAME_STEP the observation after an episode's end is the first of the next one, and `info["final_obs"]` holds the last of the
+    one that ended, `info["final_info"]` its terms and events. In mode NEXT_STEP the step after an end begins the next episode, whatever
+    its action, with reward 0. In mode DISABLED an episode begins by `reset(options={"reset_mask": ended})`, which the others know, too.
+
+    Args:
+        num_envs: worlds.
+        config, overrides, scenes: as of `Drive`.
+        autoreset_mode: a mode or its value ("SameStep", "NextStep", "Disabled").
+        arrays: numpy: as all of Gymnasium's own; jax: nothing leaves the device. Then `info` always holds `final_obs` [W, F] and
+            `final_info`, and their masks say for which worlds they count.
+
+    Raises:
+        ConfigError: as of `Drive`, and other values of `arrays`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        config: Mapping[str, Any] | None = None,
+        overrides: Sequence[str] = (),
+        scenes: sources.Scenes | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        arrays: str = "numpy",
+        render_mode: None = None,
+    ):
+        if arrays not in ("numpy", "jax"):
+            raise ConfigError(f"arrays: {arrays!r}; valid: numpy, jax")
+        self.pool = episodes.pool(config, overrides, scenes, alone=True)
+        self.names, self.render_mode, self.num_envs, self.arrays = self.pool.names, render_mode, num_envs, arrays
+        self.mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "render_fps": self.pool.control_hz, "autoreset_mode": self.mode}
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._begin = jax.jit(functools.partial(_begin, self.pool.env))
+        self._step = jax.jit(functools.partial(_step, self.pool.env, self.mode))
+        self._worlds: Episode | None = None
+        self._ended: Any = (jnp if arrays == "jax" else np).zeros(num_envs, bool)
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict]:
+        """Fresh episodes everywhere, or where `options["reset_mask"]` says: of the seeds, or the next ones of those before.
+
+        Args:
+            seed: world `i` takes `seed + i`, or its own of a sequence.
+
+        Raises:
+            ConfigError: `options["scene"]` is no scene's index, or not one seed for each world.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        if seed is None or isinstance(seed, int):
+            given = [None if seed is None else seed + world for world in range(self.num_envs)]
+        else:
+            given = list(seed)
+        if len(given) != self.num_envs:
+            raise ConfigError(f"seed: {len(given)} seeds for {self.num_envs} worlds")
+        everywhere, first = np.ones(self.num_envs, bool), self._worlds is None
+        if first:  # nothing to go on from: what has no seed takes a random one
+            given = [int(self.np_random.integers(2**32)) if one is None else one for one in given]
+        anew = np.array([one is not None for one in given])
+        known = np.array([episodes.seeded(one or 0) for one in given], np.uint32)
+        mask = everywhere if first else np.asarray((options or {}).get("reset_mask", everywhere), bool)
+        scene = episodes.chosen(options, len(self.names))
+        worlds, observation = self._begin(self.pool.scenes, self._worlds, known, anew, mask, scene)
+        self._worlds, self._ended = worlds, self._ended & ~mask
+        return self._out((observation, _paired({"scene": worlds.scene}, mask)))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One control step of every world.
+
+        Raises:
+            RuntimeError: an episode that ended was not begun anew, in mode DISABLED with numpy arrays.
+        """
+        if self.mode is AutoresetMode.DISABLED and self.arrays == "numpy" and self._ended.any():
+            raise RuntimeError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset(options={{'reset_mask': ...}}) first")
+        given = jnp.asarray(actions, jnp.float32)
+        self._worlds, step = self._step(self.pool.scenes, self._worlds, self._ended, given)
+        step = self._out(step)
+        self._ended = step.ended
+        return step.observation, step.reward, step.terminated, step.truncated, self._info(step)
+
+    def _info(self, step: "Stepped") -> dict[str, Any]:
+        """Gymnasium's layout of what is known beside observation and reward."""
+        info = _paired(step.told, step.told_for) | _paired({"scene": step.scene}, step.every)
+        if self.mode is not AutoresetMode.SAME_STEP or (self.arrays == "numpy" and not step.ended.any()):
+            return info
+        last = step.last
+        if self.arrays == "numpy" and step.last is not None:  # an array of arrays, None where nothing ended
+            last = np.full(self.num_envs, None, object)
+            for index in np.flatnonzero(step.ended):
+                last[index] = step.last[index]
+        final = _paired({**step.told, "scene": step.scene_before}, step.ended)
+        return info | {"final_obs": last, "_final_obs": step.ended, "final_info": final, "_final_info": step.ended}
+
+    def _out(self, tree: Any) -> Any:
+        return jax.device_get(tree) if self.arrays == "numpy" else tree
+
+
+def _begin(
+    env: Env, scenes: Scene, worlds: Episode | None, seeds: UInt32[Any, " W"], anew: Bool[Any, " W"], mask: Bool[Any, " W"], scene: Any
+) -> tuple[Episode, Float[Array, "W F"]]:
+    """Fresh episodes where `mask` says, of the seeds where `anew` says, else the next ones of their worlds."""
+    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+    keys = keys if worlds is None else jnp.where(anew, keys, worlds.key)
+    fresh = jax.vmap(lambda key: episodes.start(env, scenes, key, scene))(keys)
+    worlds = fresh if worlds is None else choose(jnp.asarray(mask), fresh, worlds)
+    return worlds, _observe(env, scenes, worlds)
+
+
+class Stepped(NamedTuple):
+    """What a step of all worlds gave, every array once: a host fetches each on its own."""
+
+    observation: Array  # [W, F]
+    reward: Array  # [W]
+    terminated: Array
+    truncated: Array
+    ended: Array  # terminated or truncated
+    told: dict[str, dict[str, Array]]  # terms and events
+    told_for: Array  # worlds of which the step told something: not those that began anew before or after it
+    every: Array  # all worlds
+    scene: Array
+    scene_before: Array  # of those that ended
+    last: Array | None  # [W, F], in mode SAME_STEP: what was seen before anything began anew, if something ended
+
+
+def _step(
+    env: Env, mode: AutoresetMode, scenes: Scene, worlds: Episode, ended: Bool[Any, " W"], actions: Float[Array, "W 3"]
+) -> tuple[Episode, Stepped]:
+    """One control step, and what begins anew."""
+    after, moment = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
+    ended, late, every = jnp.asarray(ended), moment.truncated[:, 0], jnp.ones(len(actions), bool)
+    anew = {AutoresetMode.SAME_STEP: moment.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]
+    now = after
+    if mode is not AutoresetMode.DISABLED:
+        now = choose(anew, jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key), after)
+    observation, last = _observe(env, scenes, now), None
+    if mode is AutoresetMode.SAME_STEP:
+        last = jax.lax.cond(jnp.any(anew), lambda: _observe(env, scenes, after), lambda: observation)
+    counts = ~ended if mode is AutoresetMode.NEXT_STEP else every
+    over = moment.over & counts
+    told = {"terms": moment.terms, "events": moment.events}
+    return now, Stepped(
+        observation=observation,
+        reward=jnp.where(counts, moment.reward[:, 0], 0.0),
+        terminated=over & ~late,
+        truncated=over & late,
+        ended=over,
+        told=jax.tree.map(lambda leaf: leaf[:, 0], told),
+        told_for=~anew,
+        every=every,
+        scene=now.scene,
+        scene_before=after.scene,
+        last=last,
+    )
+
+
+def _observe(env: Env, scenes: Scene, worlds: Episode) -> Float[Array, "W F"]:
+    return jax.vmap(lambda world: episodes.observe(env, scenes, world))(worlds)[:, 0]
+
+
+def _paired(info: Mapping[str, Any], mask: Bool[Any, " W"]) -> dict[str, Any]:
+    """Gymnasium's layout: beside every key one with an underscore that says for which worlds it counts."""
+    found = {}
+    for key, value in info.items():
+        found |= {key: _paired(value, mask) if isinstance(value, Mapping) else value, f"_{key}": mask}
+    return found
