@@ -13,8 +13,10 @@ Scenes are closed over, so a `jit` around `reset` or `step` makes constants of i
 too much, make them an argument: `jax.jit(lambda scenes, key: make_train(env.holding(scenes))(key))(env.scenes, key)`.
 """
 
+import contextlib
 import copy
 import functools
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,8 +30,10 @@ from scenefactory_jax.run import sources
 from scenefactory_jax.types import Scene
 
 try:
-    from jaxmarl.environments.multi_agent_env import MultiAgentEnv  # an optional dependency  # pyright: ignore[reportMissingImports]
-    from jaxmarl.environments.spaces import Box  # pyright: ignore[reportMissingImports]
+    # its import leaves the process with other output streams than it had; the end of a redirection puts them back
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        from jaxmarl.environments.multi_agent_env import MultiAgentEnv  # an optional dependency  # pyright: ignore[reportMissingImports]
+        from jaxmarl.environments.spaces import Box  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise ImportError("adapters.jaxmarl needs JaxMARL; `pip install 'scenefactory_jax[jaxmarl]'`") from error
 

@@ -57,7 +57,8 @@ def measure(config: Mapping[str, Any]) -> list[dict[str, Any]]:
     keys.check(config, keys.BENCH)
     sources.use_compilation_cache()
     rows = []
-    for settings in (config, configs.amend(config, [ALONE])):
+    alone = config["scenes"]["pack"]["agents"] == 1
+    for settings in (config,) if alone else (config, configs.amend(config, [ALONE])):
         scenes = sources.training(settings["scenes"])
         for case in _cases(settings, scenes):
             rows.append(_row(case, rows, horizon=config["ppo"]["horizon"], warmup=config["warmup"], repeats=config["repeats"]))
