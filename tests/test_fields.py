@@ -15,7 +15,7 @@ import scenefactory_jax
 from scenefactory_jax import build, conditions, geometry, layouts, patches, rain, weather
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import areas
-from scenefactory_jax.run.evaluate import _describe
+from scenefactory_jax.run.playing import _describe
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import SURFACES, Patches, Scene
 from scenefactory_jax.weather import uniform
