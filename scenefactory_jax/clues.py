@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.conflict import bodies
 from scenefactory_jax.dynamics.contact import touch
 from scenefactory_jax.ends import EVENTS
-from scenefactory_jax.geometry import cross, dot, norm
+from scenefactory_jax.geometry import dot, norm
+from scenefactory_jax.roadside import segment_squared
 from scenefactory_jax.struct import choose, struct
 from scenefactory_jax.types import Boxes, Events, Facts, Road, State
 
@@ -133,10 +134,7 @@ def note(
 
 def alignment(place: Float[Array, "A 2"], velocity: Float[Array, "A 2"], lanes: Road, *, within_m: float) -> Float[Array, " A"]:
     """Cosine between a car's velocity and the direction, as mapped, of the lane near it that fits best; 1 where no lane is near."""
-    offset = place[:, None] - lanes.midpoint
-    along = jnp.maximum(jnp.abs(dot(offset, lanes.direction)) - lanes.half_length, 0.0)
-    across = cross(offset, lanes.direction)
-    near = lanes.valid & (along * along + across * across <= within_m**2)
+    near = lanes.valid & (segment_squared(place, lanes, half_width_m=0.0) <= within_m**2)
     speed = norm(velocity)
     best = jnp.max(jnp.where(near, dot(velocity[:, None], lanes.direction), -jnp.inf), axis=1, initial=-jnp.inf)
     return jnp.where(jnp.isfinite(best), best / jnp.maximum(speed, 1e-6), 1.0)

@@ -13,6 +13,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax import kernels
 from scenefactory_jax.conflict import SMALLEST
 from scenefactory_jax.types import Cells, Road
 
@@ -40,14 +41,14 @@ def look(
     """
     cars, count = circles.shape[:2]
     numbers = jnp.concatenate([circles.reshape(cars, -1), radius[:, None], velocity, heading, position], axis=1)
-    limits = jnp.where(active[:, None], jnp.stack([shown(lanes.valid), shown(edges.valid)]), 0)
+    limits = jnp.where(active[:, None], jnp.stack([kernels.shown(lanes.valid), kernels.shown(edges.valid)]), 0)
     tables = (lanes.midpoint, _flags(lanes), edges.midpoint, edges.direction, edges.half_length, _flags(edges))
     shapes = [jax.ShapeDtypeStruct((cars, 1), kind) for kind in (jnp.int32, jnp.float32, jnp.float32)]
     found = pl.pallas_call(
         functools.partial(_look, circles=count, half_width=half_width_m, range_m=range_m),
         grid=(cars,),
-        in_specs=[_row(limits), _row(numbers), *map(_whole, tables)],
-        out_specs=[_row(shape) for shape in shapes],
+        in_specs=[kernels.row(limits), kernels.row(numbers), *map(kernels.whole, tables)],
+        out_specs=[kernels.row(shape) for shape in shapes],
         out_shape=shapes,
         compiler_params=plgpu.CompilerParams(num_warps=LOOK_WARPS, num_stages=1),
         interpret=interpret,
@@ -127,8 +128,8 @@ def gather(
     features, mask = pl.pallas_call(
         functools.partial(_gather, count=count, radius=radius_m, kind_scale=kind_scale),
         grid=(cars,),
-        in_specs=[_row(limits), _row(numbers), *map(_whole, tables)],
-        out_specs=[_row(shape) for shape in shapes],
+        in_specs=[kernels.row(limits), kernels.row(numbers), *map(kernels.whole, tables)],
+        out_specs=[kernels.row(shape) for shape in shapes],
         out_shape=shapes,
         compiler_params=plgpu.CompilerParams(num_warps=GATHER_WARPS, num_stages=1),
         interpret=interpret,
@@ -175,11 +176,6 @@ def _gather(limits, numbers, rows, midpoint, direction, kind, features, mask, *,
     jax.lax.fori_loop(0, pl.cdiv(count, GATHER), fill, 0)
 
 
-def shown(valid: Bool[Array, " P"]) -> Int[Array, ""]:
-    """How many rows there are up to the last valid one."""
-    return jnp.max(jnp.where(valid, jnp.arange(1, len(valid) + 1, dtype=jnp.int32), 0), initial=0)
-
-
 def _flags(road: Road) -> Int[Array, " P"]:
     return road.valid.astype(jnp.int8)
 
@@ -191,14 +187,3 @@ def _seen(valid, at, limit):
 def _pair(table, at, mask):
     """Both columns of a table of planar vectors at some rows."""
     return plgpu.load(table.at[at, 0], mask=mask, other=0.0), plgpu.load(table.at[at, 1], mask=mask, other=0.0)
-
-
-def _row(operand) -> pl.BlockSpec:
-    """Each program's own row."""
-    rest = operand.shape[1:]
-    return pl.BlockSpec((None, *rest), lambda car: (car,) + (0,) * len(rest))
-
-
-def _whole(operand) -> pl.BlockSpec:
-    """All of a table for every program."""
-    return pl.BlockSpec(operand.shape, lambda car: (0,) * len(operand.shape))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax import cells, road_kernel
 from scenefactory_jax.conflict import SMALLEST
 from scenefactory_jax.geometry import cross, dot, heading, root, to_frame
+from scenefactory_jax.kernels import on_gpu
 from scenefactory_jax.types import Road, Rows, Scene
 
 
@@ -60,15 +61,17 @@ def nearest_lane(position: Float[Array, "A 2"], lanes: Road) -> Int[Array, " A"]
 
 def edge_squared(circles: Float[Array, "A C 2"], edges: Road, *, half_width_m: float) -> Float[Array, " A"]:
     """Squared distance from the nearest of each car's circles' centres to the rectangles that valid segments with a half width are."""
-
-    def squared(point: Float[Array, "A 2"]) -> Float[Array, "A P"]:
-        offset = point[:, None] - edges.midpoint
-        along = jnp.maximum(jnp.abs(dot(offset, edges.direction)) - edges.half_length, 0.0)
-        across = jnp.maximum(jnp.abs(cross(offset, edges.direction)) - half_width_m, 0.0)
-        return along * along + across * across
-
-    nearest = functools.reduce(jnp.minimum, [squared(circles[:, number]) for number in range(circles.shape[1])])
+    each = [segment_squared(circles[:, number], edges, half_width_m=half_width_m) for number in range(circles.shape[1])]
+    nearest = functools.reduce(jnp.minimum, each)
     return jnp.min(jnp.where(edges.valid, nearest, jnp.inf), axis=1, initial=jnp.inf)
+
+
+def segment_squared(point: Float[Array, "A 2"], segments: Road, *, half_width_m: float) -> Float[Array, "A P"]:
+    """Squared distance of each point from the rectangle that each segment with a half width is, valid or not; 0 inside."""
+    offset = point[:, None] - segments.midpoint
+    along = jnp.maximum(jnp.abs(dot(offset, segments.direction)) - segments.half_length, 0.0)
+    across = jnp.maximum(jnp.abs(cross(offset, segments.direction)) - half_width_m, 0.0)
+    return along * along + across * across
 
 
 def edge_rate(
@@ -165,7 +168,7 @@ def _answer(quick: Callable, plain: Callable, *arguments: Any) -> Any:
 
     @jax.custom_jvp
     def answer(*arguments: Any) -> Any:
-        return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain)
+        return on_gpu(quick, plain, *arguments)
 
     @answer.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple:

@@ -23,6 +23,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from running import quick_compilation
 
 from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Road, Scene
@@ -50,6 +51,13 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"needs the real scenes in {SHARED}")
     return SHARED
+
+
+@pytest.fixture(scope="module")
+def quickly():
+    """XLA without its costly passes for all of a module; `pytestmark = pytest.mark.usefixtures("quickly")`."""
+    with quick_compilation():
+        yield
 
 
 def road_of(lines, capacity=None) -> Road:

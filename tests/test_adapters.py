@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adapting import ALONE, SMOKE, scenes
-from running import quick_compilation
 
 from scenefactory_jax import adapters, world
 from scenefactory_jax.adapters import episodes, flat, layout
@@ -16,11 +15,7 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
 from scenefactory_jax.types import Rows
 
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
 def test_a_flat_observation_holds_every_group_where_its_layout_says():

@@ -8,20 +8,15 @@ from adapting import ALONE, scenes
 from brax.envs.wrappers.training import wrap as repeating
 from brax.training.agents.ppo import train as ppo
 from brax.training.agents.sac import train as sac
-from running import quick_compilation
 
 from scenefactory_jax.adapters.brax import Drive, learning, wrap
 from scenefactory_jax.build import ConfigError
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WORLDS = 3
 EVALS = {"num_evals": 2}  # before and after
 HAD = hasattr(jax, "device_put_replicated")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 from adapting import ALONE, actions, scenes
-from running import quick_compilation
 
 gymnasium = pytest.importorskip("gymnasium", reason="the extra [gymnasium] is not installed")
 
@@ -17,13 +16,9 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 from scenefactory_jax.adapters.gymnasium import ID, Drive, DriveVector  # noqa: E402
 from scenefactory_jax.build import ConfigError  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WORLDS, STEPS = 3, 70  # an episode takes 60
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 @pytest.fixture(scope="module")

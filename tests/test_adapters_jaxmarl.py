@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adapting import SMOKE, scenes
-from running import quick_compilation
 
 pytest.importorskip("jaxmarl", reason="the extra [jaxmarl] is not installed")
 
@@ -15,13 +14,9 @@ from jaxmarl.wrappers.baselines import LogWrapper
 
 from scenefactory_jax.adapters.jaxmarl import Drive
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WORLDS, STEPS = 4, 64
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 @pytest.fixture(scope="module")

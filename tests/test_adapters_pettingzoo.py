@@ -5,7 +5,6 @@ import warnings
 import numpy as np
 import pytest
 from adapting import SMOKE, scenes
-from running import quick_compilation
 
 pytest.importorskip("pettingzoo", reason="the extra [pettingzoo] is not installed")
 
@@ -14,11 +13,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from scenefactory_jax.adapters.pettingzoo import Drive
 from scenefactory_jax.build import ConfigError
 
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import pytest
 import shapely
 import yaml
 from conftest import ROOT, road_of, scene_of
-from running import quick_compilation
 
 import scenefactory_jax
 from scenefactory_jax import build, conditions, geometry, layouts, patches, rain, weather
@@ -19,6 +18,8 @@ from scenefactory_jax.run.playing import _describe
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import SURFACES, Patches, Scene
 from scenefactory_jax.weather import uniform
+
+pytestmark = pytest.mark.usefixtures("quickly")
 
 ICE, SNOW = SURFACES.index("ICE"), SURFACES.index("SNOW")
 OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml") if path.stem != "base")
@@ -283,13 +284,6 @@ def test_given_shapes_lie_where_they_are_given():
 
 
 # ---- the world
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    """Without optimisation: nothing here runs for long."""
-    with quick_compilation():
-        yield
 
 
 def config_of(*overrides):

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from conftest import ROOT
 from omegaconf import OmegaConf
-from running import quick_compilation, smoke
+from running import smoke
 from scene_documents import document, thing, written
 
 from scenefactory_jax import __main__ as command_line
@@ -33,15 +33,11 @@ from scenefactory_jax.run.scenes import scenes
 from scenefactory_jax.run.train import make_policy, make_trainer, train
 from scenefactory_jax.scenes import bank
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CLOCK = {"seconds", "casps", "minutes"}  # columns that no two runs share
 # the smoke run's own shapes, so that what is trained on other scenes is compiled already
 CAPACITY = [f"scenes.capacity.{name}={size}" for name, size in dict(road=1024, lanes=768, edges=256, agents=4, steps=81).items()]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import NUMBERS, SMALL, probe, scenes
-from running import quick_compilation, smoke
+from running import smoke
 from scene_documents import document, thing, written
 from streets import street
 
@@ -22,15 +22,11 @@ from scenefactory_jax.run.train import train as run_train
 from scenefactory_jax.scenes import bank
 from scenefactory_jax.scenes.raw import SceneError
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WORLDS = 8
 SHORT = ("stream.workers=0", "stream.sample=4", "stream.share=0.5")
 CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 def bits(tree):

@@ -34,6 +34,11 @@ class Pool(NamedTuple):
     steps: int  # control steps after which a world's time is up
     control_hz: float
 
+    @property
+    def cars(self) -> list[str]:
+        """Names of the slots, where an interface wants names."""
+        return [f"car_{slot}" for slot in range(self.agents)]
+
 
 @struct
 class Episode:

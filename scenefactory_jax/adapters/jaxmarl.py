@@ -57,7 +57,7 @@ class Drive(MultiAgentEnv):
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=False, lives=True)
         super().__init__(num_agents=self.pool.agents)
-        self.agents = [f"car_{slot}" for slot in range(self.num_agents)]
+        self.agents = self.pool.cars
         self.scenes = self.pool.scenes
         self.observation_spaces = {name: Box(-jnp.inf, jnp.inf, (self.pool.columns,)) for name in self.agents}
         self.action_spaces = {name: Box(-1.0, 1.0, (3,)) for name in self.agents}

@@ -48,7 +48,7 @@ class Drive(ParallelEnv):
         self.pool = episodes.pool(config, overrides, scenes, alone=False)
         self.names, self.render_mode = self.pool.names, None
         self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.control_hz, "is_parallelizable": True}
-        self.possible_agents = [f"car_{slot}" for slot in range(self.pool.agents)]
+        self.possible_agents = self.pool.cars
         self.agents: list[str] = []
         self.observation_spaces = {name: spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32) for name in self.possible_agents}
         self.action_spaces = {name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in self.possible_agents}

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.kernels import on_gpu
 from scenefactory_jax.policy import set_kernel
 from scenefactory_jax.types import Observation, Policy, Rows
 
@@ -218,7 +219,7 @@ def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array
 
 
 def _on(kernel: bool, quick: Callable, plain: Callable, *arguments: Any) -> Any:
-    return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain) if kernel else plain(*arguments)
+    return on_gpu(quick, plain, *arguments) if kernel else plain(*arguments)
 
 
 def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, tuple]:

@@ -17,6 +17,8 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax import kernels
+
 Weights = list[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
 INPUTS = 16  # columns of a row on the chip: its features, a one that the bias takes, zeros; the least that the matrix units take
@@ -56,14 +58,12 @@ def encode(
     if not mask.size:
         return jnp.zeros((*batch, out), jnp.float32), jnp.zeros((*batch, out), jnp.int32)
     x, mask = x.reshape(-1, width, features), mask.reshape(-1, width)
-    operands = (_shown(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
-    own = [pl.BlockSpec((None, *operand.shape[1:]), lambda i, rank=operand.ndim: (i,) + (0,) * (rank - 1)) for operand in operands[:3]]
-    shared = [pl.BlockSpec(operand.shape, lambda i, rank=operand.ndim: (0,) * rank) for operand in operands[3:]]
+    operands = (kernels.shown(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
     rows = ROWS if width > FEW else FEW
     pooled, winner = pl.pallas_call(
         functools.partial(_encode, activate=_activations(interpret)[activation][0], rows=rows, width=width, features=features),
         grid=(len(x),),
-        in_specs=[*own, *shared],
+        in_specs=[*map(kernels.row, operands[:3]), *map(kernels.whole, operands[3:])],
         out_specs=[pl.BlockSpec((None, out), lambda i: (i, 0))] * 2,
         out_shape=[jax.ShapeDtypeStruct((len(x), out), jnp.float32), jax.ShapeDtypeStruct((len(x), out), jnp.int32)],
         compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
@@ -129,14 +129,14 @@ def gradient(
         return jax.tree.map(jnp.zeros_like, weights)
     cotangent = cotangent.reshape(-1, out)
     programs = min(programs, len(cotangent))
-    last = _shown((cotangent != 0.0).any(axis=1)[None])
+    last = kernels.shown((cotangent != 0.0).any(axis=1)[None])
     activate, slope = _activations(interpret)[activation]
     rounded = second.T.astype(dtype).astype(jnp.float32)
     operands = (last, x.reshape(-1, width, features), winner.reshape(-1, out), cotangent, _with_bias(first, first_bias), rounded)
     outer, inner = pl.pallas_call(
         functools.partial(_gradient, activate=activate, slope=slope, dtype=jnp.dtype(dtype), features=features),
         grid=(programs, out // CHANNELS),
-        in_specs=[pl.BlockSpec(operand.shape, lambda i, j, rank=operand.ndim: (0,) * rank) for operand in operands],
+        in_specs=[*map(kernels.whole, operands)],
         out_specs=[
             pl.BlockSpec((None, CHANNELS, hidden), lambda i, j: (i, j, 0)),
             pl.BlockSpec((None, None, INPUTS, hidden), lambda i, j: (i, j, 0, 0)),
@@ -202,11 +202,6 @@ def _product(a: Array, b: Array, *, along: int = 1) -> Array:
 def _with_bias(kernel: Array, bias: Array) -> Array:
     """The first layer as one matrix for rows that hold a one behind their features."""
     return jnp.concatenate([kernel, bias[None], jnp.zeros((INPUTS - 1 - len(kernel), kernel.shape[1]), kernel.dtype)])
-
-
-def _shown(mask: Bool[Array, "N K"]) -> Int[Array, " N"]:
-    """How many rows of each set there are up to the last one that its mask shows."""
-    return jnp.max(jnp.where(mask, jnp.arange(1, mask.shape[1] + 1, dtype=jnp.int32), 0), axis=1)
 
 
 def _activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]]:

@@ -1,0 +1,31 @@
+"""What the Triton kernels share: where they run, what a program sees of its operands, and where it may stop."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jaxtyping import Array, Bool, Int
+
+
+def on_gpu(quick: Callable, plain: Callable, *arguments: Any) -> Any:
+    """`quick` on NVIDIA GPUs, `plain` elsewhere."""
+    return jax.lax.platform_dependent(*arguments, cuda=quick, default=plain)
+
+
+def row(operand: Any) -> pl.BlockSpec:
+    """Each program's own row of an operand, in a grid of one axis."""
+    rest = operand.shape[1:]
+    return pl.BlockSpec((None, *rest), lambda program: (program,) + (0,) * len(rest))
+
+
+def whole(operand: Any) -> pl.BlockSpec:
+    """All of an operand for every program of any grid."""
+    return pl.BlockSpec(operand.shape, lambda *programs: (0,) * len(operand.shape))
+
+
+def shown(mask: Bool[Array, "*n K"]) -> Int[Array, "*n"]:
+    """How many entries of the last axis there are up to the last true one."""
+    count = jnp.arange(1, mask.shape[-1] + 1, dtype=jnp.int32)
+    return jnp.max(jnp.where(mask, count, 0), axis=-1, initial=0)
