@@ -6,7 +6,6 @@ import re
 import jax
 import pytest
 import study_parts
-from running import quick_compilation
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
@@ -14,6 +13,8 @@ from scenefactory_jax.report import levels, tables
 from scenefactory_jax.run import config, log, sources, study_plan, train
 from scenefactory_jax.run import study as command
 from scenefactory_jax.run.study import Clock, study
+
+pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (config.folder() / "study").glob("*.yaml") if path.stem != "base")
 TOY = {
@@ -34,12 +35,6 @@ TOY = {
 }
 ALONE = {"trainings": {"all terms": []}, "conditions": {"dry": []}, "judged": None, "floors": {}, "compare": [], "trend": None}
 ALONE |= {"figures": []}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    with quick_compilation():
-        yield
 
 
 def toy(folder, *overrides, **changes):
@@ -146,6 +141,22 @@ def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch
     for file in files:
         [same] = (folder / "runs").glob(f"{file.parent.name}/{file.name}")
         assert file.read_bytes() == same.read_bytes()
+
+
+def test_processes_divide_a_study_among_them(tmp_path, capfd):
+    result = study(toy(tmp_path, "processes=2", **ALONE))
+    assert result["missing"] == [] and len(list((tmp_path / "runs").glob("*/trained.json"))) == 2
+    assert result["rows"][0]["seeds"] == [3, 4]
+    printed = capfd.readouterr().out
+    assert [printed.count(f"training all terms, seed {seed}\n") for seed in (3, 4)] == [1, 1]
+    (looks,) = result["looks"]
+    assert (looks["policies"], looks["curve points"]) == (2, 4) and looks["seconds"] > 0
+
+
+def test_a_process_that_fails_is_told_once_the_others_are_done(tmp_path):
+    wrong = toy(tmp_path, "processes=2", "test_scenes=nowhere.bank", **ALONE)
+    with pytest.raises(RuntimeError, match="2 of 2 processes ended with an error"):
+        study(wrong)
 
 
 def test_a_study_stops_in_time_and_tells_what_is_missing(tmp_path, capsys):

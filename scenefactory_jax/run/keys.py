@@ -43,6 +43,7 @@ EXAMINED = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s":
 STUDY = {"train_scenes": PLACE, "test_scenes": PLACE, "cut": Key(Literal["test", "validation"]), "runs": Key(str), "out": PLACE}
 STUDY |= {"seeds": Key(list[int] | None), "common": Key(list[str]), "only": Key(list[str] | None), "until_s": Key(float | None, 0)}
 STUDY |= {"parts": Key(list[Literal["train", "judge", "report"]]), "target": Key(float, 0), "progress": FLAG, "slim": FLAG}
+STUDY |= {"processes": COUNT}
 STUDIED = {"name": Key(str), "question": Key(str), "base": Key(list[str]), "common": Key(list[str]), "trainings": Key(dict[str, list])}
 STUDIED |= {"seeds": Key(list[int]), "examined": Key(list[str]), "conditions": Key(dict[str, list]), "protocols": Key(list[str])}
 STUDIED |= {"judged": Key(dict[str, list] | None), "floors": Key(dict[str, dict]), "compare": Key(list[list[str]])}

@@ -7,6 +7,7 @@ same settings is not done twice, also not by another study that wants the same.
 import datetime
 import functools
 import itertools
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,12 +18,13 @@ import numpy as np
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import results, sources, study_plan, study_report, train
+from scenefactory_jax.run import results, sources, study_plan, study_report, together, train
 from scenefactory_jax.run.evaluate import make_examiner
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 from scenefactory_jax.run.study_report import RESULT, TRAINED
 
 COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
+LOOKS, COUNTED = "looks.json", ("policies", "curve points", "seconds")
 
 Examine = Callable[[Any], tuple[dict[str, np.ndarray], list]]
 
@@ -42,17 +44,37 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     plan = study_plan.make(config)
     sources.use_compilation_cache()
     out = Path(config["out"] or Path("experiments") / plan.name)
-    shared = Shared(config, Looks(out / RESULT, command=_command(config), cut=config["cut"]))
-    complete = True
-    if "train" in config["parts"]:
-        complete = _train(plan, shared, clock)
-    if "judge" in config["parts"] and complete:
-        complete = _judge(plan, shared, clock)
-    if not complete:
+    looks = Looks(out / RESULT, command=_command(config), cut=config["cut"])
+    do = _do if config["processes"] == 1 else _do_together
+    if not all(do(part, config, plan, looks, clock) for part in ("train", "judge") if part in config["parts"]):
         print("stopped for want of time; the same command goes on", flush=True)
     if "report" not in config["parts"]:
-        return shared.looks.result()
-    return study_report.write(plan, config, out, before=shared.looks.result())
+        return looks.result()
+    return study_report.write(plan, config, out, before=looks.result())
+
+
+def _do(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock", claims: together.Claims | None = None) -> bool:
+    """One part of a study in this process; whether all could be done."""
+    work = _train if part == "train" else _judge
+    return work(plan, Shared(config, looks, claims or together.Claims(None)), clock)
+
+
+def _do_together(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock") -> bool:
+    """One part by several processes, each on a GPU of its own; what they could not do within the time is left to the next call."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            done = together.run(_do_share, config["processes"], part, {**config, "until_s": clock.left_s()}, folder)
+        finally:
+            looks.gather(folder)
+    return all(done)
+
+
+def _do_share(index: int, part: str, config: Mapping[str, Any], folder: Path) -> bool:
+    """What one of several processes does."""
+    sources.use_compilation_cache()
+    looks = Looks(folder / f"{index}-{LOOKS}", command="", cut=config["cut"])
+    return _do(part, config, study_plan.make(config), looks, Clock(config["until_s"]), together.Claims(folder))
 
 
 class Clock:
@@ -61,13 +83,17 @@ class Clock:
     def __init__(self, until_s: float | None):
         self._begun, self._until_s = time.monotonic(), until_s
 
+    def left_s(self) -> float | None:
+        """None: without end."""
+        return None if self._until_s is None else max(0.0, self._until_s - (time.monotonic() - self._begun))
+
     def fits(self, seconds: float, *, what: str) -> bool:
         """Whether so many seconds are left. What would never fit is begun all the same: it goes on from its checkpoint."""
-        if self._until_s is None:
+        left = self.left_s()
+        if left is None or self._until_s is None:
             return True
-        left = self._until_s - (time.monotonic() - self._begun)
-        if left <= 0 or (seconds > left and seconds <= self._until_s):
-            print(f"{what}: would take about {seconds:.0f} s, {max(left, 0):.0f} s are left", flush=True)
+        if left == 0 or (seconds > left and seconds <= self._until_s):
+            print(f"{what}: would take about {seconds:.0f} s, {left:.0f} s are left", flush=True)
             return False
         return True
 
@@ -78,7 +104,7 @@ class Looks:
     def __init__(self, file: Path, *, command: str, cut: str):
         self._file, self._entry = file, None
         self._new: dict[str, Any] = {"date": datetime.date.today().isoformat(), "command": command, "cut": cut}
-        self._new |= {"policies": 0, "curve points": 0, "seconds": 0.0}
+        self._new |= dict.fromkeys(COUNTED, 0)
 
     def counted(self, examine: Examine, kind: str) -> Examine:
         """`examine`, noting each call before it begins, and what it took."""
@@ -103,16 +129,23 @@ class Looks:
         self._file.parent.mkdir(parents=True, exist_ok=True)
         results.write(self._file, result, digits=None)
 
+    def gather(self, folder: Path) -> None:
+        """Add what the processes of a common work counted in files of their own."""
+        for file in sorted(folder.glob(f"*-{LOOKS}")):
+            for entry in results.read(file)["looks"]:
+                for what in COUNTED:
+                    self._add(what, entry[what])
+
     def result(self) -> dict[str, Any]:
         """What the file holds."""
         return results.read(self._file) if self._file.is_file() else {}
 
 
 class Shared:
-    """What several trainings and judgings use: scenes, each read once, and the count of looks."""
+    """What several trainings and judgings use: scenes, each read once, the count of looks, and what is this process's to do."""
 
-    def __init__(self, config: Mapping[str, Any], looks: Looks):
-        self.config, self.looks = config, looks
+    def __init__(self, config: Mapping[str, Any], looks: Looks, claims: together.Claims):
+        self.config, self.looks, self.claims = config, looks, claims
         self._scenes: dict[str, sources.Scenes] = {}
 
     def training_scenes(self, task: Mapping[str, Any]) -> sources.Scenes:
@@ -154,6 +187,8 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
         prepared, examiners = None, {}
         for one in group:
             needs = spent.get(program, _estimate(one))
+            if not shared.claims.take(one.digest):
+                continue
             if not clock.fits(needs, what=f"training {one.variant}, seed {one.seed}"):
                 return False
             begun = time.monotonic()
@@ -208,7 +243,9 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
     ready = [one for one in ready if one.weights == study_plan.UNTRAINED or is_trained(one.training)]
     order = {program: index for index, program in enumerate(dict.fromkeys(one.program for one in ready))}
     longest = 0.0
-    for _, group in itertools.groupby(sorted(ready, key=lambda one: order[one.program]), key=lambda one: one.program):
+    for program, group in itertools.groupby(sorted(ready, key=lambda one: order[one.program]), key=lambda one: one.program):
+        if not shared.claims.take(program):
+            continue
         begun, examine = time.monotonic(), None
         for one in group:
             if not clock.fits(longest, what=f"judging {one.row}, {one.condition}, {one.protocol}"):
