@@ -27,6 +27,7 @@ NUMBERS = dict(
     desired_kl=None,
     learning_rate_min=1e-5,
     learning_rate_max=1e-2,
+    learning_rate_halved=None,
     gamma=0.9,
     gae_lambda=0.95,
     clip=0.2,

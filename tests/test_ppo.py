@@ -128,17 +128,17 @@ def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
 
 @pytest.fixture(scope="module")
 def learn(batch):
-    """Two minibatches of 12: (samples, rate) -> (parameters, optimiser state, facts)."""
+    """Two minibatches of 12: (samples, numbers of the rate, iteration) -> (parameters, optimiser state, facts)."""
     policy, parameters, _, log_std = batch
     adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
     objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
     numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
 
     @jax.jit
-    def run(samples, rate):
-        return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), rate=rate, **numbers)
+    def run(samples, rate, iteration):
+        return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), iteration, rate=rate, **numbers)
 
-    return lambda samples, *rate: run(samples, update.AdaptiveRate(*rate))
+    return lambda samples, *rate, iteration=0: run(samples, update.AdaptiveRate(*rate), iteration)
 
 
 def test_what_is_not_finite_moves_nothing_and_is_counted(batch, learn):
@@ -163,6 +163,16 @@ def test_learning_rate_follows_the_divergence(batch, learn):
     np.testing.assert_allclose(rate(divergence, 1e-5, 1e-2), 1e-3, rtol=1e-5)
     np.testing.assert_allclose(rate(divergence * 9, 1e-5, 1e-2), 1e-3 * 1.5**2, rtol=1e-5)
     np.testing.assert_allclose(rate(divergence / 9, 9e-4, 1e-2), 9e-4, rtol=1e-5)
+
+
+def test_the_largest_learning_rate_falls_as_one_over_time(batch, learn):
+    """A half after `halved` iterations, a third after twice as many, never below the least; it bounds a rate that nothing adapts, too."""
+
+    def rate(iteration, *, halved=10.0, least=1e-5, desired_kl=1e3):
+        return float(learn(batch[2], desired_kl, least, 8e-4, halved, iteration=iteration)[2]["learning_rate"])
+
+    np.testing.assert_allclose([rate(0), rate(10), rate(20), rate(70)], [8e-4, 4e-4, 8e-4 / 3, 1e-4], rtol=1e-5)
+    np.testing.assert_allclose([rate(10**6), rate(10, halved=None), rate(30, desired_kl=None)], [1e-5, 8e-4, 2e-4], rtol=1e-5)
 
 
 def counted(env: Env):

@@ -70,6 +70,7 @@ def make(
     desired_kl: float | None,
     learning_rate_min: float,
     learning_rate_max: float,
+    learning_rate_halved: float | None,
     gamma: float,
     gae_lambda: float,
     clip: float,
@@ -93,6 +94,7 @@ def make(
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate: of Adam; the first one if `desired_kl` is a number.
         desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
+        learning_rate_halved: iterations after which learning_rate_max is a half of what it was, and a third after twice that; None: it stays.
         gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
         clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
         entropy, value: weights of entropy bonus and value loss.
@@ -111,7 +113,7 @@ def make(
     axis, own, everybody = _groups(shards, mesh)
     adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
     objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis)
-    rate, each = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max), permutation == "each_epoch"
+    rate, each = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved), permutation == "each_epoch"
     passes = {"epochs": epochs, "minibatches": minibatches, "groups": own, "axis": axis}
     learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, permute_each_epoch=each, **passes)
     start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
@@ -258,7 +260,8 @@ def _iterate(
     worlds, observation, lives, samples, tally, lately = acted
     _, log_std, bootstrap = policy.apply(train_state.parameters, observation)
     batch = prepare(samples, bootstrap)
-    parameters, optimiser, facts = learn(train_state.parameters, train_state.optimiser, batch, log_std, learn_key, size=size(worlds))
+    learnt = (train_state.parameters, train_state.optimiser)
+    parameters, optimiser, facts = learn(*learnt, batch, log_std, learn_key, train_state.iteration, size=size(worlds))
     facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
     tally = across.total(tally, axis)
     following = TrainState(
@@ -385,7 +388,8 @@ def _check(numbers: dict[str, Any]) -> None:
     for name in ("horizon", "epochs", "minibatches", "episode_steps"):
         if numbers[name] < 1:
             raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a whole number of at least 1")
-    for name in ("learning_rate", "max_grad_norm", "clip", "sample_share"):
+    falls = () if numbers["learning_rate_halved"] is None else ("learning_rate_halved",)
+    for name in ("learning_rate", "max_grad_norm", "clip", "sample_share", *falls):
         if not numbers[name] > 0:
             raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number above 0")
     for name in ("gamma", "gae_lambda", "sample_share", *(() if numbers["average"] is None else ("average",))):

@@ -17,11 +17,22 @@ Loss = Callable[[Any, Batch, Float[Array, " 3"]], tuple[Float[Array, ""], dict[s
 
 
 class AdaptiveRate(NamedTuple):
-    """The learning rate is divided by 1.5 above twice `desired_kl`, multiplied by 1.5 below half of it, within bounds; None holds it."""
+    """The learning rate is divided by 1.5 above twice `desired_kl`, multiplied by 1.5 below half of it, within bounds; None holds it.
+
+    After `halved` iterations the upper bound is a half of `maximum`, after twice that a third, and so on: steps of the size 1 / t, with
+    which noisy gradients converge (Robbins and Monro 1951), without asking how long the training will be. None: it stays.
+    """
 
     desired_kl: float | None
     minimum: float
     maximum: float
+    halved: float | None = None
+
+    def at(self, iteration: Int[Array, ""]) -> "AdaptiveRate":
+        """With the upper bound of that iteration, an array if it falls."""
+        if self.halved is None:
+            return self
+        return self._replace(maximum=jnp.maximum(self.maximum / (1.0 + iteration / self.halved), self.minimum))  # pyright: ignore
 
 
 def optimiser(*, learning_rate: float, max_grad_norm: float) -> optax.GradientTransformation:
@@ -36,6 +47,7 @@ def learn(
     batch: Batch,
     log_std_old: Float[Array, " 3"],
     key: PRNGKeyArray,
+    iteration: Int[Array, ""],
     *,
     loss: Loss,
     optimiser: optax.GradientTransformation,
@@ -57,6 +69,7 @@ def learn(
         parameters, optimiser state, and what the loss reports as means over the minibatches that moved the parameters; `skipped` counts
         those whose loss or gradient was not finite, `left_out` is the share of samples with weight that no minibatch holds.
     """
+    rate = rate.at(iteration)
     step = functools.partial(_minibatch, loss=loss, optimiser=optimiser, rate=rate, batch=batch, log_std_old=log_std_old, axis=axis)
     deal = functools.partial(split, weight=batch.weight, minibatches=minibatches, size=size, groups=groups, axis=axis)
 
@@ -113,6 +126,9 @@ def _minibatch(
     adapted = jax.tree.map(lambda x: x, state)  # Brax writes into the state's dict
     if rate.desired_kl is not None:
         adapted, _ = adaptive_kl_learning_rate(adapted, facts["kl"], rate.desired_kl, rate.minimum, rate.maximum)  # pyright: ignore
+    if rate.halved is not None:
+        own = adapted[-1].hyperparams  # pyright: ignore
+        own["learning_rate"] = jnp.minimum(own["learning_rate"], rate.maximum)
     updates, adapted = optimiser.update(gradient, adapted, parameters)
     stepped = optax.apply_updates(parameters, updates)
 

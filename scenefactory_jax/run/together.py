@@ -1,13 +1,15 @@
 """One work done by several processes of this machine, each on a GPU of its own where there are several."""
 
+import contextlib
 import multiprocessing
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from scenefactory_jax.run import results
+
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 class Claims:
@@ -34,9 +36,11 @@ def run(work: Callable[..., Any], processes: int, *arguments: Any) -> list[Any]:
         RuntimeError: if a process ended with an error, which it has printed, once the others have ended, too.
     """
     context = multiprocessing.get_context("spawn")
+    gpus = [_gpu(index) for index in range(processes)]
     each = [context.Process(target=_one, args=(work, index, arguments)) for index in range(processes)]
-    for process in each:
-        process.start()
+    for gpu, process in zip(gpus, each, strict=True):
+        with _seeing(gpu):
+            process.start()
     for process in each:
         process.join()
     if failed := sum(process.exitcode != 0 for process in each):
@@ -45,8 +49,30 @@ def run(work: Callable[..., Any], processes: int, *arguments: Any) -> list[Any]:
 
 
 def _one(work: Callable[..., Any], index: int, arguments: tuple[Any, ...]) -> None:
-    jax.config.update("jax_cuda_visible_devices", str(index))
     results.write(_answer(arguments[-1], index), {"answer": work(index, *arguments)}, digits=None)
+
+
+@contextlib.contextmanager
+def _seeing(gpu: str) -> Iterator[None]:
+    """What is started meanwhile sees one GPU alone. Programs of JAX's own `jax_cuda_visible_devices` fail on any but the first (0.11.2)."""
+    before = os.environ.get(VISIBLE)
+    os.environ[VISIBLE] = gpu
+    try:
+        yield
+    finally:
+        del os.environ[VISIBLE]
+        if before is not None:
+            os.environ[VISIBLE] = before
+
+
+def _gpu(index: int) -> str:
+    """Which GPU the process of that index uses, of those that are not hidden from this one already."""
+    given = [one for one in os.environ.get(VISIBLE, "").split(",") if one]
+    if not given:
+        return str(index)
+    if index >= len(given):
+        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(given)}; `processes` is at most {len(given)}")
+    return given[index]
 
 
 def _answer(folder: Path, index: int) -> Path:

@@ -1,0 +1,44 @@
+"""Processes that divide a work: each piece is done once, each process sees one GPU, and what fails is told."""
+
+import os
+
+import pytest
+
+from scenefactory_jax.run import together
+
+
+def work(index, pieces, folder):
+    claims = together.Claims(folder)
+    return {"taken": [one for one in pieces if claims.take(one)], "sees": os.environ[together.VISIBLE], "index": index}
+
+
+def failing(index, folder):
+    if index == 1:
+        raise ValueError("this one fails")
+    (folder / "done").touch()
+
+
+def test_each_piece_is_done_once_and_each_process_sees_a_gpu_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv(together.VISIBLE, "4,GPU-7a")
+    pieces = [f"piece-{index}" for index in range(40)]
+    answers = together.run(work, 2, pieces, tmp_path)
+    assert sorted(one for answer in answers for one in answer["taken"]) == sorted(pieces)
+    assert [answer["sees"] for answer in answers] == ["4", "GPU-7a"] and os.environ[together.VISIBLE] == "4,GPU-7a"
+    monkeypatch.delenv(together.VISIBLE)
+    assert together.run(work, 1, [], tmp_path)[0]["sees"] == "0" and together.VISIBLE not in os.environ
+
+
+def test_a_failing_process_is_told_once_the_others_have_ended(tmp_path, capfd):
+    with pytest.raises(RuntimeError, match="1 of 2 processes ended with an error"):
+        together.run(failing, 2, tmp_path)
+    assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
+
+
+def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv(together.VISIBLE, "0")
+    with pytest.raises(RuntimeError, match="`processes` is at most 1"):
+        together.run(work, 2, [], tmp_path)
+
+
+def test_alone_all_is_ones_own():
+    assert all(together.Claims(None).take("piece") for _ in range(2))
