@@ -35,12 +35,13 @@ def pairwise(
     yaw: Float[Array, " A"],
     *,
     drac_gap_floor_m: float,
-) -> tuple[Float[Array, "A B"], Float[Array, "A B"]]:
-    """TTC (s) and DRAC (m/s^2) of each car (row) with each other body (column), both moving on with their present velocities.
+) -> tuple[Float[Array, "A B"], Float[Array, "A B"], Float[Array, "A B"]]:
+    """TTC (s), DRAC (m/s^2) and gap (m) of each car (row) with each other body (column), both moving on with their present velocities.
 
     TTC: first time at which a circle of the column's body, ahead of the row car's own circle, touches it; 0 when they overlap, inf when
     their paths never meet. DRAC = closing^2 / (2 gap), largest over the circle pairs in any direction, gap not below a floor (the published
-    evaluation uses 1 m). The first rows of the bodies are the cars, as many as there are in `yaw`: the diagonal holds inf and 0.
+    evaluation uses 1 m). Gap: between the nearest circles, negative where they overlap. The first rows of the bodies are the cars, as many
+    as there are in `yaw`: the diagonal holds inf, 0 and inf.
     """
     cars = len(yaw)
     apart = centres[None, :, None, :, :] - centres[:cars, None, :, None, :]  # [row, column, own circle, other circle, xy]
@@ -60,13 +61,14 @@ def pairwise(
     ttc = jnp.min(jnp.where(ahead, time, jnp.inf), axis=(2, 3))
 
     closing = jnp.maximum(-b / jnp.maximum(distance, SMALLEST), 0.0)
-    gap = jnp.maximum(distance - reach, drac_gap_floor_m)
-    drac = jnp.max(closing**2 / (2 * gap), axis=(2, 3))
+    gap = distance - reach
+    drac = jnp.max(closing**2 / (2 * jnp.maximum(gap, drac_gap_floor_m)), axis=(2, 3))
 
     self_pair = jnp.eye(cars, len(radius), dtype=bool)
-    return jnp.where(self_pair, jnp.inf, ttc), jnp.where(self_pair, 0.0, drac)
+    away = jnp.where(self_pair, jnp.inf, jnp.min(gap, axis=(2, 3)))
+    return jnp.where(self_pair, jnp.inf, ttc), jnp.where(self_pair, 0.0, drac), away
 
 
-def least(ttc: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
-    """Smallest TTC over the columns that count as present."""
-    return jnp.min(jnp.where(other[None], ttc, jnp.inf), axis=1)
+def least(of: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
+    """Smallest TTC or gap over the columns that count as present; inf where nobody is."""
+    return jnp.min(jnp.where(other[None], of, jnp.inf), axis=1)

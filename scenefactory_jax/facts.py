@@ -48,7 +48,7 @@ def measure(
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
     everyone = conflict.bodies(motion, after.agents.size, active & finite, scene.boxes)  # nobody meets a broken car
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    ttc, drac = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    ttc, drac, gap = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
     edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
     beside = roadside.look(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
@@ -67,6 +67,7 @@ def measure(
         goal_distance=norm(to_goal),
         **lane,
         ttc=conflict.least(ttc, everyone.present),
+        gap=conflict.least(gap, everyone.present),
         edge_ttc=beside.edge_ttc,
         edge_gap=edge_gap,
         drac=jnp.max(jnp.where(everyone.present[None], drac, 0.0), axis=1),
@@ -101,8 +102,8 @@ def _measure_lane(
 ) -> dict[str, Array]:
     """Facts relative to a row of the lanes; zeros in a world without lanes."""
     any_lane, position = jnp.any(scene.lanes.valid), motion.position[:, :2]
-    tangent, midpoint = scene.lanes.direction[row], scene.lanes.midpoint[row]
-    tangent = jnp.where((dot(to_goal, tangent) < 0)[:, None], -tangent, tangent)
+    direction, midpoint = scene.lanes.direction[row], scene.lanes.midpoint[row]
+    tangent = jnp.where((dot(to_goal, direction) < 0)[:, None], -direction, direction)
     offset = position - midpoint
     moved = position - before.motion.position[:, :2]
     zero = jnp.zeros(len(row), jnp.float32)
@@ -111,5 +112,6 @@ def _measure_lane(
         "lane_offset": jnp.where(any_lane, jnp.abs(cross(tangent, offset)), zero),
         "lane_distance": jnp.where(any_lane, norm(offset), zero),
         "lane_alignment": jnp.where(any_lane, dot(heading(motion.yaw), tangent), zero),
+        "lane_heading": jnp.where(any_lane, dot(heading(motion.yaw), direction), zero),
         "has_lane": jnp.broadcast_to(any_lane, row.shape),
     }

@@ -78,7 +78,7 @@ def neighbours(
     mask = jnp.take_along_axis(others, order, axis=1)
 
     centres, radius = car_circles(position, yaws, size, **circles)
-    ttc, _ = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=1.0)
+    ttc, *_ = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=1.0)
     time = jnp.minimum(jnp.take_along_axis(ttc, order, axis=1) / ttc_scale_s, 1.0)
     place = to_frame(position[order] - position[:cars, None], motion.yaw[:, None]) / distance_scale_m
     yaw = wrap_angle(yaws[order] - motion.yaw[:, None]) / jnp.pi

@@ -56,6 +56,24 @@ def edge_ttc(step: Step, *, alpha_s: float, limit: float, floor_s: float) -> Flo
     return _urgency(step.facts.edge_ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 
+def clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+    """Closeness to the nearest other car: 1 where the bounding circles touch, 0 from `limit_m` between them on.
+
+    TTC says little of a car that follows another at its own speed a hand's breadth behind it.
+    """
+    return _closeness(step.facts.gap, limit_m)
+
+
+def edge_clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+    """The same for the nearest road edge, in any direction."""
+    return _closeness(step.facts.edge_gap, limit_m)
+
+
+def wrong_way(step: Step) -> Float[Array, " A"]:
+    """How far the car points against the direction of its nearest lane: 1 against the traffic, 0 across it, with it, and without lanes."""
+    return jnp.maximum(-step.facts.lane_heading, 0.0)
+
+
 def speed(step: Step, *, limit_mps: float) -> Float[Array, " A"]:
     """Speed as a share of a limit, clamped to 1: the optional bonus of the published code, off by default."""
     return jnp.clip(step.facts.speed / limit_mps, 0.0, 1.0)
@@ -64,6 +82,10 @@ def speed(step: Step, *, limit_mps: float) -> Float[Array, " A"]:
 def action_rate(step: Step) -> Float[Array, " A"]:
     """Squared change of the action since the last step."""
     return jnp.sum((step.action - step.before.previous_action) ** 2, axis=-1)
+
+
+def _closeness(gap: Float[Array, " A"], limit_m: float) -> Float[Array, " A"]:
+    return jnp.clip(1.0 - gap / limit_m, 0.0, 1.0)
 
 
 def _urgency(time: Float[Array, " A"], *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:

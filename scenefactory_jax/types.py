@@ -197,8 +197,10 @@ class Facts:
     lane_offset: Float[Array, " A"]  # lateral distance from the nearest lane segment's line
     lane_distance: Float[Array, " A"]  # distance from its midpoint
     lane_alignment: Float[Array, " A"]  # cosine between the car and the lane, towards the goal
+    lane_heading: Float[Array, " A"]  # cosine between the car and the lane's own direction: negative against the traffic
     has_lane: Bool[Array, " A"]
     ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
+    gap: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
     edge_ttc: Float[Array, " A"]
     edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2

@@ -13,7 +13,7 @@ from scenefactory_jax import conflict, ends, facts, geometry, observations, othe
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
-from scenefactory_jax.types import Dynamics, Motion
+from scenefactory_jax.types import Dynamics, Motion, Step
 
 CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
 
@@ -108,7 +108,7 @@ def test_ttc_equals_a_simulated_one():
     velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
     sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
     centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
-    ttc, drac = conflict.pairwise(centres, radius, jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32), drac_gap_floor_m=1.0)
+    ttc, drac, _ = conflict.pairwise(centres, radius, jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32), drac_gap_floor_m=1.0)
     ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
     expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
     assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
@@ -120,8 +120,9 @@ def test_head_on_ttc_and_drac_by_hand():
     yaw, size = jnp.array([0.0, jnp.pi]), jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
     centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
     velocity = jnp.array([[5.0, 0], [-5.0, 0]])
-    ttc, drac = conflict.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    ttc, drac, away = conflict.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
     gap = 20 - 2 * 1.12 - 2 * 1.1
+    np.testing.assert_allclose(away, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
     np.testing.assert_allclose(ttc[0, 1], gap / 10, rtol=1e-5)
     np.testing.assert_allclose(drac[0, 1], 100 / (2 * gap), rtol=1e-5)
 
@@ -129,7 +130,7 @@ def test_head_on_ttc_and_drac_by_hand():
 def test_parting_cars_never_meet():
     size = jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
     centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
-    ttc, _ = conflict.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
+    ttc, *_ = conflict.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
     assert jnp.isinf(ttc).all()
 
 
@@ -210,6 +211,22 @@ def test_collision_needs_force_and_grace(env, two_cars):
     collided = [bool(h.events.collided[1]) for h in history]
     assert collided.index(True) == 23, "the first 23 control steps are masked"
     assert sum(collided) == 1
+
+
+def test_closeness_to_cars_and_edges_and_driving_against_the_traffic_by_hand(env):
+    """Two cars side by side, one of them against its lane, 1.4 m and 0.85 m from the edges at +-6 m; the third is alone."""
+    scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], [[50, 3.5], [50, -4.0], [90, 0], [90, 0]], yaws=[np.pi, 0.0, 0.0, 0.0])
+    state, (outcome,) = drive(env, scene, jnp.zeros((4, 3)), 1)
+    facts = outcome.facts
+    step = Step(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, facts=facts, events=outcome.events)
+    beside, behind = 7.5 - 2.2, 6.0 - 2.24 - 2.2
+    np.testing.assert_allclose(facts.gap, [beside, beside, behind, behind], rtol=1e-4)
+    np.testing.assert_allclose(facts.lane_heading, [-1, 1, 1, 1], atol=1e-5)
+    edge = np.asarray(facts.edge_gap)
+    np.testing.assert_allclose(edge[:2], [6 - 0.05 - 3.5 - 1.1, 6 - 0.05 - 4.0 - 1.1], atol=0.02)
+    np.testing.assert_allclose(rewards.clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)
+    np.testing.assert_allclose(rewards.edge_clearance(step, limit_m=1.0), np.clip(1 - edge, 0, 1), atol=1e-5)
+    np.testing.assert_allclose(rewards.wrong_way(step), [1, 0, 0, 0], atol=1e-5)
 
 
 def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
