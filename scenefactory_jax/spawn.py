@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
@@ -62,6 +62,44 @@ def standing(key: PRNGKeyArray, scene: Scene) -> Agents:
     return replace(scene.agents, speed=jnp.zeros_like(scene.agents.speed))
 
 
+def stretches(
+    key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_share: float
+) -> Agents:
+    """A random stretch of each recorded way, every car's drawn on its own: the ways and speeds of the recording, other encounters.
+
+    Start and goal are rows of `scene.log`, at least `travel_min` apart along the way where it is that long; a shorter way is driven whole.
+    Starts keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates fits stays absent. In a
+    share of the episodes all cars start from rest, in the others at their recorded speeds.
+    """
+    log, cars = scene.log, scene.agents
+    from_key, to_key, rest_key = jax.random.split(key, 3)
+    both = log.valid[:, 1:] & log.valid[:, :-1]
+    steps = jnp.where(both, norm(log.position[:, 1:] - log.position[:, :-1]), 0.0)
+    travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
+    whole = travelled[:, -1:]
+    shape = (len(cars.present), candidates)
+    spare = jnp.maximum(whole - travel_min_m, 0.0)
+    begin = jax.random.uniform(from_key, shape) * spare
+    end = whole - jax.random.uniform(to_key, shape) * (spare - begin)
+    row_at = jax.vmap(jnp.searchsorted)  # the first row that is so far along the way
+    first, last = row_at(travelled, begin), row_at(travelled, end)
+    read = jax.vmap(lambda track, row: track[row])
+    start, goal = read(log.position, first), read(log.position, last)
+    usable = cars.present[:, None] & ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
+    chosen, present = _choose(start, goal, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
+    pick = functools.partial(_pick, chosen=chosen, present=present)
+    moving = ~jax.random.bernoulli(rest_key, standing_share)
+    return Agents(
+        position=pick(start),
+        yaw=pick(read(log.yaw, first)),
+        speed=moving * pick(norm(read(log.velocity, first))),
+        size=cars.size,
+        goal=pick(goal),
+        route=pick(read(travelled, last) - read(travelled, first)),
+        present=present,
+    )
+
+
 def random_pairs(
     key: PRNGKeyArray,
     scene: Scene,
@@ -98,16 +136,15 @@ def random_pairs(
     )
     unbroken &= ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
     chosen, present = _choose(start, goal, unbroken, start_gap_m=start_gap_m, goal_gap_m=goal_gap_m)
-    pick = lambda rows: jnp.take_along_axis(rows, chosen.reshape((-1, 1) + (1,) * (rows.ndim - 2)), axis=1)[:, 0]  # noqa: E731
-    hide = lambda rows: jnp.where(present.reshape((-1,) + (1,) * (rows.ndim - 1)), rows, 0.0).astype(jnp.float32)  # noqa: E731
+    pick = functools.partial(_pick, chosen=chosen, present=present)
     size = jnp.broadcast_to(jnp.array(car_size_m, jnp.float32), (slots, 2))
     return Agents(
-        position=hide(pick(start)),
-        yaw=hide(pick(start_yaw)),
+        position=pick(start),
+        yaw=pick(start_yaw),
         speed=jnp.zeros(slots, jnp.float32),
         size=size,
-        goal=hide(pick(goal)),
-        route=hide(pick(travel)),
+        goal=pick(goal),
+        route=pick(travel),
         present=present,
     )
 
@@ -134,6 +171,13 @@ def _choose(
     empty = (jnp.zeros((slots, 2)), jnp.zeros((slots, 2)), jnp.zeros(slots, jnp.int32), jnp.zeros(slots, bool))
     _, _, chosen, present = jax.lax.fori_loop(0, slots, place, empty)
     return chosen, present
+
+
+def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], present: Bool[Array, " A"]) -> Float[Array, "A *d"]:
+    """Each slot's chosen candidate; zeros where it stays absent."""
+    pad = (1,) * (candidates.ndim - 2)
+    found = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
+    return jnp.where(present.reshape((-1, *pad)), found, 0.0).astype(jnp.float32)
 
 
 def is_clear(
