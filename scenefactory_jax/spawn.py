@@ -62,40 +62,37 @@ def standing(key: PRNGKeyArray, scene: Scene) -> Agents:
     return replace(scene.agents, speed=jnp.zeros_like(scene.agents.speed))
 
 
-def stretches(
+def underway(
     key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_share: float
 ) -> Agents:
-    """A random stretch of each recorded way, every car's drawn on its own: the ways and speeds of the recording, other encounters.
+    """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
 
-    Start and goal are rows of `scene.log`, at least `travel_min` apart along the way where it is that long; a shorter way is driven whole.
-    Starts keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates fits stays absent. In a
+    Starts are rows of `scene.log`, at least `travel_min` before the goal along the way where it is that long; a shorter way is driven whole.
+    They keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates fits stays absent. In a
     share of the episodes all cars start from rest, in the others at their recorded speeds.
     """
     log, cars = scene.log, scene.agents
-    from_key, to_key, rest_key = jax.random.split(key, 3)
+    place_key, rest_key = jax.random.split(key)
     both = log.valid[:, 1:] & log.valid[:, :-1]
     steps = jnp.where(both, norm(log.position[:, 1:] - log.position[:, :-1]), 0.0)
     travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
     whole = travelled[:, -1:]
-    shape = (len(cars.present), candidates)
-    spare = jnp.maximum(whole - travel_min_m, 0.0)
-    begin = jax.random.uniform(from_key, shape) * spare
-    end = whole - jax.random.uniform(to_key, shape) * (spare - begin)
-    row_at = jax.vmap(jnp.searchsorted)  # the first row that is so far along the way
-    first, last = row_at(travelled, begin), row_at(travelled, end)
-    read = jax.vmap(lambda track, row: track[row])
-    start, goal = read(log.position, first), read(log.position, last)
+    begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(whole - travel_min_m, 0.0)
+    row = jax.vmap(jnp.searchsorted)(travelled, begin)  # the first that is so far along the way
+    read = jax.vmap(lambda track, rows: track[rows])
+    start = read(log.position, row)
     usable = cars.present[:, None] & ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
-    chosen, present = _choose(start, goal, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
+    goals = jnp.broadcast_to(cars.goal[:, None], start.shape)
+    chosen, present = _choose(start, goals, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
     pick = functools.partial(_pick, chosen=chosen, present=present)
     moving = ~jax.random.bernoulli(rest_key, standing_share)
     return Agents(
         position=pick(start),
-        yaw=pick(read(log.yaw, first)),
-        speed=moving * pick(norm(read(log.velocity, first))),
+        yaw=pick(read(log.yaw, row)),
+        speed=moving * pick(norm(read(log.velocity, row))),
         size=cars.size,
-        goal=pick(goal),
-        route=pick(read(travelled, last) - read(travelled, first)),
+        goal=jnp.where(present[:, None], cars.goal, 0.0),
+        route=pick(whole - read(travelled, row)),
         present=present,
     )
 
