@@ -67,7 +67,7 @@ def underway(
 ) -> Agents:
     """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
 
-    Starts are rows of `scene.log`, at least `travel_min` before the goal along the way where it is that long; a shorter way is driven whole.
+    Starts are rows of `scene.log`, `travel_min` or more before the goal along the way where it is that long; a shorter one is driven whole.
     They keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates fits stays absent. In a
     share of the episodes all cars start from rest, in the others at their recorded speeds.
     """

@@ -108,7 +108,8 @@ def test_ttc_equals_a_simulated_one():
     velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
     sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
     centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
-    ttc, drac, _ = conflict.pairwise(centres, radius, jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32), drac_gap_floor_m=1.0)
+    moving = (jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32))
+    ttc, drac, _ = conflict.pairwise(centres, radius, *moving, drac_gap_floor_m=1.0)
     ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
     expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
     assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
@@ -350,7 +351,8 @@ def test_cars_underway_start_on_their_recorded_ways():
     valid[0, 30:34] = False
     position[0, 30:34] = 1e4
     speed = np.broadcast_to((goal - start) / 8.0, position.shape)
-    log = replace(scene.log, position=jnp.asarray(position, jnp.float32), velocity=jnp.asarray(speed, jnp.float32), valid=jnp.asarray(valid))
+    tracks = {"position": jnp.asarray(position, jnp.float32), "velocity": jnp.asarray(speed, jnp.float32)}
+    log = replace(scene.log, **tracks, valid=jnp.asarray(valid))
     numbers = scenefactory_jax.load("task", "spawn=underway", "spawn.draw.start_gap_m=4.0")["spawn"]["draw"]
     del numbers["_target_"]
     draw = jax.jit(jax.vmap(lambda key: spawn.underway(key, replace(scene, log=log), **numbers)))

@@ -94,7 +94,7 @@ def make(
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate: of Adam; the first one if `desired_kl` is a number.
         desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
-        learning_rate_halved: iterations after which learning_rate_max is a half of what it was, and a third after twice that; None: it stays.
+        learning_rate_halved: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
         gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
         clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
         entropy, value: weights of entropy bonus and value loss.

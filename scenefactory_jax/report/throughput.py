@@ -123,7 +123,7 @@ def figure(rows: list[Row]) -> Figure:
             for slots in sorted({row["slots"] for row in rows}, reverse=True):
                 points = sorted((row["worlds"], row[key]) for row in rows if row["slots"] == slots)
                 worlds, values = zip(*points, strict=True)
-                [line] = axes.loglog(worlds, values, "o-", base=2, markersize=4, label=f"{slots} {"car" if slots == 1 else "cars"} a world")
+                [line] = axes.loglog(worlds, values, "o-", base=2, markersize=4, label=f"{slots} {'car' if slots == 1 else 'cars'} a world")
                 axes.loglog(worlds, [values[-1] / worlds[-1] * count for count in worlds], ":", base=2, color=line.get_color(), linewidth=1)
             axes.set(title=title, xlabel="worlds")
         panels[0].legend()
