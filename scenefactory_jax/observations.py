@@ -10,13 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax import conflict, roadside
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
 from scenefactory_jax.patches import condition
-from scenefactory_jax.types import SURFACES, Observation, Rows, Scene, State
+from scenefactory_jax.types import SURFACES, Motion, Observation, Rows, Scene, State
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | Rows]
 
@@ -68,24 +68,77 @@ def neighbours(
     float]
 ) -> Rows:
     """The nearest other active cars and boxes: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
-    motion, cars = state.motion, len(state.active)
-    position, yaws, velocity, size, present = conflict.bodies(motion, state.agents.size, state.active, scene.boxes)
-    others = present[None] & ~jnp.eye(cars, len(present), dtype=bool)
-    apart = position[None] - position[:cars, None]
-    squared = jnp.where(others, dot(apart, apart), jnp.inf)
-    rows = min(count, len(present))
-    order = jnp.argsort(squared, axis=1)[:, :rows]
-    mask = jnp.take_along_axis(others, order, axis=1)
-
-    centres, radius = car_circles(position, yaws, size, **circles)
-    ttc, *_ = conflict.pairwise(centres, radius, velocity, motion.yaw, drac_gap_floor_m=1.0)
+    motion, everyone, order, mask = _nearest(scene, state, count)
+    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    ttc, *_ = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
     time = jnp.minimum(jnp.take_along_axis(ttc, order, axis=1) / ttc_scale_s, 1.0)
-    place = to_frame(position[order] - position[:cars, None], motion.yaw[:, None]) / distance_scale_m
-    yaw = wrap_angle(yaws[order] - motion.yaw[:, None]) / jnp.pi
-    speed = norm(velocity)[order] / speed_scale_mps
-    columns = [place, size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
-    features = jnp.where(mask[..., None], jnp.concatenate(columns, axis=-1), 0.0)
-    padding = count - rows
+    place = to_frame(everyone.position[order] - motion.position[:, None, :2], motion.yaw[:, None]) / distance_scale_m
+    yaw = wrap_angle(everyone.yaw[order] - motion.yaw[:, None]) / jnp.pi
+    speed = norm(everyone.velocity)[order] / speed_scale_mps
+    columns = [place, everyone.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
+    return _rows(jnp.concatenate(columns, axis=-1), mask, count)
+
+
+def encounters(
+    scene: Scene,
+    state: State,
+    *,
+    count: int,
+    distance_scale_m: float,
+    size_scale_m: float,
+    speed_scale_mps: float,
+    gap_scale_m: float,
+    time_scale_s: float,
+    circles: dict[str, float],
+) -> Rows:
+    """The nearest other active cars and boxes as what they will mean for a car that keeps its velocity, near ones in detail.
+
+    Columns: x, y in the car's frame; velocity x, y relative to the car's; sine and cosine of the heading; length, width; gap between the
+    bounding circles; time until the centres are closest, clamped to its scale, and the distance they then have; TTC. Lengths l, and times,
+    without an upper end read l / (scale + |l|), so that a metre beside the car counts as much as ten far away.
+    """
+    motion, everyone, order, mask = _nearest(scene, state, count)
+    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    ttc, _, gap = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
+    ttc, gap = (jnp.take_along_axis(pairs, order, axis=1) for pairs in (ttc, gap))
+    facing = motion.yaw[:, None]
+    apart = to_frame(everyone.position[order] - motion.position[:, None, :2], facing)
+    closing = to_frame(everyone.velocity[order] - motion.velocity[:, None, :2], facing)
+    turned = everyone.yaw[order] - facing
+    soonest = jnp.clip(-dot(apart, closing) / jnp.maximum(dot(closing, closing), conflict.SMALLEST), 0.0, time_scale_s)
+    closest = norm(apart + soonest[..., None] * closing)
+    columns = [
+        _squashed(apart, distance_scale_m),
+        closing / speed_scale_mps,
+        jnp.stack([jnp.sin(turned), jnp.cos(turned)], axis=-1),
+        everyone.size[order] / size_scale_m,
+        _squashed(jnp.where(jnp.isinf(gap), 0.0, gap), gap_scale_m)[..., None],
+        (soonest / time_scale_s)[..., None],
+        _squashed(closest, gap_scale_m)[..., None],
+        (time_scale_s / (time_scale_s + ttc))[..., None],  # 0 if they never meet, 1 once they touch
+    ]
+    return _rows(jnp.concatenate(columns, axis=-1), mask, count)
+
+
+def _squashed(length: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:
+    return length / (scale + jnp.abs(length))
+
+
+def _nearest(scene: Scene, state: State, count: int) -> tuple[Motion, conflict.Bodies, Int[Array, "A N"], Bool[Array, "A N"]]:
+    """The cars' motion, everybody, and for each car the `count` nearest others (fewer where there are not as many), nearest first."""
+    motion, cars = state.motion, len(state.active)
+    everyone = conflict.bodies(motion, state.agents.size, state.active, scene.boxes)
+    others = everyone.present[None] & ~jnp.eye(cars, len(everyone.present), dtype=bool)
+    apart = everyone.position[None] - everyone.position[:cars, None]
+    squared = jnp.where(others, dot(apart, apart), jnp.inf)
+    order = jnp.argsort(squared, axis=1)[:, : min(count, len(everyone.present))]
+    return motion, everyone, order, jnp.take_along_axis(others, order, axis=1)
+
+
+def _rows(features: Float[Array, "A N F"], mask: Bool[Array, "A N"], count: int) -> Rows:
+    """Padded to `count` rows, zeros where nobody is."""
+    padding = count - mask.shape[1]
+    features = jnp.where(mask[..., None], features, 0.0)
     return Rows(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))
 
 

@@ -179,6 +179,30 @@ def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
     assert rows.mask[0].sum() == len(near)
 
 
+def test_encounters_by_hand_and_from_any_frame(env):
+    """Head on, 1 m beside each other: centres are closest in 2 s, circles of the fronts meet before; a third car is far behind."""
+    numbers = scenefactory_jax.load("task", "observe=encounters")["observe"]["neighbours"]
+    del numbers["_target_"]
+
+    def seen(turn, shift):
+        place = geometry.rotate(jnp.array([[0.0, 0], [20, 1], [-180, 0]]), jnp.float32(turn)) + jnp.array(shift)
+        yaw = np.array([0, np.pi, 0]) + turn
+        scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
+        state, _ = env.reset(jax.random.key(0), scene)
+        return jax.tree.map(np.asarray, observations.encounters(scene, state, **numbers))
+
+    rows = seen(0.0, [0.0, 0.0])
+    squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
+    meet = (20 - 2 * 1.12 - np.sqrt(2.2**2 - 1)) / 10
+    gap = np.hypot(20 - 2.24, 1.0) - 2.2
+    expected = [squash(20, 20), squash(1, 20), -1.0, 0.0, 0.0, -1.0, 0.8, 0.4, squash(gap, 2), 2 / 5, squash(1, 2), 5 / (5 + meet)]
+    np.testing.assert_allclose(rows.features[0, 0], expected, atol=1e-4)
+    np.testing.assert_allclose(rows.features[0, 1, :4], [-0.9, 0, -0.5, 0], atol=1e-4)
+    assert rows.features.shape == (3, 16, 12) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
+    moved = seen(0.9, [7.0, -3.0])
+    np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
+
+
 def drive(env, scene, action, steps, key=0):
     state, _ = env.reset(jax.random.key(key), scene)
     step = jax.jit(env.step)
