@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.geometry import dot, heading, norm
+from scenefactory_jax.geometry import cross, dot, heading, norm
 from scenefactory_jax.types import Boxes, Motion
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
@@ -19,6 +19,15 @@ class Bodies(NamedTuple):
     velocity: Float[Array, "B 2"]
     size: Float[Array, "B 2"]
     present: Bool[Array, " B"]
+
+
+class Pairs(NamedTuple):
+    """Each car (row) with each other body (column); on the diagonal what means nobody: inf, and 0 for DRAC."""
+
+    ttc: Float[Array, "A B"]  # s
+    drac: Float[Array, "A B"]  # m/s^2
+    gap: Float[Array, "A B"]  # m
+    ahead: Float[Array, "A B"]  # m
 
 
 def bodies(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> Bodies:
@@ -35,20 +44,22 @@ def pairwise(
     yaw: Float[Array, " A"],
     *,
     drac_gap_floor_m: float,
-) -> tuple[Float[Array, "A B"], Float[Array, "A B"], Float[Array, "A B"]]:
-    """TTC (s), DRAC (m/s^2) and gap (m) of each car (row) with each other body (column), both moving on with their present velocities.
+) -> Pairs:
+    """TTC, DRAC and gaps of each car with each other body, both moving on with their present velocities.
 
     TTC: first time at which a circle of the column's body, ahead of the row car's own circle, touches it; 0 when they overlap, inf when
     their paths never meet. DRAC = closing^2 / (2 gap), largest over the circle pairs in any direction, gap not below a floor (the published
-    evaluation uses 1 m). Gap: between the nearest circles, negative where they overlap. The first rows of the bodies are the cars, as many
-    as there are in `yaw`: the diagonal holds inf, 0 and inf.
+    evaluation uses 1 m). Gap: between the nearest circles, negative where they overlap. Ahead: how far the car could move straight on until
+    circles touch, inf for bodies beside its way. The first rows of the bodies are the cars, as many as there are in `yaw`.
     """
     cars = len(yaw)
     apart = centres[None, :, None, :, :] - centres[:cars, None, :, None, :]  # [row, column, own circle, other circle, xy]
     relative = (velocity[None] - velocity[:cars, None])[:, :, None, None, :]
     reach = (radius[:cars, None] + radius[None])[:, :, None, None]
     distance = norm(apart)
-    ahead = dot(apart, heading(yaw)[:, None, None, None, :]) > 0
+    facing = heading(yaw)[:, None, None, None, :]
+    along = dot(apart, facing)
+    ahead = along > 0
 
     a = dot(relative, relative)
     b = dot(apart, relative)
@@ -64,11 +75,15 @@ def pairwise(
     gap = distance - reach
     drac = jnp.max(closing**2 / (2 * jnp.maximum(gap, drac_gap_floor_m)), axis=(2, 3))
 
-    self_pair = jnp.eye(cars, len(radius), dtype=bool)
-    away = jnp.where(self_pair, jnp.inf, jnp.min(gap, axis=(2, 3)))
-    return jnp.where(self_pair, jnp.inf, ttc), jnp.where(self_pair, 0.0, drac), away
+    beside = reach**2 - cross(facing, apart) ** 2
+    free = along - jnp.sqrt(jnp.where(beside > 0, beside, 0.0))
+    free = jnp.min(jnp.where(ahead & (beside > 0), jnp.maximum(free, 0.0), jnp.inf), axis=(2, 3))
+
+    own = jnp.eye(cars, len(radius), dtype=bool)
+    ttc, gap, free = (jnp.where(own, jnp.inf, pairs) for pairs in (ttc, jnp.min(gap, axis=(2, 3)), free))
+    return Pairs(ttc=ttc, drac=jnp.where(own, 0.0, drac), gap=gap, ahead=free)
 
 
 def least(of: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
-    """Smallest TTC or gap over the columns that count as present; inf where nobody is."""
+    """Smallest TTC or distance over the columns that count as present; inf where nobody is."""
     return jnp.min(jnp.where(other[None], of, jnp.inf), axis=1)

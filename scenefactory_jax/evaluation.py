@@ -33,6 +33,8 @@ class Tally:
     ttc_steps: Int[Array, " A"]
     speed_sum: Float[Array, " A"]
     grip_sum: Float[Array, " A"]
+    grip_use_sum: Float[Array, " A"]
+    margin_min: Float[Array, " A"]
     force_max: Float[Array, " A"]
     clues: Clues
 
@@ -76,6 +78,8 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
         ttc_steps=none,
         speed_sum=zero,
         grip_sum=zero,
+        grip_use_sum=zero,
+        margin_min=zero + jnp.inf,
         force_max=zero,
         clues=clues.begin(state, distance),
     )
@@ -122,6 +126,8 @@ def _note(tally: Tally, active: Bool[Array, " A"], outcome: Outcome, found: Clue
         ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
         speed_sum=add(tally.speed_sum, facts.speed),
         grip_sum=add(tally.grip_sum, facts.grip),
+        grip_use_sum=add(tally.grip_use_sum, facts.grip_use),
+        margin_min=jnp.minimum(tally.margin_min, jnp.where(active, facts.stopping_margin, jnp.inf)),
         force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
         clues=found,
     )

@@ -34,6 +34,7 @@ def measure(
     off_lane_distance_m: float,
     idle_speed_mps: float,
     drac_gap_floor_m: float,
+    gravity_mps2: float,
     kernels: bool,
 ) -> Facts:
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
@@ -48,7 +49,7 @@ def measure(
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
     everyone = conflict.bodies(motion, after.agents.size, active & finite, scene.boxes)  # nobody meets a broken car
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    ttc, drac, gap = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
     edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
     beside = roadside.look(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
@@ -66,20 +67,23 @@ def measure(
         speed=speed,
         goal_distance=norm(to_goal),
         **lane,
-        ttc=conflict.least(ttc, everyone.present),
-        gap=conflict.least(gap, everyone.present),
+        ttc=conflict.least(pairs.ttc, everyone.present),
+        gap=conflict.least(pairs.gap, everyone.present),
+        stopping_margin=conflict.least(pairs.ahead, everyone.present) - _stopping(speed, motion.grip, gravity_mps2),
         edge_ttc=beside.edge_ttc,
         edge_gap=edge_gap,
-        drac=jnp.max(jnp.where(everyone.present[None], drac, 0.0), axis=1),
+        drac=jnp.max(jnp.where(everyone.present[None], pairs.drac, 0.0), axis=1),
         strayed=strayed,
-        contact_force=motion.contact_force,
-        grip=motion.grip,
-        grip_use=motion.grip_use,
-        slip=motion.slip,
+        **{name: getattr(motion, name) for name in ("contact_force", "grip", "grip_use", "slip")},
         off_lane=lane["has_lane"] & ((lane["lane_offset"] > off_lane_lateral_m) | (lane["lane_distance"] > off_lane_distance_m)),
         idle=speed < idle_speed_mps,
         events=events,
     )
+
+
+def _stopping(speed: Float[Array, " A"], grip: Float[Array, " A"], gravity_mps2: float) -> Float[Array, " A"]:
+    """The way to a stop with all of the road's friction: v^2 / (2 mu g)."""
+    return speed**2 / (2 * gravity_mps2 * jnp.maximum(grip, 1e-3))
 
 
 def _has_crashed(

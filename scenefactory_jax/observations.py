@@ -70,8 +70,8 @@ def neighbours(
     """The nearest other active cars and boxes: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
     motion, everyone, order, mask = _nearest(scene, state, count)
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    ttc, *_ = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
-    time = jnp.minimum(jnp.take_along_axis(ttc, order, axis=1) / ttc_scale_s, 1.0)
+    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
+    time = jnp.minimum(jnp.take_along_axis(pairs.ttc, order, axis=1) / ttc_scale_s, 1.0)
     place = to_frame(everyone.position[order] - motion.position[:, None, :2], motion.yaw[:, None]) / distance_scale_m
     yaw = wrap_angle(everyone.yaw[order] - motion.yaw[:, None]) / jnp.pi
     speed = norm(everyone.velocity)[order] / speed_scale_mps
@@ -99,8 +99,8 @@ def encounters(
     """
     motion, everyone, order, mask = _nearest(scene, state, count)
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    ttc, _, gap = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
-    ttc, gap = (jnp.take_along_axis(pairs, order, axis=1) for pairs in (ttc, gap))
+    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
+    ttc, gap = (jnp.take_along_axis(one, order, axis=1) for one in (pairs.ttc, pairs.gap))
     facing = motion.yaw[:, None]
     apart = to_frame(everyone.position[order] - motion.position[:, None, :2], facing)
     closing = to_frame(everyone.velocity[order] - motion.velocity[:, None, :2], facing)

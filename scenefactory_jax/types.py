@@ -201,6 +201,7 @@ class Facts:
     has_lane: Bool[Array, " A"]
     ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
     gap: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
+    stopping_margin: Float[Array, " A"]  # way free straight ahead less the way to stop on the road's friction; inf with nobody ahead
     edge_ttc: Float[Array, " A"]
     edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2

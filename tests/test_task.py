@@ -109,7 +109,7 @@ def test_ttc_equals_a_simulated_one():
     sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
     centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
     moving = (jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32))
-    ttc, drac, _ = conflict.pairwise(centres, radius, *moving, drac_gap_floor_m=1.0)
+    ttc, drac, *_ = conflict.pairwise(centres, radius, *moving, drac_gap_floor_m=1.0)
     ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
     expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
     assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
@@ -121,9 +121,10 @@ def test_head_on_ttc_and_drac_by_hand():
     yaw, size = jnp.array([0.0, jnp.pi]), jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
     centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
     velocity = jnp.array([[5.0, 0], [-5.0, 0]])
-    ttc, drac, away = conflict.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    ttc, drac, away, ahead = conflict.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
     gap = 20 - 2 * 1.12 - 2 * 1.1
-    np.testing.assert_allclose(away, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
+    for distances in (away, ahead):
+        np.testing.assert_allclose(distances, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
     np.testing.assert_allclose(ttc[0, 1], gap / 10, rtol=1e-5)
     np.testing.assert_allclose(drac[0, 1], 100 / (2 * gap), rtol=1e-5)
 
@@ -133,6 +134,16 @@ def test_parting_cars_never_meet():
     centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
     ttc, *_ = conflict.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
     assert jnp.isinf(ttc).all()
+
+
+def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
+    """Followers 10 m behind, 1.5 m to the side; the third car is 2.3 m beside the first, just out of its way."""
+    size = jnp.tile(jnp.array([4.0, 2.0]), (3, 1))
+    place = jnp.array([[0.0, 0], [10.0, 1.5], [10.0, -2.3]])
+    centres, radius = geometry.car_circles(place, jnp.zeros(3), size, **CIRCLES)
+    ahead = conflict.pairwise(centres, radius, jnp.zeros((3, 2)), jnp.zeros(3), drac_gap_floor_m=1.0).ahead
+    free = 10 - 2 * 1.12 - np.sqrt(2.2**2 - 1.5**2)
+    np.testing.assert_allclose(ahead, [[np.inf, free, np.inf], [np.inf] * 3, [np.inf] * 3], rtol=1e-5)
 
 
 def test_first_hits_keeps_storage_order():
@@ -240,13 +251,16 @@ def test_collision_needs_force_and_grace(env, two_cars):
 
 def test_closeness_to_cars_and_edges_and_driving_against_the_traffic_by_hand(env):
     """Two cars side by side, one of them against its lane, 1.4 m and 0.85 m from the edges at +-6 m; the third is alone."""
-    scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], [[50, 3.5], [50, -4.0], [90, 0], [90, 0]], yaws=[np.pi, 0.0, 0.0, 0.0])
+    goals = [[50, 3.5], [50, -4.0], [90, 0], [90, 0]]
+    scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], goals, yaws=[np.pi, 0.0, 0.0, 0.0], speeds=[0.0, 0, 3, 3])
     state, (outcome,) = drive(env, scene, jnp.zeros((4, 3)), 1)
     facts = outcome.facts
     step = Step(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, facts=facts, events=outcome.events)
     beside, behind = 7.5 - 2.2, 6.0 - 2.24 - 2.2
     np.testing.assert_allclose(facts.gap, [beside, beside, behind, behind], rtol=1e-4)
     np.testing.assert_allclose(facts.lane_heading, [-1, 1, 1, 1], atol=1e-5)
+    stop = np.asarray(facts.speed[2]) ** 2 / (2 * 9.81 * np.asarray(facts.grip[2]))
+    np.testing.assert_allclose(facts.stopping_margin, [np.inf, np.inf, behind - stop, np.inf], rtol=1e-4)
     edge = np.asarray(facts.edge_gap)
     np.testing.assert_allclose(edge[:2], [6 - 0.05 - 3.5 - 1.1, 6 - 0.05 - 4.0 - 1.1], atol=0.02)
     np.testing.assert_allclose(rewards.clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)

@@ -92,8 +92,7 @@ def make(
         sample_share: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
             a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
-        learning_rate: of Adam; the first one if `desired_kl` is a number.
-        desired_kl: nats that the learning rate follows between learning_rate_min and learning_rate_max; None holds it.
+        learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
         learning_rate_halved: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
         gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
         clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
@@ -113,9 +112,9 @@ def make(
     axis, own, everybody = _groups(shards, mesh)
     adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
     objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis)
-    rate, each = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved), permutation == "each_epoch"
-    passes = {"epochs": epochs, "minibatches": minibatches, "groups": own, "axis": axis}
-    learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, permute_each_epoch=each, **passes)
+    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved)
+    passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
+    learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
     start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
     act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
     returns = {"gamma": gamma, "gae_lambda": gae_lambda, "normalise_advantage": normalise_advantage}

@@ -17,18 +17,10 @@ from scenefactory_jax.report.tables import LEVELS, METRICS, NEWCOMBE, NONE, SHAR
 Runs = Mapping[int, Records]  # seed of training -> one row for every spawned agent
 ROOM = 2_000_000  # numbers of one chunk of resamples
 
-# Metrics of columns that an evaluation may note or not: column -> (name, metric)
-OPTIONAL: dict[str, tuple[str, Metric]] = {
-    "grip_use": ("grip_use", Metric(
-        "Friction use", SHARE, "Tyre force over what the road's friction allows: each agent's mean over its steps; mean over agents.",
-        lambda records: records["grip_use"], tables._spawned)),
-    "stopping_margin_m": ("stopping_margin_m", Metric(
-        "Stopping margin", "m", "Gap to the car ahead less the way to stop on the road's friction: each agent's least; mean over agents "
-        "with a car ahead.", lambda records: records["stopping_margin_m"], lambda records: np.isfinite(records["stopping_margin_m"]))),
-}  # fmt: skip
 LEAST_TTC = Metric(
     "Least TTC", "s", "Each agent's least time to collision, clamped to 10 s; mean over the agents that had any.",
     lambda records: np.minimum(records["min_ttc_s"], 10.0), lambda records: np.asarray(records["has_ttc"], bool))  # fmt: skip
+ALL: dict[str, Metric] = {**METRICS, "least_ttc_s": LEAST_TTC}
 
 
 class Grid(NamedTuple):
@@ -43,13 +35,6 @@ class Grid(NamedTuple):
     world: Int[np.ndarray, " U"]  # ascending
 
 
-def metrics_of(*every: Runs) -> dict[str, Metric]:
-    """`tables.METRICS`, the least TTC, and those of OPTIONAL whose column all records have."""
-    records = [one for runs in every for one in runs.values()]
-    more = {name: metric for column, (name, metric) in OPTIONAL.items() if all(column in one for one in records)}
-    return {**METRICS, "least_ttc_s": LEAST_TTC, **more}
-
-
 def summarise(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
     """Every metric over all runs, weighing seeds the same, with a 95 % percentile interval.
 
@@ -59,12 +44,11 @@ def summarise(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
     Raises:
         RecordsError: no runs, or see `tables.check`.
     """
-    metrics = metrics_of(runs)
-    (grid,) = _grids([runs], metrics)
-    values = _ratios(grid, metrics, *_once(grid))[0]
-    draws = np.concatenate([_ratios(grid, metrics, *w) for w in _weights(grid, [len(runs)], bootstrap=bootstrap, seed=seed)])
+    (grid,) = _grids([runs], ALL)
+    values = _ratios(grid, ALL, *_once(grid))[0]
+    draws = np.concatenate([_ratios(grid, ALL, *w) for w in _weights(grid, [len(runs)], bootstrap=bootstrap, seed=seed)])
     return {
-        name: _estimate(float(values[m]), draws[:, m], metric, grid.counts[:, :, m]) for m, (name, metric) in enumerate(metrics.items())
+        name: _estimate(float(values[m]), draws[:, m], metric, grid.counts[:, :, m]) for m, (name, metric) in enumerate(ALL.items())
     }
 
 
@@ -74,20 +58,19 @@ def difference(before: Runs, after: Runs, *, bootstrap: int, seed: int) -> dict[
     Raises:
         RecordsError: other scenes; or see `summarise`.
     """
-    metrics = metrics_of(before, after)
     scenes = [set(np.concatenate([one["scene"] for one in runs.values()]).tolist()) for runs in (before, after)]
     if odd := sorted(scenes[0] ^ scenes[1]):
         raise RecordsError(f"records.scene: {odd[0]!r} is in only one of the two; a paired difference needs the same scenes")
-    first, second = _grids([before, after], metrics)
+    first, second = _grids([before, after], ALL)
     paired = list(before) == list(after)
     sizes = [len(before)] if paired else [len(before), len(after)]
-    old, new = (_ratios(grid, metrics, *_once(grid))[0] for grid in (first, second))
+    old, new = (_ratios(grid, ALL, *_once(grid))[0] for grid in (first, second))
     draws = []
     for weights in _weights(first, sizes, bootstrap=bootstrap, seed=seed):
         *seeds, scene, agent = weights
-        draws.append(_ratios(second, metrics, seeds[-1], scene, agent) - _ratios(first, metrics, seeds[0], scene, agent))
+        draws.append(_ratios(second, ALL, seeds[-1], scene, agent) - _ratios(first, ALL, seeds[0], scene, agent))
     draws, result = np.concatenate(draws), {}
-    for m, (name, metric) in enumerate(metrics.items()):
+    for m, (name, metric) in enumerate(ALL.items()):
         one = _estimate(float(new[m] - old[m]), draws[:, m], metric, np.minimum(first.counts, second.counts)[:, :, m] if paired else None)
         if one.method == WILSON:
             agents = [_agents(grid.counts[:, :, m]) for grid in (first, second)]
@@ -215,15 +198,14 @@ def _weighted(agents: Float[np.ndarray, "B U"], part: Float[np.ndarray, "S U M"]
 
 def per_seed(runs: Runs) -> dict[int, dict[str, float | None]]:
     """Each seed's own value of every metric."""
-    metrics, found = metrics_of(runs), {}
+    found = {}
     for seed, records in runs.items():
-        (grid,) = _grids([{seed: records}], metrics)
-        values = _ratios(grid, metrics, *_once(grid))[0]
-        found[seed] = {name: float(v) if np.isfinite(v) else None for name, v in zip(metrics, values, strict=True)}
+        (grid,) = _grids([{seed: records}], ALL)
+        values = _ratios(grid, ALL, *_once(grid))[0]
+        found[seed] = {name: float(v) if np.isfinite(v) else None for name, v in zip(ALL, values, strict=True)}
     return found
 
 
 def labels(names: Iterable[str]) -> dict[str, Metric]:
     """The metrics of these names."""
-    known = {**METRICS, "least_ttc_s": LEAST_TTC, **dict(OPTIONAL.values())}
-    return {name: known[name] for name in names}
+    return {name: ALL[name] for name in names}

@@ -20,7 +20,7 @@ COLUMNS: dict[str, type] = {
     "reached": bool, "collided": bool, "crashed": bool, "touched_edge": bool, "fault": bool, "clean": bool,
     "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
     "max_drac": float, "min_ttc_s": float, "mean_ttc_s": float, "has_ttc": bool, "mean_speed": float, "max_contact_force_n": float,
-    "film_mm": float, "surface": str, "friction": float,
+    "film_mm": float, "surface": str, "friction": float, "grip_use": float, "stopping_margin_m": float,
 }  # fmt: skip
 EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
@@ -105,6 +105,13 @@ METRICS: dict[str, Metric] = {
     "mean_remaining_m": Metric(
         "Remaining distance", "m", "Mean straight-line distance to the goal at the end, of all spawned agents.",
         lambda records: records["end_distance_m"], _spawned),
+    "grip_use": Metric(
+        "Friction use", SHARE, "Tyre force over what the road's friction allows: each agent's mean over its steps; mean over agents.",
+        lambda records: records["grip_use"], _spawned),
+    "stopping_margin_m": Metric(
+        "Stopping margin", "m", "Way free straight ahead less the way to a stop with all of the road's friction, v²/(2 µ g): each agent's "
+        "least; mean over the agents that had anybody ahead.",
+        lambda records: records["stopping_margin_m"], lambda records: np.isfinite(records["stopping_margin_m"])),
 }  # fmt: skip
 
 

@@ -236,6 +236,7 @@ def measure(
     off_lane_distance_m: float,
     idle_speed_mps: float,
     drac_gap_floor_m: float,  # no reward reads DRAC
+    gravity_mps2: float,  # nor the way to stop
 ) -> Facts:
     """Facts of the step that brought an agent from `before` to where it is, amid those who were on stage in it.
 

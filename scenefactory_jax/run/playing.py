@@ -122,6 +122,8 @@ def _records(
         "film_mm": np.asarray(weather.film_mm)[row_world],
         "surface": np.array(SURFACES)[np.asarray(weather.surface)[row_world]],
         "friction": of(tally.grip_sum) / steps,
+        "grip_use": of(tally.grip_use_sum) / steps,
+        "stopping_margin_m": of(tally.margin_min),
     }
 
 
