@@ -117,8 +117,7 @@ def make(
     learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
     start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
     act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
-    returns = {"gamma": gamma, "gae_lambda": gae_lambda, "normalise_advantage": normalise_advantage}
-    prepare = functools.partial(_batch, **returns, groups=own, axis=axis)
+    prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
     init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=functools.partial(size, groups=everybody))
     init, size = functools.partial(init, average=average is not None), functools.partial(size, groups=own)
