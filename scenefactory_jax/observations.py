@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax import conflict, roadside
 from scenefactory_jax.build import ConfigError, build
-from scenefactory_jax.geometry import car_circles, dot, norm, to_frame, wrap_angle
+from scenefactory_jax.geometry import CONTIGUOUS_M, car_circles, cross, dot, heading, locate, norm, running_length, to_frame, wrap_angle
 from scenefactory_jax.patches import condition
 from scenefactory_jax.types import SURFACES, Motion, Observation, Rows, Scene, State
 
@@ -61,6 +61,57 @@ def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale:
     """
     numbers = {"count": count, "radius_m": radius_m, "kind_scale": kind_scale, "kernels": kernels}
     return roadside.around(scene, state.motion.position[:, :2], state.motion.yaw, state.active, **numbers)
+
+
+def lane(
+    scene: Scene,
+    state: State,
+    *,
+    ahead_m: list[float],
+    distance_scale_m: float,
+    offset_scale_m: float,
+    gap_scale_m: float,
+    time_scale_s: float,
+    edge_half_width_m: float,
+    edge_radius_m: float,
+    edge_range_m: float,
+    circles: dict[str, float],
+    kernels: bool,
+) -> Float[Array, "A F"]:
+    """Where the nearest lane leads, further than the road points show: what a driver at speed looks at.
+
+    Columns: offset to the lane's left; sine and cosine of the car's heading against the lane's own direction; gap to the nearest road edge;
+    time to the edge ahead, as T / (T + time); then x, y in the car's frame of the places so far along the lane from where the car is beside
+    it, forwards for a car that points along it and backwards for one that points against it; behind the lane's end the last one before it.
+    Lengths read l / (scale + |l|). Zeros in a world without lanes.
+    """
+    motion, position = state.motion, state.motion.position[:, :2]
+    centres, radius = car_circles(position, motion.yaw, state.agents.size, **circles)
+    edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
+    found = roadside.look(scene, centres, radius, motion.velocity[:, :2], motion.yaw, position, state.active, **edges)
+    lanes, row = scene.lanes, found.lane
+    direction, apart = lanes.direction[row], position - lanes.midpoint[row]
+    facing = heading(motion.yaw)
+    with_lane = dot(facing, direction)
+    sign = jnp.where(with_lane >= 0, 1.0, -1.0)
+    running = running_length(lanes)
+    along, further = dot(apart, direction), sign[:, None] * jnp.array(ahead_m)
+    place, _, line, arc = locate(lanes, running, (running[row] - lanes.half_length[row] + along)[:, None] + further)
+    unbroken = jnp.abs(arc - (lanes.arc[row] + along)[:, None] - further) < CONTIGUOUS_M
+    place = _held(place, unbroken & (line == lanes.polyline[row][:, None]))
+    place = to_frame(place - position[:, None], motion.yaw[:, None])
+    columns = [
+        jnp.stack([_squashed(cross(direction, apart), offset_scale_m), cross(direction, facing), with_lane], axis=1),
+        jnp.stack([_squashed(found.edge - edge_radius_m, gap_scale_m), time_scale_s / (time_scale_s + found.edge_ttc)], axis=1),
+        _squashed(place, distance_scale_m).reshape(len(row), -1),
+    ]
+    return jnp.where(jnp.any(lanes.valid), jnp.concatenate(columns, axis=1), 0.0)
+
+
+def _held(places: Float[Array, "A N 2"], on_lane: Bool[Array, "A N"]) -> Float[Array, "A N 2"]:
+    """Places beyond the lane's end as the last one before it, or as the first of all."""
+    last = jnp.maximum(jnp.sum(jnp.cumprod(on_lane, axis=1), axis=1) - 1, 0)
+    return jnp.take_along_axis(places, jnp.minimum(jnp.arange(places.shape[1]), last[:, None])[..., None], axis=1)
 
 
 def neighbours(

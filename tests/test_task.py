@@ -214,6 +214,27 @@ def test_encounters_by_hand_and_from_any_frame(env):
     np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
 
 
+def test_the_lane_ahead_by_hand(env):
+    """With the lane and 1 m left of it, against it, and 12 m before its end at x = 60, where the places stay."""
+    numbers = scenefactory_jax.load("task", "observe=foresight")["observe"]["lane"]
+    del numbers["_target_"]
+    yaws = [0.1, np.pi, 0.0]
+    scene = scene_of([[0.2, 1.0], [0.0, -2.0], [48.0, 0.0]], [[9, 9]] * 3, yaws=yaws, speeds=[0.0, 0, 5])
+    state, _ = env.reset(jax.random.key(0), scene)
+    seen = np.asarray(jax.jit(functools.partial(observations.lane, **numbers))(scene, state))
+    squash = lambda length, scale: length / (scale + np.abs(length))  # noqa: E731
+    assert seen.shape == (3, 15)
+    np.testing.assert_allclose(seen[0, :3], [squash(1.0, 2), np.sin(0.1), np.cos(0.1)], atol=1e-4)
+    np.testing.assert_allclose(seen[1, :3], [squash(-2.0, 2), 0, -1], atol=1e-4)
+    gap = 6 - 0.05 - 2.0 - 1.1
+    np.testing.assert_allclose(seen[1, 3:5], [squash(gap, 2), 0], atol=1e-3)
+    ahead = np.array([5.0, 10, 20, 30, 45])
+    places = np.stack([ahead, np.full(5, -1.0)], 1) @ np.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
+    np.testing.assert_allclose(seen[0, 5:].reshape(5, 2), squash(places, 20), atol=1e-4)
+    np.testing.assert_allclose(seen[1, 5:].reshape(5, 2), squash(np.stack([ahead, np.full(5, -2.0)], 1), 20), atol=1e-4)
+    np.testing.assert_allclose(seen[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
+
+
 def drive(env, scene, action, steps, key=0):
     state, _ = env.reset(jax.random.key(key), scene)
     step = jax.jit(env.step)
