@@ -1,4 +1,7 @@
-"""Whole episodes with everything that a viewer shows, kept on device; `report.replay_html` makes a page of them."""
+"""Whole episodes with everything that a viewer shows, kept on device.
+
+`report.replay_html` makes a page of them, `report.film` pictures and films, `report.rerun_file` a file for rerun.
+"""
 
 import functools
 from collections.abc import Callable
@@ -38,6 +41,7 @@ class Shot:
     slip: Float[Array, " A"]
     contact_force: Float[Array, " A"]
     wheels: Tyres | None  # None: the dynamics has no wheels of its own
+    joints: Float[Array, "A 17"] | None  # chassis and wheels in MuJoCo's order; None: the dynamics has no joints
     others: Boxes
     film_mm: Float[Array, ""]  # of water on the open road
 
@@ -83,7 +87,7 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
 
 def _shot(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> Shot:
     motion, facts = after.motion, outcome.facts
-    tyres = getattr(after.body, "tyres", None)
+    tyres, joints = (getattr(after.body, name, None) for name in ("tyres", "qpos"))
     return Shot(
         time_s=after.weather.rain.now_s,
         active=before.active,
@@ -103,6 +107,7 @@ def _shot(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> 
         slip=facts.slip,
         contact_force=facts.contact_force,
         wheels=tyres if isinstance(tyres, Tyres) else None,
+        joints=joints,
         others=env.now(scene, after).boxes,
         film_mm=after.weather.film_mm,
     )

@@ -4,10 +4,8 @@ The road is rendered once a world; a frame is a copy of it with trails, goals, c
 reduced, which smooths the edges. Titles, clock and counters frame the picture.
 """
 
-import importlib.util
 import itertools
 import math
-import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,18 +15,15 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from scenefactory_jax.report import areas, canvas, gif, others
+from scenefactory_jax.report import areas, canvas, gif, mp4, others
 from scenefactory_jax.report.areas import Area
 from scenefactory_jax.report.canvas import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
+from scenefactory_jax.report.mp4 import VideoError
 
 _FINE = 2  # pictures are drawn at this many times their size and reduced
 _FLASH_S, _FADE_S = 1.2, 0.6  # how long an event is flashed, and a car that has finished fades
 _GAP = 14  # pixels between panels
 _BINS = 6  # steps of fading along a trail
-
-
-class VideoError(ValueError):
-    """A video that cannot be written; the message names the argument and what would be valid."""
 
 
 class _Stage(NamedTuple):
@@ -66,19 +61,14 @@ def write(
         VideoError: another suffix, no trajectory, a number out of range, or no ffmpeg for an .mp4.
         TrajectoryError: arrays that do not belong together.
     """
-    if path.suffix not in (".gif", ".mp4"):
-        raise VideoError(f"{path}: suffix {path.suffix!r} is no video; valid are .gif and .mp4")
-    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise VideoError(f"{path}: writing .mp4 needs ffmpeg; `pip install scenefactory_jax[video]`, or choose a .gif")
-    if fps <= 0 or (path.suffix == ".gif" and fps > 50):
-        raise VideoError(f"fps: {fps}; wanted above 0, and for a .gif at most 50: players slow down anything faster")
+    mp4.check(path, fps=fps)
     pictures = frames(trajectories, fps=fps, stride=stride, columns=columns, panel=panel, trail_s=trail_s)
     if path.suffix == ".gif":
         longest = max((len(t.active) for t in trajectories), default=0)
         few = frames(trajectories, fps=fps, stride=max(longest // 6, 1), columns=columns, panel=panel, trail_s=trail_s)
         gif.write(path, pictures, colours=gif.palette(list(few), keep=_key_colours()), fps=fps)
         return path
-    _write_mp4(path, pictures, fps=fps)
+    mp4.write(path, pictures, fps=fps)
     return path
 
 
@@ -103,26 +93,6 @@ def shown_steps(length: int, stride: int) -> list[int]:
     """The control steps that become frames: every `stride`-th one, and the last."""
     steps = list(range(0, length, stride))
     return steps if steps[-1] == length - 1 else [*steps, length - 1]
-
-
-def _write_mp4(path: Path, pictures: Iterator[np.ndarray], *, fps: float | int) -> None:
-    """Pipe raw pictures to the ffmpeg of imageio-ffmpeg; H.264 in 4:2:0, which every player shows."""
-    from imageio_ffmpeg import get_ffmpeg_exe  # an optional dependency  # pyright: ignore[reportMissingImports]
-
-    first = next(pictures)
-    height, width, _ = first.shape
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"]
-    target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "20", "-movflags", "+faststart", str(path)]
-    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        try:
-            for picture in itertools.chain([first], pictures):
-                process.stdin.write(picture.tobytes())  # pyright: ignore[reportOptionalMemberAccess]
-        except BrokenPipeError:
-            pass  # ffmpeg gave up; its message follows
-        message = process.communicate()[1].decode(errors="replace").strip()
-    if process.returncode:
-        raise VideoError(f"{path}: ffmpeg could not write it: {message}")
 
 
 def _film(stages: list[_Stage], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int) -> Iterator[np.ndarray]:
