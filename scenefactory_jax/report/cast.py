@@ -89,7 +89,7 @@ def add_goals(
     """A flat disc of each car's colour, as wide as its goal."""
     for agent in np.flatnonzero(opacity > 0):
         place = (*goal[agent].tolist(), GOAL_M / 2)
-        add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, radius_m, GOAL_M / 2), place, 0.0, _colour(int(agent), 0.45 * opacity[agent]))
+        add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, GOAL_M / 2, 0.0), place, 0.0, _colour(int(agent), 0.45 * opacity[agent]))
 
 
 def add_trails(scene: mujoco.MjvScene, whole: Cast, step: int, *, trail_s: float) -> None:

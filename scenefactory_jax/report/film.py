@@ -64,7 +64,8 @@ def write(path: Path | str, recording: Recording, *, car: CarParameters, look: L
     steps = list(range(0, _length(whole, followed, look), look.stride))
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
-        moment = min(round(look.at_s * whole.hz), len(whole.yaw) - 1)
+        last = int(np.flatnonzero(whole.active[:, followed])[-1])
+        moment = min(round(look.at_s * whole.hz), len(whole.yaw) - 1 if look.view == "bird" else last)
         imageio.imwrite(path, next(frames(whole, [moment], car=car, look=look)))
         return path
     pictures = frames(whole, steps, car=car, look=look)
@@ -92,14 +93,16 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
         for step in steps:
             stage.put(built, data, whole.joints[step], whole.opacity[step])
             behind = chase(whole.joints[step, followed, :3], heading[step], distance_m=look.distance_m, pitch_deg=look.pitch_deg)
-            stage.light(data, behind.lookat)
 
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
                 cast.add_goals(scene, whole.goal[step], whole.opacity[step], radius_m=look.goal_radius_m)
                 cast.add_trails(scene, whole, step, trail_s=look.trail_s)
                 cast.add_others(scene, whole.others, step)
 
-            shown = [paint(behind if view == "chase" else above, decorate) for view in views]
+            shown = []
+            for camera in (behind if view == "chase" else above for view in views):
+                stage.light(data, camera.lookat)
+                shown.append(paint(camera, decorate))
             yield np.concatenate(shown, axis=1)
 
 

@@ -15,10 +15,12 @@ from jaxtyping import Float, Int
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics.car import CarParameters
 from scenefactory_jax.report import canvas, surfaces
+from scenefactory_jax.report.surfaces import Surface
 from scenefactory_jax.types import Scene
 
 GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
-SUN, SHADOWS_M = (0.45, 0.3, -1.0), 45.0  # way of the light, and how far from what is looked at shadows fall
+SUN = (0.45, 0.3, -1.0)  # way of its light
+SHADOWS_M, SHADOW_PIXELS = 150.0, 4096  # how far from what is looked at shadows fall; just beyond, MuJoCo speckles the ground
 JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the front wheels; suspension and spin of the rear ones
 STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
 
@@ -42,9 +44,7 @@ def build(scene: Scene, car: CarParameters) -> Stage:
     """
     model = _empty(scene)
     for surface in surfaces.surfaces(scene):
-        mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-        mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
-        _flat(model, surface.name, mujoco.mjtGeom.mjGEOM_MESH, meshname=surface.name, rgba=list(surface.colour))
+        _mesh(model, surface)
     slots = np.flatnonzero(np.asarray(scene.agents.present))
     for slot in slots:
         length, width = (float(side) for side in np.asarray(scene.agents.size)[slot])
@@ -95,7 +95,7 @@ def put(stage: Stage, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], op
 
 def light(data: mujoco.MjData, place: Float[np.ndarray, "3"]) -> None:
     """Move the sun to where shadows are to be sharp."""
-    data.light_xpos[0] = place - SHADOWS_M * np.array(SUN)
+    data.light_xpos[0] = place - 0.5 * SHADOWS_M * np.array(SUN)
 
 
 def _empty(scene: Scene) -> mujoco.MjSpec:
@@ -105,7 +105,7 @@ def _empty(scene: Scene) -> mujoco.MjSpec:
     (x, y), half = surfaces.extent(scene.road)
     model.stat.center, model.stat.extent = [x, y, 0.0], half
     model.visual.map.znear, model.visual.map.zfar = 0.5 / half, 20.0  # in extents
-    model.visual.map.shadowclip, model.visual.quality.shadowsize = SHADOWS_M / half, 2048
+    model.visual.map.shadowclip, model.visual.quality.shadowsize = SHADOWS_M / half, SHADOW_PIXELS
     model.visual.map.haze, model.visual.rgba.haze = 0.6, [*HORIZON, 1.0]
     model.visual.headlight.ambient, model.visual.headlight.diffuse = [0.45] * 3, [0.15] * 3
     model.visual.headlight.specular = [0.0] * 3
@@ -113,12 +113,17 @@ def _empty(scene: Scene) -> mujoco.MjSpec:
     model.add_texture(name="sky", type=sky, builtin=gradient, rgb1=list(SKY), rgb2=list(HORIZON), width=128, height=768)
     sun = model.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[x, y, 0.0], dir=list(SUN))
     sun.castshadow, sun.diffuse, sun.specular = True, [0.55] * 3, [0.1] * 3
-    _flat(model, "ground", mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], rgba=list(GROUND))
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    model.worldbody.add_geom(name="ground", type=plane, size=[0, 0, 1], rgba=list(GROUND), contype=0, conaffinity=0)
     return model
 
 
-def _flat(model: mujoco.MjSpec, name: str, kind: mujoco.mjtGeom, **options) -> None:
-    model.worldbody.add_geom(name=name, type=kind, contype=0, conaffinity=0, **options)
+def _mesh(model: mujoco.MjSpec, surface: Surface) -> None:
+    """A surface to see, that nothing touches."""
+    mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    model.worldbody.add_geom(name=surface.name, type=kind, meshname=surface.name, rgba=list(surface.colour), contype=0, conaffinity=0)
 
 
 def _painted(car: CarParameters, slot: int) -> mujoco.MjSpec:
