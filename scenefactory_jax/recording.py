@@ -78,14 +78,15 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
         state, observation, over = carry
         before = replace(state, active=state.active & ~over)
         after, outcome = env.step(scene, before, act(parameters, observation, key))
-        return (after, outcome.observation, over | outcome.over), _shot(env, scene, before, after, outcome)
+        return (after, outcome.observation, over | outcome.over), shot(env, scene, before, after, outcome)
 
     over = ~jnp.any(state.active)
     _, shots = jax.lax.scan(body, (state, observation, over), jax.random.split(key, steps))
     return Recording(replace(scene, agents=state.agents, weather=state.weather), shots)
 
 
-def _shot(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> Shot:
+def shot(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> Shot:
+    """What one control step shows."""
     motion, facts = after.motion, outcome.facts
     tyres, joints = (getattr(after.body, name, None) for name in ("tyres", "qpos"))
     return Shot(

@@ -1,4 +1,5 @@
-"""`replay`: some episodes of a trained policy, of the recording, or of no policy at all, as one HTML page to watch and to ask."""
+"""`replay`: some episodes of a trained policy, of the recording, or of no policy at all: as one HTML page to watch and to ask, as a film in
+three dimensions, or as a file for rerun; the ending of `out` decides."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,9 +10,10 @@ import jax.numpy as jnp
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.recording import Act, record
-from scenefactory_jax.report import replay_data, replay_html
+from scenefactory_jax.recording import Act, Recording, record
+from scenefactory_jax.report import film, mp4, opengl, replay_data, replay_html, rerun_file
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, raws, sources
 from scenefactory_jax.run.train import make_policy
@@ -21,6 +23,7 @@ from scenefactory_jax.scenes.stack import stack
 from scenefactory_jax.types import Scene
 
 GROUPS = ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # what a run has of its own
+ENDINGS = (".html", *film.SUFFIXES, ".rrd")
 SHOWN = 3  # reasons in a message
 
 
@@ -33,34 +36,72 @@ class Shown(NamedTuple):
 
 
 def replay(config: Mapping[str, Any]) -> Path:
-    """Record one episode in each of some scenes and write the page (`load("replay", "run=...")`).
+    """Record one episode in each of some scenes and write `out` (`load("replay", "run=...")`); a film shows the first scene alone.
 
     Raises:
         ConfigError: no such run, no checkpoint in it, a key that does not fit, or one that the run decides.
         SceneError: no usable scene.
+        VideoError, OpenGLError, RerunError: nothing here to write such a file with; the message says what is missing.
     """
-    keys.check(config, keys.REPLAY)
-    if Path(config["out"]).is_dir():
-        raise ConfigError(f"out: {config['out']} is a folder; give the page's own name, such as {Path(config['out']) / 'replay.html'}")
-    if config["run"] is None and config["overrides"]:
-        raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
+    _check(config)
     sources.use_compilation_cache()
-    settings = config if config["run"] is None else _of_run(config)
-    env, shown = world.make(settings), _shown(settings["scenes"], count=config["worlds"], skip=config["skip"])
-    act, parameters = _driver(config, settings, slots=shown.scene.agents.yaw.shape[1])
+    settings = config if config["run"] is None else of_run(config, command="replay")
+    count = 1 if Path(config["out"]).suffix in film.SUFFIXES else config["worlds"]
+    env, shown = world.make(settings), chosen(settings["scenes"], count=count, skip=config["skip"])
+    act, parameters = driver(config, settings, slots=shown.scene.agents.yaw.shape[1])
     steps = max(round(min(config["seconds"], settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
     print(f"{len(shown.names)} worlds, {steps} control steps each: {', '.join(shown.names)}", flush=True)
     recording = jax.device_get(record(env, act, parameters, shown.scene, jax.random.key(config["seed"]), steps=steps))
-    title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
-    goal = settings["facts"]["goal_radius_m"]
-    out = replay_html.write(config["out"], recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal)
-    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB; open it in a browser", flush=True)
+    out = _write(config, settings, recording, shown)
+    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB; {'open it in a browser' if out.suffix == '.html' else 'done'}", flush=True)
     return out
 
 
-def _of_run(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's own config with the overrides, and with the scenes that are asked for."""
-    plain = configs.load("replay")
+def _check(config: Mapping[str, Any]) -> None:
+    """What would otherwise fail only after the drive."""
+    keys.check(config, keys.REPLAY)
+    keys.check(config["film"], keys.FILM, where="film")
+    out = Path(config["out"])
+    if out.is_dir():
+        raise ConfigError(f"out: {out} is a folder; give the page's own name, such as {out / 'replay.html'}")
+    if out.suffix not in ENDINGS:
+        raise ConfigError(f"out: {out}; valid endings: {', '.join(ENDINGS)}")
+    if config["run"] is None and config["overrides"]:
+        raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
+    if out.suffix in (".gif", ".mp4"):
+        mp4.check(out, fps=config["film"]["fps"])
+    if out.suffix in film.SUFFIXES:
+        opengl.check()
+    if out.suffix == ".rrd":
+        rerun_file.check()
+
+
+def _write(config: Mapping[str, Any], settings: Mapping[str, Any], recording: Recording, shown: "Shown") -> Path:
+    out, goal = Path(config["out"]), settings["facts"]["goal_radius_m"]
+    title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
+    if out.suffix in film.SUFFIXES:
+        return film.write(out, recording, car=looks(settings), look=film.Look(**config["film"], goal_radius_m=goal))
+    if out.suffix == ".rrd":
+        return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal)
+    return replay_html.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal)
+
+
+def looks(settings: Mapping[str, Any]) -> cars.CarParameters:
+    """The car to draw: the dynamics' own, or the articulated one where it has none."""
+    own = settings["dynamics"]
+    return cars.numbers(own if "car" in own else configs.load("task")["dynamics"])[0]
+
+
+def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
+    """The run's own config with the overrides, and with the scenes that are asked for.
+
+    Args:
+        command: whose config it is: what differs from its own is what was asked for.
+
+    Raises:
+        ConfigError: no such run, a group that the run decides, or no scenes.
+    """
+    plain = configs.load(command)
     for group in GROUPS:
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
@@ -76,7 +117,7 @@ def _of_run(config: Mapping[str, Any]) -> dict[str, Any]:
     return trained | {"scenes": own | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def _driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
+def driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
     """Who drives, and with which parameters."""
     if config["act"] == "policy" and config["run"] is not None:
         policy = make_policy(settings)
@@ -87,7 +128,7 @@ def _driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: in
     return lambda parameters, observation, key: jnp.zeros((slots, 3)), None
 
 
-def _shown(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
+def chosen(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
     """The first usable scenes; no more is read than they take."""
     keys.check_scenes(config)
     parts = sources.readers(config)
@@ -111,6 +152,6 @@ def _shown(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
         raise ConfigError("\n  ".join([f"scenes.path={config['path']}: no usable scene of {len(reasons)}", *reasons[:SHOWN]]))
     if len(packed) <= skip:
         raise ConfigError(f"skip: {skip}; valid: 0 to {len(packed) - 1}, for {len(packed)} scenes can be used")
-    chosen, account = packed[skip:], posts[skip:]
-    scene, _ = stack([one.scene for one in chosen], capacity=config["capacity"])
-    return Shown(sources.with_cells(scene, config), tuple(one.report.name for one in chosen), tuple(account))
+    taken, account = packed[skip:], posts[skip:]
+    scene, _ = stack([one.scene for one in taken], capacity=config["capacity"])
+    return Shown(sources.with_cells(scene, config), tuple(one.report.name for one in taken), tuple(account))
