@@ -25,6 +25,7 @@ from scenefactory_jax.struct import replace
 
 CODES = {name: getattr(glfw, f"KEY_{name.upper()}") for name in ("up", "down", "left", "right", "space", "enter", "home", "end", "insert", "delete")}
 CODES |= {chr(code).lower(): code for code in range(glfw.KEY_A, glfw.KEY_Z + 1)}
+LATE_S = 0.5  # by which a slow display may lag before the drive slows down
 FREE = ("ends=invincible", "timing.episode_s=3600")  # of a run that is driven in
 
 
@@ -141,15 +142,16 @@ def _window(
     with mujoco.viewer.launch_passive(stand.model, data, key_callback=keyboard, show_left_ui=False, show_right_ui=False) as viewer:
         heading, spin, due = float(begun.state.motion.yaw[built.car]), np.zeros(begun.state.motion.yaw.shape[0]), time.perf_counter()
         while viewer.is_running():
-            now = driving.advance(built, now, *keyboard.read(), feel=feel)
+            due = max(due, time.perf_counter() - LATE_S)  # a slow machine drives in slow motion
+            for _ in range(max(int((time.perf_counter() - due) / built.dt), 1)):
+                now, due = driving.advance(built, now, *keyboard.read(), feel=feel), due + built.dt
+                spin = spin if now.shot is None or now.paused else spin + now.shot.speed * now.shot.active * built.dt / car.wheel_radius
             if now.shot is not None:
-                spin = spin + now.shot.speed * now.shot.active * built.dt / car.wheel_radius * (not now.paused)
                 with viewer.lock():
                     heading = _show(viewer, stand, data, now, built, car=car, spin=spin, heading=heading, view=view)
+                viewer.set_texts((None, None, *dashboard(now, built)))  # waits for the viewer, which waits for the lock
                 viewer.sync()
-            due += built.dt
             time.sleep(max(due - time.perf_counter(), 0.0))
-            due = max(due, time.perf_counter() - 5 * built.dt)  # who is late does not race afterwards
     return now
 
 
@@ -171,7 +173,6 @@ def _show(
         camera = film.chase(joints[built.car, :3], heading, distance_m=view.distance_m, pitch_deg=view.pitch_deg)
         viewer.cam.lookat[:], viewer.cam.distance = camera.lookat, camera.distance
         viewer.cam.azimuth, viewer.cam.elevation = camera.azimuth, camera.elevation
-    viewer.set_texts((None, None, *dashboard(now, built)))
     return heading
 
 
