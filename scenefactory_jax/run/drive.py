@@ -147,10 +147,10 @@ def _window(
                 now, due = driving.advance(built, now, *keyboard.read(), feel=feel), due + built.dt
                 spin = spin if now.shot is None or now.paused else spin + now.shot.speed * now.shot.active * built.dt / car.wheel_radius
             if now.shot is not None:
-                with viewer.lock():
+                with viewer.lock():  # the camera moves at once, cars when synchronised
                     heading = _show(viewer, stand, data, now, built, car=car, spin=spin, heading=heading, view=view)
+                    viewer.sync()
                 viewer.set_texts((None, None, *dashboard(now, built)))  # waits for the viewer, which waits for the lock
-                viewer.sync()
             time.sleep(max(due - time.perf_counter(), 0.0))
     return now
 
