@@ -106,8 +106,8 @@ def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message
 
 
 def test_an_unknown_config_is_named():
-    with pytest.raises(ConfigError, match=r"no config 'drive'; valid: bench, compare, convert, evaluate, .*train"):
-        config.load("drive")
+    with pytest.raises(ConfigError, match=r"no config 'fly'; valid: bench, compare, convert, drive, evaluate, .*train"):
+        config.load("fly")
 
 
 # ---- values that do not fit

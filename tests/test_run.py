@@ -22,7 +22,7 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.report import failures, tables
+from scenefactory_jax.report import failures, opengl, tables
 from scenefactory_jax.run import config, log, sources
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
@@ -264,10 +264,10 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
     assert model.nu >= 0 and model.nbody > 10 and len(list(tmp_path.glob("*.png"))) == 2
 
     def blind(model, **size):
-        raise RuntimeError("no display")
+        raise opengl.OpenGLError("no OpenGL through egl here")
 
     monkeypatch.setattr(rendering, "photograph", blind)
-    assert render(settings) == xml and "no OpenGL for mujoco.Renderer here (no display)" in capsys.readouterr().out
+    assert render(settings) == xml and "no OpenGL through egl here" in capsys.readouterr().out
     for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: mjx_car"}.items():
         with pytest.raises(ConfigError, match=message):
             render(config.load("render", "scenes.count=1", f"out={tmp_path}", override))

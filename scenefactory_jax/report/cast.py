@@ -2,6 +2,7 @@
 # (the compiled parts of mujoco carry no types)
 """What moves in three dimensions: cars, others, goals and trails of a recorded world, step by step, and how they enter MuJoCo's scene."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -97,7 +98,7 @@ def add_trails(scene: mujoco.MjvScene, whole: Cast, step: int, *, trail_s: float
     count, stride = round(trail_s * whole.hz), max(round(whole.hz / 10), 1)
     first = max(step - count, 0)
     knots = np.arange(first + step % stride, step + 1, stride)
-    for here, there in zip(knots[:-1], knots[1:], strict=True):
+    for here, there in itertools.pairwise(knots.tolist()):
         share = (there - first) / max(count, 1)
         for agent in np.flatnonzero(whole.active[here : there + 1].all(axis=0)):
             begin, end = whole.joints[here, agent, :2], whole.joints[there, agent, :2]

@@ -92,7 +92,7 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
     with opengl.painter(built.model, data, width=look.width, height=look.height) as paint:
         for step in steps:
             stage.put(built, data, whole.joints[step], whole.opacity[step])
-            behind = chase(whole.joints[step, followed, :3], heading[step], distance_m=look.distance_m, pitch_deg=look.pitch_deg)
+            behind = chase(whole.joints[step, followed, :3], float(heading[step]), distance_m=look.distance_m, pitch_deg=look.pitch_deg)
 
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
                 cast.add_goals(scene, whole.goal[step], whole.opacity[step], radius_m=look.goal_radius_m)

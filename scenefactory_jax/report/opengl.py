@@ -2,15 +2,15 @@
 # (the compiled parts of mujoco carry no types)
 """MuJoCo's renderer without a window: a context of the machine's OpenGL, and pictures through it.
 
-`mujoco.Renderer` decides on the kind of context when mujoco is imported, and on a Linux machine without a display decides wrongly. This asks
-when the first picture is wanted: what MUJOCO_GL names, otherwise EGL on Linux, which needs no display.
+`mujoco.Renderer` decides on the kind of context when mujoco is imported, and wrongly on a Linux machine without a display. This asks when
+the first picture is wanted: what MUJOCO_GL names, otherwise EGL on Linux, which needs no display.
 """
 
 import contextlib
-import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
+from importlib import import_module
 
 import mujoco
 import numpy as np
@@ -60,11 +60,12 @@ def painter(model: mujoco.MjModel, data: mujoco.MjData, *, width: int, height: i
     named = backend()
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     try:
-        context = importlib.import_module(f"mujoco.{named}").GLContext(width, height)
+        context = import_module(f"mujoco.{named}").GLContext(width, height)
         context.make_current()
         drawing = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:  # whatever the platform's OpenGL raises
-        raise OpenGLError(" ".join(f"no OpenGL through {named} here ({error or type(error).__name__}); {_way_out(named)}".split())) from None
+        reason = " ".join((str(error) or type(error).__name__).split())
+        raise OpenGLError(f"no OpenGL through {named} here ({reason}); {_way_out(named)}") from None
     try:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawing)
         drawing.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR

@@ -1,7 +1,7 @@
 """A recording as a `.rrd` file for the rerun viewer: map, cars, trails, goals, others, events, and numbers over time.
 
-Every world is a branch `world0`, `world1`, ... of the file's tree, every car a branch `car3` of that, and every number a line `series/speed/car3`.
-Timelines are `time`, since the episode began, and `step`.
+Every world is a branch of the file's tree, `world0`, `world1`, ...; in it every car is a branch `car3`, every number a line
+`series/speed/car3`. Timelines are `time`, since the episode began, and `step`.
 """
 
 import importlib.util
@@ -96,7 +96,7 @@ class _World:
         self.log("", rr.TextDocument(name))
         self.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._send_map(scene)
-        active = shots.active & scene.agents.present & np.isfinite(shots.position).all(axis=-1) & np.isfinite(shots.yaw)
+        active = np.asarray(shots.active & scene.agents.present) & np.isfinite(shots.position).all(axis=-1) & np.isfinite(shots.yaw)
         numbers = series(shots)
         for car in np.flatnonzero(active.any(axis=0)):
             steps = np.flatnonzero(active[:, car])
@@ -132,7 +132,8 @@ class _World:
         centres = np.c_[place[steps], zero + CAR_M / 2]
         turns = np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)]
         half = np.tile([size[0] / 2, size[1] / 2, CAR_M / 2], (len(steps), 1))
-        self.columns(f"car{car}/box", steps, rr.Boxes3D.columns(half_sizes=half, centers=centres, quaternions=turns, colors=colour * len(steps)))
+        boxes = rr.Boxes3D.columns(half_sizes=half, centers=centres, quaternions=turns, colors=colour * len(steps))
+        self.columns(f"car{car}/box", steps, boxes)
         back, stride = round(TRAIL_S * self.hz), max(round(self.hz / TRAIL_HZ), 1)
         driven = [steps[(steps >= step - back) & (steps <= step)][::-1][::stride] for step in steps]
         strips = [np.c_[place[rows], np.full(len(rows), 0.05)] for rows in driven]

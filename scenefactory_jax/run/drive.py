@@ -23,7 +23,8 @@ from scenefactory_jax.run import replay as replays
 from scenefactory_jax.run.driving import COMMANDS, PEDALS, Drive, Feel, World
 from scenefactory_jax.struct import replace
 
-CODES = {name: getattr(glfw, f"KEY_{name.upper()}") for name in ("up", "down", "left", "right", "space", "enter", "home", "end", "insert", "delete")}
+NAMED = ("up", "down", "left", "right", "space", "enter", "home", "end", "insert", "delete")
+CODES = {name: getattr(glfw, f"KEY_{name.upper()}") for name in NAMED}
 CODES |= {chr(code).lower(): code for code in range(glfw.KEY_A, glfw.KEY_Z + 1)}
 LATE_S = 0.5  # by which a slow display may lag before the drive slows down
 FREE = ("ends=invincible", "timing.episode_s=3600")  # of a run that is driven in
@@ -75,7 +76,7 @@ def _check(config: Mapping[str, Any]) -> tuple[Feel, View, dict[int, str]]:
         if command not in COMMANDS:
             raise ConfigError(f"keys.{command}: unknown command; valid: {', '.join(COMMANDS)}")
         if key not in CODES:
-            raise ConfigError(f"keys.{command}: {key!r}; valid: a letter, {', '.join(name for name in CODES if len(name) > 1)}")
+            raise ConfigError(f"keys.{command}: {key!r}; valid: a letter, {', '.join(NAMED)}")
         if CODES[key] in codes:
             raise ConfigError(f"keys.{command}: {key!r} is the key of {codes[CODES[key]]}, too")
         codes[CODES[key]] = command
@@ -161,8 +162,9 @@ def _show(
     """Put everybody where they are and the camera behind the car; returns the camera's heading."""
     seen = now.shot
     assert seen is not None
-    joints = seen.joints if seen.joints is not None else stage.posture(car, seen.position, seen.yaw, seen.steer, spin)
-    stage.put(stand, data, joints, seen.active.astype(float))
+    level = stage.posture(car, *map(np.asarray, (seen.position, seen.yaw, seen.steer)), spin)
+    joints = level if seen.joints is None else np.asarray(seen.joints, float)
+    stage.put(stand, data, joints, np.asarray(seen.active, float))
     stage.light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0

@@ -1,4 +1,7 @@
-"""From keys to control steps: pedals and wheel that follow the keys, and a drive that steps, pauses and starts again. No window, no clock."""
+"""From keys to control steps: pedals and wheel that follow the keys, and a drive that steps, pauses and starts again.
+
+There is neither a window nor a clock here.
+"""
 
 import functools
 from collections.abc import Callable, Mapping, Set
@@ -101,7 +104,7 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
     ) -> tuple[State, Observation, Shot]:
         actions = act(parameters, observation, key).at[car].set(action)
         after, outcome = env.step(scene, state, actions)
-        return after, outcome.observation, shot(env, scene, state, after, outcome)
+        return after, outcome.observation or {}, shot(env, scene, state, after, outcome)
 
     scene = jax.tree.map(jnp.asarray, scene)
     return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car)

@@ -15,6 +15,7 @@ import numpy as np
 from scenefactory_jax import conditions
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
+from scenefactory_jax.report import opengl
 from scenefactory_jax.run import keys, sources
 from scenefactory_jax.run.scenes import draw
 from scenefactory_jax.scenes import mjcf
@@ -53,8 +54,8 @@ def render(config: Mapping[str, Any]) -> Path:
     try:
         imageio.imwrite(out / "mujoco.png", photograph(spec.compile(), **config["image"]))
         print(out / "mujoco.png", flush=True)
-    except Exception as error:  # whatever the platform's OpenGL raises: the files above are there all the same
-        print(f"no OpenGL for mujoco.Renderer here ({error}); set MUJOCO_GL=egl or osmesa", flush=True)
+    except opengl.OpenGLError as error:  # the files above are there all the same
+        print(error, flush=True)
     return xml
 
 
@@ -77,12 +78,14 @@ def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
 
 
 def photograph(model: mujoco.MjModel, *, width: int, height: int) -> np.ndarray:
-    """The world from above and behind, by `mujoco.Renderer`."""
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    """The world from above and behind, by MuJoCo's renderer.
+
+    Raises:
+        OpenGLError: nothing here to draw with; the message says what to install or set.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = model.stat.center, 1.1 * model.stat.extent, 90.0, -50.0
-    with mujoco.Renderer(model, height, width) as renderer:
-        renderer.update_scene(data, camera)
-        return renderer.render()
+    with opengl.painter(model, data, width=width, height=height) as paint:
+        return paint(camera, lambda scene: None)
