@@ -70,6 +70,8 @@ def test_cars_stand_and_steer_as_they_are_put():
         turned = yaw[slot] + steer[slot]
         np.testing.assert_allclose(axle, [-np.sin(turned), np.cos(turned), 0.0], atol=1e-9)
         assert data.body(f"agent{slot}/wheel_rear_left").xpos[2] == pytest.approx(CAR.wheel_radius)  # it stands on the ground
+    kinds = [built.model.joint(int(np.flatnonzero(built.model.jnt_qposadr == place)[0])).name for place in built.joints[1, 7:]]
+    assert [name.split("/")[1].split("_")[0] for name in kinds] == ["suspension", "steer", "spin"] * 2 + ["suspension", "spin"] * 2
     box = built.model.geom("agent0/box")
     np.testing.assert_allclose(2 * box.size[:2], [5.0, 2.2])
     opacity = [built.model.geom_rgba[built.geoms[row], 3] for row in range(2)]

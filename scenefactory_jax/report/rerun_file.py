@@ -19,7 +19,7 @@ from scenefactory_jax.scenes import mjcf
 from scenefactory_jax.types import Scene
 
 TRAIL_S, TRAIL_HZ = 3.0, 10.0
-CAR_M, OTHER_M = 1.5, 1.5  # heights of boxes
+CAR_M, OTHER_M, OTHER = 1.5, 1.5, (150, 152, 158)  # heights of boxes, and a colour
 ROUND = np.linspace(0.0, 2 * np.pi, 33)
 # name -> (what it is, how to read it of the shots); lines of one name share a plot
 SERIES = {
@@ -126,23 +126,23 @@ class _World:
             self.log(f"map/{layer}", self.rr.LineStrips3D(strips, colors=[colours[layer]]))
 
     def _send_car(self, car: int, steps: Int[np.ndarray, " n"], size: Float[np.ndarray, "2"], goal_radius_m: float) -> None:
-        rr, shots, colour = self.rr, self.shots, [list(canvas.colour_of(car))]
+        rr, shots, colour = self.rr, self.shots, packed(canvas.colour_of(car))
         place, yaw = np.asarray(shots.position[:, car], float), np.asarray(shots.yaw[steps, car], float)
         zero = np.zeros(len(steps))
         centres = np.c_[place[steps], zero + CAR_M / 2]
         turns = np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)]
         half = np.tile([size[0] / 2, size[1] / 2, CAR_M / 2], (len(steps), 1))
-        boxes = rr.Boxes3D.columns(half_sizes=half, centers=centres, quaternions=turns, colors=colour * len(steps))
+        boxes = rr.Boxes3D.columns(half_sizes=half, centers=centres, quaternions=turns, colors=np.full(len(steps), colour))
         self.columns(f"car{car}/box", steps, boxes)
         back, stride = round(TRAIL_S * self.hz), max(round(self.hz / TRAIL_HZ), 1)
         driven = [steps[(steps >= step - back) & (steps <= step)][::-1][::stride] for step in steps]
         strips = [np.c_[place[rows], np.full(len(rows), 0.05)] for rows in driven]
-        self.columns(f"car{car}/trail", steps, rr.LineStrips3D.columns(strips=strips, colors=colour * len(steps)))
+        self.columns(f"car{car}/trail", steps, rr.LineStrips3D.columns(strips=strips, colors=np.full(len(steps), colour)))
         goal = np.asarray(shots.goal[steps, car], float)
         begins = np.flatnonzero(np.r_[True, (goal[1:] != goal[:-1]).any(axis=1)])
         ring = goal_radius_m * np.c_[np.cos(ROUND), np.sin(ROUND), 0 * ROUND]
         rings = [ring + np.r_[goal[row], 0.05] for row in begins]
-        self.columns(f"car{car}/goal", steps[begins], rr.LineStrips3D.columns(strips=rings, colors=colour * len(rings)))
+        self.columns(f"car{car}/goal", steps[begins], rr.LineStrips3D.columns(strips=rings, colors=np.full(len(rings), colour)))
         if (gone := _gone(steps, len(self.time))).size:
             self.columns(f"car{car}", gone, rr.Clear.columns(is_recursive=[True] * len(gone)))
 
@@ -157,7 +157,7 @@ class _World:
         found = sorted((int(t), int(car), name) for name, new in vars(self.shots.events).items() for t, car in np.argwhere(new & active))
         if found:
             text = [f"car {car}: {canvas.MARKS[name].label}" for _, car, name in found]
-            colours = [list(canvas.MARKS[name].colour) for _, _, name in found]
+            colours = np.array([packed(canvas.MARKS[name].colour) for _, _, name in found])
             self.columns("events", np.array([step for step, _, _ in found]), self.rr.TextLog.columns(text=text, color=colours))
 
     def _send_others(self) -> None:
@@ -171,7 +171,7 @@ class _World:
             half_sizes=np.c_[size / 2, zero + OTHER_M / 2],
             centers=np.c_[np.asarray(others.position, float)[steps, rows], zero + OTHER_M / 2],
             quaternions=np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)],
-            colors=[[150, 152, 158]] * len(rows),
+            colors=np.full(len(rows), packed(OTHER)),
         )
         self.columns("others", np.arange(len(present)), columns.partition(present.sum(axis=1)))
 
@@ -184,6 +184,12 @@ def series(shots: Shot) -> Mapping[str, Float[np.ndarray, "T A"]]:
     near = {name: np.where(getattr(shots, name) <= replay_data.TTC_MOST_S, getattr(shots, name), np.nan) for name in ("ttc", "edge_ttc")}
     read |= near
     return {name: np.asarray(read[name] if name in read else getattr(shots, name), float) for name in SERIES}
+
+
+def packed(colour: canvas.Colour) -> np.uint32:
+    """A colour as one number, which every version of rerun takes for one colour."""
+    red, green, blue = colour
+    return np.uint32(red << 24 | green << 16 | blue << 8 | 255)
 
 
 def _gone(steps: Int[np.ndarray, " n"], length: int) -> Int[np.ndarray, " m"]:

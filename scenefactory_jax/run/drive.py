@@ -162,14 +162,15 @@ def _show(
     """Put everybody where they are and the camera behind the car; returns the camera's heading."""
     seen = now.shot
     assert seen is not None
-    level = stage.posture(car, *map(np.asarray, (seen.position, seen.yaw, seen.steer)), spin)
+    position, yaw, steer = (np.asarray(leaf, float) for leaf in (seen.position, seen.yaw, seen.steer))
+    level = stage.posture(car, position, yaw, steer, spin)
     joints = level if seen.joints is None else np.asarray(seen.joints, float)
     stage.put(stand, data, joints, np.asarray(seen.active, float))
     stage.light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0
     cast.add_others(marks, canvas.Others(*(np.asarray(getattr(seen.others, name))[None] for name in canvas.Others._fields)), 0)
-    turn = (float(seen.yaw[built.car]) - heading + np.pi) % (2 * np.pi) - np.pi
+    turn = (float(yaw[built.car]) - heading + np.pi) % (2 * np.pi) - np.pi
     heading += turn / (1.0 + view.lag_s / built.dt)
     if now.chasing:
         camera = film.chase(joints[built.car, :3], heading, distance_m=view.distance_m, pitch_deg=view.pitch_deg)
