@@ -82,6 +82,7 @@ class Drive(NamedTuple):
     state: State
     observation: Observation
     shot: Shot | None  # of the last step
+    first: PRNGKeyArray  # of the start: a reset draws the same weather, whose patches are on the picture
     key: PRNGKeyArray
     wheel: Wheel
     paused: bool
@@ -112,13 +113,13 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
 
 def start(world: World, *, seed: int) -> Drive:
     """At the first start, with the pedals up."""
-    key, begin = jax.random.split(jax.random.key(seed))
-    state, observation = world.begin(begin)
-    return Drive(state, observation, None, key, Wheel(), paused=False, chasing=True, resets=0, steps=0)
+    first, key = jax.random.split(jax.random.key(seed))
+    state, observation = world.begin(first)
+    return Drive(state, observation, None, first, key, Wheel(), paused=False, chasing=True, resets=0, steps=0)
 
 
 def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, feel: Feel) -> Drive:
-    """One control step, if the drive does not pause; a reset starts anew at once, and so does a car that can no longer be driven.
+    """One control step, if the drive does not pause; a reset goes back to the start at once, and so does a broken car.
 
     Args:
         pressed: commands (`COMMANDS`) of the keys that went down since the last call.
@@ -126,9 +127,9 @@ def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, fe
     """
     drive = drive._replace(paused=drive.paused ^ ("pause" in pressed), chasing=drive.chasing ^ ("camera" in pressed))
     if "reset" in pressed or not bool(drive.state.active[world.car]):
-        key, begin = jax.random.split(drive.key)
-        state, observation = world.begin(begin)
-        return drive._replace(state=state, observation=observation, shot=None, key=key, wheel=Wheel(), resets=drive.resets + 1, steps=0)
+        state, observation = world.begin(drive.first)
+        again = drive._replace(state=state, observation=observation, shot=None, wheel=Wheel())
+        return again._replace(paused=False, resets=drive.resets + 1, steps=0)
     if drive.paused:
         return drive
     speed = 0.0 if drive.shot is None else float(drive.shot.speed[world.car])
