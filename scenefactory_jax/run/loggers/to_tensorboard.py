@@ -15,7 +15,8 @@ def make() -> Logger:
 
     @contextlib.contextmanager
     def log(folder: Path, config: Mapping[str, Any], after: int) -> Iterator[Add]:
-        with SummaryWriter(str(Path(folder) / "tensorboard"), purge_step=after + 1 if after else None) as writer:
+        own = {"purge_step": after + 1 if after else None, "filename_suffix": f".{after}"}  # files of one second would overwrite each other
+        with SummaryWriter(str(Path(folder) / "tensorboard"), **own) as writer:
 
             def add(row: Row) -> None:
                 for name, value in row.items():
