@@ -94,7 +94,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
         ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, others, road, steps"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': base bicycle mjx_car mjx_published replay"),
-        ("experiment=smok", r"Could not find 'experiment/smok' Available options in 'experiment': demo published quick smoke"),
+        ("experiment=smok", r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo published quick smoke"),
         ("dynamics={_target_: mine.make, gain: 1.0}", r"to replace all of dynamics: ~dynamics \+dynamics=\{\.\.\.\}"),
         ("timing=null", r"timing=null: "),
         ("worlds", r"worlds"),

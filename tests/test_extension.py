@@ -1,5 +1,6 @@
-"""A reward term, observation groups, a dynamics backend and a scene format: each one new file outside the package, and config alone."""
+"""A reward term, observation groups, dynamics, a logger and a scene format: each one new file outside the package, and config alone."""
 
+import json
 import textwrap
 
 import jax
@@ -89,10 +90,25 @@ READER = """
         yield RawScene(path.stem, str(path), (Polyline(2, lane, 1),), (track,), step_s * np.arange(steps), 0)
     """
 
+LOGGER = """
+    import contextlib
+    import json
+
+    def make(*, file: str):
+        @contextlib.contextmanager
+        def log(folder, config, after):
+            rows = []
+            yield rows.append
+            (folder / file).write_text(json.dumps({"seed": config["seed"], "after": after, "rows": rows}))
+
+        return log
+    """
+
 TERM = ["+reward.haste={_target_: my_terms.haste, weight: 0.25, unit_mps: 10.0}"]
 TERM += ["+reward.jerk={_target_: my_terms.jerkiness, weight: -1.0}"]
 GROUP = ["+observe.clock={_target_: my_groups.clock, period_s: 2.0}", "+observe.mates={_target_: my_groups.mates, scale_m: 50.0}"]
 DYNAMICS = ["~dynamics", "+dynamics={_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}"]
+LOGGERS = ["loggers=[tensorboard]", "+loggers.mine={_target_: my_logger.make, file: rows.json}"]
 LEAN = [f"~{place}.{name}" for place in ("observe", "policy.rows") for name in ("road", "neighbours")]  # compiles sooner
 FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"
 
@@ -101,7 +117,7 @@ FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"
 def mine(tmp_path_factory):
     """A folder of one's own modules, importable."""
     folder = tmp_path_factory.mktemp("mine")
-    for name, text in {"my_terms": TERMS, "my_groups": GROUPS, "my_backend": BACKEND, "my_reader": READER}.items():
+    for name, text in {"my_terms": TERMS, "my_groups": GROUPS, "my_backend": BACKEND, "my_reader": READER, "my_logger": LOGGER}.items():
         (folder / f"{name}.py").write_text(textwrap.dedent(text))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
@@ -110,10 +126,10 @@ def mine(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(mine, tmp_path_factory):
-    """A training with a term, two groups and a backend that the package has never heard of."""
+    """A training with a term, two groups, a backend and a logger that the package has never heard of."""
     folder = tmp_path_factory.mktemp("extension")
     with quick_compilation():
-        yield train(smoke(folder / "run", "evaluation.enable=false", *LEAN, *TERM, *GROUP, *DYNAMICS))
+        yield train(smoke(folder / "run", "evaluation.enable=false", *LEAN, *TERM, *GROUP, *DYNAMICS, *LOGGERS))
 
 
 def test_a_reward_term_is_one_file_and_one_entry(run):
@@ -136,6 +152,13 @@ def test_an_observation_group_is_one_file_and_one_entry(run):
     assert seen["clock"].shape == (4, 4, 2) and seen["mates"].features.shape == (4, 4, 4, 2)
     active = np.asarray(run.state.worlds.active)
     np.testing.assert_allclose(np.linalg.norm(seen["clock"], axis=-1)[active], 1.0, rtol=1e-5)
+
+
+def test_a_logger_is_one_file_and_one_entry(run):
+    told = json.loads((run.folder / "rows.json").read_text())
+    assert (told["seed"], told["after"], told["rows"]) == (0, 0, run.metrics)
+    [events] = (run.folder / "tensorboard").iterdir()  # the one of the package, beside it
+    assert b"reward/haste" in events.read_bytes()
 
 
 def test_a_dynamics_backend_is_one_file_and_one_entry(mine):

@@ -14,7 +14,7 @@ from scenefactory_jax.run import keys, log, results
 
 STEPS = "steps/total"
 # settings that make no other group
-ASIDE = ("seed", "name", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept")
+ASIDE = ("seed", "name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept")
 ASIDE += ("scenes.take.seed",)  # follows the seed
 DIGITS = 6
 
@@ -80,7 +80,7 @@ def _read(folder: Path) -> Read:
         raise ConfigError(f"runs: {folder / log.FILE}: no row; the run has not finished an iteration")
     named = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
     records = {name: tables.read_csv(path) for name, path in named.items() if not name.endswith("-untrained")}
-    settings = {key: value for key, value in document.flatten(config).items() if key not in ASIDE}
+    settings = {key: value for key, value in document.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
     return Read(folder, config, settings, metrics, records)
 
 

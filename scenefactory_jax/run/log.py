@@ -1,4 +1,4 @@
-"""A training run's numbers on disk: metrics.csv, TensorBoard, and a progress bar on the terminal."""
+"""A training run's numbers in metrics.csv, and a progress bar on the terminal; `loggers` take them elsewhere."""
 
 import contextlib
 import csv
@@ -41,26 +41,6 @@ def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
         return []
     with open(path, newline="") as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
-@contextlib.contextmanager
-def tensorboard(folder: Path, *, enable: bool) -> Iterator:
-    """A writer `add(row, iteration)` of TensorBoard scalars, or one that does nothing."""
-    if not enable:
-        yield lambda row, iteration: None
-        return
-    from tensorboardX import SummaryWriter
-
-    writer = SummaryWriter(str(Path(folder) / "tensorboard"))
-
-    def add(row: Mapping[str, float | int], iteration: int) -> None:
-        for name, value in row.items():
-            writer.add_scalar(name, value, iteration)
-
-    try:
-        yield add
-    finally:
-        writer.close()
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from scenefactory_jax.run import keys, results
 TASK = ("timing", "dynamics", "weather", "spawn", "others", "facts", "reward", "observe")
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
-ASIDE = ("name", "out", "resume", "progress", "tensorboard", "checkpoint_every", "checkpoints_kept", "evaluation")
+ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # folders of a run
 
 
@@ -115,7 +115,7 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
     scenes += [] if config["test_scenes"] is None else [f"scenes.heldout.path={_quoted(config['test_scenes'])}"]
     overrides = later_wins([*study["base"], *scenes, *study["common"], *study["trainings"][variant], *config["common"]])
-    fixed = ["tensorboard=false", "evaluation.enable=false", "evaluation.untrained=true", f"progress={str(config['progress']).lower()}"]
+    fixed = ["loggers=[]", "evaluation.enable=false", "evaluation.untrained=true", f"progress={str(config['progress']).lower()}"]
     try:
         each = configs.load_each("train", *later_wins([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:

@@ -16,7 +16,7 @@ from scenefactory_jax.policy import late_fusion
 from scenefactory_jax.ppo import across, checkpoint
 from scenefactory_jax.ppo import train as ppo
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, sources, stream
+from scenefactory_jax.run import keys, log, loggers, sources, stream
 from scenefactory_jax.types import Env, Policy, Scene
 
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
@@ -71,6 +71,7 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
         SceneError: scenes that cannot be read.
     """
     keys.check_train(config)
+    watching = loggers.make(config["loggers"])
     sources.use_compilation_cache()
     folder, resume = _folder(config)
     prepared = prepared or prepare(config)
@@ -84,7 +85,7 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
             checkpoint.save(folder / "untrained", state, keep=1)  # evaluations compare with the policy before training
         watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
         callbacks = [c for c in (watch, on_iteration) if c]
-        state = _loop(config, folder, trainer, worlds, state, flow, resume=resume, callbacks=callbacks)
+        state = _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
     if config["evaluation"]["enable"]:
         if sources.has_heldout(config["scenes"]):
             from scenefactory_jax.run.evaluate import after_training
@@ -146,7 +147,16 @@ def _make_watch(
 
 
 def _loop(
-    config, folder: Path, trainer: ppo.Trainer, worlds, state, flow: stream.Flow | None, *, resume: bool, callbacks: list[OnIteration]
+    config,
+    folder: Path,
+    trainer: ppo.Trainer,
+    worlds,
+    state,
+    flow: stream.Flow | None,
+    watching: Mapping[str, loggers.Logger],
+    *,
+    resume: bool,
+    callbacks: list[OnIteration],
 ):
     """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
 
@@ -156,7 +166,7 @@ def _loop(
     file = log.MetricsFile(folder, resume_at=first if resume else None)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
-        log.tensorboard(folder, enable=config["tensorboard"]) as board,
+        loggers.opened(watching, folder, config, after=first if resume else 0) as note,
         log.progress(total, enable=config["progress"], start=first) as show,
     ):
         for iteration in range(first + 1, total + 1):
@@ -167,7 +177,7 @@ def _loop(
             row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
-            board(row, iteration)
+            note(row)
             show(iteration, describe(row))
             for callback in callbacks:
                 callback(state, row)
