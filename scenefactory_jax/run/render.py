@@ -2,6 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 # mujoco is an extension module without stubs
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -51,10 +52,12 @@ def render(config: Mapping[str, Any]) -> Path:
     one = sources.Scenes(jax.tree.map(lambda leaf: leaf[None], drawn), (loaded.names[index],), loaded.account)
     print(draw(one, out, limit=1)[0], flush=True)
     try:
-        imageio.imwrite(out / "mujoco.png", photograph(spec.compile(), **config["image"]))
+        with warnings.catch_warnings(action="ignore"):  # GLFW's own, of which the line below says what matters
+            imageio.imwrite(out / "mujoco.png", photograph(spec.compile(), **config["image"]))
         print(out / "mujoco.png", flush=True)
     except Exception as error:  # whatever the platform's OpenGL raises: the files above are there all the same
-        print(f"no OpenGL for mujoco.Renderer here ({error}); set MUJOCO_GL=egl or osmesa", flush=True)
+        reason = str(error).split(",")[0]
+        print(f"no mujoco.png: no display or OpenGL here ({reason}); set MUJOCO_GL=egl (a GPU) or MUJOCO_GL=osmesa (none)", flush=True)
     return xml
 
 
