@@ -211,6 +211,7 @@ def _begun(folder: Path) -> Iterator[None]:
     except BaseException:
         with contextlib.suppress(OSError):  # it holds something, or was never made
             folder.rmdir()
+            folder.parent.rmdir()
         raise
 
 

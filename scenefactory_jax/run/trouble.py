@@ -1,6 +1,7 @@
 """What goes wrong past the door, in the user's words: no device, too little memory, weights that do not fit, a reward that is no number."""
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,8 +22,9 @@ def explain(error: Exception, config: Mapping[str, Any]) -> str | None:
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return _memory(text, config)
     if isinstance(error, flax.errors.ScopeParamShapeError):
-        reason = text.split(" (https")[0]
-        return f"run={config.get('run')}: its weights do not fit the policy: {reason}; keep `observe` and `policy` as they were in training"
+        name, place, wanted, held = re.findall(r'"([^"]+)"|shape (\([^)]*\))', text)[:4]
+        where = f"{place[0].strip('/')}/{name[0]} {held[1]}, this config wants {wanted[1]}"
+        return f"run={config.get('run')}: has weights {where}; `observe` and `policy` must be as they were in training"
     if isinstance(error, AssertionError | RuntimeError) and (platform := _without_device()):
         return (
             f"no device: JAX_PLATFORMS={platform} asks for one that JAX does not find here; unset it to use what there is,"
@@ -57,7 +59,7 @@ def _memory(text: str, config: Mapping[str, Any]) -> str:
     sizes = {"worlds": config.get("worlds"), "ppo.horizon": horizon, "repeats": config.get("repeats")}
     held = " ".join(f"{name}={value}" for name, value in sizes.items() if value is not None)
     fewer = "fewer worlds (memory grows in proportion to them)" if "worlds" in config else "fewer scenes at once"
-    return f"out of memory: {place}{text.split('. ')[0][:160]}; {held or 'all scenes at once'} need more than there is: take {fewer}"
+    return f"out of memory: {place}{text.split('. ')[0].rstrip('.')[:160]}; {held or 'all scenes at once'} need more than there is: take {fewer}"
 
 
 def _without_device() -> str | None:
