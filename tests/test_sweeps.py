@@ -15,12 +15,15 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "sweeps.md").read_text()
 TOY = ["experiment=smoke", "evaluation.enable=false", "progress=false", "iterations=1"]
 SMALLER = {'"experiment=demo", "minutes=2"': ", ".join(f'"{one}"' for one in TOY), "n_trials=20": "n_trials=2"}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
 def sweep(folder, *arguments):
     """The command line in a folder; the runs that it leaves."""
     call = [sys.executable, "-m", "scenefactory_jax", "train", "-m", *arguments, *TOY]
-    done = subprocess.run(call, cwd=folder, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    done = subprocess.run(call, cwd=folder, capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == 0, done.stderr[-2000:]
     return [config.read(run) for run in sorted((folder / "runs").iterdir()) if len(log.read(run)) == 1]
 

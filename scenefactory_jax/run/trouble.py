@@ -59,7 +59,8 @@ def _memory(text: str, config: Mapping[str, Any]) -> str:
     sizes = {"worlds": config.get("worlds"), "ppo.horizon": horizon, "repeats": config.get("repeats")}
     held = " ".join(f"{name}={value}" for name, value in sizes.items() if value is not None)
     fewer = "fewer worlds (memory grows in proportion to them)" if "worlds" in config else "fewer scenes at once"
-    return f"out of memory: {place}{text.split('. ')[0].rstrip('.')[:160]}; {held or 'all scenes at once'} need more than there is: take {fewer}"
+    reason = text.split(". ")[0].rstrip(".")[:160]
+    return f"out of memory: {place}{reason}; {held or 'all scenes at once'} need more than there is: take {fewer}"
 
 
 def _without_device() -> str | None:
