@@ -37,6 +37,7 @@ def test_the_readme_is_short_and_in_order():
     assert len(text.splitlines()) < 200
     assert re.findall(r"^## (.+)$", text, re.MULTILINE) == SECTIONS
     assert "\nmake demo " in text and "\nmake test " in text
+    assert "make check test" in (ROOT / ".ci" / "run").read_text()
     picture = ROOT / re.search(r"!\[[^]]+\]\(([^)]+)\)", text).group(1)
     assert picture.stat().st_size < 600_000
 
@@ -54,7 +55,7 @@ def test_commands_of_the_pages_compose(page):
 def test_the_ten_lines_of_python_run(quickly):
     """At a size that compiles in seconds."""
     code = re.search(r"```python\n(import jax.*?)```", (ROOT / "README.md").read_text(), re.DOTALL).group(1)
-    assert len(code.splitlines()) <= 10 and code.count('"experiment=demo", "weather=mixed"') == 1
+    assert len(list(filter(None, code.splitlines()))) <= 10 and code.count('"experiment=demo", "weather=mixed"') == 1
     found = {}
     exec(code.replace('"experiment=demo", "weather=mixed"', '"experiment=smoke", "weather=mixed"'), found)
     outcome = found["outcome"]

@@ -14,7 +14,8 @@ from omegaconf import OmegaConf
 from running import smoke
 
 import scenefactory_jax.__main__ as command_line
-from scenefactory_jax.run import config, keys, sources
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import config, keys, sources, trouble
 from scenefactory_jax.run.train import train
 from scenefactory_jax.scenes import bank_index
 
@@ -112,3 +113,18 @@ def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkey
         assert f"\n{printed}".endswith(wanted[3:])
     else:
         assert printed == wanted
+
+
+def test_a_car_that_breaks_does_not_end_training():
+    broken = {"iteration": 3, "reward/haste": float("nan"), "ppo/skipped": 4.0, "ppo/gradient_norm": 0.0}
+    with pytest.raises(ConfigError, match=r"reward\.haste: nan in iteration 3"):
+        trouble.check_finite(broken)
+    for sound in ({"reward/haste": 1.0}, {"ppo/skipped": 0.0}, {"ppo/gradient_norm": 0.3}):  # it learnt, or no term is at fault
+        trouble.check_finite({**broken, **sound})
+
+
+def test_an_error_of_our_own_keeps_its_traceback():
+    assert trouble.explain(RuntimeError("a bug"), {}) is None and trouble.explain(AssertionError(), {}) is None
+    assert trouble.explain(KeyError("worlds"), {"worlds": 4}) is None
+    told = trouble.explain(MemoryError("Unable to allocate 1.53 GiB for an array with shape (400000, 1024)"), {"worlds": 400000})
+    assert told is not None and "out of memory: Unable to allocate 1.53 GiB" in told and "worlds=400000" in told
