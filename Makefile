@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed
 CUDA ?= # make install CUDA=1 adds the CUDA build of JAX
 
-.PHONY: help install demo test test-slow test-browser check notebook clean
+.PHONY: help install demo test test-slow test-browser check docs notebook clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -35,6 +35,9 @@ test-browser: $(STAMP) ## the replay's page in a headless browser; needs Chromiu
 check: $(STAMP) ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(STAMP) ## the site of docs/, in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 notebook: $(STAMP) ## run the notebooks and keep their outputs
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb

@@ -66,8 +66,20 @@ def _job(command: str):
         except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
+        except Exception as error:
+            if (told := _trouble(error, config)) is None:
+                raise
+            print(f"error: {told}", file=sys.stderr)
+            raise SystemExit(2) from None
 
     return job
+
+
+def _trouble(error: Exception, config) -> str | None:
+    """What the machine or a library lacks, in one line; imported when there is trouble."""
+    from scenefactory_jax.run import trouble
+
+    return trouble.explain(error, configs.plain(config))
 
 
 if __name__ == "__main__":

@@ -147,15 +147,16 @@ def _compare(held: dict[str, tuple], wanted: dict[str, tuple], where: str) -> No
     if not told:
         return
     lines = []
-    for name in told[:8]:
+    for name in told[:4]:
         there, here = held.get(name), wanted.get(name)
         if there is None or here is None:
             lines.append(f"checkpoint has {'no' if there is None else 'an array'} {name}, config wants {'none' if here is None else 'one'}")
         else:
             which = int(there[0] == here[0])  # the shape, or if that is the same, the type
             lines.append(f"checkpoint has {name} {there[which]}, config wants {here[which]}")
-    more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
-    raise ConfigError(f"{where} does not fit this config: {'; '.join(lines)}{more}")
+    more = f"; and {len(told) - 4} more" if len(told) > 4 else ""
+    out = "use the settings that the run was made with, or another folder"
+    raise ConfigError(f"{where} does not fit this config: {'; '.join(lines)}{more}; {out}")
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:

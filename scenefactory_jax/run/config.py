@@ -103,6 +103,8 @@ def _explain(name: str, error: Exception) -> str:
     """Hydra's message, and the keys that the place in question has."""
     text = str(error) + (f" ({error.__cause__})" if error.__cause__ else "")
     text = " ".join(text.split())
+    if "provider=hydra.searchpath" not in text:  # the user has named no folder: where ours lie is no news
+        text = text.partition(" Config search path:")[0]
     match = re.search(r"Could not override '([^']+)'", text)
     if not match:
         return text

@@ -3,6 +3,7 @@
 The groups (dynamics, reward, ppo, ...) are checked against the functions that they configure, by `build`. These keys configure commands.
 """
 
+import importlib.util
 import os
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
@@ -105,7 +106,7 @@ def check_train(config: Mapping[str, Any]) -> None:
     check(config, TRAIN)
     evaluation = config["evaluation"]
     check(evaluation, EVALUATION, where="evaluation")
-    check(evaluation["video"], VIDEO, where="evaluation.video")
+    check_video(evaluation["video"], where="evaluation.video")
     check_failures(evaluation, where="evaluation.failures")
     _check_protocols(evaluation["protocols"], where="evaluation.protocols")
 
@@ -124,8 +125,19 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
         ConfigError: naming the key, the value and what would be valid.
     """
     check(config, {"run": Key(str), "out": PLACE, "overrides": Key(list[str]), **JUDGE})
-    check(config["video"], VIDEO, where="video")
+    check_video(config["video"], where="video")
     check_failures(config, where="failures")
+
+
+def check_video(video: Mapping[str, Any], *, where: str) -> None:
+    """Every key of a video, and that there is what writes it: it comes last, after all the work.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(video, VIDEO, where=where)
+    if video["enable"] and video["suffix"] == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ConfigError(f"{where}.suffix: .mp4 needs ffmpeg, which is missing; `pip install 'scenefactory_jax[video]'`, or choose .gif")
 
 
 def check_failures(settings: Mapping[str, Any], *, where: str) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from scenefactory_jax.policy import late_fusion
 from scenefactory_jax.ppo import across, checkpoint
 from scenefactory_jax.ppo import train as ppo
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, loggers, sources, stream
+from scenefactory_jax.run import keys, log, loggers, sources, stream, trouble
 from scenefactory_jax.types import Env, Policy, Scene
 
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
@@ -73,10 +74,9 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
     keys.check_train(config)
     watching = loggers.make(config["loggers"])
     sources.use_compilation_cache()
-    folder, resume = _folder(config)
     prepared = prepared or prepare(config)
-    trainer = prepared.trainer
-    with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
+    trainer, (folder, resume) = prepared.trainer, _folder(config)
+    with _begun(folder), _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
@@ -179,6 +179,7 @@ def _loop(
             file.add(row)
             note(row)
             show(iteration, describe(row))
+            trouble.check_finite(row)
             for callback in callbacks:
                 callback(state, row)
             late = config["minutes"] is not None and spent >= config["minutes"]
@@ -212,17 +213,29 @@ def describe(row: Mapping[str, float | int]) -> str:
     return f"{rates} | {row['casps']:,.0f} steps/s"
 
 
+@contextlib.contextmanager
+def _begun(folder: Path) -> Iterator[None]:
+    """A folder that is still empty when an error ends the run was no run's: it goes."""
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # it holds something, or was never made
+            folder.rmdir()
+            folder.parent.rmdir()
+        raise
+
+
 def _folder(config: Mapping[str, Any]) -> tuple[Path, bool]:
     """The run's folder, and whether there is something in it to go on from."""
     if config["out"] is None:
         if config["resume"]:
             raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = Path("runs") / f"{config['name']}-{stamp}"
-        attempt = 1
-        while folder.exists():  # the jobs of a parallel sweep start in one second
-            attempt += 1
-            folder = folder.with_name(f"{config['name']}-{stamp}-{attempt}")
+        base = Path("runs") / f"{config['name']}-{stamp}"
+        for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
+            with contextlib.suppress(FileExistsError):  # the jobs of a parallel sweep start in one second: making it says whose it is
+                folder.mkdir(parents=True)
+                break
         return folder, False
     folder = Path(config["out"])
     if checkpoint.latest(folder / "checkpoints") is None:

@@ -1,0 +1,84 @@
+"""The documents: what they link to is there, what they name exists, and the site builds without network."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from scenefactory_jax import __version__
+from scenefactory_jax.run import config
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").rglob("*.md"))
+SECTIONS = ["What is new", "Install", "Ten lines of Python", "Train, evaluate, sweep", "Results", "Map of the package"]
+SECTIONS += ["Your own reward, observation, dynamics, converter", "Limits", "Terms, contributing, citation"]
+
+
+def commands(page):
+    """(command, overrides) of the lines of a page that call the package, as Hydra takes them."""
+    for line in re.findall(r"^(?:\$ )?python -m scenefactory_jax (\w+) +(.*)$", page.read_text(), re.MULTILINE):
+        text = re.sub(r"\s+#.*$", "", line[1])
+        words = [word.replace("'", "") for word in re.findall(r"(?:[^\s']|'[^']*')+", text)]
+        yield line[0], [word for word in words if word not in ("-m", "--cfg", "job")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+        assert target.startswith("https://") or (page.parent / target).exists(), target
+
+
+def test_the_readme_is_short_and_in_order():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) < 200
+    assert re.findall(r"^## (.+)$", text, re.MULTILINE) == SECTIONS
+    assert "\nmake demo " in text and "\nmake test " in text
+    assert "make check test" in (ROOT / ".ci" / "run").read_text()
+    picture = ROOT / re.search(r"!\[[^]]+\]\(([^)]+)\)", text).group(1)
+    assert picture.stat().st_size < 600_000
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "troubleshooting"], ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_of_the_pages_compose(page):
+    """Every key and option exists; what they name on disk is the reader's."""
+    for command, words in commands(page):
+        swept = ("seed=", "weather=", "ppo.gamma=")  # of a sweep, the first value
+        settings = [word.split(",")[0] if word.startswith(swept) else word for word in words]
+        launched = [word for word in settings if not word.startswith("hydra")]
+        assert config.load(command, *launched)
+
+
+def test_the_ten_lines_of_python_run(quickly):
+    """At a size that compiles in seconds."""
+    code = re.search(r"```python\n(import jax.*?)```", (ROOT / "README.md").read_text(), re.DOTALL).group(1)
+    assert len(list(filter(None, code.splitlines()))) <= 10 and code.count('"experiment=demo", "weather=mixed"') == 1
+    found = {}
+    exec(code.replace('"experiment=demo", "weather=mixed"', '"experiment=smoke", "weather=mixed"'), found)
+    outcome = found["outcome"]
+    assert outcome.reward.shape == outcome.facts.ttc.shape == (4, 4) and np.isfinite(outcome.reward).all()
+
+
+def test_the_version_is_the_same_everywhere():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == __version__ and citation["cff-version"] == "1.2.0" and citation["license"] == "Apache-2.0"
+    assert {"message", "title", "authors"} <= set(citation) and all(set(author) == {"name"} for author in citation["authors"])
+    assert f"## {__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    assert f'version = "{__version__}"' in (ROOT / "pyproject.toml").read_text()
+
+
+def test_the_site_builds_without_network(tmp_path):
+    pytest.importorskip("mkdocs", reason="needs mkdocs: pip install scenefactory_jax[docs]")
+    pytest.importorskip("mkdocstrings_handlers.python", reason="needs mkdocstrings: pip install scenefactory_jax[docs]")
+    call = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    nowhere = {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9", "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, env={"PATH": "/usr/bin:/bin", **nowhere})
+    assert done.returncode == 0, done.stderr[-2000:]
+    site = tmp_path / "site"
+    reference = (site / "reference" / "index.html").read_text()
+    assert "scenefactory_jax.run.train.train" in reference and "A key that does not fit".lower() in reference.lower()
+    fetched = r"<(?:script|img|link)\b[^>]*\b(?:src|href)=\"?https?://[^\">]*"
+    assert not [found for page in site.rglob("*.html") for found in re.findall(fetched, page.read_text())]

@@ -1,0 +1,129 @@
+"""docs/troubleshooting.md quotes what a user sees: each of its commands is called here, and must say what the page says."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+from omegaconf import OmegaConf
+from running import smoke
+
+import scenefactory_jax.__main__ as command_line
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import config, keys, sources, trouble
+from scenefactory_jax.run.train import train
+from scenefactory_jax.scenes import bank_index
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "troubleshooting.md").read_text()
+SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
+CALL = "python -m scenefactory_jax "
+OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.facts.speed - 100.0)\n"
+ELSEWHERE = re.compile(r"JAX_PLATFORMS=cuda")  # what a process decides when it starts
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder as a user has one: a short run, a bank of another version, a reward of one's own."""
+    folder = tmp_path_factory.mktemp("here")
+    train(smoke(folder / "runs" / "mine", "evaluation.enable=false", "iterations=1"))
+    (folder / "old.bank").mkdir()
+    (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
+    (folder / "my_terms.py").write_text(OWN_REWARD)
+    return folder
+
+
+@pytest.fixture
+def lacking(monkeypatch):
+    """A machine without the extras and with too little memory, whatever this one has."""
+    found = keys.importlib.util.find_spec
+    monkeypatch.setattr(keys.importlib.util, "find_spec", lambda name, *rest: None if name == "imageio_ffmpeg" else found(name, *rest))
+    for name in ("ray", "gymnasium"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "scenefactory_jax.adapters.gymnasium", raising=False)
+    assign = sources.assign
+
+    def short_of_memory(scenes, worlds, **rest):
+        return assign(scenes, worlds, **rest) if worlds < 10_000 else jnp.zeros((10**15,), jnp.uint8)
+
+    monkeypatch.setattr(sources, "assign", short_of_memory)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def said(command, folder, monkeypatch, capsys) -> str:
+    """What a command of the page prints, called in a folder; paths are relative to it."""
+    monkeypatch.chdir(folder)
+    if ELSEWHERE.search(command):
+        environment, arguments = command.split(CALL)
+        done = subprocess.run(
+            [sys.executable, "-m", "scenefactory_jax", *_words(arguments)], capture_output=True, text=True,
+            env={**os.environ, **dict(one.split("=") for one in environment.split()), "PYTHONPATH": str(config.folder().parent)},
+        )  # fmt: skip
+        return done.stdout + done.stderr
+    if not command.startswith(CALL):
+        with pytest.raises(ImportError) as caught:
+            exec(command.removeprefix("python -c ").strip('"'), {})
+        return traceback.format_exception_only(caught.value)[-1]
+    monkeypatch.syspath_prepend(str(folder))
+    arguments = _words(command.removeprefix(CALL))
+    monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
+
+    def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
+        return lambda job: lambda: job(OmegaConf.create(config.load(config_name, *arguments[1:])))
+
+    monkeypatch.setattr("hydra.main", composing)
+    try:
+        command_line.main()
+    except SystemExit as stopped:
+        assert stopped.code == 2
+    captured = capsys.readouterr()
+    return captured.out + captured.err
+
+
+def _words(arguments: str) -> list[str]:
+    """As a shell would divide them; the page quotes with ' alone."""
+    return [word.replace("'", "") for word in re.findall(r"(?:[^\s']|'[^']*')+", arguments)]
+
+
+def normal(text: str, folder: Path) -> str:
+    """Without the machine: where the folder lies, how much an allocation was, progress bars."""
+    text = text.replace(f"{folder.resolve()}/", "").replace(f"{folder}/", "")
+    lines = [line.rstrip() for line in re.sub(r"allocating \d+ bytes", "allocating N bytes", text).splitlines()]
+    return "\n".join(line for line in lines if line and not re.match(r"convert +\d+%", line))
+
+
+def test_the_page_shows_every_likely_mistake():
+    headings = re.findall(r"^## \d+\. (.+)$", PAGE, re.MULTILINE)
+    assert len(headings) == 10 and len(SHOWN) >= 10 and PAGE.count("```console") == len(SHOWN)
+    assert all("Traceback" not in text for _, text in SHOWN)
+
+
+@pytest.mark.parametrize(("command", "quoted"), SHOWN, ids=[command[:70] for command, _ in SHOWN])
+def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkeypatch, capsys):
+    printed, wanted = normal(said(command, place, monkeypatch, capsys), place), normal(quoted, place)
+    if wanted.startswith("...\n"):  # the page leaves out what stands before
+        assert f"\n{printed}".endswith(wanted[3:])
+    else:
+        assert printed == wanted
+
+
+def test_a_car_that_breaks_does_not_end_training():
+    broken = {"iteration": 3, "reward/haste": float("nan"), "ppo/skipped": 4.0, "ppo/gradient_norm": 0.0}
+    with pytest.raises(ConfigError, match=r"reward\.haste: nan in iteration 3"):
+        trouble.check_finite(broken)
+    for sound in ({"reward/haste": 1.0}, {"ppo/skipped": 0.0}, {"ppo/gradient_norm": 0.3}):  # it learnt, or no term is at fault
+        trouble.check_finite({**broken, **sound})
+
+
+def test_an_error_of_our_own_keeps_its_traceback():
+    assert trouble.explain(RuntimeError("a bug"), {}) is None and trouble.explain(AssertionError(), {}) is None
+    assert trouble.explain(KeyError("worlds"), {"worlds": 4}) is None
+    told = trouble.explain(MemoryError("Unable to allocate 1.53 GiB for an array with shape (400000, 1024)"), {"worlds": 400000})
+    assert told is not None and "out of memory: Unable to allocate 1.53 GiB" in told and "worlds=400000" in told
