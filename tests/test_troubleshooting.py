@@ -35,7 +35,7 @@ def place(tmp_path_factory):
     train(smoke(folder / "runs" / "mine", "evaluation.enable=false", "iterations=1"))
     (folder / "old.bank").mkdir()
     (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
-    (folder / "my_terms.py").write_text(OWN_REWARD)
+    (folder / "my_reward.py").write_text(OWN_REWARD)
     return folder
 
 
