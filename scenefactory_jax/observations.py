@@ -119,10 +119,8 @@ def neighbours(
     float]
 ) -> Rows:
     """The nearest other active cars and boxes: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
-    motion, everyone, order, mask = _nearest(scene, state, count)
-    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
-    time = jnp.minimum(jnp.take_along_axis(pairs.ttc, order, axis=1) / ttc_scale_s, 1.0)
+    motion, everyone, order, mask, pairs = _nearest(scene, state, count, circles)
+    time = jnp.minimum(pairs.ttc / ttc_scale_s, 1.0)
     place = to_frame(everyone.position[order] - motion.position[:, None, :2], motion.yaw[:, None]) / distance_scale_m
     yaw = wrap_angle(everyone.yaw[order] - motion.yaw[:, None]) / jnp.pi
     speed = norm(everyone.velocity)[order] / speed_scale_mps
@@ -148,10 +146,7 @@ def encounters(
     bounding circles; time until the centres are closest, clamped to its scale, and the distance they then have; TTC. Lengths l, and times,
     without an upper end read l / (scale + |l|), so that a metre beside the car counts as much as ten far away.
     """
-    motion, everyone, order, mask = _nearest(scene, state, count)
-    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
-    ttc, gap = (jnp.take_along_axis(one, order, axis=1) for one in (pairs.ttc, pairs.gap))
+    motion, everyone, order, mask, pairs = _nearest(scene, state, count, circles)
     facing = motion.yaw[:, None]
     apart = to_frame(everyone.position[order] - motion.position[:, None, :2], facing)
     closing = to_frame(everyone.velocity[order] - motion.velocity[:, None, :2], facing)
@@ -163,10 +158,10 @@ def encounters(
         closing / speed_scale_mps,
         jnp.stack([jnp.sin(turned), jnp.cos(turned)], axis=-1),
         everyone.size[order] / size_scale_m,
-        _squashed(jnp.where(jnp.isinf(gap), 0.0, gap), gap_scale_m)[..., None],
+        _squashed(jnp.where(jnp.isinf(pairs.gap), 0.0, pairs.gap), gap_scale_m)[..., None],
         (soonest / time_scale_s)[..., None],
         _squashed(closest, gap_scale_m)[..., None],
-        (time_scale_s / (time_scale_s + ttc))[..., None],  # 0 if they never meet, 1 once they touch
+        (time_scale_s / (time_scale_s + pairs.ttc))[..., None],  # 0 if they never meet, 1 once they touch
     ]
     return _rows(jnp.concatenate(columns, axis=-1), mask, count)
 
@@ -175,15 +170,23 @@ def _squashed(length: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:
     return length / (scale + jnp.abs(length))
 
 
-def _nearest(scene: Scene, state: State, count: int) -> tuple[Motion, conflict.Bodies, Int[Array, "A N"], Bool[Array, "A N"]]:
-    """The cars' motion, everybody, and for each car the `count` nearest others (fewer where there are not as many), nearest first."""
+def _nearest(
+    scene: Scene, state: State, count: int, circles: dict[str, float]
+) -> tuple[Motion, conflict.Bodies, Int[Array, "A N"], Bool[Array, "A N"], conflict.Pairs]:
+    """The cars' motion, everybody, and for each car the `count` nearest others (fewer where there are not as many), nearest first.
+
+    Their mask says who is there at all, the pairs how each of them and the car meet.
+    """
     motion, cars = state.motion, len(state.active)
     everyone = conflict.bodies(motion, state.agents.size, state.active, scene.boxes)
     others = everyone.present[None] & ~jnp.eye(cars, len(everyone.present), dtype=bool)
     apart = everyone.position[None] - everyone.position[:cars, None]
     squared = jnp.where(others, dot(apart, apart), jnp.inf)
     order = jnp.argsort(squared, axis=1)[:, : min(count, len(everyone.present))]
-    return motion, everyone, order, jnp.take_along_axis(others, order, axis=1)
+    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=1.0)
+    mask, pairs = jax.tree.map(lambda one: jnp.take_along_axis(one, order, axis=1), (others, pairs))
+    return motion, everyone, order, mask, pairs
 
 
 def _rows(features: Float[Array, "A N F"], mask: Bool[Array, "A N"], count: int) -> Rows:

@@ -44,9 +44,9 @@ def summarise(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
     Raises:
         RecordsError: no runs, or see `tables.check`.
     """
-    (grid,) = _grids([runs], ALL)
-    values = _ratios(grid, ALL, *_once(grid))[0]
-    draws = np.concatenate([_ratios(grid, ALL, *w) for w in _weights(grid, [len(runs)], bootstrap=bootstrap, seed=seed)])
+    (grid,) = _grids([runs])
+    values = _ratios(grid, *_once(grid))[0]
+    draws = np.concatenate([_ratios(grid, *w) for w in _weights(grid, [len(runs)], bootstrap=bootstrap, seed=seed)])
     return {
         name: _estimate(float(values[m]), draws[:, m], metric, grid.counts[:, :, m]) for m, (name, metric) in enumerate(ALL.items())
     }
@@ -61,14 +61,14 @@ def difference(before: Runs, after: Runs, *, bootstrap: int, seed: int) -> dict[
     scenes = [set(np.concatenate([one["scene"] for one in runs.values()]).tolist()) for runs in (before, after)]
     if odd := sorted(scenes[0] ^ scenes[1]):
         raise RecordsError(f"records.scene: {odd[0]!r} is in only one of the two; a paired difference needs the same scenes")
-    first, second = _grids([before, after], ALL)
+    first, second = _grids([before, after])
     paired = list(before) == list(after)
     sizes = [len(before)] if paired else [len(before), len(after)]
-    old, new = (_ratios(grid, ALL, *_once(grid))[0] for grid in (first, second))
+    old, new = (_ratios(grid, *_once(grid))[0] for grid in (first, second))
     draws = []
     for weights in _weights(first, sizes, bootstrap=bootstrap, seed=seed):
         *seeds, scene, agent = weights
-        draws.append(_ratios(second, ALL, seeds[-1], scene, agent) - _ratios(first, ALL, seeds[0], scene, agent))
+        draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
     draws, result = np.concatenate(draws), {}
     for m, (name, metric) in enumerate(ALL.items()):
         one = _estimate(float(new[m] - old[m]), draws[:, m], metric, np.minimum(first.counts, second.counts)[:, :, m] if paired else None)
@@ -110,7 +110,7 @@ def _agents(counts: Float[np.ndarray, "S U"]) -> int:
 # ---- layout
 
 
-def _grids(every: Sequence[Runs], metrics: Mapping[str, Metric]) -> list[Grid]:
+def _grids(every: Sequence[Runs]) -> list[Grid]:
     """All runs over one list of agents."""
     for runs in every:
         if not runs:
@@ -128,22 +128,22 @@ def _grids(every: Sequence[Runs], metrics: Mapping[str, Metric]) -> list[Grid]:
     _, world = np.unique(units[:, :2], axis=0, return_inverse=True)
     grids = []
     for runs in every:
-        sums, counts = (np.zeros((len(runs), len(units), len(metrics))) for _ in range(2))
+        sums, counts = (np.zeros((len(runs), len(units), len(ALL))) for _ in range(2))
         for s, records in enumerate(runs.values()):
             rows = np.array([row[tuple(unit)] for unit in place(records).tolist()])
-            sums[s, rows], counts[s, rows] = _columns(records, metrics)
+            sums[s, rows], counts[s, rows] = _columns(records)
         grids.append(Grid(sums, counts, units[:, 0], world.ravel()))
     return grids
 
 
-def _columns(records: Records, metrics: Mapping[str, Metric]) -> tuple[Float[np.ndarray, "R M"], Float[np.ndarray, "R M"]]:
+def _columns(records: Records) -> tuple[Float[np.ndarray, "R M"], Float[np.ndarray, "R M"]]:
     """Value and weight of every metric in every row."""
-    masks = [np.asarray(metric.counted(records), bool) for metric in metrics.values()]
-    values = [np.where(mask, np.asarray(m.value(records), float), 0.0) for m, mask in zip(metrics.values(), masks, strict=True)]
+    masks = [np.asarray(metric.counted(records), bool) for metric in ALL.values()]
+    values = [np.where(mask, np.asarray(m.value(records), float), 0.0) for m, mask in zip(ALL.values(), masks, strict=True)]
     found = np.stack(values, axis=1)
     if not np.isfinite(found).all():
-        name = list(metrics)[int(np.argmin(np.isfinite(found).all(axis=0)))]
-        raise RecordsError(f"records: {metrics[name].label} has a value that is not finite")
+        name = list(ALL)[int(np.argmin(np.isfinite(found).all(axis=0)))]
+        raise RecordsError(f"records: {ALL[name].label} has a value that is not finite")
     return found, np.stack(masks, axis=1).astype(float)
 
 
@@ -174,14 +174,13 @@ def _weights(grid: Grid, seeds: Sequence[int], *, bootstrap: int, seed: int) -> 
 
 
 def _ratios(
-    grid: Grid, metrics: Mapping[str, Metric], seeds: Float[np.ndarray, "B S"], scenes: Float[np.ndarray, "B C"],
-    agents: Float[np.ndarray, "B U"],
+    grid: Grid, seeds: Float[np.ndarray, "B S"], scenes: Float[np.ndarray, "B C"], agents: Float[np.ndarray, "B U"]
 ) -> Float[np.ndarray, "B M"]:  # fmt: skip
     """Each metric of each resample; NaN where a draw holds nobody who counts."""
     top, bottom = (np.einsum("bs,bsm->bm", seeds, _weighted(agents, part)) for part in (grid.sums, grid.counts))
     starts = np.flatnonzero(np.diff(grid.world, prepend=-1))
     home = grid.scene[starts]
-    for m in (m for m, metric in enumerate(metrics.values()) if metric.by_world):
+    for m in (m for m, metric in enumerate(ALL.values()) if metric.by_world):
         top[:, m] = bottom[:, m] = 0.0
         for s in range(len(grid.sums)):
             total, number = (np.add.reduceat(agents * part[s, :, m], starts, axis=1) for part in (grid.sums, grid.counts))
@@ -200,8 +199,8 @@ def per_seed(runs: Runs) -> dict[int, dict[str, float | None]]:
     """Each seed's own value of every metric."""
     found = {}
     for seed, records in runs.items():
-        (grid,) = _grids([{seed: records}], ALL)
-        values = _ratios(grid, ALL, *_once(grid))[0]
+        (grid,) = _grids([{seed: records}])
+        values = _ratios(grid, *_once(grid))[0]
         found[seed] = {name: float(v) if np.isfinite(v) else None for name, v in zip(ALL, values, strict=True)}
     return found
 
