@@ -13,7 +13,7 @@ from scenefactory_jax.run import config as configs
 
 
 class Key(NamedTuple):
-    """A key's type, and the least value that makes sense."""
+    """A key's type, and the least value that makes sense, also for each of a list."""
 
     hint: Any
     least: float | None = None
@@ -28,7 +28,7 @@ FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck
 FAILURE_PICTURES = {"enable": FLAG, "panels": COUNT, "before_s": Key(float, 0), "video": FLAG}
 FAILURES = {"notes": FAILURE_NOTES, "kinds": FAILURE_KINDS, "pictures": FAILURE_PICTURES}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
-EVALUATION = {"enable": FLAG, "every": Key(int | None, 0), "protocols": Key(list[str]), **JUDGE}
+EVALUATION = {"enable": FLAG, "every": Key(int | list[int] | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
 TRAIN |= {"devices": Key(int | None, 1), "stream": Key(dict | None)}
 TRAIN |= {"minutes": Key(float | None, 0), "checkpoint_every": COUNT, "checkpoints_kept": COUNT, "loggers": Key(dict), "progress": FLAG}
@@ -93,7 +93,8 @@ def check(config: Mapping[str, Any], keys: Mapping[str, Key], *, where: str = ""
             raise ConfigError(f"{place}: missing; {where or 'the command'} needs {', '.join(keys)}")
         value = os.fspath(config[name]) if isinstance(config[name], os.PathLike) else config[name]
         check_type(value, hint, where=place)
-        if least is not None and value is not None and not value >= least:
+        numbers = value if isinstance(value, list) else [value]
+        if least is not None and value is not None and not all(number >= least for number in numbers):
             raise ConfigError(f"{place}: {value}; wanted is at least {least}")
 
 

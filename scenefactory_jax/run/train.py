@@ -136,14 +136,18 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
 def _make_watch(
     config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
 ) -> OnIteration | None:
-    """Held-out evaluation every so many iterations, if the config asks for it."""
+    """Held-out evaluation every so many iterations or at those that are listed, if the config asks for it."""
     every = config["evaluation"]["every"]
     if not every or (examiners is None and not config["evaluation"]["enable"]):
         return None
     from scenefactory_jax.run.evaluate import make_watch
 
     watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
-    return lambda state, row: watch(ppo.parameters_of(state), row) if row["iteration"] % every == 0 else None
+
+    def due(iteration: int) -> bool:
+        return iteration in every if isinstance(every, list) else iteration % every == 0
+
+    return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
 
 
 def _loop(
