@@ -17,6 +17,7 @@ class Bodies(NamedTuple):
     position: Float[Array, "B 2"]
     yaw: Float[Array, " B"]
     velocity: Float[Array, "B 2"]
+    yaw_rate: Float[Array, " B"]
     size: Float[Array, "B 2"]
     present: Bool[Array, " B"]
 
@@ -32,8 +33,8 @@ class Pairs(NamedTuple):
 
 def bodies(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> Bodies:
     """Cars and boxes as one list; its first rows are the cars."""
-    cars = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], size, active)
-    beside = (boxes.position, boxes.yaw, boxes.velocity, boxes.size, boxes.present)
+    cars = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], motion.yaw_rate, size, active)
+    beside = (boxes.position, boxes.yaw, boxes.velocity, boxes.yaw_rate, boxes.size, boxes.present)
     return Bodies(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
 
 

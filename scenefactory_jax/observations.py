@@ -50,6 +50,11 @@ def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
 
 
+def turning(scene: Scene, state: State, *, turn_scale_radps: float, steer_scale_rad: float) -> Float[Array, "A 2"]:
+    """The car's yaw rate, and the mean angle of its front wheels."""
+    return jnp.stack([state.motion.yaw_rate / turn_scale_radps, state.motion.steer / steer_scale_rad], axis=1)
+
+
 def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float, kernels: bool) -> Rows:
     """Road segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y.
 
@@ -136,14 +141,15 @@ def encounters(
     distance_scale_m: float,
     size_scale_m: float,
     speed_scale_mps: float,
+    turn_scale_radps: float,
     gap_scale_m: float,
     time_scale_s: float,
     circles: dict[str, float],
 ) -> Rows:
     """The nearest other active cars and boxes as what they will mean for a car that keeps its velocity, near ones in detail.
 
-    Columns: x, y in the car's frame; velocity x, y relative to the car's; sine and cosine of the heading; length, width; gap between the
-    bounding circles; time until the centres are closest, clamped to its scale, and the distance they then have; TTC. Lengths l, and times,
+    Columns: x, y in the car's frame; velocity x, y relative to the car's; sine and cosine of the heading; yaw rate, which shows who turns
+    before the way does; length, width; gap between the bounding circles; time until the centres are closest, clamped to its scale, and the distance they then have; TTC. Lengths l, and times,
     without an upper end read l / (scale + |l|), so that a metre beside the car counts as much as ten far away.
     """
     motion, everyone, order, mask, pairs = _nearest(scene, state, count, circles)
@@ -156,7 +162,7 @@ def encounters(
     columns = [
         _squashed(apart, distance_scale_m),
         closing / speed_scale_mps,
-        jnp.stack([jnp.sin(turned), jnp.cos(turned)], axis=-1),
+        jnp.stack([jnp.sin(turned), jnp.cos(turned), everyone.yaw_rate[order] / turn_scale_radps], axis=-1),
         everyone.size[order] / size_scale_m,
         _squashed(jnp.where(jnp.isinf(pairs.gap), 0.0, pairs.gap), gap_scale_m)[..., None],
         (soonest / time_scale_s)[..., None],

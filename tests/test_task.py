@@ -200,18 +200,27 @@ def test_encounters_by_hand_and_from_any_frame(env):
         yaw = np.array([0, np.pi, 0]) + turn
         scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
         state, _ = env.reset(jax.random.key(0), scene)
+        state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.1, 0.3, 0.0])))
         return jax.tree.map(np.asarray, observations.encounters(scene, state, **numbers))
 
     rows = seen(0.0, [0.0, 0.0])
     squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
     meet = (20 - 2 * 1.12 - np.sqrt(2.2**2 - 1)) / 10
     gap = np.hypot(20 - 2.24, 1.0) - 2.2
-    expected = [squash(20, 20), squash(1, 20), -1.0, 0.0, 0.0, -1.0, 0.8, 0.4, squash(gap, 2), 2 / 5, squash(1, 2), 5 / (5 + meet)]
+    expected = [squash(20, 20), squash(1, 20), -1.0, 0.0, 0.0, -1.0, 0.3, 0.8, 0.4, squash(gap, 2), 2 / 5, squash(1, 2), 5 / (5 + meet)]
     np.testing.assert_allclose(rows.features[0, 0], expected, atol=1e-4)
     np.testing.assert_allclose(rows.features[0, 1, :4], [-0.9, 0, -0.5, 0], atol=1e-4)
-    assert rows.features.shape == (3, 16, 12) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
+    assert rows.features.shape == (3, 16, 13) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
     moved = seen(0.9, [7.0, -3.0])
     np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
+
+
+def test_a_car_knows_how_it_turns(env):
+    scene = scene_of([[0.0, 0], [0, 9]], [[50.0, 0]] * 2)
+    state, _ = env.reset(jax.random.key(0), scene)
+    state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.4, -1.0]), steer=jnp.array([-0.1, 0.2])))
+    seen = observations.turning(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
+    np.testing.assert_allclose(seen, [[0.2, -0.2], [-0.5, 0.4]], rtol=1e-6)
 
 
 def test_the_lane_ahead_by_hand(env):
