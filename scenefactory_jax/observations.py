@@ -149,8 +149,9 @@ def encounters(
     """The nearest other active cars and boxes as what they will mean for a car that keeps its velocity, near ones in detail.
 
     Columns: x, y in the car's frame; velocity x, y relative to the car's; sine and cosine of the heading; yaw rate, which shows who turns
-    before the way does; length, width; gap between the bounding circles; time until the centres are closest, clamped to its scale, and the distance they then have; TTC. Lengths l, and times,
-    without an upper end read l / (scale + |l|), so that a metre beside the car counts as much as ten far away.
+    before the way does; length, width; gap between the bounding circles; time until the centres are closest, clamped to its scale, and the
+    distance they then have; TTC. Lengths l, and times, without an upper end read l / (scale + |l|), so that a metre beside the car counts
+    as much as ten far away.
     """
     motion, everyone, order, mask, pairs = _nearest(scene, state, count, circles)
     facing = motion.yaw[:, None]

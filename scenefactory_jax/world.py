@@ -27,6 +27,7 @@ class Parts(NamedTuple):
     """What an environment is made of, every part bound to its numbers."""
 
     dynamics: Dynamics
+    command: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
     draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
     draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
     others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
@@ -51,12 +52,12 @@ def make(config: Mapping[str, Any]) -> Env:
 
 
 def parts_of(config: Mapping[str, Any]) -> Parts:
-    """The parts of a config with the groups timing, dynamics, weather, spawn, others, facts, ends, reward and observe.
+    """The parts of a config with the groups timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
 
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
-    _require(config, ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
+    _require(config, ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
     timing = config["timing"]
     for key in ("physics_hz", "control_hz", "episode_s"):
         if key not in timing:
@@ -72,6 +73,7 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
     ends.check(config["ends"].get("ending", []), where="ends")
     return Parts(
         dynamics=dynamics,
+        command=build(config["controls"], builtins="scenefactory_jax.controls", where="controls"),
         draw_agents=spawn.make(config["spawn"]["draw"]),
         draw_weather=conditions.make(config["weather"]),
         others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
@@ -132,7 +134,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
 def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
     """One control step, without the observation."""
     scene = _now(parts, scene, replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt)))
-    action = jnp.where(state.active[:, None], jnp.clip(action, -1.0, 1.0), 0.0)
+    action = jnp.where(state.active[:, None], jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
     scene = _now(parts, scene, after)
     measured, after = _quarantine(parts.measure(scene, state, after), state, after)

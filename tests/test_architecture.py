@@ -14,7 +14,7 @@ RANK = {
     "struct": 0, "build": 0, "types": 1, "geometry": 2, "patches": 2, "rain": 2, "weather": 2, "layouts": 3, "conditions": 3, "conflict": 3,
     "tracks": 3, "cells": 2, "kernels": 0, "road_kernel": 4, "roadside": 4, "clues": 6,
     "ends": 4, "spawn": 4, "others": 4, "facts": 5, "rewards": 5, "observations": 5, "dynamics": 5,
-    "world": 6, "policy": 7, "ppo": 7, "evaluation": 7, "recording": 7, "validation": 7, "sysid": 7, "report": 8, "run": 9,
+    "controls": 5, "world": 6, "policy": 7, "ppo": 7, "evaluation": 7, "recording": 7, "validation": 7, "sysid": 7, "report": 8, "run": 9,
     "adapters": 9, "__init__": 9, "__main__": 10,
 }  # fmt: skip
 

@@ -185,5 +185,5 @@ def test_a_config_from_python_is_checked_too(tmp_path):
     keys.check_train(settings | {"out": tmp_path})  # a path is as good as its text
     with pytest.raises(ConfigError, match="worlds: missing; the command needs name, out, resume, seed, worlds"):
         keys.check_train({name: value for name, value in settings.items() if name != "worlds"})
-    with pytest.raises(ConfigError, match="group 'reward' is missing; an environment needs timing, dynamics"):
+    with pytest.raises(ConfigError, match="group 'reward' is missing; an environment needs timing, controls"):
         world.make({name: value for name, value in settings.items() if name != "reward"})

@@ -9,7 +9,7 @@ import pytest
 from conftest import road_of, scene_of
 
 import scenefactory_jax
-from scenefactory_jax import conflict, ends, facts, geometry, observations, others, rewards, roadside, spawn, world
+from scenefactory_jax import conflict, controls, ends, facts, geometry, observations, others, rewards, roadside, spawn, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
@@ -49,6 +49,7 @@ def config():
 def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None, beside=others.ignore):
     parts = world.Parts(
         dynamics=glide(),
+        command=controls.pedals,
         draw_agents=draw,
         draw_weather=keep,
         others=beside,
@@ -213,6 +214,34 @@ def test_encounters_by_hand_and_from_any_frame(env):
     assert rows.features.shape == (3, 16, 13) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
     moved = seen(0.9, [7.0, -3.0])
     np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
+
+
+def test_one_pedal_brakes_below_zero():
+    asked = jnp.array([[0.6, -0.2, -1.0], [-0.3, 0.1, -1.0], [-0.3, 0.0, 0.7], [0.5, 1.0, 0.4], [-1.0, 0.0, 0.0]])
+    wanted = [[0.6, -0.2, -0.6], [0.0, 0.1, 0.3], [0.0, 0.0, 0.7], [0.5, 1.0, 0.4], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(controls.one_pedal(asked), wanted, rtol=1e-6)
+    np.testing.assert_array_equal(controls.pedals(asked), asked)
+
+
+def test_controls_are_what_dynamics_and_rewards_are_given(config):
+    """Off the throttle a bicycle rolls on; with one pedal it brakes. Another's function comes in by its own name, and is kept in bounds."""
+    own = scenefactory_jax.load("task", "dynamics=bicycle", "spawn=logged", "observe.road=null")
+    scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]], speeds=[10.0])
+
+    def speed_after(entry):
+        env = world.make({**own, "controls": entry})
+        state, _ = env.reset(jax.random.key(0), scene)
+        state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
+        return float(geometry.norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
+
+    rolled, braked = speed_after({"_target_": "pedals"}), speed_after({"_target_": "one_pedal"})
+    assert rolled[0] == pytest.approx(10.0, abs=0.01) and braked[0] < 9.95
+    np.testing.assert_allclose(braked[1], [0, 0, 0.5])
+    np.testing.assert_allclose(speed_after({"_target_": "test_task.flat_out"})[1], [1, 0, 0])
+
+
+def flat_out(action):
+    return jnp.array([[5.0, 0.0, 0.0]]) + 0 * action
 
 
 def test_a_car_knows_how_it_turns(env):

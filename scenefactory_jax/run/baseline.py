@@ -155,7 +155,7 @@ def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGK
 
 
 def make(config: Mapping[str, Any]) -> Task:
-    """The parts of a config that has timing, dynamics, weather, spawn, others, facts, ends, reward and observe.
+    """The parts of a config that has timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
 
     Raises:
         ConfigError: a part that exists for the vectorised environment only, by name.
@@ -199,6 +199,8 @@ def _refuse(config: Mapping[str, Any]) -> None:
     dynamics, weather = config["dynamics"], config["weather"]
     if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
+    if config["controls"]["_target_"] != "pedals":
+        raise ConfigError(f"controls._target_: {config['controls']['_target_']}; the baseline has pedals")
     if config["others"]["_target_"] != "ignore":
         raise ConfigError(f"others._target_: {config['others']['_target_']}; the baseline has ignore")
     if config["spawn"]["respawn_clear_m"] is not None:

@@ -22,7 +22,7 @@ from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.scenes.stack import stack
 from scenefactory_jax.types import Scene
 
-GROUPS = ("timing", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # what a run has of its own
+GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # what a run has of its own
 ENDINGS = (".html", *film.SUFFIXES, ".rrd")
 SHOWN = 3  # reasons in a message
 

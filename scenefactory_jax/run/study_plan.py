@@ -9,7 +9,7 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, results
 
-TASK = ("timing", "dynamics", "weather", "spawn", "others", "facts", "reward", "observe")
+TASK = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "reward", "observe")
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
 ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
