@@ -27,15 +27,18 @@ from scenefactory_jax.world import Parts, assemble, make
 
 if TYPE_CHECKING:
     from scenefactory_jax.run.evaluate import evaluate
+    from scenefactory_jax.run.policies import load_policy
     from scenefactory_jax.run.replay import replay
     from scenefactory_jax.run.train import train
 
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_scenes", "make", "read", "replay", "train"]
+__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_policy", "load_scenes", "make", "read", "replay"]
+__all__ += ["train"]
 
 
 def __getattr__(name: str) -> Any:
-    """`train`, `evaluate` and `replay` are imported when they are first used: checkpoints and reports take a second to load."""
-    if name not in ("train", "evaluate", "replay"):
+    """What loads checkpoints and reports is imported when it is first used: that takes a second."""
+    places = {"train": "train", "evaluate": "evaluate", "replay": "replay", "load_policy": "policies"}
+    if name not in places:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"scenefactory_jax.run.{name}"), name)
+    return getattr(importlib.import_module(f"scenefactory_jax.run.{places[name]}"), name)

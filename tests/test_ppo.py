@@ -248,7 +248,7 @@ def test_mistakes_are_named():
         train.make(env, policy, **{**NUMBERS, "learning_rate": 1.0})
 
 
-@pytest.mark.parametrize("name", ["published", "demo", "quick", "smoke"])
+@pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])
 def test_configs_build(name):
     entry = {"_target_": "make", **configs.load("train", f"ppo={name}")["ppo"]}
     trainer = build(entry, builtins=train, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))

@@ -18,15 +18,17 @@ from omegaconf import OmegaConf
 from running import smoke
 from scene_documents import document, thing, written
 
+import scenefactory_jax
 from scenefactory_jax import __main__ as command_line
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import failures, opengl, tables
-from scenefactory_jax.run import config, log, sources
+from scenefactory_jax.run import config, log, policies, sources
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
+from scenefactory_jax.run.export import export
 from scenefactory_jax.run.render import render
 from scenefactory_jax.run.replay import replay
 from scenefactory_jax.run.scenes import scenes
@@ -170,6 +172,26 @@ def test_other_settings_of_a_run(whole, tmp_path):
             judged(whole, tmp_path / "bad", override)
     with pytest.raises(ConfigError, match=r"is no run: it has no config\.yaml"):
         evaluate(config.load("evaluate", f"run={tmp_path}"))
+
+
+def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
+    """Judged alike, also by name as one of the package's own, and without a word about where scenes lay."""
+    kept = export(config.load("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}"))
+    assert sorted(str(one.relative_to(kept)) for one in kept.rglob("*.*")) == ["checkpoints/policy.npz", "config.yaml", "versions.yaml"]
+    assert (kept / "versions.yaml").read_text() == (whole.folder / "versions.yaml").read_text()
+    assert config.read(kept)["scenes"]["heldout"]["path"] is None and str(tmp_path.parent) not in (kept / "config.yaml").read_text()
+    monkeypatch.setattr(policies, "SHIPPED", tmp_path / "pretrained")
+    monkeypatch.chdir(tmp_path)
+    trained = scenefactory_jax.load_policy("handy")
+    assert trained.folder == kept and trained.config["observe"] == whole.config["observe"]
+    jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
+    again = evaluate(config.load("evaluate", "run=handy", "invincible=false", "video.enable=false", "failures.pictures.enable=false"))
+    assert again.folder == Path("runs/handy/evaluation")
+    assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
+    with pytest.raises(ConfigError, match=r"hand is no run: .*, or one of the package's own: handy"):
+        scenefactory_jax.load_policy("hand")
+    with pytest.raises(ConfigError, match="holds something already; give a new folder"):
+        export(config.load("export", "run=handy", f"out={whole.folder}"))
 
 
 def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):

@@ -20,6 +20,7 @@ from scenefactory_jax.build import ConfigError
 
 LEARNT, AVERAGED, REST = "parameters", "averaged", "rest"  # apart, so that an evaluation reads no more than it needs
 PREFIX = {LEARNT: LEARNT, AVERAGED: AVERAGED, REST: ""}  # of the names of their arrays in a train state
+FILE = "policy.npz"  # in place of checkpoints: what a policy learnt, alone
 HOST = "host"  # what the loop around the train state carries
 
 
@@ -107,11 +108,14 @@ def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, 
 def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
     """Only what the policy learnt, as nested dicts of arrays on the default device: for evaluation, wherever training ran.
 
-    The running mean of the parameters, where training kept one.
+    The running mean of the parameters, where training kept one. A folder that `write_parameters` wrote holds nothing else.
 
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
     """
+    if iteration is None and (Path(folder) / FILE).is_file():
+        with np.load(Path(folder) / FILE) as file:
+            return _nest({name: jnp.asarray(file[name]) for name in file.files})
     with _manager(Path(folder)) as manager:
         step = _find(manager, Path(folder), iteration)
         held = manager.item_metadata(step)
@@ -119,6 +123,13 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
         plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), held[name], is_leaf=_is_metadata)
         found = manager.restore(step, args=ocp.args.Composite(**{name: ocp.args.StandardRestore(plain)}))
     return jax.tree.map(jnp.asarray, found[name])
+
+
+def write_parameters(folder: Path | str, parameters: Any) -> Path:
+    """What a policy learnt, in one compressed file of the folder that `restore_parameters` reads."""
+    file = Path(folder) / FILE
+    np.savez_compressed(file, **{name: np.asarray(leaf) for name, leaf in _named(parameters)})
+    return file
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from scenefactory_jax.build import ConfigError
 
 COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
-COMMANDS += ("weather",)
+COMMANDS += ("weather", "export")
 LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined")  # keys whose values are lists of overrides
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 

@@ -12,7 +12,7 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, playing, sources
+from scenefactory_jax.run import keys, log, playing, policies, sources
 
 PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
@@ -35,13 +35,13 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     """
     keys.check_evaluate(config)
     sources.use_compilation_cache()
-    run = Path(config["run"])
+    run = policies.find(config["run"])
     trained = configs.amend(configs.read(run), config["overrides"])
     wanted = {True: "invincible", False: "strict"}.get(config["invincible"], config["invincible"])
     if wanted not in PROTOCOLS:
         raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
     scenes = sources.heldout(trained["scenes"], path=config["scenes"]["path"])
-    out = Path(config["out"]) if config["out"] else run / "evaluation"
+    out = Path(config["out"] or (Path("runs") / run.name if policies.is_shipped(run) else run) / "evaluation")
     return judge(trained, run, scenes, out, settings=config, protocols=PROTOCOLS[wanted])
 
 

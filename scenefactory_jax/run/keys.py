@@ -60,6 +60,7 @@ REPLAY |= {"seconds": Key(float, 0.1), "seed": SEED, "out": Key(str), "title": P
 FILM = {"view": Key(Literal["chase", "bird", "both"]), "car": Key(int | None, 0), "width": Key(int, 64), "height": Key(int, 64)}
 VIEW = {"distance_m": Key(float, 1), "pitch_deg": Key(float, -90), "lag_s": Key(float, 0)}
 FILM |= {"fps": Key(float, 0.1), "stride": COUNT, "at_s": Key(float, 0), "trail_s": Key(float, 0), **VIEW}
+HANDING_ON = {"run": Key(str), "out": Key(str)}
 DRIVE = {"run": PLACE, "overrides": Key(list[str]), "skip": SEED, "car": Key(int | None, 0), "seed": SEED}
 DRIVE_KEYS = {name: Key(str) for name in ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")}
 FEEL = {name: Key(float, 0.01) for name in ("rise_s", "fall_s", "turn_s", "centre_s", "calm_mps", "tap_s")}

@@ -15,7 +15,7 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.recording import Act, Recording, record
 from scenefactory_jax.report import film, mp4, opengl, replay_data, replay_html, rerun_file
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, raws, sources
+from scenefactory_jax.run import keys, policies, raws, sources
 from scenefactory_jax.run.train import make_policy
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.raw import SceneError
@@ -105,7 +105,7 @@ def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
     for group in GROUPS:
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
-    trained = configs.amend(configs.read(Path(config["run"])), config["overrides"])
+    trained = configs.amend(configs.read(policies.find(config["run"])), config["overrides"])
     own, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
     if asked["path"] is not None:
         return trained | {"scenes": own | {"path": asked["path"]}}
@@ -121,7 +121,7 @@ def driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int
     """Who drives, and with which parameters."""
     if config["act"] == "policy" and config["run"] is not None:
         policy = make_policy(settings)
-        parameters = checkpoint.restore_parameters(Path(config["run"]) / "checkpoints")
+        parameters = checkpoint.restore_parameters(policies.find(config["run"]) / "checkpoints")
         return lambda parameters, observation, key: policy.apply(parameters, observation)[0], parameters
     if config["act"] == "random":
         return lambda parameters, observation, key: jax.random.uniform(key, (slots, 3), jnp.float32, -1.0, 1.0), None

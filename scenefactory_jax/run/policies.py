@@ -1,0 +1,60 @@
+"""Trained policies by where they are: a folder that `train` or `export` wrote, or the name of one that comes with the package."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.run import config as configs
+from scenefactory_jax.run.train import make_policy
+from scenefactory_jax.types import Policy
+
+SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
+
+
+class Trained(NamedTuple):
+    """A policy with what it learnt, and the config that it was trained with."""
+
+    folder: Path
+    config: dict[str, Any]
+    policy: Policy
+    parameters: Any
+
+
+def load_policy(run: str | Path) -> Trained:
+    """A trained policy to act with, to judge or to train on.
+
+        trained = sf.load_policy("runs/demo-...")
+        env = sf.make(trained.config)
+        mean, log_std, value = trained.policy.apply(trained.parameters, observation)
+
+    Args:
+        run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package.
+
+    Raises:
+        ConfigError: neither.
+        FileNotFoundError: a run without a checkpoint.
+    """
+    folder = find(run)
+    config = configs.read(folder)
+    return Trained(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
+
+
+def find(run: str | Path) -> Path:
+    """The folder of a run, or of a policy that comes with the package, by its name.
+
+    Raises:
+        ConfigError: neither is there; the message names the policies that come with the package.
+    """
+    if (Path(run) / "config.yaml").is_file():
+        return Path(run)
+    shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/config.yaml"))}
+    if str(run) in shipped:
+        return shipped[str(run)]
+    known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
+    raise ConfigError(f"{run} is no run: it has no config.yaml; give the folder that `train` wrote{known}")
+
+
+def is_shipped(folder: Path) -> bool:
+    """Whether a policy comes with the package, whose folder is nobody's to write to."""
+    return folder.parent == SHIPPED
