@@ -280,7 +280,7 @@ class Dynamics(NamedTuple):
 class Env(NamedTuple):
     """One world as pure functions. `reset` and `step` are the public pair; the next three are their parts, so that a training loop can
     reset finished worlds before it pays for the observation. `now` gives the scene as it is at a state's moment, for dynamics and
-    viewers."""
+    viewers. Of the actions of an episode every `hold`-th is read, the first one first, and stands until the next."""
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
@@ -288,6 +288,7 @@ class Env(NamedTuple):
     transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
     observe: Callable[[Scene, State], Observation]
     now: Callable[[Scene, State], Scene]
+    hold: int = 1
 
 
 class Policy(NamedTuple):

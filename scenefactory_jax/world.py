@@ -28,6 +28,7 @@ class Parts(NamedTuple):
 
     dynamics: Dynamics
     command: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
+    hold: int  # control steps from one action to the next
     draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
     draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
     others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
@@ -73,7 +74,8 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
     ends.check(config["ends"].get("ending", []), where="ends")
     return Parts(
         dynamics=dynamics,
-        command=build(config["controls"], builtins="scenefactory_jax.controls", where="controls"),
+        command=build(config["controls"]["command"], builtins="scenefactory_jax.controls", where="controls.command"),
+        hold=_hold(config),
         draw_agents=spawn.make(config["spawn"]["draw"]),
         draw_weather=conditions.make(config["weather"]),
         others=build(config["others"], builtins="scenefactory_jax.others", where="others", **context),
@@ -85,6 +87,15 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
         control_dt=context["control_dt"],
         respawn_clear_m=config["spawn"]["respawn_clear_m"],
     )
+
+
+def _hold(config: Mapping[str, Any]) -> int:
+    """Control steps from one action to the next; episodes hold a whole number of actions."""
+    hold, steps = config["controls"]["every"], episode_steps(config["timing"])
+    check_type(hold, int, where="controls.every")
+    if hold < 1 or steps % hold:
+        raise ConfigError(f"controls.every: {hold}; wanted is a divisor of the {steps} control steps of an episode")
+    return hold
 
 
 def assemble(parts: Parts) -> Env:
@@ -101,7 +112,7 @@ def assemble(parts: Parts) -> Env:
     def bind(function: Callable) -> Callable:
         return functools.partial(function, parts)
 
-    return Env(reset, step, bind(_start), bind(_transition), bind(_observe), bind(_now))
+    return Env(reset, step, bind(_start), bind(_transition), bind(_observe), bind(_now), parts.hold)
 
 
 def _now(parts: Parts, scene: Scene, state: State) -> Scene:
@@ -134,7 +145,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
 def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
     """One control step, without the observation."""
     scene = _now(parts, scene, replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt)))
-    action = jnp.where(state.active[:, None], jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0), 0.0)
+    action = jnp.where(state.active[:, None], _command(parts, state, action), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
     scene = _now(parts, scene, after)
     measured, after = _quarantine(parts.measure(scene, state, after), state, after)
@@ -152,6 +163,12 @@ def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "
 
 def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
     return observations.observe(_now(parts, scene, state), state, parts.groups)
+
+
+def _command(parts: Parts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+    """Throttle, steer and brake in this step: what the action means, or what stands since the last one that was read."""
+    fresh = jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
+    return fresh if parts.hold == 1 else jnp.where(state.step % parts.hold == 0, fresh, state.previous_action)
 
 
 def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:

@@ -12,7 +12,7 @@ from probes import NUMBERS, PRESENT, SMALL, probe, scenes
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.policy import late_fusion
-from scenefactory_jax.ppo import gae, loss, train, update
+from scenefactory_jax.ppo import gae, loss, rollout, train, update
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.types import Env
 
@@ -226,6 +226,35 @@ def test_metrics_count_what_happened(course):
     assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
     assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
     assert metrics["events/reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
+
+
+@pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
+def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length):
+    """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
+    env, policy, stage = probe(life=life, episode_steps=length)._replace(hold=3), late_fusion.make(**SMALL), scenes(2, 1)
+    worlds = jax.vmap(env.start)(jax.random.split(jax.random.key(0), 2), stage)
+    seen = jax.vmap(env.observe)(stage, worlds)
+    parameters = policy.init(jax.random.key(1), seen)
+    begin = (stage, worlds, seen, rollout.no_lives(worlds), jax.random.key(2))
+    after, _, lives, samples, tally, record = jax.jit(functools.partial(rollout.collect, env, policy, horizon=4))(parameters, *begin)
+    lived = min(life, length)
+    held = samples.active[..., :2]
+    assert held.all() and not samples.active[..., 2].any()
+    np.testing.assert_array_equal(samples.reward[:, 0, 0], [3, lived - 3, 3, lived - 3])
+    assert float(samples.reward[..., 2].sum()) == 0.0
+    ends = np.array([False, True, False, True])
+    assert (samples.done[..., 0] == (ends & (life < length))[:, None]).all() and not samples.done[..., 2].any()
+    assert (samples.truncated[..., 1] == (ends & (life > length))[:, None]).all()
+    assert {name: float(tally[name]) for name in ("spawned", "active", "ended", "length", "return")} == {
+        "spawned": 2 * 2 * 12, "active": 2 * 2 * 2 * lived, "ended": 8, "length": 8 * lived, "return": 8 * lived}  # fmt: skip
+    assert record.episodes.tolist() == [4, 4] and not lives.steps.any() and (after.step == 0).all()
+
+
+def test_worlds_begin_where_an_action_is_read():
+    env = probe(life=5, episode_steps=12)._replace(hold=3)
+    trainer = train.make(env, late_fusion.make(**SMALL), **{**NUMBERS, "initial_phase": True, "episode_steps": 12})
+    steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
+    assert set(steps.tolist()) == {0, 3, 6, 9}
 
 
 def test_restart_keeps_what_was_learnt(course):

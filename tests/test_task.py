@@ -46,10 +46,11 @@ def config():
     return scenefactory_jax.load("task")
 
 
-def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None, beside=others.ignore):
+def build_env(config, *, draw=spawn.logged, steps=1500, respawn=None, ending=None, beside=others.ignore, hold=1):
     parts = world.Parts(
         dynamics=glide(),
         command=controls.pedals,
+        hold=hold,
         draw_agents=draw,
         draw_weather=keep,
         others=beside,
@@ -229,7 +230,7 @@ def test_controls_are_what_dynamics_and_rewards_are_given(config):
     scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]], speeds=[10.0])
 
     def speed_after(entry):
-        env = world.make({**own, "controls": entry})
+        env = world.make({**own, "controls": {"command": entry, "every": 1}})
         state, _ = env.reset(jax.random.key(0), scene)
         state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
         return float(geometry.norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
@@ -238,6 +239,21 @@ def test_controls_are_what_dynamics_and_rewards_are_given(config):
     assert rolled[0] == pytest.approx(10.0, abs=0.01) and braked[0] < 9.95
     np.testing.assert_allclose(braked[1], [0, 0, 0.5])
     np.testing.assert_allclose(speed_after({"_target_": "test_task.flat_out"})[1], [1, 0, 0])
+
+
+def test_an_action_stands_until_the_next_is_read(config):
+    """Every third is read, the first one first; who begins anew in between waits with free pedals."""
+    env = build_env(config, hold=3)
+    scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]])
+    state, _ = env.reset(jax.random.key(0), scene)
+    step, taken = jax.jit(env.step), []
+    for throttle in range(7):
+        state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
+        taken.append(float(state.previous_action[0, 0]))
+    np.testing.assert_allclose(taken, [0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
+    for every, message in ((7, "controls.every: 7; wanted is a divisor of the 1500 control steps"), (0, "controls.every: 0; wanted")):
+        with pytest.raises(ConfigError, match=message):
+            world.make({**config, "controls": {**config["controls"], "every": every}})
 
 
 def flat_out(action):

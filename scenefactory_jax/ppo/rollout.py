@@ -30,17 +30,17 @@ class Record:
 
 @struct
 class Sample:
-    """One step of every slot, as the learner needs it."""
+    """One action of every slot and what came of it until the next, as the learner needs it."""
 
     observation: Observation
     action: Float[Array, "W A 3"]  # before the environment's clipping
     mean: Float[Array, "W A 3"]
     log_probability: Float[Array, "W A"]
     value: Float[Array, "W A"]
-    reward: Float[Array, "W A"]
-    active: Bool[Array, "W A"]  # on stage before the step
-    done: Bool[Array, "W A"]  # ended by an event in the step
-    truncated: Bool[Array, "W A"]  # alive when the world's time ran out in the step
+    reward: Float[Array, "W A"]  # sum over the control steps
+    active: Bool[Array, "W A"]  # on stage before the action
+    done: Bool[Array, "W A"]  # ended by an event
+    truncated: Bool[Array, "W A"]  # alive when the world's time ran out
 
 
 Tally = dict[str, Array]
@@ -60,7 +60,9 @@ def collect(
     horizon: int,
     axis: str | None = None,
 ) -> tuple[State, Observation, Lives, Sample, Tally, Record]:
-    """Act for `horizon` steps in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
+    """Act `horizon` times in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
+
+    An action stands for `env.hold` control steps.
 
     Args:
         axis: of the devices that share the worlds, see `across`.
@@ -75,27 +77,46 @@ def collect(
         mean, log_std, value = policy.apply(parameters, observation)
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(across.keys(action_key, len(mean), axis))
         action = mean + jnp.exp(log_std) * noise
-        after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
-        truncated = outcome.truncated[:, None] & worlds.active & ~outcome.done
+        after, lives, came, over, counts = _hold(env, scenes, worlds, action, lives)
         sample = Sample(
             observation=observation,
             action=action,
             mean=mean,
             log_probability=log_probability(action, mean, log_std),
             value=value,
-            reward=jnp.where(worlds.active, outcome.reward, 0.0),
             active=worlds.active,
-            done=outcome.done & worlds.active,
-            truncated=truncated,
+            **came,
         )
-        lives, counts = _tally(worlds, outcome, sample, lives)
-        fresh = jax.vmap(env.start)(across.keys(start_key, len(outcome.over), axis), scenes)
-        worlds = choose(outcome.over, fresh, after)
+        fresh = jax.vmap(env.start)(across.keys(start_key, len(over), axis), scenes)
+        worlds = choose(over, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
     record = Record(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/reached")))
     return worlds, observation, lives, samples, jax.tree.map(jnp.sum, counts), record
+
+
+def _hold(
+    env: Env, scenes: Scene, worlds: State, action: Float[Array, "W A 3"], lives: Lives
+) -> tuple[State, Lives, dict[str, Array], Bool[Array, " W"], Tally]:
+    """The control steps of one action: worlds after them, and reward, end and time-out of the agents that took it; whose slot begins a new
+    life meanwhile has no part in it. A world that is over stands still until the next action."""
+
+    def control(carry: tuple[State, Lives, Array], _: None) -> tuple[tuple[State, Lives, Array], tuple]:
+        worlds, lives, taking = carry
+        after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
+        came = {
+            "reward": jnp.where(taking, outcome.reward, 0.0),
+            "done": outcome.done & taking,
+            "truncated": outcome.truncated[:, None] & taking & ~outcome.done,
+        }
+        lives, counts = _tally(worlds, outcome, lives)
+        return (after, lives, taking & ~outcome.done), (came, outcome.over, counts)
+
+    held = jax.lax.scan(control, (worlds, lives, worlds.active), None, length=env.hold, unroll=env.hold == 1)
+    (after, lives, _), (came, over, counts) = held
+    came = {"reward": came["reward"].sum(0), "done": came["done"].any(0), "truncated": came["truncated"].any(0)}
+    return after, lives, came, over[-1], {name: count.sum(0) for name, count in counts.items()}
 
 
 def no_record(worlds: State) -> Record:
@@ -109,8 +130,8 @@ def no_lives(worlds: State) -> Lives:
     return Lives(jnp.zeros(worlds.active.shape, jnp.float32), jnp.zeros(worlds.active.shape, jnp.float32))
 
 
-def _tally(worlds: State, outcome: Outcome, sample: Sample, lives: Lives) -> tuple[Lives, Tally]:
-    """Carry lives on, and sum the step up for each world: all of them would be one long sum, for which a GPU waits at every step.
+def _tally(worlds: State, outcome: Outcome, lives: Lives) -> tuple[Lives, Tally]:
+    """Carry lives on, and sum the control step up for each world: all of them would be one long sum, for which a GPU waits at every step.
 
     Float32 holds sums of up to 16.7 million agent steps exactly.
     """
@@ -118,12 +139,14 @@ def _tally(worlds: State, outcome: Outcome, sample: Sample, lives: Lives) -> tup
     def total(x: Array, where: Array) -> Array:
         return jnp.sum(jnp.where(where, x, 0), axis=1, dtype=jnp.float32)
 
-    active, ended = sample.active, sample.done | sample.truncated
-    lives = Lives(lives.returns + sample.reward, lives.steps + active)
+    active = worlds.active
+    ended = active & (outcome.done | outcome.truncated[:, None])
+    reward = jnp.where(active, outcome.reward, 0.0)
+    lives = Lives(lives.returns + reward, lives.steps + active)
     counts = {
         "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
-        "reward": total(sample.reward, active),
+        "reward": total(reward, active),
         "speed": total(outcome.facts.speed, active),
         "ended": total(ended, ended),
         "return": total(lives.returns, ended),

@@ -88,13 +88,14 @@ def make(
     """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
 
     Args:
-        horizon, epochs, minibatches: control steps of a rollout, passes over it, and gradient steps in each.
+        horizon, epochs, minibatches: actions of a rollout (each stands for `env.hold` control steps), passes over it, gradient steps in
+            each.
         sample_share: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
             a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
         learning_rate_halved: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
-        gamma, gae_lambda: discount of a control step, and the advantage's mix of horizons.
+        gamma, gae_lambda: discount of an action, and the advantage's mix of horizons.
         clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
         entropy, value: weights of entropy bonus and value loss.
         normalise_advantage: over the active samples of the whole rollout.
@@ -115,7 +116,7 @@ def make(
     rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved)
     passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
     learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
-    start = functools.partial(_start, env=env, phases=episode_steps if initial_phase else 1)
+    start = functools.partial(_start, env=env, phases=episode_steps // env.hold if initial_phase else 1)
     act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
@@ -176,12 +177,12 @@ def parameters_of(train_state: TrainState) -> Any:
 
 
 def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[State, Observation]:
-    """All worlds at their start, each at one of the first `phases` steps of its episode."""
+    """All worlds at their start, each at one of the first `phases` actions of its episode."""
 
     def one(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         phase_key, start_key = jax.random.split(key)
         world = env.start(start_key, scene)
-        world = replace(world, step=jax.random.randint(phase_key, (), 0, phases, world.step.dtype))
+        world = replace(world, step=env.hold * jax.random.randint(phase_key, (), 0, phases, world.step.dtype))
         return world, env.observe(scene, world)
 
     return jax.vmap(one)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)

@@ -199,8 +199,8 @@ def _refuse(config: Mapping[str, Any]) -> None:
     dynamics, weather = config["dynamics"], config["weather"]
     if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
-    if config["controls"]["_target_"] != "pedals":
-        raise ConfigError(f"controls._target_: {config['controls']['_target_']}; the baseline has pedals")
+    if config["controls"] != {"command": {"_target_": "pedals"}, "every": 1}:
+        raise ConfigError(f"controls: {config['controls']}; the baseline has pedals, read at every control step")
     if config["others"]["_target_"] != "ignore":
         raise ConfigError(f"others._target_: {config['others']['_target_']}; the baseline has ignore")
     if config["spawn"]["respawn_clear_m"] is not None:

@@ -143,7 +143,8 @@ def _measured(
 def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = None) -> dict[str, Any]:
     """One configuration on worlds that are already on the device, or on those of a mesh; phases are measured on one device only."""
     parts = world.parts_of(config)
-    env, scope, horizon = world.assemble(parts), config["scope"], config["ppo"]["horizon"]
+    env, scope = world.assemble(parts), config["scope"]
+    horizon = config["ppo"]["horizon"] * env.hold  # control steps
     slots = worlds.agents.present.shape
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 

@@ -35,7 +35,7 @@ class Timed(NamedTuple):
 
 
 def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
-    """`steps` control steps of all worlds with random actions, up to and with one of `ACTING`.
+    """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
 
     Returns:
         A function of the worlds' state, their scenes and a key, for `jit`: the state afterwards, and a number that all went into.
@@ -49,19 +49,24 @@ def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
     def step(scenes: Scene, worlds: State, key: PRNGKeyArray) -> tuple[State, Array]:
         action_key, start_key = jax.random.split(key)
         action = jax.random.uniform(action_key, (*worlds.active.shape, 3), jnp.float32, -1.0, 1.0)
-        if not depth:
-            return jax.vmap(moved)(scenes, worlds, action), jnp.float32(0.0)
-        after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
-        told = outcome.reward.sum()
+
+        def control(worlds: State, _: None) -> tuple[State, tuple[Array, Array]]:
+            if not depth:
+                return jax.vmap(moved)(scenes, worlds, action), (jnp.zeros(len(worlds.step), bool), jnp.float32(0.0))
+            after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
+            return after, (outcome.over, outcome.reward.sum())
+
+        after, (over, told) = jax.lax.scan(control, worlds, None, length=env.hold, unroll=env.hold == 1)
+        told = told.sum()
         if depth > 1:
-            after = choose(outcome.over, jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
+            after = choose(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
         if depth > 2:
             seen = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # a learner would keep it: it is written out
             told += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
         return after, told
 
     def run(worlds: State, scenes: Scene, key: PRNGKeyArray) -> tuple[State, Array]:
-        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps))
+        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps // env.hold))
         return worlds, told.sum()
 
     return run
