@@ -128,7 +128,8 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
 def write_parameters(folder: Path | str, parameters: Any) -> Path:
     """What a policy learnt, in one compressed file of the folder that `restore_parameters` reads."""
     file = Path(folder) / FILE
-    np.savez_compressed(file, **{name: np.asarray(leaf) for name, leaf in _named(parameters)})
+    numbers: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named(parameters)}
+    np.savez_compressed(file, **numbers)
     return file
 
 

@@ -88,8 +88,7 @@ def make(
     """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
 
     Args:
-        horizon, epochs, minibatches: actions of a rollout (each stands for `env.hold` control steps), passes over it, gradient steps in
-            each.
+        horizon, epochs, minibatches: actions of a rollout (`env.hold` control steps each), passes over it, gradient steps in each.
         sample_share: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
             a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
