@@ -42,6 +42,13 @@ GROUPS = """
         return Rows(offset, jnp.broadcast_to(state.active[None], offset.shape[:2]))
     """
 
+CONTROLS = """
+    import jax.numpy as jnp
+
+    def cruise(action, *, gentle: float):
+        return jnp.stack([gentle * action[:, 0], action[:, 1], 9.0 * jnp.maximum(-action[:, 0], action[:, 2])], axis=1)
+    """
+
 BACKEND = """
     import jax.numpy as jnp
     from scenefactory_jax.struct import replace, struct
@@ -108,6 +115,7 @@ TERM = ["+reward.haste={_target_: my_terms.haste, weight: 0.25, unit_mps: 10.0}"
 TERM += ["+reward.jerk={_target_: my_terms.jerkiness, weight: -1.0}"]
 GROUP = ["+observe.clock={_target_: my_groups.clock, period_s: 2.0}", "+observe.mates={_target_: my_groups.mates, scale_m: 50.0}"]
 DYNAMICS = ["~dynamics", "+dynamics={_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}"]
+CRUISE = ["controls.command._target_=my_controls.cruise", "+controls.command.gentle=0.5"]
 LOGGERS = ["loggers=[tensorboard]", "+loggers.mine={_target_: my_logger.make, file: rows.json}"]
 LEAN = [f"~{place}.{name}" for place in ("observe", "policy.rows") for name in ("road", "neighbours")]  # compiles sooner
 FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"
@@ -117,7 +125,8 @@ FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"
 def mine(tmp_path_factory):
     """A folder of one's own modules, importable."""
     folder = tmp_path_factory.mktemp("mine")
-    for name, text in {"my_terms": TERMS, "my_groups": GROUPS, "my_backend": BACKEND, "my_reader": READER, "my_logger": LOGGER}.items():
+    own = {"my_terms": TERMS, "my_groups": GROUPS, "my_backend": BACKEND, "my_reader": READER, "my_logger": LOGGER, "my_controls": CONTROLS}
+    for name, text in own.items():
         (folder / f"{name}.py").write_text(textwrap.dedent(text))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
@@ -159,6 +168,13 @@ def test_a_logger_is_one_file_and_one_entry(run):
     assert (told["seed"], told["after"], told["rows"]) == (0, 0, run.metrics)
     [events] = (run.folder / "tensorboard").iterdir()  # the one of the package, beside it
     assert b"reward/haste" in events.read_bytes()
+
+
+def test_what_an_action_means_is_one_function_and_one_entry(mine):
+    env = world.make(config.load("task", "dynamics=bicycle", *CRUISE))
+    scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]])
+    state, _ = jax.jit(env.transition)(scene, env.start(jax.random.key(0), scene), jnp.array([[0.8, 0.5, 0.0], [-0.6, 0.0, 0.0]]))
+    np.testing.assert_allclose(state.previous_action, [[0.4, 0.5, 0.0], [-0.3, 0.0, 1.0]])  # and kept in bounds
 
 
 def test_a_dynamics_backend_is_one_file_and_one_entry(mine):
