@@ -1,5 +1,6 @@
 """What all adapters stand on: one vector an agent, episodes drawn from a pool, configs that fit, and the functional API of the docs."""
 
+import functools
 import sys
 import textwrap
 
@@ -61,6 +62,23 @@ def test_a_step_of_an_episode_is_the_environments_own():
     np.testing.assert_array_equal(moment.reward[~driving], 0)
     np.testing.assert_allclose(sum(moment.terms.values()), moment.reward, atol=1e-4)
     np.testing.assert_array_equal(moment.active, after.active)
+
+
+def test_a_step_is_all_control_steps_of_an_action():
+    held = episodes.pool(config.load("train", SMOKE), ["controls.every=3"], scenes(agents=4), alone=False)
+    assert (held.steps, held.step_hz) == (20, 10.0)
+    episode = episodes.start(held.env, held.scenes, jax.random.key(3), 1)
+    action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
+    after, moment = jax.jit(functools.partial(episodes.advance, held.env))(held.scenes, episode, action)
+    scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
+    step, paid = jax.jit(held.env.transition), 0.0
+    for _ in range(3):
+        driving = state.active
+        state, outcome = step(scene, state, action)
+        paid += np.where(driving, outcome.reward, 0.0)
+    np.testing.assert_allclose(moment.reward, paid, atol=1e-4)
+    np.testing.assert_allclose(after.state.motion.position, state.motion.position, atol=1e-4)
+    assert int(after.state.step) == 3 and (np.asarray(paid)[np.asarray(driving)] > 0).any()
 
 
 @pytest.mark.parametrize(

@@ -232,7 +232,7 @@ def test_networks_of_the_studies_fit_their_observations():
 
 def test_studies_share_what_they_train_alike(tmp_path):
     same = set()
-    for name, variant in {"navigation": "rigid body", "transfer": "rigid body", "diversity": "all scenes", "rewards": "all terms"}.items():
+    for name, variant in {"transfer": "rigid body", "diversity": "all scenes", "rewards": "all terms"}.items():
         entry = config.load("study", f"study={name}", f"runs={tmp_path}", "seeds=[1]")
         entry["study"]["trainings"] = {variant: entry["study"]["trainings"][variant]}
         plan = study_plan.make(entry | {"study": {**entry["study"], "compare": [], "trend": None, "floors": {}}})

@@ -31,8 +31,8 @@ class Pool(NamedTuple):
     agents: int  # slots
     columns: int  # of an observation
     terms: tuple[str, ...]  # of the reward, sorted
-    steps: int  # control steps after which a world's time is up
-    control_hz: float
+    steps: int  # after which a world's time is up; a step is an action, with all control steps that it stands for
+    step_hz: float
 
     @property
     def cars(self) -> list[str]:
@@ -96,7 +96,8 @@ def pool(
     episode, seen = jax.eval_shape(functools.partial(begin, env), held, jax.random.key(0))
     moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(moment.terms))
-    return Pool(env, held, found.names, slots, seen.shape[1], terms, world.episode_steps(timing), timing["control_hz"])
+    steps, step_hz = world.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
+    return Pool(env, held, found.names, slots, seen.shape[1], terms, steps, step_hz)
 
 
 def begin(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
@@ -119,25 +120,32 @@ def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
 
 
 def advance(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
-    """One control step of one world, which may end the episode; nothing begins anew."""
+    """One action of one world, which may end the episode; nothing begins anew."""
     episode, moment = transition(env, scenes, episode, action)
     return episode, _seen(moment, observe(env, scenes, episode))
 
 
 def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
     """`advance` with an empty observation, [A, 0]."""
-    state, outcome = env.transition(_one(scenes, episode.scene), episode.state, action)
-    moment = Moment(
-        observation=jnp.zeros((len(outcome.done), 0), jnp.float32),
-        reward=jnp.where(episode.state.active, outcome.reward, 0.0),
-        terms={name: jnp.where(episode.state.active, term, 0.0) for name, term in outcome.terms.items()},
-        events=dict(vars(outcome.events)),
-        terminated=outcome.done & episode.state.active,
-        truncated=outcome.truncated & episode.state.active & ~outcome.done,
-        active=state.active,
-        over=outcome.over,
-    )
-    return Episode(episode.scene, state, episode.key), moment
+    scene = _one(scenes, episode.scene)
+
+    def control(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], tuple[dict[str, Any], Array]]:
+        state, taking = carry  # who began a new life meanwhile has no part in the action
+        after, outcome = env.transition(scene, state, action)
+        gave = {
+            "reward": jnp.where(taking, outcome.reward, 0.0),
+            "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
+            "events": {name: new & taking for name, new in vars(outcome.events).items()},
+            "terminated": outcome.done & taking,
+            "truncated": outcome.truncated & taking & ~outcome.done,
+        }
+        return (after, taking & ~outcome.done), (gave, outcome.over)
+
+    begin = (episode.state, episode.state.active)
+    (state, _), (gave, over) = jax.lax.scan(control, begin, None, length=env.hold, unroll=env.hold == 1)
+    gave = jax.tree.map(lambda each: each.any(0) if each.dtype == bool else each.sum(0), gave)
+    empty = jnp.zeros((len(state.active), 0), jnp.float32)
+    return Episode(episode.scene, state, episode.key), Moment(observation=empty, active=state.active, over=over[-1], **gave)
 
 
 class Told(NamedTuple):

@@ -53,7 +53,7 @@ class Drive(gymnasium.Env):
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode = self.pool.names, render_mode
-        self.metadata = {"render_modes": [], "render_fps": self.pool.control_hz}
+        self.metadata = {"render_modes": [], "render_fps": self.pool.step_hz}
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
         self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))

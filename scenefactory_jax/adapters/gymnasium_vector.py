@@ -53,7 +53,7 @@ class DriveVector(VectorEnv):
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode, self.num_envs, self.arrays = self.pool.names, render_mode, num_envs, arrays
         self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "render_fps": self.pool.control_hz, "autoreset_mode": self.mode}
+        self.metadata = {"render_modes": [], "render_fps": self.pool.step_hz, "autoreset_mode": self.mode}
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
         self.observation_space = batch_space(self.single_observation_space, num_envs)

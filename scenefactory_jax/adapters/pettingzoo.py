@@ -47,7 +47,7 @@ class Drive(ParallelEnv):
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=False)
         self.names, self.render_mode = self.pool.names, None
-        self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.control_hz, "is_parallelizable": True}
+        self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.step_hz, "is_parallelizable": True}
         self.possible_agents = self.pool.cars
         self.agents: list[str] = []
         self.observation_spaces = {name: spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32) for name in self.possible_agents}
