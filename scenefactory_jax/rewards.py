@@ -69,6 +69,15 @@ def edge_clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
     return _closeness(step.facts.edge_gap, limit_m)
 
 
+def stopping(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+    """How much longer than the free way straight ahead the way to stop is, on the road's friction: 0 for a car that could stop before
+    whoever is ahead, 1 for one that could not by `limit_m` or more.
+
+    It grows with every metre per second too many and with every bit of friction too few long before TTC does.
+    """
+    return jnp.clip(-step.facts.stopping_margin / limit_m, 0.0, 1.0)
+
+
 def wrong_way(step: Step) -> Float[Array, " A"]:
     """How far the car points against the direction of its nearest lane: 1 against the traffic, 0 across it, with it, and without lanes."""
     return jnp.maximum(-step.facts.lane_heading, 0.0)

@@ -336,6 +336,8 @@ def test_closeness_to_cars_and_edges_and_driving_against_the_traffic_by_hand(env
     np.testing.assert_allclose(rewards.clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)
     np.testing.assert_allclose(rewards.edge_clearance(step, limit_m=1.0), np.clip(1 - edge, 0, 1), atol=1e-5)
     np.testing.assert_allclose(rewards.wrong_way(step), [1, 0, 0, 0], atol=1e-5)
+    late = replace(step, facts=replace(facts, stopping_margin=jnp.array([jnp.inf, 2.0, -1.0, -9.0])))
+    np.testing.assert_allclose(rewards.stopping(late, limit_m=4.0), [0, 0, 0.25, 1], atol=1e-6)
 
 
 def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
