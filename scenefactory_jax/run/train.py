@@ -144,7 +144,7 @@ def _make_watch(
 
     watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
 
-    def due(iteration: float) -> bool:
+    def due(iteration: int | float) -> bool:
         return iteration in every if isinstance(every, list) else iteration % every == 0
 
     return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
