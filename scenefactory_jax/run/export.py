@@ -28,7 +28,7 @@ def export(config: Mapping[str, Any]) -> Path:
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config
-    # where the scenes lay is of no use elsewhere, and nobody else's business
+    # where scenes lay is of no use elsewhere, and nobody else's business
     scenes = {**own["scenes"], "path": None, "heldout": {**own["scenes"]["heldout"], "path": None}}
     configs.write(out, {**own, "out": None, "resume": False, "scenes": scenes})
     shutil.copy(run / "versions.yaml", out)
