@@ -17,6 +17,8 @@ from scenefactory_jax.build import ConfigError, build, check_type
 from scenefactory_jax.struct import choose, replace, strong
 from scenefactory_jax.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
+GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # of a config
+
 
 def episode_steps(timing: Mapping[str, float | int]) -> int:
     """Control steps in an episode."""
@@ -58,7 +60,7 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
-    _require(config, ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe"))
+    _require(config, GROUPS)
     timing = config["timing"]
     for key in ("physics_hz", "control_hz", "episode_s"):
         if key not in timing:
@@ -113,6 +115,45 @@ def assemble(parts: Parts) -> Env:
         return functools.partial(function, parts)
 
     return Env(reset, step, bind(_start), bind(_transition), bind(_observe), bind(_now), parts.hold)
+
+
+def act(
+    transition: Callable[[State], tuple[State, Outcome]],
+    state: State,
+    noted: Any,
+    *,
+    hold: int,
+    note: Callable[[Any, State, Outcome], tuple[Any, Any]],
+) -> tuple[State, Any, dict[str, Any], Bool[Array, "*W"], Any]:
+    """All control steps that one action stands for, of one world or of many.
+
+    Args:
+        transition: one control step with that action.
+        noted: what `note` carries from step to step: (noted, state before the step, its outcome) -> (noted, numbers to add up).
+
+    Returns:
+        The state, what was noted, what came of the action for the agents that took it (reward and terms are sums; who begins a new life
+        meanwhile has no part in it), whether a world is over, and the sums of the numbers. Without a restart a world that is over stands
+        still until the next action.
+    """
+
+    def control(carry: tuple[State, Any, Array], _: None) -> tuple[tuple[State, Any, Array], tuple]:
+        before, noted, taking = carry
+        after, outcome = transition(before)
+        came = {
+            "reward": jnp.where(taking, outcome.reward, 0.0),
+            "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
+            "events": {name: new & taking for name, new in vars(outcome.events).items()},
+            "done": outcome.done & taking,
+            "truncated": outcome.truncated[..., None] & taking & ~outcome.done,
+        }
+        noted, numbers = note(noted, before, outcome)
+        return (after, noted, taking & ~outcome.done), (came, outcome.over, numbers)
+
+    # unrolled, a single step is no loop in the program
+    (state, noted, _), (came, over, numbers) = jax.lax.scan(control, (state, noted, state.active), None, length=hold, unroll=hold == 1)
+    came = jax.tree.map(lambda each: each.any(0) if each.dtype == bool else each.sum(0), came)
+    return state, noted, came, over[-1], jax.tree.map(lambda each: each.sum(0), numbers)
 
 
 def _now(parts: Parts, scene: Scene, state: State) -> Scene:

@@ -128,24 +128,11 @@ def advance(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3
 def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
-
-    def control(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], tuple[dict[str, Any], Array]]:
-        state, taking = carry  # who began a new life meanwhile has no part in the action
-        after, outcome = env.transition(scene, state, action)
-        gave = {
-            "reward": jnp.where(taking, outcome.reward, 0.0),
-            "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
-            "events": {name: new & taking for name, new in vars(outcome.events).items()},
-            "terminated": outcome.done & taking,
-            "truncated": outcome.truncated & taking & ~outcome.done,
-        }
-        return (after, taking & ~outcome.done), (gave, outcome.over)
-
-    begin = (episode.state, episode.state.active)
-    (state, _), (gave, over) = jax.lax.scan(control, begin, None, length=env.hold, unroll=env.hold == 1)
-    gave = jax.tree.map(lambda each: each.any(0) if each.dtype == bool else each.sum(0), gave)
+    control = lambda state: env.transition(scene, state, action)  # noqa: E731
+    state, _, came, over, _ = world.act(control, episode.state, None, hold=env.hold, note=lambda *_: (None, None))
+    came["terminated"] = came.pop("done")
     empty = jnp.zeros((len(state.active), 0), jnp.float32)
-    return Episode(episode.scene, state, episode.key), Moment(observation=empty, active=state.active, over=over[-1], **gave)
+    return Episode(episode.scene, state, episode.key), Moment(observation=empty, active=state.active, over=over, **came)
 
 
 class Told(NamedTuple):

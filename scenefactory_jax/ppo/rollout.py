@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from scenefactory_jax import world
 from scenefactory_jax.ppo import across
 from scenefactory_jax.ppo.loss import log_probability
 from scenefactory_jax.struct import choose, struct
@@ -77,7 +78,8 @@ def collect(
         mean, log_std, value = policy.apply(parameters, observation)
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(across.keys(action_key, len(mean), axis))
         action = mean + jnp.exp(log_std) * noise
-        after, lives, came, over, counts = _hold(env, scenes, worlds, action, lives)
+        control = lambda worlds: jax.vmap(env.transition)(scenes, worlds, action)  # noqa: E731
+        after, lives, came, over, counts = world.act(control, worlds, lives, hold=env.hold, note=_tally)
         sample = Sample(
             observation=observation,
             action=action,
@@ -85,7 +87,7 @@ def collect(
             log_probability=log_probability(action, mean, log_std),
             value=value,
             active=worlds.active,
-            **came,
+            **{name: came[name] for name in ("reward", "done", "truncated")},
         )
         fresh = jax.vmap(env.start)(across.keys(start_key, len(over), axis), scenes)
         worlds = choose(over, fresh, after)
@@ -94,29 +96,6 @@ def collect(
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
     record = Record(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/reached")))
     return worlds, observation, lives, samples, jax.tree.map(jnp.sum, counts), record
-
-
-def _hold(
-    env: Env, scenes: Scene, worlds: State, action: Float[Array, "W A 3"], lives: Lives
-) -> tuple[State, Lives, dict[str, Array], Bool[Array, " W"], Tally]:
-    """The control steps of one action: worlds after them, and reward, end and time-out of the agents that took it; whose slot begins a new
-    life meanwhile has no part in it. A world that is over stands still until the next action."""
-
-    def control(carry: tuple[State, Lives, Array], _: None) -> tuple[tuple[State, Lives, Array], tuple]:
-        worlds, lives, taking = carry
-        after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
-        came = {
-            "reward": jnp.where(taking, outcome.reward, 0.0),
-            "done": outcome.done & taking,
-            "truncated": outcome.truncated[:, None] & taking & ~outcome.done,
-        }
-        lives, counts = _tally(worlds, outcome, lives)
-        return (after, lives, taking & ~outcome.done), (came, outcome.over, counts)
-
-    held = jax.lax.scan(control, (worlds, lives, worlds.active), None, length=env.hold, unroll=env.hold == 1)
-    (after, lives, _), (came, over, counts) = held
-    came = {"reward": came["reward"].sum(0), "done": came["done"].any(0), "truncated": came["truncated"].any(0)}
-    return after, lives, came, over[-1], {name: count.sum(0) for name, count in counts.items()}
 
 
 def no_record(worlds: State) -> Record:
@@ -130,7 +109,7 @@ def no_lives(worlds: State) -> Lives:
     return Lives(jnp.zeros(worlds.active.shape, jnp.float32), jnp.zeros(worlds.active.shape, jnp.float32))
 
 
-def _tally(worlds: State, outcome: Outcome, lives: Lives) -> tuple[Lives, Tally]:
+def _tally(lives: Lives, worlds: State, outcome: Outcome) -> tuple[Lives, Tally]:
     """Carry lives on, and sum the control step up for each world: all of them would be one long sum, for which a GPU waits at every step.
 
     Float32 holds sums of up to 16.7 million agent steps exactly.

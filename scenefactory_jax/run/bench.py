@@ -144,7 +144,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
     """One configuration on worlds that are already on the device, or on those of a mesh; phases are measured on one device only."""
     parts = world.parts_of(config)
     env, scope = world.assemble(parts), config["scope"]
-    horizon = config["ppo"]["horizon"] * env.hold  # control steps
+    horizon = phases.control_steps(config)
     slots = worlds.agents.present.shape
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
@@ -183,7 +183,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
 
 def _size(config: Mapping[str, Any], shape: tuple[int, ...], mesh: Mesh | None) -> dict[str, Any]:
     """What a row is of: `shape` is worlds and slots."""
-    devices, horizon = 1 if mesh is None else mesh.size, config["ppo"]["horizon"]
+    devices, horizon = 1 if mesh is None else mesh.size, phases.control_steps(config)
     return {"scope": config["scope"], "worlds": shape[0], "slots": shape[1], "devices": devices, "horizon": horizon}
 
 

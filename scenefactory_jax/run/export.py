@@ -21,16 +21,16 @@ def export(config: Mapping[str, Any]) -> Path:
         ConfigError: no such run, no checkpoint in it, or a folder that holds something.
     """
     keys.check(config, keys.HANDING_ON)
-    run, out = policies.find(config["run"]), Path(config["out"])
+    out = Path(config["out"])
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"out: {out} holds something already; give a new folder")
-    trained = policies.load_policy(run)
+    trained = policies.load_policy(config["run"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config
     # where scenes lay is of no use elsewhere, and nobody else's business
     scenes = {**own["scenes"], "path": None, "heldout": {**own["scenes"]["heldout"], "path": None}}
     configs.write(out, {**own, "out": None, "resume": False, "scenes": scenes})
-    shutil.copy(run / "versions.yaml", out)
+    shutil.copy(trained.folder / "versions.yaml", out)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out

@@ -34,6 +34,11 @@ class Timed(NamedTuple):
         return statistics.median(self.seconds)
 
 
+def control_steps(config: Mapping[str, Any]) -> int:
+    """Of a rollout."""
+    return config["ppo"]["horizon"] * config["controls"]["every"]
+
+
 def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
     """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
 

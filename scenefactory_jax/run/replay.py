@@ -22,7 +22,6 @@ from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.scenes.stack import stack
 from scenefactory_jax.types import Scene
 
-GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # what a run has of its own
 ENDINGS = (".html", *film.SUFFIXES, ".rrd")
 SHOWN = 3  # reasons in a message
 
@@ -102,7 +101,7 @@ def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
         ConfigError: no such run, a group that the run decides, or no scenes.
     """
     plain = configs.load(command)
-    for group in GROUPS:
+    for group in world.GROUPS:  # what a run has of its own
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
     trained = configs.amend(configs.read(policies.find(config["run"])), config["overrides"])

@@ -57,7 +57,7 @@ def _row(
 ) -> dict[str, Any]:
     """The figures that rows of a bench have in common."""
     worlds, slots = shape
-    horizon, spawned = config["ppo"]["horizon"], [row["steps/spawned"] for row in rows]
+    horizon, spawned = phases.control_steps(config), [row["steps/spawned"] for row in rows]
     steps, whole = worlds * slots * horizon, sum(seconds)
     each = [count / taken for count, taken in zip(spawned, seconds, strict=True)]
     return {

@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, results
 
-TASK = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "reward", "observe")
+TASK = tuple(group for group in world.GROUPS if group != "ends")  # how episodes end is the protocol's
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
 ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
