@@ -40,5 +40,13 @@ def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):
         together.run(work, 2, [], tmp_path)
 
 
-def test_alone_all_is_ones_own():
-    assert all(together.Claims(None).take("piece") for _ in range(2))
+def test_alone_all_is_ones_own_once():
+    claims = together.Claims(None)
+    assert claims.take("piece") and not claims.take("piece") and claims.take("another")
+
+
+def test_each_begins_with_groups_that_nobody_has_begun_and_helps_at_the_end(tmp_path):
+    groups = {"wide": ["a", "b"], "narrow": ["c"], "deep": ["d"]}
+    first, second = (together.Claims(tmp_path).shares(groups) for _ in range(2))
+    assert [next(first)[0], next(second)[0], next(first)[0]] == ["wide", "narrow", "deep"]
+    assert [name for name, _ in second] == list(groups) == [name for name, _ in first]

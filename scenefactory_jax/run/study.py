@@ -6,12 +6,11 @@ same settings is not done twice, also not by another study that wants the same.
 
 import datetime
 import functools
-import itertools
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from scenefactory_jax.run.study_report import RESULT, TRAINED
 COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
 LOOKS, COUNTED = "looks.json", ("policies", "curve points", "seconds")
 
+Work = TypeVar("Work", Training, Judging)
 Examine = Callable[[Any], tuple[dict[str, np.ndarray], list]]
 
 
@@ -181,9 +181,8 @@ class Shared:
 def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
     """Train what is not trained yet, seeds and variants that share their programs one after the other; whether all could be done."""
     todo = {one.digest: one for one in plan.trainings if shared.wanted(one.variant) and not is_trained(one)}
-    order = {program: index for index, program in enumerate(dict.fromkeys(one.program for one in todo.values()))}
     spent: dict[str, float] = {}
-    for program, group in itertools.groupby(sorted(todo.values(), key=lambda one: order[one.program]), key=lambda one: one.program):
+    for program, group in shared.claims.shares(_by_program(todo.values())):
         prepared, examiners = None, {}
         for one in group:
             needs = spent.get(program, _estimate(one))
@@ -203,6 +202,14 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
                 for weights in (study_plan.TRAINED, study_plan.UNTRAINED):
                     checkpoint.strip(one.folder / weights)
     return True
+
+
+def _by_program(works: Iterable[Work]) -> dict[str, list[Work]]:
+    """In the order in which the programs first appear."""
+    groups: dict[str, list[Work]] = {}
+    for one in works:
+        groups.setdefault(one.program, []).append(one)
+    return groups
 
 
 def _scenes_of(one: Training, shared: Shared) -> sources.Scenes | None:
@@ -241,9 +248,8 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
     todo = {one.file: one for one in plan.judgings if shared.wanted(one.training.variant) and not one.file.is_file()}
     ready = [one for one in todo.values() if checkpoint.latest(one.training.folder / one.weights) is not None]
     ready = [one for one in ready if one.weights == study_plan.UNTRAINED or is_trained(one.training)]
-    order = {program: index for index, program in enumerate(dict.fromkeys(one.program for one in ready))}
     longest = 0.0
-    for program, group in itertools.groupby(sorted(ready, key=lambda one: order[one.program]), key=lambda one: one.program):
+    for program, group in _by_program(ready).items():
         if not shared.claims.take(program):
             continue
         begun, examine = time.monotonic(), None

@@ -3,30 +3,38 @@
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from scenefactory_jax.run import results
 
+T = TypeVar("T")
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 class Claims:
-    """Which pieces of a common work are this process's: each belongs to whoever asks first. Without a folder all are."""
+    """Which pieces of a common work are this process's: each belongs to whoever asks first. Without a folder nobody else asks."""
 
     def __init__(self, folder: Path | None):
-        self._folder = folder
+        self._folder, self._taken = folder, set[str]()
 
     def take(self, piece: str) -> bool:
-        """Whether nobody took the piece before; `piece` is a file's name."""
+        """Whether nobody took the piece before, this process included; `piece` is a file's name."""
         if self._folder is None:
-            return True
+            new = piece not in self._taken
+            self._taken.add(piece)
+            return new
         try:
             (self._folder / f"{piece}.taken").touch(exist_ok=False)
         except FileExistsError:
             return False
         return True
+
+    def shares(self, groups: Mapping[str, T]) -> Iterator[tuple[str, T]]:
+        """First the groups that no other process has begun, so that what a group has in common is made once, then all again, to help."""
+        yield from (item for item in groups.items() if self.take(item[0]))
+        yield from groups.items()
 
 
 def run(work: Callable[..., Any], processes: int, *arguments: Any) -> list[Any]:
