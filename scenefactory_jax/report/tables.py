@@ -25,6 +25,7 @@ COLUMNS: dict[str, type] = {
 EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
 NEAR_MISS_TTC = 2.0  # s
+BEND = 1.05  # way over straight line
 SHARE = "share"  # the unit of a rate: a fraction of agents, printed in per cent
 
 BOOTSTRAP, WILSON, AGENTS, NEWCOMBE, NONE = "scene bootstrap", "Wilson", "agent bootstrap", "Newcombe", "none"
@@ -70,6 +71,10 @@ def _share(label: str, definition: str, column: str) -> Metric:
     return Metric(label, SHARE, definition, lambda records: records[column], _spawned)
 
 
+def _bends(records: Records) -> np.ndarray:
+    return np.asarray(records["route_m"]) >= BEND * np.asarray(records["start_distance_m"])
+
+
 def _unfinished(records: Records) -> np.ndarray:
     return ~np.any([np.asarray(records[name], bool) for name in EVENTS], axis=0)
 
@@ -78,6 +83,10 @@ METRICS: dict[str, Metric] = {
     "success_rate": _share("Success rate", "Agents that came within the goal radius, of all spawned agents.", "reached"),
     "clean_success_rate": _share(
         "Clean success rate", "Agents that reached the goal and had no other event, of all spawned agents.", "clean"),
+    "clean_bend_rate": Metric(
+        "Clean on bends", SHARE, f"Clean success rate of the agents whose way is at least {100 * (BEND - 1):.0f} % longer than the "
+        "straight line to the goal. Most ways are straight, and on those a car that nobody steers arrives, too.",
+        lambda records: records["clean"], _bends),
     "collision_rate": _share(
         "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collided"),
     "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "touched_edge"),
