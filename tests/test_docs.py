@@ -10,12 +10,24 @@ import pytest
 import yaml
 
 from scenefactory_jax import __version__
-from scenefactory_jax.run import config
+from scenefactory_jax.report import tables
+from scenefactory_jax.run import config, results
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").rglob("*.md"))
 SECTIONS = ["What is new", "Install", "Ten lines of Python", "Train, evaluate, sweep", "Results", "Map of the package"]
 SECTIONS += ["Your own reward, observation, dynamics, converter", "Limits", "Terms, contributing, citation"]
+
+NAVIGATION = ROOT / "experiments" / "navigation" / "result.json"
+README_ROWS = [  # label, condition, protocol, metric
+    ("goal reached", "original", "invincible", "success_rate"),
+    ("... without any other event", "original", "invincible", "clean_success_rate"),
+    ("... and of ways that bend, those alone", "original", "invincible", "clean_bend_rate"),
+    ("agents in a collision", "original", "invincible", "collision_rate"),
+    ("goal reached, any event ends an agent", "original", "strict", "success_rate"),
+    ("goal reached from rest", "original, from rest", "invincible", "success_rate"),
+    ("agents in a collision, from rest", "original, from rest", "invincible", "collision_rate"),
+]
 
 
 def commands(page):
@@ -50,6 +62,20 @@ def test_commands_of_the_pages_compose(page):
         settings = [word.split(",")[0] if word.startswith(swept) else word for word in words]
         launched = [word for word in settings if not word.startswith("hydra")]
         assert config.load(command, *launched)
+
+
+def test_results_of_the_readme_are_those_of_the_study():
+    """Every row of the table: of the policy, of the untrained one, and of the log replay."""
+    found = {(row["row"], row["condition"], row["protocol"]): row["pooled"] for row in results.read(NAVIGATION)["rows"]}
+    text = (ROOT / "README.md").read_text()
+
+    def shown(row, condition, protocol, metric):
+        return tables.text(tables.Estimate(**found[row, condition, protocol][metric]))
+
+    for label, *place in README_ROWS:
+        policy, nobody = (shown(row, *place) for row in ("rigid body", "untrained"))
+        assert f"| {label} | {policy} | {nobody} |" in text
+    assert f"clean on {shown('log replay', 'original', 'invincible', 'clean_bend_rate')} of them" in text
 
 
 def test_the_ten_lines_of_python_run(quickly):

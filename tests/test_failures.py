@@ -154,6 +154,13 @@ def test_when_where_and_how_much(played):
     assert stood["still_s"] == pytest.approx(SECONDS - 1.5, abs=0.2) and stood["failure_x_m"] == pytest.approx(-18, abs=1.0)
 
 
+def test_bends_cost_lateral_acceleration(played):
+    """Speed squared over the radius; nothing on a straight line."""
+    records, _ = played
+    lateral = {name: records["lateral_mps2"][row_of(records, name)] for name in ("circles", "arrives")}
+    assert lateral == pytest.approx({"circles": 6.0**2 / 8.0, "arrives": 0.0}, abs=0.1)
+
+
 def test_flags_tell_what_else_is_true(played):
     records, _ = played
     found = {(failure.scene, failure.agent): failure for ranked in failures.of(records).values() for failure in ranked}

@@ -128,15 +128,15 @@ def _trainings(result: Result) -> list[str]:
     for variant, trained in result["trainings"].items():
         for seed, run in trained["runs"].items():
             scenes = "" if run["scenes"] is None else f"{run['scenes']} ({run['agents']} agents)"
-            took = _steps(run["steps"]), f"{run['minutes']:.1f}"
+            took = _steps(run["steps"]), f"{run['minutes']:.1f}", f"{run['casps']:,.0f}"
             cells.append([variant, seed, scenes, run["iterations"], *took, run["device"], f"`{run['commit']}`"])
     if not cells:
         return []
-    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Minutes", "Device", "Commit"]
+    header = ["", "Seed", "Scenes", "Iterations", "Agent steps", "Minutes", "Steps/s", "Device", "Commit"]
     total = sum(run["minutes"] for trained in result["trainings"].values() for run in trained["runs"].values())
     words = (
         f"{total:.0f} minutes of training in all. Minutes are those of iterations; the first run of a program compiles it in its first "
-        "iteration. Agent steps count spawned slots."
+        "iteration. Agent steps are control steps of spawned slots; of the steps a second, the median over iterations."
     )
     return [words, tables.grid(header, cells), _to_target(result, target)]
 
