@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scenefactory_jax import clues, ends
 from scenefactory_jax.clues import Clues
 from scenefactory_jax.struct import replace, struct
-from scenefactory_jax.types import Env, Events, Motion, Outcome, Scene, State
+from scenefactory_jax.types import Env, Events, Outcome, Scene, State
 
 Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 
@@ -32,7 +32,7 @@ class Tally:
     ttc_sum: Float[Array, " A"]
     ttc_steps: Int[Array, " A"]
     speed_sum: Float[Array, " A"]
-    lateral_sum: Float[Array, " A"]  # |speed x yaw rate|, m/s²
+    swing_sum: Float[Array, " A"]  # |change of the yaw rate|, rad/s
     grip_sum: Float[Array, " A"]
     grip_use_sum: Float[Array, " A"]
     margin_min: Float[Array, " A"]
@@ -78,7 +78,7 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
         ttc_sum=zero,
         ttc_steps=none,
         speed_sum=zero,
-        lateral_sum=zero,
+        swing_sum=zero,
         grip_sum=zero,
         grip_use_sum=zero,
         margin_min=zero + jnp.inf,
@@ -104,7 +104,7 @@ def play(
         state, outcome = env.step(scene, before, action)
         seen, boxes = episode.tally, env.now(scene, state).boxes
         found = clues.note(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
-        tally = _note(seen, before.active, state.motion, outcome, found, ttc_limit_s=ttc_limit_s)
+        tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
         place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = Frame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
         return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
@@ -112,8 +112,8 @@ def play(
     return jax.lax.scan(body, episode, None, length=steps)
 
 
-def _note(tally: Tally, active: Bool[Array, " A"], motion: Motion, outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
-    facts = outcome.facts
+def _note(tally: Tally, before: State, after: State, outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
+    facts, active = outcome.facts, before.active
     seen = active & jnp.isfinite(facts.ttc)
     happened = jax.tree.map(lambda old, new: old | (new & active), tally.happened, facts.events)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
@@ -127,7 +127,7 @@ def _note(tally: Tally, active: Bool[Array, " A"], motion: Motion, outcome: Outc
         ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(facts.ttc, ttc_limit_s), 0.0),
         ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
         speed_sum=add(tally.speed_sum, facts.speed),
-        lateral_sum=add(tally.lateral_sum, jnp.abs(facts.speed * motion.yaw_rate)),
+        swing_sum=add(tally.swing_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
         grip_sum=add(tally.grip_sum, facts.grip),
         grip_use_sum=add(tally.grip_use_sum, facts.grip_use),
         margin_min=jnp.minimum(tally.margin_min, jnp.where(active, facts.stopping_margin, jnp.inf)),

@@ -35,12 +35,19 @@ def around(x, y, *, radius, speed):
     return x + radius * np.cos(angle), y + radius * np.sin(angle), angle + np.pi / 2
 
 
+def weaving(x, *, speed, yaw, period_s):
+    """A track along x whose yaw swings to and fro."""
+    angle = yaw * np.sin(2 * np.pi * TIME / period_s)
+    return x + np.cumsum(speed * np.cos(angle)) * DT, np.cumsum(speed * np.sin(angle)) * DT, angle
+
+
 def parked(x, y=0.0, yaw=0.0):
     return drive(x, y, yaw=yaw)
 
 
 AWAY = parked(-55.0, 20.0)  # a car that has nothing to do with it
 FAR = (90.0, 20.0)
+WEAVE = {"speed": 6.0, "yaw": 0.1, "period_s": 2.0}
 # name -> (first car, its goal, second car); the road runs along x, its one lane along +x at y = 0, its edges at y = +-28
 DRIVES = {
     "arrives": (drive(-30, speed=8), (10, 0), AWAY),
@@ -61,6 +68,7 @@ DRIVES = {
     "circles": (around(0, 0, radius=8.0, speed=6.0), (3, 0), AWAY),
     "stuck": (drive(-30, speed=8, until=1.5), (50, 0), AWAY),
     "stops_short": (drive(-30, speed=8, until=3.0), (0, 0), AWAY),
+    "weaves": (weaving(-40, **WEAVE), FAR, AWAY),
     "late": (drive(-30, speed=2), (50, 0), AWAY),
 }
 NAMES = list(DRIVES)
@@ -154,11 +162,12 @@ def test_when_where_and_how_much(played):
     assert stood["still_s"] == pytest.approx(SECONDS - 1.5, abs=0.2) and stood["failure_x_m"] == pytest.approx(-18, abs=1.0)
 
 
-def test_bends_cost_lateral_acceleration(played):
-    """Speed squared over the radius; nothing on a straight line."""
+def test_weaving_shows_as_yaw_acceleration(played):
+    """Its mean is what the yaw rate moved up and down over the time: 4 x amplitude a period; nothing on a straight line or in a circle."""
     records, _ = played
-    lateral = {name: records["lateral_mps2"][row_of(records, name)] for name in ("circles", "arrives")}
-    assert lateral == pytest.approx({"circles": 6.0**2 / 8.0, "arrives": 0.0}, abs=0.1)
+    swing = {name: records["yaw_acceleration"][row_of(records, name)] for name in ("weaves", "arrives", "circles")}
+    assert swing["weaves"] == pytest.approx(4 * WEAVE["yaw"] * 2 * np.pi / WEAVE["period_s"] ** 2, rel=0.1)
+    assert swing["arrives"] == pytest.approx(0.0, abs=0.01) and swing["circles"] < 0.2  # whose start is a turn out of none
 
 
 def test_flags_tell_what_else_is_true(played):

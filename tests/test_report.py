@@ -40,7 +40,7 @@ def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: 
         "mean_speed": rng.uniform(1, 9, n), "max_contact_force_n": np.where(events["collided"], 900.0, 0.0),
         "film_mm": np.array([0.0, 0.5])[scene % 2],
         "surface": np.array(["AC", "SMA"])[scene % 2], "friction": np.array([0.86, 0.6])[scene % 2],
-        "lateral_mps2": rng.uniform(0, 3, n), "grip_use": rng.uniform(0, 1, n),
+        "yaw_acceleration": rng.uniform(0, 3, n), "grip_use": rng.uniform(0, 1, n),
         "stopping_margin_m": np.where(np.isfinite(ttc), rng.uniform(-5, 30, n), np.inf),
     }  # fmt: skip
 

@@ -12,7 +12,7 @@ Result = Mapping[str, Any]
 
 HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 RATES = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate", "unfinished_rate")
-SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "lateral_mps2",
+SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
           "grip_use", "stopping_margin_m")  # fmt: skip
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 

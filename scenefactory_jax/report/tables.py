@@ -20,7 +20,7 @@ COLUMNS: dict[str, type] = {
     "reached": bool, "collided": bool, "crashed": bool, "touched_edge": bool, "fault": bool, "clean": bool,
     "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
     "max_drac": float, "min_ttc_s": float, "mean_ttc_s": float, "has_ttc": bool, "mean_speed": float, "max_contact_force_n": float,
-    "lateral_mps2": float, "film_mm": float, "surface": str, "friction": float, "grip_use": float, "stopping_margin_m": float,
+    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "grip_use": float, "stopping_margin_m": float,
 }  # fmt: skip
 EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
@@ -114,9 +114,9 @@ METRICS: dict[str, Metric] = {
     "mean_remaining_m": Metric(
         "Remaining distance", "m", "Mean straight-line distance to the goal at the end, of all spawned agents.",
         lambda records: records["end_distance_m"], _spawned),
-    "lateral_mps2": Metric(
-        "Lateral acceleration", "m/s²", "|Speed x yaw rate|: each agent's mean over its steps; mean over agents. Bends cause some, weaving "
-        "causes more.", lambda records: records["lateral_mps2"], _spawned),
+    "yaw_acceleration": Metric(
+        "Yaw acceleration", "rad/s²", "|Change of the yaw rate| over time: each agent's mean over its steps; mean over agents. A car that "
+        "weaves shows here; at no moment beyond 1.93 is comfortable (nuPlan).", lambda records: records["yaw_acceleration"], _spawned),
     "grip_use": Metric(
         "Friction use", SHARE, "Tyre force over what the road's friction allows: each agent's mean over its steps; mean over agents.",
         lambda records: records["grip_use"], _spawned),

@@ -118,7 +118,7 @@ def _records(
         "mean_ttc_s": of(tally.ttc_sum) / np.maximum(seen, 1),
         "has_ttc": seen > 0,
         "mean_speed": of(tally.speed_sum) / steps,
-        "lateral_mps2": of(tally.lateral_sum) / steps,
+        "yaw_acceleration": of(tally.swing_sum) / steps * control_hz,
         "max_contact_force_n": of(tally.force_max),
         "film_mm": np.asarray(weather.film_mm)[row_world],
         "surface": np.array(SURFACES)[np.asarray(weather.surface)[row_world]],
