@@ -66,7 +66,8 @@ def test_commands_of_the_pages_compose(page):
 
 def test_results_of_the_readme_are_those_of_the_study():
     """Every row of the table: of the policy, of the untrained one, and of the log replay."""
-    found = {(row["row"], row["condition"], row["protocol"]): row["pooled"] for row in results.read(NAVIGATION)["rows"]}
+    result = results.read(NAVIGATION)
+    found = {(row["row"], row["condition"], row["protocol"]): row["pooled"] for row in result["rows"]}
     text = (ROOT / "README.md").read_text()
 
     def shown(row, condition, protocol, metric):
@@ -76,6 +77,8 @@ def test_results_of_the_readme_are_those_of_the_study():
         policy, nobody = (shown(row, *place) for row in ("rigid body", "untrained"))
         assert f"| {label} | {policy} | {nobody} |" in text
     assert f"clean on {shown('log replay', 'original', 'invincible', 'clean_bend_rate')} of them" in text
+    pace = [run["casps"] for run in result["trainings"]["rigid body"]["runs"].values()]
+    assert f"trains at {min(pace):,.0f} to {max(pace):,.0f} steps/s" in text
 
 
 def test_the_ten_lines_of_python_run(quickly):
