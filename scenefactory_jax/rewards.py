@@ -93,6 +93,14 @@ def action_rate(step: Step) -> Float[Array, " A"]:
     return jnp.sum((step.action - step.before.previous_action) ** 2, axis=-1)
 
 
+def steer_rate(step: Step) -> Float[Array, " A"]:
+    """Squared change of the steering since the last step: a price on weaving that leaves the pedals alone.
+
+    A price on every change (`action_rate`) keeps cars from learning to brake.
+    """
+    return (step.action[:, 1] - step.before.previous_action[:, 1]) ** 2
+
+
 def _closeness(gap: Float[Array, " A"], limit_m: float) -> Float[Array, " A"]:
     return jnp.clip(1.0 - gap / limit_m, 0.0, 1.0)
 

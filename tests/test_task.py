@@ -319,7 +319,7 @@ def test_collision_needs_force_and_grace(env, two_cars):
     assert sum(collided) == 1
 
 
-def test_closeness_to_cars_and_edges_and_driving_against_the_traffic_by_hand(env):
+def test_terms_beyond_the_published_ones_by_hand(env):
     """Two cars side by side, one of them against its lane, 1.4 m and 0.85 m from the edges at +-6 m; the third is alone."""
     goals = [[50, 3.5], [50, -4.0], [90, 0], [90, 0]]
     scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], goals, yaws=[np.pi, 0.0, 0.0, 0.0], speeds=[0.0, 0, 3, 3])
@@ -338,6 +338,10 @@ def test_closeness_to_cars_and_edges_and_driving_against_the_traffic_by_hand(env
     np.testing.assert_allclose(rewards.wrong_way(step), [1, 0, 0, 0], atol=1e-5)
     late = replace(step, facts=replace(facts, stopping_margin=jnp.array([jnp.inf, 2.0, -1.0, -9.0])))
     np.testing.assert_allclose(rewards.stopping(late, limit_m=4.0), [0, 0, 0.25, 1], atol=1e-6)
+    before = replace(state, previous_action=jnp.tile(jnp.array([0.5, -0.4, 0.0]), (4, 1)))
+    turned = replace(step, before=before, action=jnp.array([[0.5, -0.4, 0.0], [-0.5, -0.4, 0.5], [0.5, 0.6, 0.0], [-0.5, 0.6, 0.5]]))
+    np.testing.assert_allclose(rewards.steer_rate(turned), [0, 0, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(rewards.action_rate(turned), [0, 1.25, 1, 2.25], atol=1e-6)
 
 
 def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
