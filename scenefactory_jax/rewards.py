@@ -96,7 +96,7 @@ def action_rate(step: Step) -> Float[Array, " A"]:
 def steer_rate(step: Step) -> Float[Array, " A"]:
     """Squared change of the steering since the last step: a price on weaving that leaves the pedals alone.
 
-    A price on every change (`action_rate`) keeps cars from learning to brake.
+    A dear price on every change (`action_rate`) was seen to keep cars from learning to brake.
     """
     return (step.action[:, 1] - step.before.previous_action[:, 1]) ** 2
 

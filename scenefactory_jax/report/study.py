@@ -10,7 +10,6 @@ from scenefactory_jax.report.tables import Estimate
 
 Result = Mapping[str, Any]
 
-HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 RATES = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate", "unfinished_rate")
 SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
           "grip_use", "stopping_margin_m")  # fmt: skip
@@ -45,7 +44,7 @@ def headline(result: Result) -> str:
     for name in result["study"]["trainings"]:
         row = next((row for row in result["rows"] if row["row"] == name), None)
         if row:
-            success, clean, collisions = (tables.text(Estimate(**row["pooled"][metric])) for metric in HEADLINE)
+            success, clean, collisions = (tables.text(Estimate(**row["pooled"][metric])) for metric in study_figures.HEADLINE)
             size = f"{_many(len(row['seeds']), 'seed')} x {row['agents']} agents"
             told = f"success {success}, without any other event {clean}, collisions {collisions}"
             lines.append(f"- **{name}** ({row['condition']}, {row['protocol']}; {size}): {told}")

@@ -16,6 +16,7 @@ from scenefactory_jax.report.tables import Estimate
 Result = Mapping[str, Any]
 LEARNING = ("events/reached", "events/collided", "events/touched_edge", "reward")
 TITLES = ("Goal reached, share of ended lives", "Collision, share of ended lives", "Road edge, share of ended lives", "Reward a step")
+HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 SHOWN = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate")
 TREND = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate")
 
@@ -128,14 +129,13 @@ def _matrix(result: Result) -> dict[str, tuple[str, Figure]]:
 
 
 def _heat_maps(cells: Mapping[tuple[str, str], Mapping[str, Estimate]], rows: Sequence[str], columns: Sequence[str]) -> Figure:
-    shown = ("success_rate", "clean_success_rate", "collision_rate")
     with matplotlib.rc_context({**STYLE, "axes.grid": False}):
         figure = Figure(figsize=(1.15 * len(columns) + 2.0, 3 * (0.55 * len(rows) + 0.45) + 1.1), layout="constrained")
-        panels = figure.subplots(len(shown), 1, sharex=True)
-        for axes, name in zip(panels, shown, strict=True):
+        panels = figure.subplots(len(HEADLINE), 1, sharex=True)
+        for axes, name in zip(panels, HEADLINE, strict=True):
             values = np.full((len(rows), len(columns)), np.nan)
             told = [cells[key][name].value for key in cells if key[0] in rows]
-            top = 1.0 if name in shown[:2] else max([0.1, *(value for value in told if value is not None)])
+            top = 1.0 if name in HEADLINE[:2] else max([0.1, *(value for value in told if value is not None)])
             for r, row in enumerate(rows):
                 for c, column in enumerate(columns):
                     one = cells.get((row, column), {}).get(name)
@@ -165,12 +165,11 @@ def _differences(result: Result) -> dict[str, tuple[str, Figure]]:
 
 
 def _forest(shown: Sequence[Mapping[str, Any]]) -> Figure:
-    names = ("success_rate", "clean_success_rate", "collision_rate")
     conditions = len({one["condition"] for one in shown}) > 1
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10, 0.32 * len(shown) + 1.1), layout="constrained")
-        panels = figure.subplots(1, len(names), sharey=True)
-        for axes, name in zip(panels, names, strict=True):
+        panels = figure.subplots(1, len(HEADLINE), sharey=True)
+        for axes, name in zip(panels, HEADLINE, strict=True):
             for place, one in enumerate(shown):
                 change = Estimate(**one["change"][name])
                 if change.value is None:

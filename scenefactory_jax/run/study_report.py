@@ -97,19 +97,19 @@ def _trained(variant: str, plan: Plan, target: float) -> dict[str, Any]:
     own = [one for one in plan.trainings if one.variant == variant]
     notes = {one.seed: results.read(one.folder / TRAINED) for one in own if (one.folder / TRAINED).is_file()}
     metrics = {one.seed: log.read(one.folder) for one in own if one.seed in notes}
-    keep = ("iterations", "steps", "minutes", "commit", "scenes", "agents")
     return {
         "overrides": [override for override in own[0].overrides if "path=" not in override],  # nobody else's business
         "digests": {one.seed: one.digest for one in own},
-        "runs": {seed: {name: note.get(name) for name in keep} | _pace(note, metrics[seed]) for seed, note in notes.items()},
+        "runs": {seed: _run(note, metrics[seed]) for seed, note in notes.items()},
         "curves": _curves(metrics),
         "held_out": _held_out([one for one in own if one.seed in notes], plan, notes, target),
     }
 
 
-def _pace(note: Mapping[str, Any], rows: list[dict[str, float]]) -> dict[str, Any]:
-    """Steps of spawned slots a second, the median over iterations, and what they were made on."""
-    return {"casps": float(np.median([row["casps"] for row in rows])), "device": note["versions"]["device"]}
+def _run(note: Mapping[str, Any], rows: list[dict[str, float]]) -> dict[str, Any]:
+    """What one training took; casps: control steps of spawned slots a second, the median over iterations."""
+    kept = {name: note.get(name) for name in ("iterations", "steps", "minutes", "commit", "scenes", "agents")}
+    return kept | {"casps": float(np.median([row["casps"] for row in rows])), "device": note["versions"]["device"]}
 
 
 def _curves(metrics: Mapping[int, list[dict[str, float]]]) -> dict[str, Any]:
