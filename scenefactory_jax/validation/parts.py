@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.build import build
+from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.validation import encounters as meetings
 from scenefactory_jax.validation import engines, equivalence, extremes, ground, impacts, laws, sequences
@@ -31,9 +31,16 @@ def _rates(config: Mapping[str, Any]) -> dict[str, float]:
 
 
 def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
-    """Single cars on the batched path and in the C engine, and how sensitive the drives themselves are."""
+    """Single cars on the batched path and in the C engine, and how sensitive the drives themselves are.
+
+    Raises:
+        ConfigError: drives that end before the bound does, which they would keep unseen.
+    """
     settings, entry, rates = config["validation"], config["dynamics"], _rates(config)
     cases = _sequences(config, settings["drives"]["draw"]["count"])
+    seconds, until = settings["drives"]["draw"]["seconds"], settings["bound"]["horizon_s"]
+    if seconds < until:
+        raise ConfigError(f"validation.drives.draw.seconds: {seconds}; at least {until}, validation.bound.horizon_s")
     truth = {**rates, **settings["road"], **settings["reference"], "friction_scale": 1.0}
     run = engines.drive(entry, cases, **rates, **settings["road"])
     reference, nudged = (
@@ -41,7 +48,7 @@ def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     )
     options = {"control_hz": rates["control_hz"], "bins": settings["drives"]["bins"], **settings["bound"]}
     found = equivalence.compare(run, reference, **options)
-    horizon = round(settings["bound"]["horizon_s"] * rates["control_hz"]) - 1
+    horizon = round(until * rates["control_hz"]) - 1
     position = equivalence.errors(run, reference).position[..., 0]
     sensitivity = equivalence.errors(nudged, reference).position[..., 0]
     return {
