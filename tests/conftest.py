@@ -23,7 +23,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from running import quick_compilation
+from running import ROOT, quick_compilation
 
 from scenefactory_jax.tracks import nobody, unrecorded
 from scenefactory_jax.types import Agents, Log, Road, Scene
@@ -31,7 +31,6 @@ from scenefactory_jax.weather import uniform
 
 BY_DEFAULT = {"xla_backend_optimization_level": 3}  # for what is about XLA's own rounding
 BY_DEFAULT |= {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.environ["XLA_FLAGS"] else {}
-ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared" / "data"
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
     "test_study", "test_tree", "test_run", "test_validate", "test_notebook", "test_solve", "test_fleet", "test_others", "test_fields",

@@ -1,10 +1,17 @@
-"""Compilation that costs the tests of whole runs less, and configs of runs at the smallest size."""
+"""Compilation that costs the tests of whole runs less, configs of runs at the smallest size, and the command line."""
 
 import contextlib
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 
 from scenefactory_jax.run import config
+
+ROOT = Path(__file__).resolve().parent.parent
+QUICKLY = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # quick_compilation, for a process
 
 
 @contextlib.contextmanager
@@ -19,3 +26,10 @@ def quick_compilation():
 def smoke(out, *overrides):
     """A training config of seconds."""
     return config.load("train", "experiment=smoke", "progress=false", f"out={out}", *overrides)
+
+
+def shell(folder, *words, timeout=None, **environment):
+    """`python -m scenefactory_jax WORDS` in a folder, whose own modules it finds, too."""
+    call = [sys.executable, "-m", "scenefactory_jax", *words]
+    found = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"} | environment
+    return subprocess.run(call, cwd=folder, capture_output=True, text=True, env=found, timeout=timeout)

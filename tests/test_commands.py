@@ -1,16 +1,14 @@
 """Every command of README and of the documents, as a shell takes it, at toy size: what it names on disk is made first. `make test-slow`."""
 
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import textwrap
-from pathlib import Path
 
 import pytest
-from running import quick_compilation, smoke
+from conftest import ROOT
+from pages import commands
+from running import QUICKLY, quick_compilation, shell, smoke
 from scene_banks import banked, generated
 from test_extension import BACKEND, READER
 
@@ -18,7 +16,6 @@ from scenefactory_jax.run import config
 from scenefactory_jax.run.scenes import scenes
 from scenefactory_jax.run.train import train
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGES = ["README.md", "docs/commands.md", "docs/extending.md", "docs/sweeps.md"]
 INTERACTIVE = {"drive"}  # a window and a keyboard: tests/test_drive.py
 SHORTER = {  # words of the pages, and what stands for them here
@@ -47,13 +44,6 @@ SMALL = {
 }
 
 pytestmark = pytest.mark.slow
-
-
-def lines():
-    """(page, words) of every line of a page that calls the package."""
-    for page in PAGES:
-        for call in re.findall(r"^python -m scenefactory_jax (.+)$", (ROOT / page).read_text(), re.MULTILINE):
-            yield page, shlex.split(call, comments=True)
 
 
 def snippets(text):
@@ -87,7 +77,7 @@ def name_of(line):
     return f"{page}: {' '.join(words)}"[:100]
 
 
-@pytest.mark.parametrize("line", list(lines()), ids=name_of)
+@pytest.mark.parametrize("line", [(page, words) for page in PAGES for words in commands(ROOT / page)], ids=name_of)
 def test_a_command_of_the_pages_runs(desk, line):
     command, *words = line[1]
     if command in INTERACTIVE:
@@ -99,7 +89,6 @@ def test_a_command_of_the_pages_runs(desk, line):
     words = [SHORTER.get(word, word) for word in words]
     if command in ("train", "bench") and not any(word.startswith("experiment=") for word in words):
         words.append("experiment=smoke")
-    call = [sys.executable, "-m", "scenefactory_jax", command, *words, *SMALL.get(command, [])]
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{desk}", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-    done = subprocess.run(call, cwd=desk, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, f"{shlex.join(call[1:])}\n{done.stdout[-1500:]}\n{done.stderr[-2500:]}"
+    words += SMALL.get(command, [])
+    done = shell(desk, command, *words, **QUICKLY)
+    assert done.returncode == 0, f"{shlex.join([command, *words])}\n{done.stdout[-1500:]}\n{done.stderr[-2500:]}"

@@ -3,17 +3,17 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import ROOT
+from pages import commands
 
 from scenefactory_jax import __version__
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config, results
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").rglob("*.md"))
 SECTIONS = ["What is new", "Install", "Ten lines of Python", "Train, evaluate, sweep", "Results", "Map of the package"]
 SECTIONS += ["Your own reward, observation, dynamics, converter", "Limits", "Terms, contributing, citation"]
@@ -28,14 +28,6 @@ README_ROWS = [  # label, condition, protocol, metric
     ("goal reached from rest", "original, from rest", "invincible", "success_rate"),
     ("agents in a collision, from rest", "original, from rest", "invincible", "collision_rate"),
 ]
-
-
-def commands(page):
-    """(command, overrides) of the lines of a page that call the package, as Hydra takes them."""
-    for line in re.findall(r"^(?:\$ )?python -m scenefactory_jax (\w+) +(.*)$", page.read_text(), re.MULTILINE):
-        text = re.sub(r"\s+#.*$", "", line[1])
-        words = [word.replace("'", "") for word in re.findall(r"(?:[^\s']|'[^']*')+", text)]
-        yield line[0], [word for word in words if word not in ("-m", "--cfg", "job")]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -57,9 +49,9 @@ def test_the_readme_is_short_and_in_order():
 @pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "troubleshooting"], ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_of_the_pages_compose(page):
     """Every key and option exists; what they name on disk is the reader's."""
-    for command, words in commands(page):
+    for command, *words in commands(page):
         swept = ("seed=", "weather=", "ppo.gamma=")  # of a sweep, the first value
-        settings = [word.split(",")[0] if word.startswith(swept) else word for word in words]
+        settings = [word.split(",")[0] if word.startswith(swept) else word for word in words if word not in ("-m", "--cfg", "job")]
         launched = [word for word in settings if not word.startswith("hydra")]
         assert config.load(command, *launched)
 

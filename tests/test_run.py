@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +13,7 @@ import pytest
 import yaml
 from conftest import ROOT
 from omegaconf import OmegaConf
-from running import smoke
+from running import shell, smoke
 from scene_documents import document, thing, written
 
 import scenefactory_jax
@@ -298,11 +296,6 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
 # ---- command line
 
 
-def shell(*arguments):
-    command = [sys.executable, "-m", "scenefactory_jax", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-
-
 def test_help_lists_the_commands(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "--help"])
     with pytest.raises(SystemExit) as stopped:
@@ -312,13 +305,14 @@ def test_help_lists_the_commands(monkeypatch, capsys):
 
 
 def test_a_wrong_key_ends_as_one_line():
-    done = shell("train", "ppo.horizn=3")
+    done = shell(ROOT, "train", "ppo.horizn=3", timeout=120, JAX_PLATFORMS="cpu")
     assert done.returncode == 2 and not done.stdout and len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("error: ppo.horizn: unknown key 'horizn'; ppo has: average, clip, ") and "horizon" in done.stderr
 
 
 def test_a_wrong_value_ends_as_one_line():
-    done = shell("evaluate", "run=/nowhere", "overrides=[dynamics=bicycle,weather=wet]")  # a list that Hydra alone would not read
+    words = ["run=/nowhere", "overrides=[dynamics=bicycle,weather=wet]"]  # a list that Hydra alone would not read
+    done = shell(ROOT, "evaluate", *words, timeout=120, JAX_PLATFORMS="cpu")
     assert done.returncode == 2 and not done.stdout and "Traceback" not in done.stderr
     assert done.stderr == "error: /nowhere is no run: it has no config.yaml; give the folder that `train` wrote\n"
 

@@ -1,29 +1,24 @@
 """The sweeps of docs/sweeps.md, at toy size."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
+from running import QUICKLY, shell
 
 from scenefactory_jax.run import config, log
 from scenefactory_jax.run.train import _folder
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "sweeps.md").read_text()
 TOY = ["experiment=smoke", "evaluation.enable=false", "progress=false", "iterations=1"]
 SMALLER = {'"experiment=demo", "minutes=2"': ", ".join(f'"{one}"' for one in TOY), "n_trials=20": "n_trials=2"}
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
 
 def sweep(folder, *arguments):
     """The command line in a folder; the runs that it leaves."""
-    call = [sys.executable, "-m", "scenefactory_jax", "train", "-m", *arguments, *TOY]
-    done = subprocess.run(call, cwd=folder, capture_output=True, text=True, env=ENVIRONMENT)
+    done = shell(folder, "train", "-m", *arguments, *TOY, **QUICKLY)
     assert done.returncode == 0, done.stderr[-2000:]
     return [config.read(run) for run in sorted((folder / "runs").iterdir()) if len(log.read(run)) == 1]
 

@@ -1,17 +1,17 @@
 """docs/troubleshooting.md quotes what a user sees: each of its commands is called here, and must say what the page says."""
 
 import json
-import os
 import re
-import subprocess
+import shlex
 import sys
 import traceback
 from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
+from conftest import ROOT
 from omegaconf import OmegaConf
-from running import smoke
+from running import shell, smoke
 
 import scenefactory_jax.__main__ as command_line
 from scenefactory_jax.build import ConfigError
@@ -19,7 +19,7 @@ from scenefactory_jax.run import config, keys, sources, trouble
 from scenefactory_jax.run.train import train
 from scenefactory_jax.scenes import bank_index
 
-PAGE = (Path(__file__).resolve().parent.parent / "docs" / "troubleshooting.md").read_text()
+PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
 CALL = "python -m scenefactory_jax "
 OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.facts.speed - 100.0)\n"
@@ -62,17 +62,14 @@ def said(command, folder, monkeypatch, capsys) -> str:
     monkeypatch.chdir(folder)
     if ELSEWHERE.search(command):
         environment, arguments = command.split(CALL)
-        done = subprocess.run(
-            [sys.executable, "-m", "scenefactory_jax", *_words(arguments)], capture_output=True, text=True,
-            env={**os.environ, **dict(one.split("=") for one in environment.split()), "PYTHONPATH": str(config.folder().parent)},
-        )  # fmt: skip
+        done = shell(folder, *shlex.split(arguments), **dict(one.split("=") for one in environment.split()))
         return done.stdout + done.stderr
     if not command.startswith(CALL):
         with pytest.raises(ImportError) as caught:
             exec(command.removeprefix("python -c ").strip('"'), {})
         return traceback.format_exception_only(caught.value)[-1]
     monkeypatch.syspath_prepend(str(folder))
-    arguments = _words(command.removeprefix(CALL))
+    arguments = shlex.split(command.removeprefix(CALL))
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
 
     def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
@@ -85,11 +82,6 @@ def said(command, folder, monkeypatch, capsys) -> str:
         assert stopped.code == 2
     captured = capsys.readouterr()
     return captured.out + captured.err
-
-
-def _words(arguments: str) -> list[str]:
-    """As a shell would divide them; the page quotes with ' alone."""
-    return [word.replace("'", "") for word in re.findall(r"(?:[^\s']|'[^']*')+", arguments)]
 
 
 def normal(text: str, folder: Path) -> str:
