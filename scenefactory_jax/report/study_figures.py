@@ -18,7 +18,7 @@ LEARNING = ("events/reached", "events/collided", "events/touched_edge", "reward"
 TITLES = ("Goal reached, share of ended lives", "Collision, share of ended lives", "Road edge, share of ended lives", "Reward a step")
 HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 SHOWN = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate")
-TREND = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate")
+TREND = (("success_rate", "clean_success_rate"), ("collision_rate", "road_edge_rate"))  # a panel each: the scales differ
 
 
 def all_of(result: Result) -> dict[str, tuple[str, Figure]]:
@@ -214,23 +214,28 @@ def _along(row: str, result: Result) -> float | int | None:
 
 def _lines(points: Mapping[str, list[tuple[float | int, dict[str, Estimate]]]], label: str) -> Figure:
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(5.2 * len(points), 3.4), layout="constrained")
-        for axes, (condition, found) in zip(figure.subplots(1, len(points), squeeze=False)[0], points.items(), strict=True):
-            found = sorted(found, key=lambda one: one[0])
-            for colour, name in zip(_colours(len(TREND)), TREND, strict=True):
-                told = [(x, row[name]) for x, row in found if row[name].value is not None]
-                x, values = [one[0] for one in told], np.array([one[1].value for one in told])
-                ends = np.array([[one.value if end is None else end for end in (one.low, one.high)] for _, one in told]).reshape(-1, 2)
-                axes.plot(x, values, color=colour, marker="o", markersize=4, label=levels.labels([name])[name].label)
-                axes.fill_between(x, ends[:, 0], ends[:, 1], color=colour, alpha=0.13, linewidth=0)
-            axes.set_xscale("log", base=2)
-            axes.set_xticks([x for x, _ in found], [f"{x:g}" for x, _ in found])
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.set(title=condition, xlabel=label, ylim=(-0.02, 1.02))
-            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=4)
+        figure = Figure(figsize=(9.0, 3.2 * len(points)), layout="constrained")
+        panels = figure.subplots(len(points), len(TREND), squeeze=False)
+        for row, (condition, found) in zip(panels, points.items(), strict=True):
+            for axes, names in zip(row, TREND, strict=True):
+                _line(axes, sorted(found, key=lambda one: one[0]), names)
+                axes.set(title=condition, xlabel=label)
     return figure
+
+
+def _line(axes: Axes, found: Sequence[tuple[float | int, Mapping[str, Estimate]]], names: Sequence[str]) -> None:
+    """Some rates of one condition, with their intervals, on a scale of their own."""
+    for colour, name in zip(_colours(len(names)), names, strict=True):
+        told = [(x, row[name]) for x, row in found if row[name].value is not None]
+        x, values = [one[0] for one in told], np.array([one[1].value for one in told])
+        ends = np.array([[one.value if end is None else end for end in (one.low, one.high)] for _, one in told]).reshape(-1, 2)
+        axes.plot(x, values, color=colour, marker="o", markersize=4, label=levels.labels([name])[name].label)
+        axes.fill_between(x, ends[:, 0], ends[:, 1], color=colour, alpha=0.13, linewidth=0)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks([x for x, _ in found], [f"{x:g}" for x, _ in found])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.legend(loc="best")
 
 
 def _estimates(row: Mapping[str, Any]) -> dict[str, Estimate]:
