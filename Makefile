@@ -19,7 +19,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 comma := ,
 
-demo: $(STAMP) ## train cars on generated roads, evaluate them on unseen ones, write a report and a video
+demo: $(STAMP) ## a page of the package's policy driving; then train cars on generated roads, and judge them on unseen ones
+	$(BIN)/python -m scenefactory_jax replay run=town out=runs/town.html
 	$(BIN)/python -m scenefactory_jax train experiment=demo
 
 test: $(STAMP) ## the fast tests

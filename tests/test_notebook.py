@@ -9,7 +9,7 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "notebooks").glob("*.ipynb"))
 SHORT = '"timing.episode_s=2"'
 SHORTER = {  # how well it learns is for other tests: notebook -> what a test runs in place of a line, and what must be there in the end
-    "01_quickstart": ({'"iterations=25"': '"iterations=2"'}, "runs/quickstart-*/evaluation/report.md"),
+    "01_quickstart": ({'"iterations=25"': '"iterations=2"', "steps=300": "steps=30"}, "runs/quickstart-*/evaluation/report.md"),
     "02_scenes": ({"scenes.count=24": "scenes.count=8"}, "outputs/scenes/parts/test/bank.json"),
     "03_own_algorithm": ({"range(80)": "range(2)", "steps=450": "steps=60"}, None),
     "04_friction": ({"steps = 540": "steps = 90"}, "outputs/weather/weather.md"),
@@ -26,10 +26,10 @@ SHORTER = {  # how well it learns is for other tests: notebook -> what a test ru
         },
         "runs/slower-*/metrics.csv",
     ),
-    "07_failures": ({'"iterations=60"': f'"iterations=2", {SHORT}'}, "runs/judged-*/evaluation/failures-strict-*.png"),
+    "07_failures": ({"heldout.count=16": "heldout.count=2"}, "outputs/snow/failures-strict-*.png"),
     "08_own_dataset": ({'"iterations=40"': f'"iterations=2", {SHORT}'}, "outputs/quality/quality.md"),
 }
-FIGURES = {"01_quickstart": 5, "02_scenes": 4, "03_own_algorithm": 2, "04_friction": 5, "05_ppo": 2, "06_own_parts": 1, "07_failures": 2}
+FIGURES = {"01_quickstart": 6, "02_scenes": 4, "03_own_algorithm": 2, "04_friction": 5, "05_ppo": 2, "06_own_parts": 1, "07_failures": 2}
 FIGURES |= {"08_own_dataset": 3}
 # XLA without its costly passes, for programs that run for a moment; the others find what other tests compiled
 QUICK = ("04_friction", "05_ppo", "06_own_parts", "07_failures", "08_own_dataset")

@@ -60,7 +60,7 @@ def test_a_run_folder_holds_what_it_promises(whole):
     kept = config.read(whole.folder)
     assert kept == whole.config and kept["name"] == "smoke" and kept["iterations"] == 4
     versions = yaml.safe_load((whole.folder / "versions.yaml").read_text())
-    assert versions["jax"] == jax.__version__ and versions["platform"] == "cpu"
+    assert versions["commit"] and versions["jax"] == jax.__version__ and versions["platform"] == "cpu"
     assert checkpoint.latest(whole.folder / "checkpoints") == 4 and checkpoint.latest(whole.folder / "untrained") == 0
     for trained, stored in zip(
         jax.tree.leaves(whole.state.parameters), jax.tree.leaves(checkpoint.restore_parameters(whole.folder / "checkpoints")), strict=True
@@ -174,8 +174,15 @@ def test_other_settings_of_a_run(whole, tmp_path):
 
 def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     """Judged alike, also by name as one of the package's own, and without a word about where scenes lay."""
-    kept = export(config.load("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}"))
-    assert sorted(str(one.relative_to(kept)) for one in kept.rglob("*.*")) == ["checkpoints/policy.npz", "config.yaml", "versions.yaml"]
+    told = ["card.about='For tests.'", f"card.judged={{unseen roads: {whole.folder}}}"]
+    kept = export(config.load("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}", *told))
+    files = ["README.md", "checkpoints/policy.npz", "config.yaml", "versions.yaml"]
+    assert sorted(str(one.relative_to(kept)) for one in kept.rglob("*.*")) == files
+    card, last = (kept / "README.md").read_text(), log.read(whole.folder)[-1]
+    strict = tables.summarise(tables.read_csv(whole.folder / "agents-strict.csv"), bootstrap=2000, seed=1000)
+    scored = [strict["success_rate"].count, *(tables.text(strict[name]) for name in ("success_rate", "clean_success_rate"))]
+    assert card.startswith("# handy\n\nFor tests.\n") and f"| agent steps | {last['steps/total']:,.0f} |" in card
+    assert "| unseen roads | strict | {} | {} | {} |".format(*scored) in card
     assert (kept / "versions.yaml").read_text() == (whole.folder / "versions.yaml").read_text()
     assert config.read(kept)["scenes"]["heldout"]["path"] is None and str(tmp_path.parent) not in (kept / "config.yaml").read_text()
     monkeypatch.setattr(policies, "SHIPPED", tmp_path / "pretrained")
@@ -188,6 +195,8 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
     with pytest.raises(ConfigError, match=r"hand is no run: .*, or one of the package's own: handy"):
         scenefactory_jax.load_policy("hand")
+    with pytest.raises(ConfigError, match=r"card\.judged\.nothing: \S+ holds no records of agents; give a folder that `evaluate` wrote"):
+        export(config.load("export", "run=handy", f"out={tmp_path / 'other'}", f"card.judged={{nothing: {tmp_path}}}"))
     with pytest.raises(ConfigError, match="holds something already; give a new folder"):
         export(config.load("export", "run=handy", f"out={whole.folder}"))
 
@@ -314,7 +323,8 @@ def test_a_wrong_value_ends_as_one_line():
     words = ["run=/nowhere", "overrides=[dynamics=bicycle,weather=wet]"]  # a list that Hydra alone would not read
     done = shell(ROOT, "evaluate", *words, timeout=120, JAX_PLATFORMS="cpu")
     assert done.returncode == 2 and not done.stdout and "Traceback" not in done.stderr
-    assert done.stderr == "error: /nowhere is no run: it has no config.yaml; give the folder that `train` wrote\n"
+    wanted = "give the folder that `train` wrote, or one of the package's own: town"
+    assert done.stderr == f"error: /nowhere is no run: it has no config.yaml; {wanted}\n"
 
 
 @pytest.mark.parametrize(

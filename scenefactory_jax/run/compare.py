@@ -78,10 +78,8 @@ def _read(folder: Path) -> Read:
     config, metrics = configs.read(folder), log.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / log.FILE}: no row; the run has not finished an iteration")
-    named = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    records = {name: tables.read_csv(path) for name, path in named.items() if not name.endswith("-untrained")}
     settings = {key: value for key, value in document.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
-    return Read(folder, config, settings, metrics, records)
+    return Read(folder, config, settings, metrics, results.records(folder))
 
 
 def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:

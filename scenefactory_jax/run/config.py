@@ -171,10 +171,10 @@ def _task(override: str) -> dict[str, Any]:
 
 
 def write(path: Path, config: Mapping[str, Any]) -> None:
-    """Keep a run's config and the versions it ran with beside its results."""
+    """Keep a run's config, and the commit and the versions it ran with, beside its results."""
     Path(path).mkdir(parents=True, exist_ok=True)
     (Path(path) / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    (Path(path) / "versions.yaml").write_text(yaml.safe_dump(versions(), sort_keys=False))
+    (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": commit(), **versions()}, sort_keys=False))
 
 
 def versions() -> dict[str, str]:

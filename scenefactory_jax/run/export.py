@@ -1,36 +1,54 @@
-"""`export`: what a run's policy learnt, as a small folder to hand on."""
+"""`export`: what a run's policy learnt, as a small folder to hand on, with a card."""
 
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.report import card, tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, policies
+from scenefactory_jax.run import keys, log, policies, results
 
 
 def export(config: Mapping[str, Any]) -> Path:
-    """Write the policy's numbers, the run's config and the versions it was made with (`load("export", "run=...", "out=...")`).
+    """Write the policy's numbers, the run's config, the versions it was made with, and a card (`load("export", "run=...", "out=...")`).
 
     The folder stands for the run wherever a policy is wanted (`evaluate`, `replay`, `drive`, `sf.load_policy`); training cannot go on from
     it.
 
     Raises:
-        ConfigError: no such run, no checkpoint in it, or a folder that holds something.
+        ConfigError: no such run, no checkpoint in it, a folder that holds something, or one of `card.judged` that `evaluate` did not write.
     """
-    keys.check(config, keys.HANDING_ON)
+    keys.check_export(config)
     out = Path(config["out"])
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"out: {out} holds something already; give a new folder")
+    judged = {what: _summaries(what, Path(folder), config["card"]) for what, folder in (config["card"]["judged"] or {}).items()}
     trained = policies.load_policy(config["run"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config
     # where scenes lay is of no use elsewhere, and nobody else's business
     scenes = {**own["scenes"], "path": None, "heldout": {**own["scenes"]["heldout"], "path": None}}
-    configs.write(out, {**own, "out": None, "resume": False, "scenes": scenes})
+    own = {**own, "out": None, "resume": False, "scenes": scenes}
+    configs.write(out, own)
     shutil.copy(trained.folder / "versions.yaml", out)
+    versions = yaml.safe_load((out / "versions.yaml").read_text())
+    text = card.markdown(
+        out.name, config["card"]["about"], config=own, versions=versions, training=log.read(trained.folder), judged=judged
+    )
+    (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out
+
+
+def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, tables.Estimate]]:
+    """Protocol -> estimates of an evaluation's trained policy."""
+    records = results.records(folder)
+    if not records:
+        raise ConfigError(f"card.judged.{what}: {folder} holds no records of agents; give a folder that `evaluate` wrote")
+    return {name: tables.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}

@@ -61,6 +61,7 @@ FILM = {"view": Key(Literal["chase", "bird", "both"]), "car": Key(int | None, 0)
 VIEW = {"distance_m": Key(float, 1), "pitch_deg": Key(float, -90), "lag_s": Key(float, 0)}
 FILM |= {"fps": Key(float, 0.1), "stride": COUNT, "at_s": Key(float, 0), "trail_s": Key(float, 0), **VIEW}
 HANDING_ON = {"run": Key(str), "out": Key(str)}
+CARD = {"about": PLACE, "judged": Key(dict[str, str] | None), "bootstrap": COUNT, "seed": SEED}
 DRIVE = {"run": PLACE, "overrides": Key(list[str]), "skip": SEED, "car": Key(int | None, 0), "seed": SEED}
 DRIVE_KEYS = {name: Key(str) for name in ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")}
 FEEL = {name: Key(float, 0.01) for name in ("rise_s", "fall_s", "turn_s", "centre_s", "calm_mps", "tap_s")}
@@ -129,6 +130,16 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     check(config, {"run": Key(str), "out": PLACE, "overrides": Key(list[str]), **JUDGE})
     check_video(config["video"], where="video")
     check_failures(config, where="failures")
+
+
+def check_export(config: Mapping[str, Any]) -> None:
+    """Every key of `export`.
+
+    Raises:
+        ConfigError: naming the key, the value and what would be valid.
+    """
+    check(config, HANDING_ON)
+    check(config["card"], CARD, where="card")
 
 
 def check_video(video: Mapping[str, Any], *, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Results as JSON: written whole or not at all, with a digest of the settings that made them."""
+"""Results on the disk: JSON, written whole or not at all, with a digest of the settings that made it; and the records of evaluations."""
 
 import hashlib
 import json
@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from scenefactory_jax.report import tables
 
 
 def digest(settings: Mapping[str, Any]) -> str:
@@ -53,3 +55,13 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return [float("nan") if one is None else _numbers(one) for one in value]
     return value
+
+
+def records(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Protocol -> records of the trained policy's agents, of what an evaluation wrote to a folder; empty where none did.
+
+    Raises:
+        RecordsError: a file that holds something else.
+    """
+    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
+    return {name: tables.read_csv(path) for name, path in files.items() if not name.endswith("-untrained")}
