@@ -9,7 +9,10 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).resolve().parent.parent / "notebooks").glob("*.ipynb"))
 SHORT = '"timing.episode_s=2"'
 SHORTER = {  # how well it learns is for other tests: notebook -> what a test runs in place of a line, and what must be there in the end
-    "01_quickstart": ({'"iterations=25"': '"iterations=2"', "steps=300": "steps=30"}, "runs/quickstart-*/evaluation/report.md"),
+    "01_quickstart": (
+        {'"iterations=25"': '"iterations=2"', '"spawn=logged"]': '"spawn=logged", "dynamics=bicycle"]', "steps=300": "steps=30"},
+        "runs/quickstart-*/evaluation/report.md",
+    ),
     "02_scenes": ({"scenes.count=24": "scenes.count=8"}, "outputs/scenes/parts/test/bank.json"),
     "03_own_algorithm": ({"range(80)": "range(2)", "steps=450": "steps=60"}, None),
     "04_friction": ({"steps = 540": "steps = 90"}, "outputs/weather/weather.md"),

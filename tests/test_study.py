@@ -144,9 +144,10 @@ def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch
 
 
 def test_processes_divide_a_study_among_them(tmp_path, capfd):
-    result = study(toy(tmp_path, "processes=2", **ALONE))
+    result = study(toy(tmp_path, "processes=2", "per_gpu=2", **ALONE))
     assert result["missing"] == [] and len(list((tmp_path / "runs").glob("*/trained.json"))) == 2
     assert result["rows"][0]["seeds"] == [3, 4]
+    assert all(run["device"].endswith(", shared by 2") for run in result["trainings"]["all terms"]["runs"].values())
     printed = capfd.readouterr().out
     assert [printed.count(f"training all terms, seed {seed}\n") for seed in (3, 4)] == [1, 1]
     (looks,) = result["looks"]

@@ -12,6 +12,10 @@ def work(index, pieces, folder):
     return {"taken": [one for one in pieces if claims.take(one)], "sees": os.environ[together.VISIBLE], "index": index}
 
 
+def surrounded(index, folder):
+    return [os.environ[together.VISIBLE], os.environ[together.MEMORY]]
+
+
 def failing(index, folder):
     if index == 1:
         raise ValueError("this one fails")
@@ -38,6 +42,15 @@ def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv(together.VISIBLE, "0")
     with pytest.raises(RuntimeError, match="`processes` is at most 1"):
         together.run(work, 2, [], tmp_path)
+
+
+def test_processes_that_share_a_gpu_share_its_memory(tmp_path, monkeypatch):
+    monkeypatch.setenv(together.VISIBLE, "4,5")
+    monkeypatch.delenv(together.MEMORY, raising=False)
+    answers = together.run(surrounded, 3, tmp_path, per_gpu=2)
+    assert answers == [["4", "0.450"], ["4", "0.450"], ["5", "0.450"]] and together.MEMORY not in os.environ
+    with pytest.raises(RuntimeError, match="`processes` is at most 4"):
+        together.run(surrounded, 5, tmp_path, per_gpu=2)
 
 
 def test_alone_all_is_ones_own_once():

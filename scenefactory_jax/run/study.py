@@ -60,11 +60,12 @@ def _do(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock:
 
 
 def _do_together(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock") -> bool:
-    """One part by several processes, each on a GPU of its own; what they could not do within the time is left to the next call."""
+    """One part by several processes, `per_gpu` of them on each GPU; what they could not do within the time is left to the next call."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            done = together.run(_do_share, config["processes"], part, {**config, "until_s": clock.left_s()}, folder)
+            shares = {**config, "until_s": clock.left_s()}
+            done = together.run(_do_share, config["processes"], part, shares, folder, per_gpu=config["per_gpu"])
         finally:
             looks.gather(folder)
     return all(done)
@@ -195,7 +196,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             watched = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
             examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
             own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
-            note = _train_one(one, own) | {"watched": {j.protocol: j.program for j in watched}}
+            note = _train_one(one, own) | {"per_gpu": shared.config["per_gpu"], "watched": {j.protocol: j.program for j in watched}}
             spent[program] = time.monotonic() - begun
             results.write(one.folder / TRAINED, note, digits=None)
             if shared.config["slim"]:

@@ -109,7 +109,8 @@ def _trained(variant: str, plan: Plan, target: float) -> dict[str, Any]:
 def _run(note: Mapping[str, Any], rows: list[dict[str, float]]) -> dict[str, Any]:
     """What one training took; casps: control steps of spawned slots a second, the median over iterations."""
     kept = {name: note.get(name) for name in ("iterations", "steps", "minutes", "commit", "scenes", "agents")}
-    return kept | {"casps": float(np.median([row["casps"] for row in rows])), "device": note["versions"]["device"]}
+    device = note["versions"]["device"] + (f", shared by {note['per_gpu']}" if note.get("per_gpu", 1) > 1 else "")
+    return kept | {"casps": float(np.median([row["casps"] for row in rows])), "device": device}
 
 
 def _curves(metrics: Mapping[int, list[dict[str, float]]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One work done by several processes of this machine, each on a GPU of its own where there are several."""
+"""One work done by several processes of this machine, each on a GPU of its own, or some to a GPU."""
 
 import contextlib
 import multiprocessing
@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 from scenefactory_jax.run import results
 
 T = TypeVar("T")
-VISIBLE = "CUDA_VISIBLE_DEVICES"
+VISIBLE, MEMORY = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
+USED = 0.9  # of a GPU's memory, by all processes that share it
 
 
 class Claims:
@@ -37,17 +38,20 @@ class Claims:
         yield from groups.items()
 
 
-def run(work: Callable[..., Any], processes: int, *arguments: Any) -> list[Any]:
+def run(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int = 1) -> list[Any]:
     """What `work(index, *arguments)` returned in each process, as plain values; `arguments[-1]` is a folder that all of them share.
+
+    Args:
+        per_gpu: processes that share a GPU and its memory: while one compiles on the CPU, the others compute.
 
     Raises:
         RuntimeError: if a process ended with an error, which it has printed, once the others have ended, too.
     """
     context = multiprocessing.get_context("spawn")
-    gpus = [_gpu(index) for index in range(processes)]
+    surroundings = [_surroundings(index, per_gpu) for index in range(processes)]
     each = [context.Process(target=_one, args=(work, index, arguments)) for index in range(processes)]
-    for gpu, process in zip(gpus, each, strict=True):
-        with _seeing(gpu):
+    for variables, process in zip(surroundings, each, strict=True):
+        with _among(variables):
             process.start()
     for process in each:
         process.join()
@@ -61,26 +65,27 @@ def _one(work: Callable[..., Any], index: int, arguments: tuple[Any, ...]) -> No
 
 
 @contextlib.contextmanager
-def _seeing(gpu: str) -> Iterator[None]:
-    """What is started meanwhile sees one GPU alone. Programs of JAX's own `jax_cuda_visible_devices` fail on any but the first (0.11.2)."""
-    before = os.environ.get(VISIBLE)
-    os.environ[VISIBLE] = gpu
+def _among(variables: Mapping[str, str]) -> Iterator[None]:
+    """What is started meanwhile finds these in its environment. JAX's own `jax_cuda_visible_devices` fails on all but one GPU (0.11.2)."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        del os.environ[VISIBLE]
-        if before is not None:
-            os.environ[VISIBLE] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
-def _gpu(index: int) -> str:
-    """Which GPU the process of that index uses, of those that are not hidden from this one already."""
-    given = [one for one in os.environ.get(VISIBLE, "").split(",") if one]
-    if not given:
-        return str(index)
-    if index >= len(given):
-        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(given)}; `processes` is at most {len(given)}")
-    return given[index]
+def _surroundings(index: int, per_gpu: int) -> dict[str, str]:
+    """Which GPU the process of that index sees, of those that are not hidden from this one already, and how much of it is its own."""
+    given, place = [one for one in os.environ.get(VISIBLE, "").split(",") if one], index // per_gpu
+    if given and place >= len(given):
+        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(given)}; `processes` is at most {per_gpu * len(given)}")
+    seen = {VISIBLE: given[place] if given else str(place)}
+    return seen | ({MEMORY: f"{USED / per_gpu:.3f}"} if per_gpu > 1 else {})
 
 
 def _answer(folder: Path, index: int) -> Path:
