@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scenefactory_jax.report import tables
+from scenefactory_jax.report import document, tables
 
 SHOWN = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate")
 
@@ -29,11 +29,7 @@ def markdown(
     """
     parts = [f"# {name}", about or "", "## Training", tables.grid(["", ""], _training(config, versions, training))]
     if judged:
-        parts += ["## Scores", _scores(judged)]
-        parts.append(
-            "n: agents. Brackets: 95 % intervals over scenes and their agents, not over seeds of training: this is one policy. "
-            "strict: any event ends an agent; invincible: events are counted, only the goal ends one."
-        )
+        parts += ["## Scores", *_scores(judged)]
     parts.append("`config.yaml` has every setting of the training, `checkpoints/policy.npz` what was learnt.")
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -51,9 +47,12 @@ def _training(config: Mapping[str, Any], versions: Mapping[str, str], training: 
     return rows + [[name, str(version)] for name, version in versions.items()]
 
 
-def _scores(judged: Mapping[str, Mapping[str, Mapping[str, tables.Estimate]]]) -> str:
-    rows = []
-    for what, protocols in judged.items():
-        for protocol, summary in protocols.items():
-            rows.append([what, protocol, summary["success_rate"].count, *(tables.text(summary[metric]) for metric in SHOWN)])
-    return tables.grid(["Driven", "Protocol", "n", *(tables.METRICS[metric].label for metric in SHOWN)], rows)
+def _scores(judged: Mapping[str, Mapping[str, Mapping[str, tables.Estimate]]]) -> list[str]:
+    """A table, what its marks mean, and what the protocols are."""
+    placed = {(what, protocol): summary for what, protocols in judged.items() for protocol, summary in protocols.items()}
+    found = {place: {metric: summary[metric] for metric in SHOWN} for place, summary in placed.items()}
+    rows = [[*place, shown["success_rate"].count, *map(tables.text, shown.values())] for place, shown in found.items()]
+    table = tables.grid(["Driven", "Protocol", "n", *(tables.METRICS[metric].label for metric in SHOWN)], rows)
+    rules = [f"- **{name}**: {text}." for name, text in document.PROTOCOLS.items() if any(name == protocol for _, protocol in found)]
+    notes = document.marks({" ".join(place): shown for place, shown in found.items()})
+    return [table, f"{notes} No interval holds seeds of training: this is one policy.", "\n".join(rules)]

@@ -147,10 +147,10 @@ def _results(table: Mapping[str, Summary], records: Mapping[str, Records]) -> st
          ", ".join(str(s) for s in np.unique(records[name]["seed"]))]
         for name in table
     ]  # fmt: skip
-    return "\n\n".join([tables.markdown(table), _marks(table), tables.grid(["Protocol", "Scenes", "Episodes", "Agents", "Seeds"], sizes)])
+    return "\n\n".join([tables.markdown(table), marks(table), tables.grid(["Protocol", "Scenes", "Episodes", "Agents", "Seeds"], sizes)])
 
 
-def _marks(table: Mapping[str, Summary]) -> str:
+def marks(table: Mapping[str, Summary]) -> str:
     """What the marks behind intervals mean, those that occur."""
     used = {estimate.method for column in table.values() for estimate in column.values()}
     notes = ["n: agents that enter a number. Intervals: bootstrap over scenes."]
@@ -180,7 +180,7 @@ def _comparison(
         f"Both drove the same scenes. The change of the success rate, {tables.text(gain, signed=True)}, {verdict}. "
         "Differences are in percentage points for rates; their intervals resample scenes in pairs.",
         tables.markdown(table, signed=["difference"]),
-        _marks({"difference": change}),
+        marks({"difference": change}),
     ]
     return "\n\n".join(lines)
 
@@ -202,7 +202,7 @@ def _conditions(records: Records, name: str, columns: Sequence[str], *, bootstra
         header = [column, "Agents", *(METRICS[metric].label for metric in metrics)]
         parts += [f"### By {column} ({name})", *([note] if note else []), tables.grid(header, rows)]
         seen |= {f"{column}={value}": {metric: table[value][metric] for metric in metrics} for value in shown}
-    return "\n\n".join([*parts, _marks(seen)]) if parts else ""
+    return "\n\n".join([*parts, marks(seen)]) if parts else ""
 
 
 def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Path], numbers: Mapping[str, float]) -> str:

@@ -217,8 +217,9 @@ def _lines(points: Mapping[str, list[tuple[float | int, dict[str, Estimate]]]], 
         figure = Figure(figsize=(9.0, 3.2 * len(points)), layout="constrained")
         panels = figure.subplots(len(points), len(TREND), squeeze=False)
         for row, (condition, found) in zip(panels, points.items(), strict=True):
+            along = sorted(found, key=lambda one: one[0])
             for axes, names in zip(row, TREND, strict=True):
-                _line(axes, sorted(found, key=lambda one: one[0]), names)
+                _line(axes, along, names)
                 axes.set(title=condition, xlabel=label)
     return figure
 

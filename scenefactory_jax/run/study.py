@@ -196,7 +196,8 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             watched = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
             examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
             own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
-            note = _train_one(one, own) | {"per_gpu": shared.config["per_gpu"], "watched": {j.protocol: j.program for j in watched}}
+            sharing = min(shared.config["per_gpu"], shared.config["processes"])
+            note = _train_one(one, own) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
             spent[program] = time.monotonic() - begun
             results.write(one.folder / TRAINED, note, digits=None)
             if shared.config["slim"]:

@@ -66,7 +66,10 @@ def _one(work: Callable[..., Any], index: int, arguments: tuple[Any, ...]) -> No
 
 @contextlib.contextmanager
 def _among(variables: Mapping[str, str]) -> Iterator[None]:
-    """What is started meanwhile finds these in its environment. JAX's own `jax_cuda_visible_devices` fails on all but one GPU (0.11.2)."""
+    """What is started meanwhile finds these in its environment.
+
+    Programs of JAX's own `jax_cuda_visible_devices` fail on any GPU but the first (0.11.2).
+    """
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
