@@ -8,6 +8,7 @@ of them, with the annotated types: a misspelt, missing or mistyped key fails her
 import functools
 import importlib
 import inspect
+import math
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -84,6 +85,38 @@ def check_type(value: Any, hint: Any, *, where: str) -> None:
     if not _fits(value, hint):
         wanted = getattr(hint, "__name__", None) if not typing.get_args(hint) else None
         raise ConfigError(f"{where}: {value!r} is of type {type(value).__name__}, wanted {wanted or hint}")
+
+
+def check_number(
+    value: float | int, *, where: str, above: float | int | None = None, least: float | int | None = None, below: float | int | None = None
+) -> None:
+    """Refuse a number of the config that is not finite or beyond a bound.
+
+    Raises:
+        ConfigError: naming `where`, the value and what is wanted.
+    """
+    within = (above is None or value > above) and (least is None or value >= least) and (below is None or value < below)
+    if not math.isfinite(value) or not within:
+        bounds = {"above": above, "of at least": least, "below": below}
+        wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None)
+        kind = "number" if math.isfinite(value) else "finite number"
+        raise ConfigError(f"{where}: {value:g}; wanted is a {kind} {wanted}".rstrip())
+
+
+def check_numbers(values: Mapping[str, float], *, where: str, **bounds: float) -> None:
+    """`check_number` for several keys of the entry `where`, all of the same bounds."""
+    for name, value in values.items():
+        check_number(value, where=f"{where}.{name}", **bounds)
+
+
+def check_share(value: float | int, *, where: str) -> None:
+    """Refuse a share of the config that is none.
+
+    Raises:
+        ConfigError: a number outside 0 to 1.
+    """
+    if not 0 <= value <= 1:
+        raise ConfigError(f"{where}: {value}; wanted is a number from 0 to 1")
 
 
 def check_range(span: Sequence[float | int], *, where: str, least: float | None = 0.0) -> tuple[float | int, float | int]:

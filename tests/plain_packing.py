@@ -10,11 +10,12 @@ import numpy as np
 from scenefactory_jax.cells import SLACK_M
 from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.checks import DUPLICATE_M, _some
-from scenefactory_jax.scenes.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS, PackReport, _centre, _wrap, overlaps
+from scenefactory_jax.scenes.logs import wrapped
+from scenefactory_jax.scenes.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS, PackReport, _centre, overlaps
 from scenefactory_jax.types import ROAD_USERS, STOP_SIGN, Scene
 
 
-def check(raw, *, track_speed_limit_m_s, car_size_m):
+def check(raw, *, track_speed_limit_m_s, car_size_m, most_m):  # of scenes without a number beyond the last
     lines = []
     roads = _repair_roads(raw.roads, lines)
     tracks, sdc = _repair_tracks(raw, tuple(float(x) for x in car_size_m), lines)
@@ -204,7 +205,7 @@ def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
         path = track.xyz[raw.current :][track.valid[raw.current :], :2] - origin[:2]
         yaw = track.yaw[raw.current]
         along = float(track.velocity[raw.current] @ np.array([np.cos(yaw), np.sin(yaw)]))
-        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], _wrap(yaw)
+        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrapped(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         rows["route"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
@@ -228,7 +229,7 @@ def _recording(tracks, raw, origin, slots, first):
         valid = track.valid[first:]
         rows["valid"][slot] = valid
         rows["position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
-        rows["yaw"][slot][valid] = _wrap(track.yaw[first:][valid])
+        rows["yaw"][slot][valid] = wrapped(track.yaw[first:][valid])
         rows["velocity"][slot][valid] = track.velocity[first:][valid]
     return rows
 

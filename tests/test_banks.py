@@ -22,13 +22,16 @@ import pytest
 import shapely
 from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, packer, parsed, prepared, scenefactory_document, thing, written
 
-from scenefactory_jax.scenes import arrow, bank, columns, convert, mjcf, source, stack
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import config
+from scenefactory_jax.scenes import arrow, bank, bank_index, columns, convert, mjcf, source, stack, topology
 from scenefactory_jax.scenes import spread as spreads
 from scenefactory_jax.scenes.raw import Light, Polyline, Reject, SceneError, Track
 from scenefactory_jax.struct import unchecked
 from scenefactory_jax.types import Boxes, Scene
 
 NONE = dict.fromkeys(stack.AXES)
+TOPOLOGY = {key: value for key, value in config.load("lanes")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
@@ -214,6 +217,17 @@ def test_a_bank_replaces_a_bank_and_nothing_else(tmp_path, made):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bank", "home", "scene.json"]  # no leftovers
 
 
+def test_what_is_chosen_of_a_stopped_conversion_does_not_say_that_it_is_whole(tmp_path, made):
+    _, opened = made
+    bank_index.write(opened.path, replace(opened.index, complete=False))
+    stopped = bank.open(opened.path)
+    assert not opened.unfinished and "whose conversion was stopped" in stopped.unfinished
+    several = {"view": bank.view(stopped, [0]), "join": bank.join([opened, stopped])}
+    several |= {f"copy={copy}": bank.save(several["join"], tmp_path / f"{copy}", copy=copy, settings={}) for copy in (True, False)}
+    assert {name: one.unfinished for name, one in several.items()} == dict.fromkeys(several, stopped.unfinished)
+    assert not bank.join([opened, opened]).unfinished
+
+
 def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
     _, opened = made
     path = opened.path
@@ -343,6 +357,39 @@ def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     assert convert.convert(folder, out, **options()).scenes == 8 and bank.open(out).names[-1] == "t7"
     assert convert.convert(folder, out, **options(formats={})).scenes == 8  # nothing is left to read
     assert sorted(path.name[0] for path in out.iterdir())[0] == "b"
+
+
+def test_a_file_that_gave_nothing_is_read_again(tmp_path):
+    folder, out, read = streets(tmp_path / "in", "a_killed", "b", "c_two", "d_broken"), tmp_path / "bank", []
+    spread = functools.partial(spreads.local, workers=2, timeout_s=9.0)
+    first = convert.convert(folder, out, **options(formats={"eventful": eventful.read}, spread=spread))
+    assert (first.scenes, first.files, len(first.rejects)) == (3, 4, 3)
+    reader = lambda path: read.append(path.stem) or eventful.plainly(path)  # noqa: E731
+    again = convert.convert(folder, out, **options(formats={"whole": reader}))  # they were repaired
+    assert read == ["a_killed", "d_broken"] and (again.scenes, again.files, again.agents_kept) == (5, 4, 10)
+    assert [reject["scene"] for reject in again.rejects] == ["second"] and sorted(bank.open(out).names)[0] == "a_killed"
+    assert convert.convert(folder, out, **options(formats={"whole": reader})) == again and len(read) == 2
+
+
+def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
+    folder = streets(tmp_path / "in", "a", "b", "c")
+    wrong = functools.partial(topology.rebuild, **TOPOLOGY | {"beside_m": [5.0, 2.0]})
+    for workers in (1, 2):
+        spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
+        with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
+            convert.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.box_m: -1; wanted is a number above 0"):
+            convert.read(folder, formats=source.make(FORMATS), check=checker(), pack=packer(box_m=-1.0), workers=workers)
+    assert not (tmp_path / "bank").exists()
+
+
+@pytest.mark.parametrize("numbers", [{"workers": 0}, {"timeout_s": 0.0}, {"timeout_s": -1.0}])
+def test_numbers_with_which_nothing_would_be_done_are_refused(numbers):
+    [name] = numbers
+    with pytest.raises(ConfigError, match=rf"spread\.{name}: "):
+        list(spreads.local(dies_of_three, [1], **{"workers": 1, "timeout_s": None} | numbers))
+    with pytest.raises(ConfigError, match=r"spread\.pending: 0"):
+        list(spreads.ray(dies_of_three, [1], address=None, pending=0, timeout_s=None))
 
 
 def test_nothing_usable_writes_no_bank(tmp_path):

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from format_documents import argoverse2_files, dumped, encoded, scenarionet_document
-from scene_documents import FORMATS
+import womd_records as records
+from format_documents import argoverse2_files, dumped, encoded, in_march_2023, in_spring_2023, pufferdrive_map, scenarionet_document
+from scene_documents import FORMATS, document, scenefactory_document
 
 from scenefactory_jax.scenes import source
 from scenefactory_jax.scenes.export import gpudrive, scenarionet
@@ -71,6 +72,42 @@ def test_real_scenes_come_back_as_they_went(shared_data, readers, tmp_path, patt
         require_same(raw, again, topology=True)
         assert (again.current, again.metadata["dataset"]) == (raw.current, raw.metadata["dataset"])
         np.testing.assert_allclose(again.times, raw.times)
+
+
+def made_up(folder):
+    """A small file of every format and layout, with what lies beside it."""
+    table, area = argoverse2_files()
+    contents = {
+        "womd_scenario.tfrecord": records.framed(records.scenario().SerializeToString()),
+        "womd_example.tfrecord": records.framed(records.example(records.features()).SerializeToString()),
+        "gpudrive.json": encoded(document()),
+        "scenefactory.json": encoded(scenefactory_document()),
+        "pufferdrive.bin": pufferdrive_map(),
+        "scenario_a-b.parquet": table,
+        "log_map_archive_a-b.json": encoded(area),
+    }
+    today = scenarionet_document()
+    layouts = {"today": today, "spring": in_spring_2023(today), "march": in_march_2023(today)}
+    for name, content in (contents | {f"{layout}.pkl": dumped(whole) for layout, whole in layouts.items()}).items():
+        (folder / name).write_bytes(content)
+    return [folder / name for name in contents if "map" not in name] + [folder / f"{layout}.pkl" for layout in layouts]
+
+
+def test_every_format_goes_out_in_every_other(readers, tmp_path):
+    for path in made_up(tmp_path):
+        raw = one(path, readers)
+        for write, target in ((gpudrive.write, tmp_path / "out.json"), (scenarionet.write, tmp_path / "sd_out.pkl")):
+            write(raw, target)
+            require_same(raw, one(target, readers), topology=write is scenarionet.write)
+
+
+def test_the_lanes_of_stop_signs_go_out(readers, tmp_path):
+    path = tmp_path / "scene.tfrecord"
+    path.write_bytes(records.framed(records.scenario().SerializeToString()))
+    raw = one(path, readers)
+    older = replace(raw, metadata=raw.metadata | {"stop_sign_lanes": [{"sign": 12, "lanes": [4]}]})
+    for scene in (raw, older):  # as banks held them before
+        assert scenarionet.scenario(scene)["map_features"]["12"]["lane"] == ["4"]
 
 
 def test_what_scenarionet_gets_back_is_what_it_gave(street, readers, tmp_path):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scene_banks import FEATURES, generated, moved, rounded
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes import catalogue, features, places
 from scenefactory_jax.scenes.raw import Polyline, RawScene, Track
 
+STREETS = FEATURES.keywords["streets"]
 LINE = np.linspace(0.0, 1.0, 201)[:, None]
 
 
@@ -83,6 +85,12 @@ def test_order_and_place_change_nothing():
     for name in set(here) - {"streets"} - unknown:
         assert there[name] == pytest.approx(here[name], rel=0.02, abs=0.03), name
     assert not set(here["streets"]) & set(there["streets"])
+
+
+@pytest.mark.parametrize("name", ["cell_m", "height_m", "headings", "one_in"])
+def test_a_number_of_no_place_is_refused(name):
+    with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: 0; wanted is a number above 0"):
+        places.streets(generated(0), **STREETS | {name: type(STREETS[name])(0)})
 
 
 def test_streets_are_those_of_the_shared_frame():

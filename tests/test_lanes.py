@@ -154,8 +154,9 @@ def test_the_topology_of_womd_is_found_again(shared_data, names, links, neighbou
 
 
 def test_numbers_that_make_no_sense_are_refused():
-    with pytest.raises(ConfigError, match=r"topology\.beside_m"):
-        rebuild(scene(lane(1, (0, 0), (9, 0))), beside_m=[4.0, 2.0])
+    for wrong in ({"beside_m": [4.0, 2.0]}, {"station_m": 0.0}):
+        with pytest.raises(ConfigError, match=rf"lanes\.topology\.{next(iter(wrong))}: "):
+            rebuild(scene(lane(1, (0, 0), (9, 0))), **wrong)
 
 
 # ---- lanes

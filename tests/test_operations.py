@@ -11,10 +11,10 @@ import pytest
 from scene_banks import FEATURES, PROCEDURAL, banked, generated, moved, rounded, window
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import config
+from scenefactory_jax.run import batches, config
 from scenefactory_jax.run.scenes import scenes
 from scenefactory_jax.scenes import bank as banks
-from scenefactory_jax.scenes import duplicates, expressions, operations, places, source
+from scenefactory_jax.scenes import bank_index, duplicates, expressions, operations, places, source
 from scenefactory_jax.scenes.raw import SceneError
 
 SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
@@ -303,6 +303,27 @@ def test_what_is_exported_reads_back(town, tmp_path, name, pattern):
         np.testing.assert_allclose(back.tracks[0].xyz[:, :2], raw.tracks[0].xyz[:, :2], atol=0.01)
 
 
+def test_a_bank_is_held_against_its_checksums(tmp_path, capsys):
+    bank = banked(tmp_path / "bank", [generated(0)])
+    assert len(command(bank, "op=verify")) == 1
+    assert "1 scenes in 1 files, all as they were written" in capsys.readouterr().out
+    for name, damage in {"scenes-00000.arrow": lambda old: old[:-1] + b"!", "metadata-00000.arrow": lambda old: old[:-1]}.items():
+        (bank.path / name).write_bytes(damage((bank.path / name).read_bytes()))
+    with pytest.raises(SceneError, match=r"damaged: scenes-00000\.arrow, metadata-00000\.arrow: not what was written"):
+        command(bank, "op=verify")
+
+
+def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
+    bank = banked(tmp_path / "bank", [generated(0), generated(1)])
+    bank_index.write(bank.path, replace(bank.index, complete=False))
+    found = command(bank, "op=info", "info.json=true")
+    told = capsys.readouterr()
+    assert json.loads(told.out) == found and f"bank {bank.path}, whose conversion was stopped" in told.err
+    command(bank, "op=sample", "sample.count=1", f"out={tmp_path / 'sample'}")
+    assert "whose conversion was stopped" in capsys.readouterr().err
+    assert "whose conversion was stopped" in batches.open(config.load("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+
+
 def test_banks_are_judged_and_compared(town, tmp_path):
     counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
     assert counts.keys() == config.load("scenes")["quality"]["rules"].keys()
@@ -331,6 +352,11 @@ def test_banks_are_judged_and_compared(town, tmp_path):
         (["op=sample", "+sample.size=3"], "sample.size: unknown key; valid: count, share, stratify"),
         (["op=sheet"], "out: null; give a folder"),
         (["op=info", "scenes.path=null"], "scenes.path: null; op=info needs a bank"),
+        (["op=verify", "scenes.path=null"], "scenes.path: null; op=verify needs a bank"),
+        (["scenes.pack.others=-1"], "scenes.pack.others: -1; wanted is a number of at least 0"),
+        (["scenes.pack.box_m=0.0"], "scenes.pack.box_m: 0; wanted is a number above 0"),
+        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: \[4.0\]; wanted are length and width"),
+        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: \[4.0, -2.0\]; wanted are length and width"),
     ],
 )
 def test_what_cannot_be_done_is_named(town, overrides, message):

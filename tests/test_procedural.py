@@ -266,6 +266,10 @@ def test_numbers_are_obeyed():
         ({"traffic": TRAFFIC | {"speed": 1.0}}, "generate.traffic.speed.*valid"),
         ({"edges": CONFIG["edges"] | {"shoulder_m": -0.5}}, "edges.shoulder_m"),
         ({"blocks": CONFIG["blocks"] | {"straight": CONFIG["blocks"]["straight"] | {"length_m": [9.0, 8.0]}}}, "straight.length_m"),
+        *(
+            ({"kinds": [kind], "blocks": {kind: CONFIG["blocks"][kind] | {"bend_radius_m": 0.0}}}, f"{kind}.bend_radius_m")
+            for kind in ("merge", "roundabout", "intersection", "t_intersection")
+        ),
         ({"blocks": CONFIG["blocks"] | {"straight": {"_target_": "spiral"}}}, "spiral.*valid: curve, straight"),
     ],
 )

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_documents import FORMATS
+from scene_documents import FORMATS, checker, document, written
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.run import config
 from scenefactory_jax.run.quality import quality as report_quality
-from scenefactory_jax.scenes import quality, source
+from scenefactory_jax.scenes import convert, quality, source, topology
 from scenefactory_jax.scenes.procedural import generate
 from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import DRIVEWAY, EDGES
@@ -17,6 +17,7 @@ from scenefactory_jax.types import DRIVEWAY, EDGES
 QUALITY = config.load("quality")["quality"]
 PROCEDURAL = config.load("scenes")["scenes"]["generate"]
 RULES = quality.make(QUALITY["rules"])
+rebuild = build(config.load("quality")["lanes"]["topology"], builtins=topology, where="lanes.topology")
 LOG = 91
 ALONG = np.arange(0.0, 121.0)
 
@@ -157,18 +158,43 @@ def test_places_and_steps_are_those_of_the_defect():
     assert bridge[(1, 5)].xyz == pytest.approx((50.0, 0.0, 6.0))
 
 
+def gate(raw, reject=(), drop=()):
+    return quality.gate(raw, RULES, check=checker(), reject=list(reject), drop=list(drop))
+
+
+def test_the_gate_judges_what_the_check_makes_of_a_scene_and_passes_the_whole():
+    scene = street()
+    boxless = replace(scene, tracks=(replace(scene.tracks[0], size=(0.0, float("nan"), 1.0)), *scene.tracks[1:]))
+    passed = gate(boxless)  # on its own the size would make a box of no area, which shapely cannot cut
+    assert passed.tracks == boxless.tracks and passed.metadata["quality"] == {}
+    broken = replace(scene.roads[0], xyz=np.full((3, 3), np.nan))
+    for message, bad in {
+        "times: they must be finite and rise from step to step": replace(scene, times=np.zeros(len(scene.times))),
+        r"roads\[0\] \(id 1\): xyz\[0\]\[0\]: nan is not finite": replace(scene, roads=(broken, *scene.roads[1:])),
+    }.items():
+        with pytest.raises(SceneError, match=message):  # in its words, not in those of a library that stumbles over it
+            convert.complete(bad, check=checker(), rebuild=rebuild, gate=gate)
+
+
+def test_a_log_of_one_step_can_be_judged():
+    whole = street()
+    cut = lambda track: replace(track, **{name: getattr(track, name)[:1] for name in ("xyz", "yaw", "velocity", "valid")})  # noqa: E731
+    scene = replace(whole, times=whole.times[:1], current=0, tracks=tuple(map(cut, whole.tracks)))
+    assert not judge(scene).findings
+
+
 def test_the_gate_refuses_drops_and_counts():
     with pytest.raises(SceneError, match="a test: missing_map: the map has 0 road edges"):
-        quality.gate(DEFECTS["no edges"][0], RULES, reject=["missing_map"], drop=[])
+        gate(DEFECTS["no edges"][0], reject=["missing_map"])
     scene = replace(DEFECTS["a start in another"][0], sdc=2)
-    passed = quality.gate(scene, RULES, reject=[], drop=[])
+    passed = gate(scene)
     assert passed.tracks == scene.tracks and passed.metadata == {"dataset": "WOMD", "quality": {"overlapping_starts": 1}}
     jumping = with_car(xyz=pushed(40, 6.0))
-    left = quality.gate(replace(jumping, sdc=1), RULES, reject=[], drop=["jumps"])
+    left = gate(replace(jumping, sdc=1), drop=["jumps"])
     assert [track.id for track in left.tracks] == [8] and left.sdc == 0
-    assert quality.gate(jumping, RULES, reject=[], drop=["jumps"]).sdc is None
+    assert gate(jumping, drop=["jumps"]).sdc is None
     with pytest.raises(ConfigError, match=r"quality\.drop: 'jump' is no rule"):
-        quality.gate(jumping, RULES, reject=[], drop=["jump"])
+        gate(jumping, drop=["jump"])
 
 
 def test_a_rule_of_one_s_own_is_an_entry_and_a_rule_can_be_left_out():
@@ -192,6 +218,15 @@ def test_the_report_counts_and_draws(tmp_path, capsys):
     text = (tmp_path / "quality.md").read_text()
     assert f"| length | {cars} | 2 | {cars} | 100 % | drops |" in text and (tmp_path / "length.png").stat().st_size > 10_000
     assert f"2 scenes judged, 0 refused, {cars} objects left out" in capsys.readouterr().out
+
+
+def test_what_the_check_refuses_is_not_judged(tmp_path, capsys):
+    written(tmp_path, document(), "good.json")
+    written(tmp_path, document(roads=document()["roads"][:1]), "laneless.json")
+    scenes = config.load("scenes", "scenes=womd", f"scenes.path={tmp_path}")["scenes"]
+    counts = report_quality({"scenes": scenes, "quality": QUALITY | {"drop": []}, "out": str(tmp_path / "out")})
+    assert counts["missing_map"].findings == 0 and "1 scenes judged, 0 refused, 0 objects left out, 1 not read" in capsys.readouterr().out
+    assert "no driving lane" in (tmp_path / "out" / "quality.md").read_text()
 
 
 def test_findings_on_real_scenes(shared_data):

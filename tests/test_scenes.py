@@ -26,6 +26,7 @@ from scene_documents import (
 
 import scenefactory_jax as sf
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import raws
 from scenefactory_jax.scenes import bank, checks, columns, pack, source
 from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import EDGES
@@ -69,6 +70,16 @@ def test_anything_is_read_from_python(tmp_path):
     assert again.name == raw.name and again.metadata == raw.metadata
     with pytest.raises(SceneError, match="no such file or folder"):
         list(sf.read(tmp_path / "c"))
+
+
+def test_a_reader_that_breaks_costs_its_file_alone(tmp_path):
+    for name in ("a", "b_broken", "c_two", "d_map", "e"):
+        written(tmp_path, document(name=name), f"{name}.json")
+    found = list(raws.scenes({"path": str(tmp_path), "formats": {"eventful": {"_target_": "eventful.read"}}}))
+    assert [one if isinstance(one, str) else one.name for one in found] == [
+        "a", f"{tmp_path / 'b_broken.json'}: KeyError: 'x'", "c_two", "c_two",
+        f"{tmp_path / 'c_two.json'}: second: record 2 at byte 77: its checksum is wrong", "e",
+    ]  # fmt: skip
 
 
 def test_old_layout_has_degrees_and_type_names(tmp_path, readers):
@@ -119,6 +130,9 @@ def damaged(path, value):
         (["objects", 1, "position", 10, "x"], "far", r"objects\[1\]\.position\[10\]\.x: 'far' is not a number"),
         (["objects", 1, "position", 10, "y"], ..., r"objects\[1\]\.position\[10\]\.y: missing; there are: x, z"),
         (["objects", 1, "position", 10], 3, r"objects\[1\]\.position\[10\]: 3 is not an object"),
+        pytest.param(["objects", 1, "position", 10, "x"], 10**400, r"objects\[1\]\.position\[10\]\.x: an integer of 1329", id="huge x"),
+        pytest.param(["objects", 1, "heading", 2], -(10**400), r"objects\[1\]\.heading\[2\]: an integer of 1329", id="huge heading"),
+        pytest.param(["objects", 1, "length"], 10**400, r"objects\[1\]\.length: an integer of 1329", id="huge length"),
         (["objects", 1, "heading"], [0.0], r"objects\[1\]\.heading: 1 entries; there must be 12"),
         (["objects", 1, "heading", 3], 90.0, r"objects\[1\]\.heading\[3\]: 90.0 is no angle in radians"),
         (["objects", 1, "heading", 3], True, r"objects\[1\]\.heading\[3\]: True is not a number"),
@@ -163,12 +177,15 @@ def test_damaged_and_foreign_files_are_named(tmp_path, readers):
     cut = written(tmp_path, text[: len(text) // 2], "cut.json")
     squeezed = tmp_path / "cut.json.xz"
     squeezed.write_bytes(lzma.compress(text.encode())[:200])
+    wrong = tmp_path / "wrong.json.gz"
+    wrong.write_bytes(gzip.compress(b"")[:10] + b"\xff" * 50)  # zlib's own error
     fake = tmp_path / "fake.json.gz"
     fake.write_bytes(b"\x1f\x8bnothing of the kind")
     binary = tmp_path / "scene.bin"
     binary.write_bytes(bytes(range(200)))
     other = written(tmp_path, {"lanes": []}, "other.json")
     cases = {cut: "cut short", squeezed: "begins as xz", fake: "begins as gzip", binary: "no reader", other: "'objects'.*road.pol"}
+    cases |= {wrong: "begins as gzip"}
     for path, message in cases.items():
         with pytest.raises(SceneError, match=message) as caught:
             list(source.read(path, readers))
@@ -228,6 +245,17 @@ def test_repairs_are_named_and_counted(street):
     assert not lines and len(again.tracks) == len(checked.tracks) - 1
 
 
+def test_roads_of_unknown_elements_are_dropped_and_named(street):
+    strange = [replace(street.roads[0], id=90 + kind % 7, kind=kind) for kind in (1000, -1, 4)]
+    checked, lines = checker()(replace(street, roads=(*strange, *street.roads)))
+    assert lines == ["roads of unknown map elements dropped: 3 (ids and elements 96: 1000, 96: -1, 94: 4)"]
+    assert [line.kind for line in checked.roads] == [15, 2, 17]
+    with pytest.raises(SceneError, match=r"no driving lane.*the elements there are: -1, 4, 1000"):
+        checker()(replace(street, roads=tuple(strange)))
+    unknown = [replace(street.roads[0], kind=kind) for kind in (0, 5, 14)]  # of which it is known that nobody knows them
+    assert len(checker()(replace(street, roads=(*unknown, *street.roads)))[0].roads) == 6
+
+
 def test_refusals_name_the_element(street):
     def refused(message, **changes):
         with pytest.raises(SceneError, match=message) as caught:
@@ -242,6 +270,15 @@ def test_refusals_name_the_element(street):
     yaw[3] = np.inf
     refused(r"tracks\[1\] \(id 8\): yaw\[3\]: inf", tracks=(street.tracks[0], replace(street.tracks[1], yaw=yaw)))
     refused("current: 40 is no step", current=40)
+    far = street.roads[1].xyz.copy()
+    far[4, 1] = -1e39  # finite, but not in float32
+    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: -1e\+39 is more than any map has; valid: up to 1e\+07", roads=(
+        street.roads[0], replace(street.roads[1], xyz=far)))  # fmt: skip
+    fast = street.tracks[1].velocity.copy()
+    fast[5, 0] = 1e39
+    refused(r"tracks\[1\] \(id 8\): velocity\[5\]: 1e\+39 is more", tracks=(street.tracks[0], replace(street.tracks[1], velocity=fast)))
+    long = replace(street.tracks[0], size=(1e39, 2.0, 1.0))
+    refused(r"tracks\[0\] \(id 7\): size\[0\]: 1e\+39 is more", tracks=(long, street.tracks[1]))
     refused("times: they must be finite and rise", times=np.zeros(STEPS))
     refused("sdc: 5 is no track", sdc=5)
 

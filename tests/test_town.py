@@ -12,7 +12,7 @@ from scenefactory_jax.report import realism
 from scenefactory_jax.run import config, sources
 from scenefactory_jax.scenes.pack import prepare
 from scenefactory_jax.scenes.raw import LIGHT_STATES, SceneError
-from scenefactory_jax.scenes.town import conflicts, drivers, generate, routes, signals
+from scenefactory_jax.scenes.town import conflicts, drivers, generate, plans, routes, signals, streets
 from scenefactory_jax.scenes.town.junctions import Arm, find_turns, intersection
 from scenefactory_jax.scenes.town.network import ON_ROAD, Street, assemble
 from scenefactory_jax.types import DRIVABLE, EDGES, STOP_SIGN
@@ -242,6 +242,11 @@ def test_the_demo_runs_on_towns():
     [
         ({"network": NETWORK | {"plans": {}}}, "generate.network.plans"),
         ({"reach_m": 0.0}, "generate.reach_m"),
+        ({"reach_m": 30.0}, r"generate.reach_m: 30; wanted is more than generate.network.plans.grid.inset_m, 35"),
+        ({"network": NETWORK | {"junctions": NETWORK["junctions"] | {"signal_share": []}}}, r"junctions.signal_share: \[\]"),
+        ({"network": NETWORK | {"junctions": NETWORK["junctions"] | {"signal_share": [2.0]}}}, r"junctions.signal_share: \[2.0\]"),
+        ({"warm_s": -1.0}, "generate.warm_s: -1"),
+        ({"signals": CONFIG["signals"] | {"walk_mps": 0.0}}, "generate.signals.walk_mps"),
         ({"log_current": 90}, "generate.log_current"),
         ({"network": NETWORK | {"streets": {"minor": MINOR | {"lanes": [2, 1]}}}}, "streets.minor.lanes"),
         ({"network": NETWORK | {"streets": {"minor": MINOR | {"tram_share": 1.0}}}}, "streets.minor.tram_share"),
@@ -254,6 +259,13 @@ def test_the_demo_runs_on_towns():
 def test_bad_numbers_are_refused_by_name(changes, named):
     with pytest.raises(ConfigError, match=named):
         generator(**changes)(0, 0)
+
+
+def test_a_grid_without_its_middle_crossing_is_drawn_anew():
+    draw = build(NETWORK["plans"]["grid"], builtins=plans, where="grid")
+    classes = [streets.make_class("minor", 1, MINOR)]
+    drawn = [draw(np.random.default_rng(seed), 45.0, classes) for seed in range(20)]
+    assert {plan is None for plan in drawn} == {True, False} and all(plan.edges for plan in drawn if plan)
 
 
 def test_too_many_cars_are_refused(monkeypatch):

@@ -83,7 +83,7 @@ def open(config: Mapping[str, Any]) -> Source:
         opened = bank.open(path)
         names = opened.metadata["name"]
         job = lambda index: functools.partial(_banked, _alone(opened, index), ready)  # noqa: E731
-        return Source(len(opened), job, lambda index: str(names[index]), f"{len(opened)} scenes of the bank {path}")
+        return Source(len(opened), job, lambda index: str(names[index]), f"{len(opened)} scenes of the bank {path}{opened.unfinished}")
     files = source.find(path)
     job = lambda index: functools.partial(_filed, files[index], ready, parts["formats"])  # noqa: E731
     return Source(len(files), job, lambda index: str(files[index]), f"{len(files)} files of {path}")
@@ -208,6 +208,7 @@ def load(source: Source, pool: Executor | None, indices: Sequence[int] | np.ndar
 
     Raises:
         SceneError: not one can be used, with reasons.
+        ConfigError: a number that packing refuses.
         RuntimeError: anything else that went wrong, with the scene's name.
     """
     names = [source.name(int(index)) for index in indices]
@@ -241,5 +242,7 @@ def _each(pool: Executor | None, work: Callable[[Any], Any], jobs: Sequence[Any]
     for job, future, name in zip(jobs, waiting, names, strict=True):
         try:
             yield work(job) if future is None else future.result()
+        except ConfigError:
+            raise  # no scene is to blame
         except Exception as error:
             raise RuntimeError(f"{name}: cannot be loaded: {type(error).__name__}: {error}") from error

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from rich.progress import Progress
 
 from scenefactory_jax.build import ConfigError, build
@@ -11,13 +12,16 @@ from scenefactory_jax.run import keys, sources
 from scenefactory_jax.scenes import quality
 from scenefactory_jax.scenes.convert import Summary, complete, describe
 from scenefactory_jax.scenes.convert import convert as to_bank
+from scenefactory_jax.scenes.raw import RawScene
+
+NOTHING = RawScene(name="nothing", source="nowhere", roads=(), tracks=(), times=np.zeros(1), current=0)
 
 
 def convert(config: Mapping[str, Any]) -> Summary:
     """Convert as a config says (`load("convert", "source=...", "out=...")`). A bad file is listed and the rest goes on.
 
     Raises:
-        ConfigError: source or out is missing.
+        ConfigError: source or out is missing, or a number that a part refuses.
         SceneError: no files, `out` is something else than a bank or a bank made with other settings, or not one usable scene.
     """
     keys.check(config, keys.CONVERT)
@@ -30,14 +34,18 @@ def convert(config: Mapping[str, Any]) -> Summary:
     own = ("features", "bank", "quality", "lanes")
     settings = {key: scenes[key] for key in ("formats", "check", "pack")} | {key: config[key] for key in own}
     judged = {"rules": quality.make(config["quality"]["rules"]), **{key: config["quality"][key] for key in ("reject", "drop")}}
+    quality.check_names(**judged)
     rebuild = build(config["lanes"]["topology"], builtins=f"{built_in}.topology", where="lanes.topology")
+    rebuild(NOTHING)  # which refuses numbers that make no sense, before a file is read
+    readers = sources.readers(scenes)
+    gate = functools.partial(quality.gate, check=readers["check"], **judged)
     with Progress(disable=not config["progress"]) as bar:
         task = bar.add_task("convert")
         summary = to_bank(
             config["source"],
             config["out"],
-            **sources.readers(scenes),
-            refine=functools.partial(complete, rebuild=rebuild, gate=functools.partial(quality.gate, **judged)),
+            **readers,
+            refine=functools.partial(complete, check=readers["check"], rebuild=rebuild, gate=gate),
             features=None if features is None else build(features, builtins=f"{built_in}.catalogue", where="features"),
             settings=settings,
             spread=build(config["spread"], builtins=f"{built_in}.spread", where="spread"),

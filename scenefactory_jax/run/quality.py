@@ -11,7 +11,7 @@ from scenefactory_jax.report import quality as report
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.quality import Count, Example
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, raws
+from scenefactory_jax.run import keys, raws, sources
 from scenefactory_jax.scenes import quality as judging
 from scenefactory_jax.scenes.quality import Finding
 from scenefactory_jax.scenes.raw import RawScene, SceneError
@@ -39,9 +39,15 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
     rng = np.random.default_rng(numbers["seed"])
     counts, chosen = dict.fromkeys(rules, Count(0, 0, 0)), {name: [] for name in rules}
     scenes, refused, dropped, unread = 0, 0, 0, []
+    check = sources.readers(config["scenes"])["check"]
     for raw in raws.scenes(config["scenes"]):
         if isinstance(raw, str):
             unread.append(raw)
+            continue
+        try:
+            raw = check(raw)[0]
+        except SceneError as error:
+            unread.append(str(error))
             continue
         verdict = judging.judge(raw, rules, **names)
         scenes, refused = scenes + 1, refused + bool(verdict.rejected)

@@ -7,8 +7,8 @@ from typing import Any
 
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import sources
-from scenefactory_jax.scenes import bank, source
-from scenefactory_jax.scenes.raw import Companion, RawScene, Reject, SceneError
+from scenefactory_jax.scenes import bank, convert, source
+from scenefactory_jax.scenes.raw import RawScene
 
 
 def scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[RawScene | str]:
@@ -52,10 +52,7 @@ def _of_bank(config: Mapping[str, Any]) -> Iterator[RawScene]:
 def _of_files(config: Mapping[str, Any]) -> Iterator[RawScene | str]:
     formats = source.make(config["formats"])
     for path in source.find(config["path"]):
-        try:
-            for raw in source.read(path, formats):
-                yield f"{path}: {raw.scene or ''}: {raw.reason}" if isinstance(raw, Reject) else raw
-        except Companion:
-            continue
-        except SceneError as error:
-            yield str(error)
+        rejects: list[dict[str, Any]] = []
+        yield from convert.examine(path, formats, rejects, companions=[])
+        for reject in rejects:
+            yield ": ".join(filter(None, (reject["source"], reject["scene"], reject["reason"])))

@@ -1,7 +1,7 @@
 """The operations of `scenes` on banks: open them, do what `scenes/operations.py` does, print the account, write the result."""
 
 import json
-import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from scenefactory_jax.scenes import duplicates, operations
 from scenefactory_jax.scenes.bank import Bank
 from scenefactory_jax.scenes.export import gpudrive, scenarionet
 from scenefactory_jax.scenes.features import COLUMNS, EVERY_BANK
+from scenefactory_jax.scenes.names import for_file
 from scenefactory_jax.scenes.raw import RawScene, SceneError
 
 SHOWN = 10  # groups of duplicates, and values of a text, that are printed
@@ -71,7 +72,7 @@ def merge(config: Mapping[str, Any]) -> Bank:
     """`scenes.path` and `merge.banks` as one bank."""
     numbers = config["merge"]
     paths = [path for path in (config["scenes"]["path"], *numbers["banks"]) if path is not None]
-    return _written(config, operations.merge([banks.open(path) for path in paths], duplicates=numbers["duplicates"]))
+    return _written(config, operations.merge([_open(path) for path in paths], duplicates=numbers["duplicates"]))
 
 
 def dedupe(config: Mapping[str, Any]) -> Bank:
@@ -82,6 +83,19 @@ def dedupe(config: Mapping[str, Any]) -> Bank:
     if (more := len(made.account["groups"]) - SHOWN) > 0:
         print(f"... and {more} groups more")
     return _written(config, made)
+
+
+def verify(config: Mapping[str, Any]) -> Bank:
+    """Read every byte of the bank against its checksums.
+
+    Raises:
+        SceneError: files that are not what was written, by name.
+    """
+    path = _path(config)
+    banks.verify(path)
+    bank = _open(path)
+    print(f"{path}: {len(bank)} scenes in {len(bank.shards)} files, all as they were written", flush=True)
+    return bank
 
 
 def export(config: Mapping[str, Any]) -> int:
@@ -95,7 +109,7 @@ def export(config: Mapping[str, Any]) -> int:
         raise ConfigError(f"export.format: {name!r}; valid: {', '.join(EXPORTS)}")
     if out is None:
         raise ConfigError("out: null; give a folder for the files")
-    bank = _bank(config)
+    bank = _open(_path(config))
     Path(out).mkdir(parents=True, exist_ok=True)
     with Progress(disable=not config["progress"], transient=True) as bar:
         written = EXPORTS[name](bar.track(banks.raws(bank, range(len(bank))), total=len(bank), description="export"), Path(out))
@@ -107,7 +121,7 @@ def _as_json(scenes: Iterable[RawScene], folder: Path) -> int:
     """A file for each scene, in the layout of GPUDrive."""
     written: set[Path] = set()
     for raw in scenes:
-        path = folder / (re.sub(r"[^\w.-]", "_", raw.name) + ".json")
+        path = folder / f"{for_file(raw.name)}.json"
         if path in written:
             raise SceneError(f"{raw.source}: scene {raw.name!r}: {path} is written already; two scenes need two names")
         gpudrive.write(raw, path)
@@ -118,16 +132,24 @@ def _as_json(scenes: Iterable[RawScene], folder: Path) -> int:
 EXPORTS: dict[str, Callable[[Iterable[RawScene], Path], int]] = {"gpudrive": _as_json, "scenarionet": scenarionet.write_all}
 
 
-def _bank(config: Mapping[str, Any]) -> Bank:
-    """The bank at `scenes.path`."""
+def _path(config: Mapping[str, Any]) -> str:
+    """Where the bank is."""
     if config["scenes"]["path"] is None:
         raise ConfigError(f"scenes.path: null; op={config['op']} needs a bank: make one with `convert source=FILES out=BANK`")
-    return banks.open(config["scenes"]["path"])
+    return config["scenes"]["path"]
+
+
+def _open(path: str) -> Bank:
+    """A bank, and a word where it is not whole: beside the account, which may be JSON."""
+    bank = banks.open(path)
+    if bank.unfinished:
+        print(f"bank {path}{bank.unfinished}", file=sys.stderr, flush=True)
+    return bank
 
 
 def _opened(config: Mapping[str, Any]) -> tuple[Bank, pa.Table]:
     """The bank at `scenes.path`, and its metadata with every feature."""
-    bank = _bank(config)
+    bank = _open(_path(config))
     features = build(config["features"], builtins="scenefactory_jax.scenes.features", where="features")
     quiet = not config["progress"] or not len(operations.undescribed(bank))
     with Progress(disable=quiet, transient=True) as bar:

@@ -89,9 +89,24 @@ def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
         return from_path(config, path)
     if config["path"] is not None or not _has_generator(config):
         raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
-    if config["heldout"]["seed"] == config["seed"]:
-        raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
+    check_heldout(config)
     return generated(config, seed=config["heldout"]["seed"], count=config["heldout"]["count"])
+
+
+def check_heldout(config: Mapping[str, Any]) -> None:
+    """Refuse held-out scenes that are not there or not held out, without reading them: at the door, not after a training.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    keys.check_scenes(config)
+    path, own = config["heldout"]["path"], config["path"]
+    if path is not None and not Path(path).exists():
+        raise ConfigError(f"scenes.heldout.path: {path}: no such file or folder; give held-out scenes, or null for none")
+    if path is not None and own is not None and Path(path).resolve() == Path(own).resolve():
+        raise ConfigError(f"scenes.heldout.path: {path} is what is trained on; the scenes would not be held out")
+    if path is None and own is None and config["heldout"]["seed"] == config["seed"]:
+        raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
 
 
 def has_heldout(config: Mapping[str, Any]) -> bool:
@@ -126,8 +141,7 @@ def _from_bank(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[P
     refused = [one._asdict() | {"source": place} for one, place in zip(found, sources, strict=True) if isinstance(one, Reject)]
     packed = [one for one in found if isinstance(one, Packed)]
     summary = convert.summarise([one.report for one in packed], files=len(set(sources)), rejects=[*opened.rejects, *refused])
-    stopped = "" if opened.index.complete else ", whose conversion was stopped: the same command goes on with it"
-    return f"bank {path}{stopped}", packed, summary
+    return f"bank {path}{opened.unfinished}", packed, summary
 
 
 def _from_files(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[Packed], convert.Summary]:

@@ -27,7 +27,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import ConfigError, build, check_number, check_share
 from scenefactory_jax.ppo import across
 from scenefactory_jax.run import batches, samplers, workers
 from scenefactory_jax.run.batches import Batch
@@ -79,11 +79,9 @@ def numbers(
         if value < bound:
             raise ConfigError(f"stream.{name}: {value}; wanted is at least {bound}")
     for name, value in {"share": share, "memory": memory}.items():
-        if not 0 <= value <= 1:
-            raise ConfigError(f"stream.{name}: {value}; wanted is a number from 0 to 1")
+        check_share(value, where=f"stream.{name}")
     for name, value in {"wait_s": wait_s, "memory_gib": memory_gib}.items():
-        if not value > 0:
-            raise ConfigError(f"stream.{name}: {value}; wanted is a number above 0")
+        check_number(value, where=f"stream.{name}", above=0)
     if worlds % devices:
         raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
     swapped = min(worlds, int(np.ceil(share * worlds / devices)) * devices)  # every device takes an equal part of the rows

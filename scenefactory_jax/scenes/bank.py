@@ -60,6 +60,11 @@ class Bank:
     def rejects(self) -> tuple[dict[str, Any], ...]:
         return self.index.rejects
 
+    @property
+    def unfinished(self) -> str:
+        """What to say after the bank's name where scenes may be missing; else nothing."""
+        return "" if self.index.complete else ", whose conversion was stopped: the same `convert` goes on with it"
+
     def __len__(self) -> int:
         return len(self.places)
 
@@ -98,12 +103,10 @@ def verify(path: Path | str) -> None:
         SceneError: as `open`, or the files that have changed, by name.
     """
     path = Path(path).resolve()
-    index, damaged = bank_index.read(path), []
-    for shard in (*index.shards, *index.metadata):
-        bank_index.require_whole(path / shard.file, shard)
-        if bank_index.describe(path, shard.file, shard.scenes) != shard:
-            damaged.append(shard.file)
-    if damaged:
+    index = bank_index.read(path)
+    shards = (*index.shards, *index.metadata)
+    whole = lambda shard: (path / shard.file).is_file() and bank_index.describe(path, shard.file, shard.scenes) == shard  # noqa: E731
+    if damaged := [shard.file for shard in shards if not whole(shard)]:
         raise SceneError(f"{path}: damaged: {', '.join(damaged)}: not what was written; copy or convert the bank again")
     open(path)
 
@@ -135,7 +138,7 @@ def view(bank: Bank, indices: Sequence[int] | np.ndarray) -> Bank:
     rows = _rows(bank, indices)
     if not len(rows):
         raise SceneError(f"{bank.path}: a view of no scene; valid indices: 0 to {len(bank) - 1}")
-    return replace(bank, index=_chosen(bank.index.settings), places=bank.places[rows], metadata=bank.metadata.take(rows))
+    return replace(bank, index=_chosen(bank.index.settings, [bank]), places=bank.places[rows], metadata=bank.metadata.take(rows))
 
 
 def join(banks: Sequence[Bank]) -> Bank:
@@ -157,7 +160,7 @@ def join(banks: Sequence[Bank]) -> Bank:
     except pa.ArrowException as error:
         raise SceneError(f"{', '.join(str(bank.path) for bank in banks)}: their catalogues do not go together: {error}") from error
     settings = {"joined": [dict(bank.index.settings) for bank in banks]}
-    return Bank(banks[0].path, _chosen(settings), tuple(shards.values()), np.concatenate(places), table)
+    return Bank(banks[0].path, _chosen(settings, banks), tuple(shards.values()), np.concatenate(places), table)
 
 
 def save(bank: Bank, path: Path | str, *, copy: bool, settings: Mapping[str, Any]) -> Bank:
@@ -178,9 +181,9 @@ def save(bank: Bank, path: Path | str, *, copy: bool, settings: Mapping[str, Any
         if copy:
             parts = [slice(start, start + SHARD) for start in range(0, len(bank), SHARD)]
             shards = ((_batches(bank.shards, bank.places[part], bank.readers), bank.metadata[part]) for part in parts)
-            bank_writer.fill(folder, shards, settings=settings, compression=None)
+            bank_writer.fill(folder, shards, settings=settings, compression=None, complete=bank.index.complete)
         else:
-            bank_writer.refer(folder, path, bank.shards, bank.places, bank.metadata, settings=settings)
+            bank_writer.refer(folder, path, bank.shards, bank.places, bank.metadata, settings=settings, complete=bank.index.complete)
     return open(path)
 
 
@@ -313,6 +316,6 @@ def _rows(bank: Bank, indices: Sequence[int] | np.ndarray) -> Int[np.ndarray, " 
     return rows % max(count, 1)
 
 
-def _chosen(settings: Mapping[str, Any]) -> Index:
-    """The index of what was chosen: whole, and without the account of a conversion."""
-    return Index(settings=dict(settings), complete=True)
+def _chosen(settings: Mapping[str, Any], banks: Sequence[Bank]) -> Index:
+    """The index of what was chosen: as complete as the banks are, and without the account of a conversion."""
+    return Index(settings=dict(settings), complete=all(bank.index.complete for bank in banks))

@@ -129,10 +129,15 @@ def remove_parts(folder: Path) -> None:
 
 
 def fill(
-    folder: Path, shards: Iterable[tuple[Iterable[pa.RecordBatch], pa.Table]], *, settings: Mapping[str, Any], compression: Compression
+    folder: Path,
+    shards: Iterable[tuple[Iterable[pa.RecordBatch], pa.Table]],
+    *,
+    settings: Mapping[str, Any],
+    compression: Compression,
+    complete: bool = True,
 ) -> None:
     """A whole bank in a new folder, of shards: scenes, and their part of the catalogue."""
-    index = Index(bank_index.plain(settings), complete=True)
+    index = Index(bank_index.plain(settings), complete=complete)
     for number, (batches, metadata) in enumerate(shards):
         name = f"scenes-{number:05d}.arrow"
         _write_scenes(folder / name, batches, compression)
@@ -143,14 +148,21 @@ def fill(
 
 
 def refer(
-    folder: Path, path: Path, shards: Sequence[Shard], places: Int[np.ndarray, "N 2"], metadata: pa.Table, *, settings: Mapping[str, Any]
+    folder: Path,
+    path: Path,
+    shards: Sequence[Shard],
+    places: Int[np.ndarray, "N 2"],
+    metadata: pa.Table,
+    *,
+    settings: Mapping[str, Any],
+    complete: bool,
 ) -> None:
     """A view, in a new folder: the shards' paths relative to `path`, where the folder is to lie."""
     used, own = np.unique(places[:, 0], return_inverse=True)
     placed = np.stack([own, places[:, 1]], axis=1)
     written = _write_catalogue(folder, "metadata-00000.arrow", metadata, placed)
     chosen = tuple(replace(shards[number], file=os.path.relpath(shards[number].file, path)) for number in used)
-    bank_index.write(folder, Index(bank_index.plain(settings), shards=chosen, metadata=(written,), complete=True))
+    bank_index.write(folder, Index(bank_index.plain(settings), shards=chosen, metadata=(written,), complete=complete))
 
 
 @contextlib.contextmanager

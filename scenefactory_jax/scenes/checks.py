@@ -1,5 +1,6 @@
 """What a scene must be before it is packed: refused by name where nothing can be done, repaired and counted where something can."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,28 +10,33 @@ from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import DRIVABLE, STOP_SIGN
 
 DUPLICATE_M = 1e-6  # points closer than this in the plane give no segment
+ELEMENTS = (*range(4), *range(5, 21))  # WOMD's map element ids, those of unknown lanes, lines and edges among them
 NAMED = 5  # how many offenders a line names
 
 
-def check(raw: RawScene, *, track_speed_limit_m_s: float, car_size_m: list[float]) -> tuple[RawScene, list[str]]:
+def check(
+    raw: RawScene, *, track_speed_limit_m_s: float, car_size_m: list[float], most_m: float = 1e7
+) -> tuple[RawScene, list[str]]:
     """A scene that can be packed, and one line for each kind of repair or finding.
 
     Args:
         raw: as a reader or a generator gave it.
         track_speed_limit_m_s: a track whose positions imply more than that in a step is reported as jumping.
         car_size_m: length, width, height given to objects whose logged size is not positive.
+        most_m: no coordinate, size or speed is larger; the configs of older runs do not say it.
 
     Raises:
-        SceneError: steps that disagree, no driving lane, or a number that is not finite, naming the file and the element.
+        SceneError: steps that disagree, no driving lane, or a number that is not finite or too large, naming the file and the element.
     """
     _require_steps(raw)
     points, logs = joined(raw.roads), stacked(raw.tracks, len(raw.times))
-    _require_finite_map(raw, points)
-    _require_finite_tracks(raw, logs)
+    _require_map(raw, points, most_m)
+    _require_tracks(raw, logs, most_m)
     lines: list[str] = []
-    roads = _repair_roads(raw.roads, points, lines)
+    whole = _repair_roads(raw.roads, points, lines)
+    roads = _known(whole, lines)
     if not any(line.kind in DRIVABLE for line in roads):
-        found = ", ".join(map(str, sorted({line.kind for line in roads}))) or "none"
+        found = ", ".join(map(str, sorted({line.kind for line in whole}))) or "none"
         raise SceneError(f"{raw.source}: roads: no driving lane (map elements {DRIVABLE}); the elements there are: {found}")
     tracks, sdc = _repair_tracks(raw, logs, tuple(float(x) for x in car_size_m), lines)  # pyright: ignore[reportArgumentType]
     _report_jumps(raw, logs, track_speed_limit_m_s, lines)
@@ -51,28 +57,45 @@ def _require_steps(raw: RawScene) -> None:
             raise SceneError(f"{raw.source}: tracks[{index}] (id {track.id}): {len(track.valid)} steps; the log has {steps}")
 
 
-def _require_finite_map(raw: RawScene, points: Points) -> None:
-    """No NaN or infinity on the map."""
-    bad = ~np.isfinite(points.xyz)
+def _require_map(raw: RawScene, points: Points, most: float) -> None:
+    """No NaN, infinity or absurd number on the map."""
+    bad = ~(np.abs(points.xyz) <= most)
     if bad.any():
         row, axis = np.argwhere(bad)[0]
         index = int(np.searchsorted(points.bounds, row, side="right")) - 1
         place = f"roads[{index}] (id {raw.roads[index].id}): xyz[{row - points.bounds[index]}][{axis}]"
-        raise SceneError(f"{raw.source}: {place}: {points.xyz[row, axis]} is not finite")
+        raise SceneError(f"{raw.source}: {place}: {_fault(float(points.xyz[row, axis]), most)}")
 
 
-def _require_finite_tracks(raw: RawScene, logs: Logs) -> None:
-    """No NaN or infinity in a track's valid steps."""
+def _require_tracks(raw: RawScene, logs: Logs, most: float) -> None:
+    """No NaN, infinity or absurd number in a track's valid steps, and no absurd size."""
     found = []
     for name in ("xyz", "yaw", "velocity"):
         table = getattr(logs, name).reshape(*logs.valid.shape, -1)
-        bad = ~np.isfinite(table) & logs.valid[..., None]
+        bad = ~(np.abs(table) <= most) & logs.valid[..., None]
         if bad.any():
             index, step, axis = np.argwhere(bad)[0]
-            found.append((int(index), f"{name}[{step}]: {table[index, step, axis]}"))
+            found.append((int(index), f"{name}[{step}]: {_fault(float(table[index, step, axis]), most)}"))
+    huge = np.isfinite(logs.size) & (logs.size > most)  # what is not finite is repaired
+    found += [(int(index), f"size[{axis}]: {_fault(float(logs.size[index, axis]), most)}") for index, axis in np.argwhere(huge)[:1]]
     if found:
         index, place = min(found, key=lambda one: one[0])
-        raise SceneError(f"{raw.source}: tracks[{index}] (id {raw.tracks[index].id}): {place} is not finite at a valid step")
+        raise SceneError(f"{raw.source}: tracks[{index}] (id {raw.tracks[index].id}): {place}")
+
+
+def _fault(value: float, most: float) -> str:
+    """What is wrong with a number."""
+    if not np.isfinite(value):
+        return f"{value} is not finite"
+    return f"{value:g} is more than any map has; valid: up to {most:g} (scenes.check.most_m)"
+
+
+def _known(roads: tuple[Polyline, ...], lines: list[str]) -> tuple[Polyline, ...]:
+    """Without roads of which nobody knows what they are."""
+    if unknown := [line for line in roads if line.kind not in ELEMENTS]:
+        named = _some([f"{line.id}: {line.kind}" for line in unknown])
+        lines.append(f"roads of unknown map elements dropped: {len(unknown)} (ids and elements {named})")
+    return tuple(line for line in roads if line.kind in ELEMENTS)
 
 
 def _repair_roads(roads: tuple[Polyline, ...], points: Points, lines: list[str]) -> tuple[Polyline, ...]:
@@ -136,5 +159,5 @@ def _report_jumps(raw: RawScene, logs: Logs, limit_m_s: float, lines: list[str])
         lines.append(f"track jumps above {limit_m_s:g} m/s: {jumps.sum()} steps (ids {_some(ids)})")
 
 
-def _some(ids: list[int]) -> str:
+def _some(ids: Sequence[int | str]) -> str:
     return ", ".join(map(str, ids[:NAMED])) + (", ..." if len(ids) > NAMED else "")

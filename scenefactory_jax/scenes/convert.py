@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.scenes import arrow, bank_index, bank_writer, catalogue, source
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.scenes import arrow, bank, bank_index, bank_writer, catalogue, source
 from scenefactory_jax.scenes import spread as spreads
 from scenefactory_jax.scenes.bank_index import Index
 from scenefactory_jax.scenes.bank_writer import Compression, Piece
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.pack import CUTS, DROPS, OTHER_DROPS, Packed, PackReport, prepare
 from scenefactory_jax.scenes.raw import Companion, RawScene, Reject, SceneError
 
@@ -56,6 +58,8 @@ def convert(
 ) -> Summary:
     """Read every file below `path` into the bank `out`. One that was stopped goes on where it stopped; a complete one takes up new files.
 
+    Files that could not be read are read again: they may have been repaired.
+
     Args:
         path: a file, or a folder searched to its bottom.
         out: the bank's folder.
@@ -71,10 +75,11 @@ def convert(
 
     Raises:
         SceneError: no files, `out` is no bank or one made with other settings, or not one usable scene, with the first reasons.
+        ConfigError: a number that a part refuses.
     """
     root, out = Path(path).absolute(), Path(out).resolve()
     files = source.find(root)
-    index = _begun(out, bank_index.plain({"source": str(root), **settings}))
+    index = _begun(root, out, bank_index.plain({"source": str(root), **settings}))
     known = set(index.files)
     waiting = [file for file in files if _name(file, root) not in known]
     done = len(files) - len(waiting)
@@ -99,8 +104,8 @@ def convert(
     return _summary(index)
 
 
-def _begun(out: Path, settings: dict[str, Any]) -> Index:
-    """The index of the bank that is there, if these settings made it; else that of a new one."""
+def _begun(root: Path, out: Path, settings: dict[str, Any]) -> Index:
+    """The index of the bank that is there, if these settings made it, without the files that gave nothing; else that of a new one."""
     bank_writer.require_free(out)
     if not bank_index.is_bank(out):
         return Index(settings)
@@ -108,12 +113,21 @@ def _begun(out: Path, settings: dict[str, Any]) -> Index:
     if found := bank_index.differences(settings, index.settings):
         raise SceneError(f"{out}: a bank made with other settings ({'; '.join(found)}); give another out, or remove it")
     bank_writer.remove_parts(out)
-    return replace(index, complete=False)
+    lost = {reject["source"] for reject in index.rejects if reject["scene"] is None}
+    lost -= set(bank.open(out).metadata["source"].to_pylist())
+    files = tuple(file for file in index.files if str(_path(file, root)) not in lost)
+    rejects = tuple(reject for reject in index.rejects if reject["source"] not in lost)
+    return replace(index, files=files, rejects=rejects, complete=False)
 
 
 def _name(file: Path, root: Path) -> str:
     """A source file's name in the bank."""
     return file.relative_to(root).as_posix() if file != root else file.name
+
+
+def _path(name: str, root: Path) -> Path:
+    """The source file of that name."""
+    return root / name if root.is_dir() else root
 
 
 def convert_file(
@@ -127,7 +141,7 @@ def convert_file(
     refine: Callable[[RawScene], RawScene] | None,
     features: catalogue.Features | None,
 ) -> Piece:
-    """One file's scenes, in a part of the bank's folder; it raises nothing, whatever the file or a reader of somebody's own does."""
+    """One file's scenes, in a part of the bank's folder; it raises only `ConfigError`, whatever the file or a reader does."""
     number, path = item
     rows: list[dict[str, Any]] = []
     reports: list[PackReport] = []
@@ -140,6 +154,8 @@ def convert_file(
                 raw = replace(raw, source=str(path))
                 raw = raw if refine is None else refine(raw)
                 report, row, batch = prepare(raw, check=check, pack=pack).report, catalogue.extended(raw, features), arrow.encode(raw)
+            except ConfigError:
+                raise  # no file is to blame
             except Exception as error:
                 rejects.append({"source": str(path), "scene": raw.name, "reason": _reason(error, path)})
                 continue
@@ -158,15 +174,18 @@ def convert_file(
     )
 
 
-def complete(raw: RawScene, *, rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]) -> RawScene:
+def complete(
+    raw: RawScene, *, check: Callable[..., Any], rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]
+) -> RawScene:
     """How lanes hang together where the source does not say, then what the rules of quality make of it: the `refine` of a bank."""
+    check(raw)  # what cannot be used is refused in its words, before geometry stumbles over it
     return gate(rebuild(raw))
 
 
 def examine(
     path: Path, formats: Mapping[str, source.Reader], rejects: list[dict[str, Any]], companions: list[dict[str, Any]]
 ) -> Iterator[RawScene]:
-    """The scenes of one file; what is none is added to one of the lists. It raises nothing."""
+    """The scenes of one file; what is none is added to one of the lists. It raises nothing but `ConfigError`."""
     scenes = source.read(path, formats)
     while True:
         try:
@@ -174,6 +193,8 @@ def examine(
         except Companion as companion:
             companions.append({"source": str(path), "reason": _reason(companion, path)})
             return
+        except ConfigError:
+            raise
         except Exception as error:
             rejects.append({"source": str(path), "scene": None, "reason": _reason(error, path)})
             return  # a reader that has failed yields no more
@@ -192,6 +213,7 @@ def read(
 
     Raises:
         SceneError: no files.
+        ConfigError: a number that a part refuses.
     """
     files = source.find(path)
     work = functools.partial(_read_file, formats=dict(formats), check=check, pack=pack)
@@ -217,6 +239,8 @@ def _read_file(
     for raw in examine(path, formats, rejects, companions):
         try:
             scenes.append(prepare(replace(raw, source=str(path)), check=check, pack=pack))
+        except ConfigError:
+            raise
         except Exception as error:
             rejects.append({"source": str(path), "scene": raw.name, "reason": _reason(error, path)})
     return scenes, rejects, companions
@@ -279,7 +303,7 @@ def describe(summary: Summary) -> list[str]:
     lines.append(
         f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected"
     )
-    return lines
+    return [for_terminal(line) for line in lines]
 
 
 def _near(source: str) -> Path:

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scenefactory_jax.scenes import places
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.pack import corners, overlaps
 from scenefactory_jax.scenes.raw import Polyline, RawScene, Track
 from scenefactory_jax.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP
@@ -191,7 +192,7 @@ def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> 
     samples = places.along(lanes, spacing_m=chord_m, least=4)
     way = samples.xyz[1:, :2] - samples.xyz[:-1, :2]
     heading = np.arctan2(way[:, 1], way[:, 0])
-    turn = np.abs(np.remainder(heading[1:] - heading[:-1] + np.pi, 2 * np.pi) - np.pi)
+    turn = np.abs(wrapped(heading[1:] - heading[:-1]))
     line, step = samples.line[1:-1], samples.step[1:-1]
     bends = (samples.line[2:] == line) & (samples.line[:-2] == line) & (step > chord_m / 4)  # shorter lanes are shorter than a chord
     turn, line, step = turn[bends], line[bends], step[bends]

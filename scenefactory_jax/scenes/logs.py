@@ -1,12 +1,14 @@
 """The tracks or the polylines of a scene as arrays over all of them: what is done to each is then done to all at once."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.scenes.raw import Polyline, Track
+
+FULL_TURN = 2 * np.pi + 0.01  # more is no angle in radians; rounding to a few digits may exceed the turn itself
 
 
 class Logs(NamedTuple):
@@ -39,6 +41,11 @@ def joined(lines: Sequence[Polyline]) -> Points:
     xyz = [line.xyz for line in lines]
     bounds = np.cumsum([0, *map(len, xyz)])
     return Points(np.concatenate(xyz) if xyz else np.zeros((0, 3)), bounds)
+
+
+def wrapped(angle: Any) -> Any:
+    """The same angles, or angle, in [-pi, pi)."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def lengths(delta: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N"]:

@@ -10,8 +10,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes import columns
-from scenefactory_jax.scenes.logs import Logs, joined, lengths, stacked
+from scenefactory_jax.scenes.logs import Logs, joined, lengths, stacked, wrapped
 from scenefactory_jax.scenes.raw import RawScene, SceneError
 from scenefactory_jax.types import DRIVABLE, ROAD_USERS, Scene
 
@@ -96,9 +97,10 @@ def pack(
 
     Raises:
         SceneError: no lane segment in the box, or no agent where one is required.
+        ConfigError: a number that makes no sense.
     """
-    origin, centred_on = _centre(raw, centre)
-    half = box_m / 2
+    _check(box_m, car_size_m, others)
+    (origin, centred_on), half = _centre(raw, centre), box_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m)
     _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
     logs = _around(stacked(raw.tracks, len(raw.times)), origin)
@@ -128,6 +130,14 @@ def pack(
         metadata=dict(raw.metadata),
     )
     return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _check(box_m: float, car_size_m: list[float] | None, others: int) -> None:
+    """Refuse numbers that make no sense."""
+    check_number(box_m, where="scenes.pack.box_m", above=0)
+    if car_size_m is not None and not (len(car_size_m) == 2 and min(car_size_m) > 0):
+        raise ConfigError(f"scenes.pack.car_size_m: {car_size_m}; wanted are length and width, both above 0, or null")
+    check_number(others, where="scenes.pack.others", least=0)
 
 
 def _around(logs: Logs, origin: Float[np.ndarray, "3"]) -> Logs:
@@ -277,7 +287,7 @@ def _agents(
         path = logs.xyz[index, current:][logs.valid[index, current:], :2]
         yaw = logs.yaw[index, current]
         along = float(logs.velocity[index, current] @ np.array([np.cos(yaw), np.sin(yaw)]))
-        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], _wrap(yaw)
+        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrapped(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
         rows["route"][slot] = max(lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(chosen)
@@ -296,7 +306,7 @@ def _recording(chosen: list[int], logs: Logs, first: int, slots: int) -> dict[st
     rows = {
         "position": np.where(valid[..., None], logs.xyz[chosen, first:, :2], 0.0),
         "velocity": np.where(valid[..., None], logs.velocity[chosen, first:], 0.0),
-        "yaw": np.where(valid, _wrap(logs.yaw[chosen, first:]), 0.0),
+        "yaw": np.where(valid, wrapped(logs.yaw[chosen, first:]), 0.0),
         "valid": valid,
     }
     return {name: np.concatenate([leaf, np.zeros((slots - len(chosen), *leaf.shape[1:]), leaf.dtype)]) for name, leaf in rows.items()}
@@ -344,8 +354,3 @@ def _others(
     rows["size"] = np.maximum(logs.size[chosen, :2], least)
     rows["kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
     return {f"others.{name}": leaf for name, leaf in rows.items()}, dropped
-
-
-def _wrap(angle: Any) -> Any:
-    """The same angle in [-pi, pi)."""
-    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi

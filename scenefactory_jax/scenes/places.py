@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from scenefactory_jax.build import ConfigError
+from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes.raw import Polyline, RawScene
 from scenefactory_jax.types import DRIVABLE
 
@@ -95,7 +95,12 @@ def streets(raw: RawScene, *, cell_m: float, height_m: float, headings: int, one
         height_m: height of a place: bridges, and cities on top of each other, are different places.
         headings: directions that are told apart.
         one_in: how many places one that is kept stands for.
+
+    Raises:
+        ConfigError: one that is not above 0.
     """
+    for name, value in {"cell_m": cell_m, "height_m": height_m, "headings": headings, "one_in": one_in}.items():
+        check_number(value, where=f"features.streets.{name}", above=0)
     samples = along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=cell_m / 2)  # no place is jumped over
     # places are centred on round numbers: made-up roads lie on these, and should not fall between two places
     cells = np.rint((samples.xyz + np.asarray(raw.origin)) / np.array([cell_m, cell_m, height_m])).astype(np.int64)
@@ -168,7 +173,7 @@ def deal(group: Int[np.ndarray, " N"], shares: Mapping[str, float | int], *, see
     if empty := [name for name, found in rows.items() if not len(found)]:
         sizes = ", ".join(map(str, np.sort(size)[::-1][:5]))
         some = f"{len(group)} scenes in {len(size)} groups that cannot be divided (the largest: {sizes})"
-        more = "ask for more, raise split.least_shared, or take no heed of streets (split.by=scene): generated ones all lie about one place"
+        more = "ask for more, raise split.least_shared, or take no heed of streets (split.by=scene)"
         raise ConfigError(f"split.shares.{empty[0]}: {shares[empty[0]]} of {some} is none; {more}")
     return rows
 

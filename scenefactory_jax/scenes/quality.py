@@ -56,10 +56,22 @@ def make(rules: Mapping[str, Any]) -> dict[str, Rule]:
     return {name: build(entry, builtins=__name__, where=f"quality.rules.{name}") for name, entry in rules.items() if entry is not None}
 
 
+def check_names(rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> None:
+    """Refuse names of rules that are none.
+
+    Raises:
+        ConfigError: naming the key, the name and the rules that there are.
+    """
+    for key, names in (("reject", reject), ("drop", drop)):
+        if unknown := [name for name in names if name not in rules]:
+            raise ConfigError(f"quality.{key}: {unknown[0]!r} is no rule; valid: {', '.join(rules)}")
+
+
 def judge(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> Verdict:
     """What the rules find.
 
     Args:
+        raw: a checked scene.
         rules: name -> rule (`make`).
         reject: names of rules whose findings refuse the scene.
         drop: names of rules whose findings leave their objects out.
@@ -67,22 +79,25 @@ def judge(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], dr
     Raises:
         ConfigError: `reject` or `drop` name no rule.
     """
-    for key, names in (("reject", reject), ("drop", drop)):
-        if unknown := [name for name in names if name not in rules]:
-            raise ConfigError(f"quality.{key}: {unknown[0]!r} is no rule; valid: {', '.join(rules)}")
+    check_names(rules, reject=reject, drop=drop)
     findings = tuple(finding._replace(rule=name) for name, rule in rules.items() for finding in rule(raw))
     dropped = dict.fromkeys(identity for finding in findings if finding.rule in drop for identity in finding.objects)
     return Verdict(findings, tuple(finding for finding in findings if finding.rule in reject), tuple(dropped))
 
 
-def gate(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> RawScene:
+def gate(
+    raw: RawScene, rules: Mapping[str, Rule], *, check: Callable[..., Any], reject: Sequence[str], drop: Sequence[str]
+) -> RawScene:
     """The scene without the objects that rules drop, and the counts of all findings in `metadata["quality"]`.
 
+    Args:
+        check: `checks.check` bound to its numbers: rules judge what it makes of the scene, which itself passes unrepaired.
+
     Raises:
-        SceneError: a rule refuses the scene, with the first of its findings.
+        SceneError: the check, or a rule, refuses the scene, the latter with the first of its findings.
         ConfigError: see `judge`.
     """
-    verdict = judge(raw, rules, reject=reject, drop=drop)
+    verdict = judge(check(raw)[0], rules, reject=reject, drop=drop)
     if verdict.rejected:
         first = verdict.rejected[0]
         more = f" (and {len(verdict.rejected) - 1} more)" if len(verdict.rejected) > 1 else ""

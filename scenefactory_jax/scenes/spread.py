@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
+from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes.raw import SceneError
 
 Work = Callable[[Any], Any]
@@ -36,8 +37,12 @@ def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | 
 
     Raises:
         SceneError: a process cannot be started.
+        ConfigError: numbers with which nothing would be done, or what an item's work says of the config.
     """
-    if workers <= 1:
+    check_number(workers, where="spread.workers", least=1)
+    if timeout_s is not None:
+        check_number(timeout_s, where="spread.timeout_s", above=0)
+    if workers == 1:
         yield from map(work, items)
         return
     waiting, done = deque(enumerate(items)), {}
@@ -48,7 +53,7 @@ def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | 
             while number not in done:
                 for connection in wait(list(busy)):
                     _answer(connection, busy, waiting, done, work, timeout_s)  # pyright: ignore[reportArgumentType]
-            yield done.pop(number)
+            yield _passed(done.pop(number))
     finally:
         for connection, (process, _) in busy.items():
             connection.close()
@@ -109,15 +114,27 @@ def _serve(connection: Connection, work: Work, timeout_s: float | None) -> None:
 
 
 def _timed(work: Work, timeout_s: float | None, item: Any) -> Any:
-    """The result, or why there is none. Past its time the kernel's alarm ends the process, whatever code it hangs in."""
+    """The result, or why there is none; of a mistake in the config the error itself.
+
+    Past its time the kernel's alarm ends the process, whatever code it hangs in.
+    """
     if timeout_s is not None:
         signal.setitimer(signal.ITIMER_REAL, timeout_s)
     try:
         return work(item)
+    except ConfigError as error:
+        return error
     except Exception as error:
         return Lost(f"{type(error).__name__}: {error}")
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _passed(result: Any) -> Any:
+    """The result; a mistake in the config is no item's own, and ends the work."""
+    if isinstance(result, ConfigError):
+        raise result
+    return result
 
 
 def _death(process: BaseProcess, timeout_s: float | None) -> str:
@@ -140,7 +157,11 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
 
     Raises:
         SceneError: Ray is not installed.
+        ConfigError: as for `local`.
     """
+    check_number(pending, where="spread.pending", least=1)
+    if timeout_s is not None:
+        check_number(timeout_s, where="spread.timeout_s", above=0)
     try:
         cluster = importlib.import_module("ray")
     except ImportError as error:
@@ -155,4 +176,4 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
             result = cluster.get(ahead.popleft())
         except cluster.exceptions.RayError as error:
             result = Lost(f"Ray: {type(error).__name__}: {str(error).strip().splitlines()[0]}")
-        yield result
+        yield _passed(result)

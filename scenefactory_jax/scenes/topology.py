@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from scenefactory_jax.build import check_range
+from scenefactory_jax.build import check_number, check_range
 from scenefactory_jax.scenes import lanes as lane_graph
 from scenefactory_jax.scenes.raw import Polyline, RawScene
 from scenefactory_jax.types import DRIVABLE
@@ -60,9 +60,10 @@ def rebuild(
         station_m: how finely lanes are compared.
 
     Raises:
-        ConfigError: `beside_m` is no range.
+        ConfigError: `beside_m` is no range, or `station_m` not above 0.
     """
-    check_range(beside_m, where="topology.beside_m")
+    check_range(beside_m, where="lanes.topology.beside_m")
+    check_number(station_m, where="lanes.topology.station_m", above=0)
     order = [index for index, line in enumerate(raw.roads) if line.kind in DRIVABLE and len(line.xyz)]
     lanes = [raw.roads[index] for index in order]
     linked = any(line.entry or line.exit for line in raw.roads)

@@ -7,7 +7,6 @@ it lies; a light without a stop point gets its lane's first point, as MetaDrive 
 
 import pickle
 import pickletools
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from scenefactory_jax.scenes.export import files
 from scenefactory_jax.scenes.formats.scenarionet import DATASETS, ELEMENTS, KEPT, LANES, UNITS
+from scenefactory_jax.scenes.names import for_file
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import CROSSWALK, DRIVEWAY, LINES, SPEED_BUMP, STOP_SIGN
 
@@ -60,7 +60,7 @@ def write_all(scenes: Iterable[RawScene], folder: Path | str) -> int:
 
 def file_name(raw: RawScene) -> str:
     """The name that ScenarioNet gives a scenario's file: `sd_DATASET_SCENARIO.pkl`."""
-    return re.sub(r"[^\w.-]", "_", f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl")
+    return for_file(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl")
 
 
 def scenario(raw: RawScene) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def scenario(raw: RawScene) -> dict[str, Any]:
         key = lanes.get(light.lane, str(light.lane))
         lights[key] = _light(light, key, roads.get(light.lane), _dataset(raw))
     tracks = {name: _track(track, name, _dataset(raw)) for name, track in zip(names, raw.tracks, strict=True)}
-    signs = raw.metadata.get("stop_sign_lanes", {})
+    signs = _sign_lanes(raw.metadata.get("stop_sign_lanes", {}))
     features = {key: _feature(line, lanes, signs, raw.source) for key, line in zip(keys, raw.roads, strict=True)}
     return {
         "id": _scenario_id(raw),
@@ -99,6 +99,11 @@ def _dataset(raw: RawScene) -> str:
 
 def _scenario_id(raw: RawScene) -> str:
     return str(raw.metadata.get("scenario_id", raw.name))
+
+
+def _sign_lanes(found: Mapping[str, list[int]] | list[Mapping[str, Any]]) -> Mapping[str, list[int]]:
+    """The lanes of each stop sign by its id; older banks of WOMD's protos hold a list of records."""
+    return {str(one["sign"]): one["lanes"] for one in found} if isinstance(found, list) else found
 
 
 def _names(ids: list[int], tokens: Mapping[str, int]) -> list[str]:

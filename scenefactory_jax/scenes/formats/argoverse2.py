@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from scenefactory_jax.scenes.formats import argoverse2_map, documents, identities
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.raw import Companion, OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import RoadUser
 
@@ -151,7 +152,7 @@ def _track(
     tree, heights = ground
     xyz, yaw, velocity, valid = np.zeros((steps, 3)), np.zeros(steps), np.zeros((steps, 2)), np.zeros(steps, bool)
     xyz[step] = np.column_stack([plane, heights[tree.query(plane)[1]] + height / 2])
-    yaw[step] = np.remainder(rows["heading"] + np.pi, 2 * np.pi) - np.pi
+    yaw[step] = wrapped(rows["heading"])
     velocity[step] = np.stack([rows["velocity_x"], rows["velocity_y"]], axis=1)
     valid[step] = True
     return Track(id=identity, kind=KINDS.get(name, "other"), size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)

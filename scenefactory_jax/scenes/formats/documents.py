@@ -1,9 +1,12 @@
 """JSON documents: unpacking, and reading values out of them with messages that name the file and the key."""
 
+import contextlib
 import gzip
 import json
 import lzma
 import operator
+import sys
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +50,7 @@ def unpack(path: Path) -> bytes:
         if content.startswith(magic):
             try:
                 return decompress(content)
-            except (OSError, EOFError, lzma.LZMAError, ValueError) as error:
+            except (OSError, EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
                 raise SceneError(f"{path}: begins as {name} but cannot be unpacked, damaged or cut short: {error}") from error
     return content
 
@@ -58,7 +61,7 @@ def is_number(value: Any) -> bool:
 
 
 def expect(value: Any, kind: type, where: str) -> Any:
-    """`value`, if it is of that JSON type; an integer passes for a number.
+    """`value`, if it is of that JSON type; an integer that a float can hold passes for a number.
 
     Raises:
         SceneError: naming `where` and the value.
@@ -67,6 +70,8 @@ def expect(value: Any, kind: type, where: str) -> Any:
     if not fits:
         text = repr(value)
         raise SceneError(f"{where}: {text if len(text) < 80 else text[:77] + '...'} is not {NAMES[kind]}")
+    if kind is float and isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise SceneError(f"{where}: an integer of {value.bit_length()} bits is larger than any number of 64 bits")
     return value
 
 
@@ -91,10 +96,10 @@ def numbers(values: Any, where: str, *, length: int | None = None) -> Float[np.n
     expect(values, list, where)
     if length is not None and len(values) != length:
         raise SceneError(f"{where}: {len(values)} entries; there must be {length}, one for each step")
-    if not set(map(type, values)) <= {int, float}:
-        place = next(i for i, value in enumerate(values) if not is_number(value))
-        expect(values[place], float, f"{where}[{place}]")
-    return np.asarray(values, np.float64)
+    with contextlib.suppress(OverflowError):  # of an integer, which is named below
+        if set(map(type, values)) <= {int, float}:
+            return np.asarray(values, np.float64)
+    return np.array([expect(value, float, f"{where}[{place}]") for place, value in enumerate(values)], np.float64)
 
 
 def points(rows: Any, keys: Sequence[str], where: str, *, length: int | None = None) -> Float[np.ndarray, "N D"]:
@@ -106,16 +111,12 @@ def points(rows: Any, keys: Sequence[str], where: str, *, length: int | None = N
     expect(rows, list, where)
     if length is not None and len(rows) != length:
         raise SceneError(f"{where}: {len(rows)} entries; there must be {length}, one for each step")
-    try:
+    with contextlib.suppress(KeyError, TypeError, IndexError, OverflowError):  # what is wrong is named below
         columns = [list(map(operator.itemgetter(key), rows)) for key in keys]
-    except (KeyError, TypeError, IndexError):
-        columns = []
-    if not columns or not all(set(map(type, column)) <= {int, float} for column in columns):
-        for place, row in enumerate(rows):
-            expect(row, dict, f"{where}[{place}]")
-            for key in keys:
-                get(row, key, float, f"{where}[{place}]")
-    return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+        if all(set(map(type, column)) <= {int, float} for column in columns):
+            return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    places = [(expect(row, dict, f"{where}[{place}]"), f"{where}[{place}]") for place, row in enumerate(rows)]
+    return np.array([[get(row, key, float, place) for key in keys] for row, place in places], np.float64)
 
 
 def require_finite(

@@ -5,7 +5,6 @@ these, `{state[], x[], y[], z[], time_index[]}` (GPUDrive's `process_waymo_files
 elements nor metadata nor heights, and its headings are in degrees.
 """
 
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents, identities
+from scenefactory_jax.scenes.logs import FULL_TURN, wrapped
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import ROAD_USERS
 
 # the map element that a type's name stands for where `map_element_id` is missing
 ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crosswalk": 18, "speed_bump": 19, "driveway": 20}
-FULL_TURN = 2 * math.pi + 0.01  # rounding to a few digits may exceed the turn itself
 
 
 def read(
@@ -106,7 +105,7 @@ def _track(record: dict[str, Any], index: int, steps: int, where: str, degrees: 
         kind=kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=_size(record, where, height_m),
         xyz=np.where(mask, np.pad(xyz, ((0, 0), (0, 1))) if flat else xyz, 0.0),
-        yaw=np.where(valid, np.remainder(yaw + np.pi, 2 * np.pi) - np.pi, 0.0),
+        yaw=np.where(valid, wrapped(yaw), 0.0),
         velocity=np.where(mask, velocity, 0.0),
         valid=valid,
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefactory_jax.scenes.formats import documents, lines
+from scenefactory_jax.scenes.logs import FULL_TURN, wrapped
 from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, LANE_STREET, LINES, SPEED_BUMP, STOP_SIGN, RoadUser
 
@@ -24,7 +25,6 @@ ROADS = {4: LANE_STREET, 5: LINES[0], 6: EDGE_BOUNDARY, 7: STOP_SIGN, 8: CROSSWA
 THINNED = (4, 5, 6)  # roads of which points were dropped
 WORD = 4  # bytes of a number
 OBJECT_COLUMNS, ROAD_COLUMNS, HEAD, TAIL = 8, 3, 2, 7  # numbers for each step, for each point, before and after them
-FULL_TURN = 2 * np.pi + 0.01
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _track(entity: _Entity, index: int, words: np.ndarray, values: np.ndarray, w
         kind=OBJECTS[entity.type],
         size=(length, width, height),
         xyz=np.where(mask, xyz, 0.0),
-        yaw=np.where(valid, np.remainder(heading + np.pi, 2 * np.pi) - np.pi, 0.0),
+        yaw=np.where(valid, wrapped(heading), 0.0),
         velocity=np.where(mask, velocity, 0.0),
         valid=valid,
     )

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents, identities, lines, pickles, scenarionet_layouts
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, Light, OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import (
     CROSSWALK,
@@ -177,7 +178,7 @@ def _track(track: Mapping[str, Any], identity: int, steps: int, where: str) -> T
         kind=kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=(length, width, height),
         xyz=np.where(mask, xyz, 0.0),
-        yaw=np.where(valid, np.remainder(yaw + np.pi, 2 * np.pi) - np.pi, 0.0),
+        yaw=np.where(valid, wrapped(yaw), 0.0),
         velocity=np.where(mask, velocity[:, :2], 0.0),
         valid=valid,
     )

@@ -190,5 +190,5 @@ def _metadata(message: Message, tracks: Sequence[Track], where: str) -> dict[str
         "objects_of_interest": list(message.objects_of_interest),
         "tracks_to_predict": [tracks[entry.track_index].id for entry in chosen],
         "difficulty_levels": [entry.difficulty for entry in chosen],  # of tracks_to_predict: 0 none, 1, 2
-        "stop_sign_lanes": [{"sign": feature.id, "lanes": list(feature.stop_sign.lane)} for feature in signs],
+        "stop_sign_lanes": {str(feature.id): list(feature.stop_sign.lane) for feature in signs},
     }

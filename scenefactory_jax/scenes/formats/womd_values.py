@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from scenefactory_jax.scenes.formats import documents
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.raw import SceneError, Track
 from scenefactory_jax.types import ROAD_USERS, RoadUser
 
@@ -51,7 +52,7 @@ def make_tracks(
         current: the step at which a simulation takes over.
     """
     numbers = np.where(valid[..., None], numbers, 0.0)
-    yaw = np.where(valid, np.remainder(numbers[..., 3] + np.pi, 2 * np.pi) - np.pi, 0.0)
+    yaw = np.where(valid, wrapped(numbers[..., 3]), 0.0)
     measured = np.where(valid[:, current], current, np.argmax(valid, axis=1))
     sizes = numbers[np.arange(len(numbers)), measured, 6:9].tolist()
     return tuple(

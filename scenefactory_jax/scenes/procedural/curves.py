@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from scenefactory_jax.scenes.logs import wrapped
+
 FINE_M = 0.25  # spacing of the points that everything is computed on; what a scene holds is coarser
 Points = Float[np.ndarray, "_ 2"]
 Curve = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, " N"]]
@@ -15,7 +17,7 @@ def heading(yaw: float | Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 2"]:
 
 def wrap_angle(angle: float) -> float:
     """The same angle in [-pi, pi)."""
-    return float(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+    return float(wrapped(angle))
 
 
 def arc_length(points: Points) -> Float[np.ndarray, " N"]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.procedural.curves import Points, heading, resample
 from scenefactory_jax.scenes.procedural.layout import (
     DOUBLE_YELLOW,
@@ -158,7 +159,7 @@ def _track(index: int, origin: Float[np.ndarray, " 2"], car: Car, size: Sequence
         kind="vehicle",
         size=(float(size[0]), float(size[1]), float(size[2])),
         xyz=np.concatenate([position, np.full((len(position), 1), size[2] / 2)], axis=1),
-        yaw=np.mod(car.drive.yaw + np.pi, 2 * np.pi) - np.pi,
+        yaw=wrapped(car.drive.yaw),
         velocity=car.drive.speed[:, None] * heading(car.drive.yaw),
         valid=np.ones(len(position), bool),
     )

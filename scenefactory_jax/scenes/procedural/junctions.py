@@ -6,7 +6,7 @@ import numpy as np
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes.procedural.curves import FINE_M, connect, curvature, heading, integrate, wrap_angle
-from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Line, Style, carriageway, count_lanes, draw
+from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Line, Style, carriageway, check_positive, count_lanes, draw
 
 STRAIGHT_ON = np.radians(45.0)  # a movement that turns by less goes straight on
 GROWTHS = 20  # steps at most
@@ -44,6 +44,7 @@ def t_intersection(
     yaws = [0.0, np.pi / 2 + skew[0], np.pi + skew[1]]
     ahead, back, into, out = (count_lanes(rng, style) for _ in range(4))
     counts = [(back, ahead), (into, out), (ahead, back)]  # incoming, outgoing
+    check_positive(bend_radius_m, "t_intersection.bend_radius_m")
     corner = draw(rng, corner_radius_m, "t_intersection.corner_radius_m")
     lengths = [draw(rng, arm_length_m, "t_intersection.arm_length_m", low=1.0) for _ in yaws]
     return _junction(rng, style, yaws, counts, lengths, corner=corner, turn_radius=turn_radius_m, bend_radius=bend_radius_m)
@@ -64,6 +65,7 @@ def intersection(
     yaws = [0.0, np.pi / 2 + skew[0], np.pi + skew[1], 3 * np.pi / 2 + skew[2]]
     ahead, back, across, counter = (count_lanes(rng, style) for _ in range(4))
     counts = [(back, ahead), (across, counter), (ahead, back), (counter, across)]
+    check_positive(bend_radius_m, "intersection.bend_radius_m")
     corner = draw(rng, corner_radius_m, "intersection.corner_radius_m")
     lengths = [draw(rng, arm_length_m, "intersection.arm_length_m", low=1.0) for _ in yaws]
     return _junction(rng, style, yaws, counts, lengths, corner=corner, turn_radius=turn_radius_m, bend_radius=bend_radius_m)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from scenefactory_jax.scenes.procedural.curves import FINE_M, cut, easing_bend, integrate, tangents
-from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Style, carriageway, count_lanes, draw
+from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Style, carriageway, check_positive, count_lanes, draw
 
 
 def merge(
@@ -19,6 +19,7 @@ def merge(
     easing_m: float,
 ) -> Layout:
     """A main road, slightly bent, with oncoming lanes or without, and a ramp that joins it at `merge_share` of its length."""
+    check_positive(bend_radius_m, "merge.bend_radius_m")
     length = draw(rng, length_m, "merge.length_m", low=1.0)
     bend = rng.uniform(-1, 1) / bend_radius_m
     count = round(length / FINE_M)

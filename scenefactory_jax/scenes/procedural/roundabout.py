@@ -5,7 +5,7 @@ import numpy as np
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes.procedural.curves import FINE_M, connect, heading
 from scenefactory_jax.scenes.procedural.junctions import Arm, build_arm
-from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Style, check_range, draw
+from scenefactory_jax.scenes.procedural.layout import Lane, Layout, Style, check_positive, check_range, draw
 
 WIDEST_SPLIT = np.radians(35.0)  # between an arm and the points where its cars leave and join the ring
 SPLIT_SHARE = 0.4  # of the angle to the next arm
@@ -22,12 +22,13 @@ def roundabout(
     bend_radius_m: float,
     skew_deg: float,
 ) -> Layout:
-    """A ring with 3 to 5 arms of one lane a direction. `ring_radius_m` is that of the ring's lane centre.
+    """A ring with two arms or more of one lane a direction. `ring_radius_m` is that of the ring's lane centre.
 
     Raises:
         ConfigError: too many arms for the ring.
     """
     check_range(arms, "roundabout.arms", low=2.0)
+    check_positive(bend_radius_m, "roundabout.bend_radius_m")
     count = int(rng.integers(arms[0], arms[1] + 1))
     radius = draw(rng, ring_radius_m, "roundabout.ring_radius_m", low=5.0)
     width = draw(rng, ring_width_m, "roundabout.ring_width_m", low=1.0)

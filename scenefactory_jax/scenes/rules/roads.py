@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.quality import Finding, point
 from scenefactory_jax.scenes.raw import Polyline, RawScene
 from scenefactory_jax.types import DRIVABLE, EDGES
@@ -151,4 +152,4 @@ def _long(raw: RawScene) -> Iterator[Polyline]:
 def _turns(step: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " M"]:
     """Changes of direction from each step to the next, radians."""
     yaw = np.arctan2(step[:, 1], step[:, 0])
-    return np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi)
+    return np.abs(wrapped(np.diff(yaw)))

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.quality import Finding, point
 from scenefactory_jax.scenes.raw import RawScene, Track
 
@@ -39,7 +40,7 @@ def yaw_rate(raw: RawScene, *, most_rad_s: float) -> list[Finding]:
 
     def measure(track: Track) -> Excess:
         steps = _neighbours(track)
-        turn = np.abs((track.yaw[steps + 1] - track.yaw[steps] + np.pi) % (2 * np.pi) - np.pi)
+        turn = np.abs(wrapped(track.yaw[steps + 1] - track.yaw[steps]))
         return steps + 1, turn / np.diff(raw.times)[steps]
 
     return _worst(raw, measure, most_rad_s, "turns at {:.1f} rad/s")
@@ -139,4 +140,4 @@ def _neighbours(track: Track) -> Int[np.ndarray, " K"]:
 
 
 def _step_s(raw: RawScene) -> float:
-    return float(np.median(np.diff(raw.times)))
+    return float(np.median(np.diff(raw.times))) if len(raw.times) > 1 else np.inf

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes.procedural.curves import heading, wrap_angle
 from scenefactory_jax.scenes.town import links
 from scenefactory_jax.scenes.town.junctions import OPPOSITE, Arm, Control
@@ -45,7 +46,13 @@ def choice(
     bay_room_m: float,
     skew_deg: float,
 ) -> Choice:
-    """`Choice` from a config entry; see there."""
+    """`Choice` from a config entry; see there.
+
+    Raises:
+        ConfigError: `signal_share` is empty, or has a number that is no share.
+    """
+    if not signal_share or not all(0 <= share <= 1 for share in signal_share):
+        raise ConfigError(f"generate.network.junctions.signal_share: {signal_share}; wanted are one or more numbers from 0 to 1")
     return Choice(
         intersection=blocks["intersection"],
         driveway=blocks["driveway"],

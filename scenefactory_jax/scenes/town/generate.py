@@ -7,7 +7,8 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import ConfigError, build, check_number
+from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.procedural.curves import Points, heading, resample
 from scenefactory_jax.scenes.procedural.layout import check_positive
 from scenefactory_jax.scenes.raw import Light, Polyline, RawScene, SceneError, Track
@@ -64,6 +65,7 @@ def generate(
         SceneError: no town holds the fewest cars asked for.
     """
     _check(seed, index, log_steps, log_current)
+    check_number(warm_s, where="generate.warm_s", least=0)
     numbers = {"reach_m": reach_m, "lane_spacing_m": lane_spacing_m, "line_spacing_m": line_spacing_m, "log_dt": log_dt}
     for name, value in numbers.items():
         check_positive(value, f"generate.{name}")
@@ -141,7 +143,7 @@ def _track(index: int, actor: Actor) -> Track:
     """An actor's log, zeros where it is not seen."""
     mask = actor.valid
     position = np.concatenate([actor.position, np.full((len(mask), 1), actor.size[2] / 2)], axis=1)
-    yaw = np.mod(actor.yaw + np.pi, 2 * np.pi) - np.pi
+    yaw = wrapped(actor.yaw)
     velocity = actor.speed[:, None] * heading(actor.yaw)
     position, velocity = (np.where(mask[:, None], column, 0.0) for column in (position, velocity))
     return Track(index, actor.kind, actor.size, position, np.where(mask, yaw, 0.0), velocity, mask)

@@ -32,7 +32,7 @@ def draw_network(
     """A kind of town and its network; None where the plan that was drawn cannot be built.
 
     Args:
-        plans: entries for the towns' streets, `(rng, reach, classes) -> Plan`, each as likely as the others.
+        plans: entries for the towns' streets, `(rng, reach, classes) -> Plan` or None, each as likely as the others.
         motorway: entry for `(rng, reach) -> Network`.
         motorway_share: of scenes that are a motorway.
         streets: name -> numbers of a class of streets (`streets.StreetClass`), the least important first.
@@ -62,5 +62,6 @@ def draw_network(
         return "motorway", build(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
     kind = str(rng.choice(list(makers)))
     lane = Street(1, 1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_WHITE + 3)
-    network = realise(rng, add_lots(rng, makers[kind](rng, reach, classes), reach, lane), choice)
+    plan = makers[kind](rng, reach, classes)
+    network = None if plan is None else realise(rng, add_lots(rng, plan, reach, lane), choice)
     return None if network is None else (kind, network)

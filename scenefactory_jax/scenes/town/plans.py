@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes.procedural.curves import heading
 from scenefactory_jax.scenes.procedural.layout import check_range, draw
 from scenefactory_jax.scenes.town.network import Street
@@ -111,8 +112,8 @@ def grid(
     shear_deg: float,
     keep_share: float,
     inset_m: float,
-) -> Plan:
-    """Streets in two directions that cross, some of them broken off at a crossing.
+) -> Plan | None:
+    """Streets in two directions that cross, some of them broken off at a crossing; None where not even the middle crossing is within.
 
     Args:
         spacing_m: between parallel streets.
@@ -121,7 +122,12 @@ def grid(
         shear_deg: how far the two directions may be from a right angle.
         keep_share: how much of the streets beside the two that cross in the middle is there.
         inset_m: between a crossing and the square of half side `reach`.
+
+    Raises:
+        ConfigError: the square holds no crossing.
     """
+    if reach <= inset_m:
+        raise ConfigError(f"generate.reach_m: {reach:g}; wanted is more than generate.network.plans.grid.inset_m, {inset_m:g}")
     angle = rng.uniform(0, np.pi / 2)
     turn = np.stack([heading(angle), heading(angle + np.pi / 2 + np.radians(rng.uniform(-shear_deg, shear_deg)))])
     along = [_lines(rng, reach, spacing_m, offset_m) for _ in range(2)]
@@ -135,7 +141,9 @@ def grid(
                 index[i, j] = len(nodes)
                 nodes.append(Node("junction", place))
     edges: list[Edge] = []
-    middle = tuple(int(np.argmin(np.abs(line))) for line in along)
+    middle = (int(np.argmin(np.abs(along[0]))), int(np.argmin(np.abs(along[1]))))
+    if middle not in index:
+        return None
     for axis in (0, 1):
         for row in range(len(along[axis])):
             line = [index[key] for at in range(len(along[1 - axis])) if (key := (row, at) if axis == 0 else (at, row)) in index]
@@ -151,7 +159,7 @@ def grid(
                 if row == middle[axis] or rng.random() < keep_share:
                     nodes.append(Node("outlet", _outside(nodes[node].place, out, reach, least=45.0)))
                     edges.append(Edge(node, len(nodes) - 1, streets[axis][row]))
-    return _tidy(Plan(nodes, edges), index[middle[0], middle[1]])
+    return _tidy(Plan(nodes, edges), index[middle])
 
 
 def _lines(rng: np.random.Generator, reach: float, spacing: list[float], offset: float) -> list[float]:

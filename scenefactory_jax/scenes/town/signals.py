@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from scenefactory_jax.scenes.procedural.layout import draw
+from scenefactory_jax.scenes.procedural.layout import check_positive, draw
 from scenefactory_jax.scenes.raw import LIGHT_STATES
 from scenefactory_jax.scenes.town.network import Network
 
@@ -35,7 +35,11 @@ def draw_gates(
     Args:
         green_s, yellow_s, clear_s: how long a phase is green and yellow, and how long all is red behind it.
         walk_mps: a crosswalk is open for as long as people at this speed get over it before its road has green again.
+
+    Raises:
+        ConfigError: a number that makes no sense, by name.
     """
+    check_positive(walk_mps, "generate.signals.walk_mps")
     state = np.full((len(network.stops) + len(network.crosswalks), len(times)), OPEN)
     light = np.full(state.shape, -1)
     for index, stop in enumerate(network.stops):
