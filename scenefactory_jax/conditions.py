@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import ConfigError, build, check_numbers
 from scenefactory_jax.patches import join
 from scenefactory_jax.rain import pass_time
 from scenefactory_jax.struct import replace
@@ -81,7 +81,7 @@ def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Wea
     """A road condition for one episode, drawn from `cases` with probability proportional to their weights.
 
     Raises:
-        ConfigError: no case, an unknown surface, a negative film or weight, or no positive weight.
+        ConfigError: no case, an unknown surface, a film or weight below 0 or not finite, or no positive weight.
     """
     chosen = _cases(cases)
     weights = jnp.asarray([case.weight for case in chosen], jnp.float32)
@@ -100,8 +100,7 @@ def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
         case = make()
         if case.surface not in SURFACES:
             raise ConfigError(f"{where}.surface: {case.surface!r}; valid: {', '.join(SURFACES)}")
-        if case.film_mm < 0 or case.weight < 0:
-            raise ConfigError(f"{where}: film_mm {case.film_mm} and weight {case.weight} must not be negative")
+        check_numbers({"film_mm": case.film_mm, "weight": case.weight}, where=where, least=0.0)
         chosen.append(case)
     if sum(case.weight for case in chosen) <= 0:
         raise ConfigError("weather.draw.cases: no case with a positive weight")

@@ -6,13 +6,14 @@ of Zhao et al. (2024) as published with SceneFactory: `conf/weather/base.yaml` h
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import ConfigError, build, check_number, check_numbers
 from scenefactory_jax.patches import condition
 from scenefactory_jax.types import SURFACES, Patches, Rain, Weather
 
@@ -47,6 +48,17 @@ class Surface:
     texture_mm: float
 
 
+def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"], Float[Array, "*shape"]], Float[Array, "*shape"]]:
+    """The `grip` of a weather config, bound to its numbers. It is traced once, so that what it refuses is refused here.
+
+    Raises:
+        ConfigError: naming the key that does not fit.
+    """
+    bound = build(entry, builtins=__name__, where="weather.grip")
+    jax.eval_shape(bound, uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
+    return bound
+
+
 def friction(
     speed: Float[Array, "*shape"],
     film_mm: Float[Array, "*shape"],
@@ -65,7 +77,7 @@ def friction(
     contact = jnp.maximum(theta * spacing(speed, film_mm, texture_mm, tyre=tyre) - lift(speed, film_mm, tyre=tyre), 0.0)
     b1, b2, b3, b4 = tyre.stribeck_velocity
     stribeck = b1 * jnp.exp(b2 * film_mm + b3) + b4
-    # the floor keeps the gradient of x^alpha finite at rest; it moves g by less than 4e-5 and only below 1e-8 of a metre a second
+    # the floor keeps the gradient of x^alpha finite at rest; it moves g by less than 4e-5 and only below 1e-7 of a metre a second
     ratio = jnp.maximum(slip * speed / stribeck, 1e-9)
     g = tyre.coulomb + (tyre.static - tyre.coulomb) * jnp.exp(-(ratio**tyre.stribeck_exponent))
     lumping = 7.0 / (6.0 * tyre.patch_length)  # K of the average lumped model
@@ -123,9 +135,12 @@ def grip(
         surfaces: for every name of `types.SURFACES` the numbers of `Surface`.
 
     Raises:
-        ConfigError: an unknown mode, tyre constant or surface, by name.
+        ConfigError: an unknown mode, tyre constant or surface, or a number out of its range, by name.
     """
-    constants = build({**tyre, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
+    constants = _tyre(tyre)
+    check_number(floor, where="weather.grip.floor", above=0.0)  # at 0 the solver's cone is empty, and cars fall through the road
+    slips = {"reference_speed": reference_speed, "slip_static": slip_static, "slip_dynamic": slip_dynamic}
+    check_numbers(slips, where="weather.grip", least=0.0)
     if mode not in ("static", "dynamic", "speed"):
         raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
     film_mm, surface = condition(weather, position)
@@ -135,11 +150,25 @@ def grip(
     return jnp.maximum(friction(v, film_mm, theta, texture, s, tyre=constants), floor)
 
 
+def _tyre(entry: Mapping[str, Any]) -> Tyre:
+    tyre: Tyre = build({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
+    numbers = dict(vars(tyre))
+    stribeck = {f"stribeck_velocity[{i}]": b for i, b in enumerate(numbers.pop("stribeck_velocity"))}
+    if len(stribeck) != 4:
+        raise ConfigError(f"weather.grip.tyre.stribeck_velocity: {list(stribeck.values())}; wanted are b1, b2, b3, b4")
+    check_numbers(stribeck, where="weather.grip.tyre")
+    factor, rest = "stribeck_velocity[0]", "stribeck_velocity[3]"  # above 0, so that the velocity is, under any film
+    check_numbers({**numbers, factor: stribeck[factor], rest: stribeck[rest]}, where="weather.grip.tyre", above=0.0)
+    return tyre
+
+
 def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
     """theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
     rows = [build({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
+    for name, row in zip(SURFACES, rows, strict=True):
+        check_numbers(vars(row), where=f"weather.grip.surfaces.{name}", above=0.0)
     return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
 
 

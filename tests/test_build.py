@@ -6,7 +6,7 @@ import types
 import pytest
 
 from scenefactory_jax import rewards
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import ConfigError, build, check_number
 
 
 def _module():
@@ -53,6 +53,22 @@ def test_missing_key_lists_what_is_needed():
 def test_a_context_value_is_no_key():
     with pytest.raises(ConfigError, match=r"x.dt: unknown key"):
         build({**ENTRY, "dt": 1.0}, builtins=_module(), where="x", dt=0.5)
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds", "message"),
+    [
+        (0, {"above": 0.0}, "x: 0; wanted is a number above 0"),
+        (1.0, {"above": 0.0, "below": 1.0}, "x: 1; wanted is a number above 0 and below 1"),
+        (-1, {"least": 0.0}, "x: -1; wanted is a number of at least 0"),
+        (float("nan"), {"least": 0.0}, "x: nan; wanted is a finite number of at least 0"),
+        (float("inf"), {}, "x: inf; wanted is a finite number$"),
+    ],
+)
+def test_a_number_beyond_its_bounds_is_refused(value, bounds, message):
+    with pytest.raises(ConfigError, match=message):
+        check_number(value, where="x", **bounds)
+    check_number(0.5, where="x", **bounds)
 
 
 def test_reward_entries_need_a_weight():

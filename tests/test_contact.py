@@ -7,6 +7,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.dynamics import contact
 from scenefactory_jax.struct import replace
 from scenefactory_jax.tracks import nobody
@@ -113,7 +114,7 @@ def test_momentum_is_kept(seed):
 def test_friction_and_damping_never_add_energy(seed):
     """With springs away (depths tiny compared to speeds), contact power is not positive."""
     cars = crowd(seed)
-    force, torque, _ = jax.jit(with_numbers(stiffness=0.0))(cars, nobody())
+    force, torque, _ = jax.jit(with_numbers(stiffness=1e-9))(cars, nobody())
     assert float((force * cars.velocity).sum() + (torque * cars.yaw_rate).sum()) < 0
 
 
@@ -306,3 +307,25 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
     end, energy = jax.lax.scan(step, cars, length=600)
     assert np.isfinite(energy).all() and float(energy.max()) < 64e6
     assert np.abs(np.asarray(end.velocity)).max() < 80.0 and np.abs(np.asarray(end.velocity.sum(0))).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"stiffness": -1e6}, "dynamics.contact.stiffness: -1e.06; wanted is a number above 0"),
+        ({"damping": -1.0}, "dynamics.contact.damping"),
+        ({"friction": -0.3}, "dynamics.contact.friction"),
+        ({"mass": 0.0}, "dynamics.contact.mass"),
+        ({"yield_s": 0.0}, "dynamics.contact.yield_s"),
+        ({"nearest": -1}, "dynamics.contact.nearest: -1; wanted is a number of at least 0"),
+        ({"stiffness": 1e9}, "stiffness 1e.09 and damping 30000 cannot be integrated: .* at physics_dt 0.00833"),
+        ({"damping": 3e5}, "cannot be integrated"),
+        ({"mass": 500.0}, "cannot be integrated"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(changes, named):
+    """The last three give cars that meet more energy than they had; a contact that moves nobody may be as stiff as it likes."""
+    with pytest.raises(ConfigError, match=named):
+        contact.make(**{**NUMBERS, "height": 1.0, **changes}, physics_dt=1 / 120)
+    contact.make(**{**NUMBERS, "stiffness": 1e9}, height=1.0)
+    contact.make(**NUMBERS, height=1.0, physics_dt=1 / 120)

@@ -15,8 +15,8 @@ from conftest import scene_of
 from omegaconf import OmegaConf
 
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.dynamics import bounds, oracle
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import oracle
 from scenefactory_jax.run.config import load
 from scenefactory_jax.struct import replace
 
@@ -359,11 +359,61 @@ def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
         ({"car": {"stop_stiffness": 1e7}}, "suspension and stop"),
         ({"car": {"steering_damping": 3e3}}, "steering cannot be integrated"),
         ({"car": {"tyre_slip_damping": 130.0}}, "tyre_slip_damping dt / tyre_impedance is 2.17 at physics_dt 0.00833"),
+        ({"solver": {"integrator": "implicitfast"}}, "dynamics.solver.integrator: implicitfast; wanted is Euler"),
+        ({"contact": {"stiffness": 1e8}}, "dynamics.contact: stiffness 1e.08 and damping 30000 cannot be integrated"),
     ],
 )
 def test_refuses_by_name(changes, named):
     with pytest.raises(ConfigError, match=named):
         make("mjx_car", **changes)
+
+
+@pytest.mark.parametrize(
+    ("key", "bad", "wanted"),
+    [
+        ("car.mass", -1800.0, "above 0"), ("car.mass", float("nan"), "above 0"), ("car.mass", float("inf"), "above 0"),
+        ("car.inertia", [-750.0, 2550.0, 3000.0], "above 0"), ("car.inertia", [750.0, 2550.0, 5000.0], "no moment above the sum"),
+        ("car.wheel_inertia", [3.0, 1.3], "no moment above the sum"), ("car.inertia", [750.0, 2550.0], "3 moments"),
+        ("car.wheelbase", 0.0, "above 0"),
+        ("car.wheel_radius", -0.35, "above 0"), ("car.suspension_stiffness", 0.0, "above 0"), ("car.spin_limit", 0.0, "above 0"),
+        ("car.suspension_damping", -1.0, "of at least 0"), ("car.knuckle_mass", -50.0, "of at least 0"),
+        ("car.drive_torque", -500.0, "of at least 0"), ("car.steering_limit", 1.6, "below 1.5708"),
+        ("car.tyre_impedance", 1.0, "below 1"), ("car.brake_impedance", 0.0, "above 0"), ("car.mass_height", float("inf"), "finite"),
+        ("solver.iterations", 0, "of at least 1"), ("solver.line_search", -1, "of at least 1"), ("solver.friction_ratio", 0.0, "above 0"),
+    ],
+)  # fmt: skip
+def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
+    group, name = key.split(".")
+    entry = {**config("mjx_car"), group: {**config("mjx_car")[group], name: bad}}
+    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted (is|are) .*{wanted}"):
+        cars.numbers(entry)
+
+
+def test_every_number_of_a_car_has_its_bounds():
+    numbers = {field.name for kind in (cars.CarParameters, cars.Solver) for field in dataclasses.fields(kind)}
+    assert bounds.BOUNDS.keys() == numbers - {"algorithm", "integrator"}
+    for name in ("mjx_car", "mjx_published"):
+        cars.numbers(config(name))
+
+
+@pytest.mark.parametrize(
+    ("key", "bad"),
+    [
+        ("mass", 0.0), ("wheelbase", -2.6), ("speed_limit", 0.0), ("steering_limit", 0.0), ("steering_limit", 1.6), ("rear_length", -1.3),
+        ("acceleration", -1.0), ("deceleration", -5.0), ("rolling", float("nan")), ("drag", -1.0), ("air_drag", -1.0),
+    ],
+)  # fmt: skip
+def test_numbers_that_no_bicycle_has_are_refused(key, bad):
+    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted is"):
+        make("bicycle", **{key: bad})
+    make("bicycle", rear_length=0.0)
+
+
+@pytest.mark.parametrize("name", ["mjx_car", "bicycle"])
+def test_no_two_parts_of_a_start_share_memory(name):
+    """Else a step could not be given the start to keep (`donate_argnums`)."""
+    leaves = jax.tree.leaves(make(name).init(KEY, scene_for()))
+    assert len({leaf.unsafe_buffer_pointer() for leaf in leaves}) == len(leaves)
 
 
 def test_refuses_a_control_step_that_is_no_multiple():

@@ -7,7 +7,7 @@ from scene_documents import checker, document, packer, straight, thing, written
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import config, keys, sources
+from scenefactory_jax.run import batches, config, keys, sources
 from scenefactory_jax.run.bench import bench
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
@@ -81,6 +81,42 @@ def test_nothing_to_train_on_says_why(tmp_path):
     assert "scenes.path: null; give a bank, a scene file or a folder" in refused("train", "experiment=smoke", "scenes=womd")
     with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: 7 is the training seed"):
         sources.heldout(config.load("train", "scenes.seed=7", "scenes.heldout.seed=7")["scenes"], path=None)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("quality.reject=[level]", "quality.reject: 'level' is no rule; valid: missing_map, "),
+        ("lanes.topology.beside_m=[5.0,2.0]", "lanes.topology.beside_m: [5.0, 2.0]; wanted is [least, most]"),
+        ("features.streets.one_in=0", "features.streets.one_in: 0; wanted is a number above 0"),
+        ("spread.timeout_s=0.0", "spread.timeout_s: 0; wanted is a number above 0"),
+        ("scenes.workers=0", "spread.workers: 0; wanted is a number of at least 1"),
+    ],
+)
+def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, message):
+    path = written(tmp_path, document(), "good.json")
+    assert refused("convert", f"source={path}", f"out={tmp_path / 'bank'}", "progress=false", override).startswith(message)
+    assert not (tmp_path / "bank").exists()
+
+
+def test_a_mistake_in_the_config_is_no_scene_s_fault_in_a_stream():
+    source = batches.open(config.load("scenes", "scenes.pack.box_m=-1.0")["scenes"])
+    with pytest.raises(ConfigError, match=r"^scenes\.pack\.box_m: -1; wanted is a number above 0"):
+        batches.measure(source, None, grid={"radius_m": None}, sample=1, headroom=1.0, given={}, seed=0)
+
+
+def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    written(folder, document(name="../escaped"), "a.json")
+    written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
+    loaded = scenes(config.load("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
+    assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_half.png", "sheet.png"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
+    summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", "progress=false"))
+    assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair
+    assert "b.json (\\ud800half): " in capsys.readouterr().out
 
 
 # ---- keys that do not exist

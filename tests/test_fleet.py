@@ -262,7 +262,11 @@ def test_logged_sizes_are_cut_to_the_range():
     [
         ({"scale": {"colour": [0.9, 1.1]}}, "dynamics.fleet.scale.colour: unknown parameter; valid: length"),
         ({"scale": {"mass": [1.2, 0.8]}}, "dynamics.fleet.scale.mass"),
-        ({"scale": {"mass": [0.0, 1.0]}}, "dynamics.fleet.scale: .*must be above 0"),
+        ({"scale": {"mass": [0.0, 1.0]}}, "dynamics.fleet.scale.mass: 0; wanted is a number above 0"),
+        ({"scale": {"wheelbase": [0.0, 0.0]}}, "dynamics.fleet.scale.wheelbase: 0; wanted is a number above 0"),
+        ({"scale": {"tyre_impedance": [0.9, 2.0]}}, "dynamics.fleet.scale.tyre_impedance: 1; wanted is a number above 0 and below 1"),
+        ({"scale": {"tyre_impedance": [0.3, 1.0]}}, "tyre_slip_damping dt / tyre_impedance is 3.03"),
+        ({"length_m": [0.0, 5.0]}, "dynamics.fleet.length_m: 0; wanted is a number above 0"),
         ({"length_m": [5.0]}, "dynamics.fleet.length_m"),
         ({"size": "huge"}, "dynamics.fleet.size"),
         ({"scale": {"suspension_damping": [1.0, 12.0]}}, "dynamics.fleet.scale: the suspension and stop cannot be integrated"),

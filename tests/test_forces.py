@@ -96,3 +96,22 @@ def test_the_engine_ends_at_the_spin_limit():
     spins = jnp.array([[-50.0, 0.0, 0.0, 0.0], [89.0, 95.0, 0.0, 0.0], [100.0, 400.0, 0.0, 0.0]])
     torque = jax.vmap(lambda spin: forces.pulling(car, jnp.float32(600.0), spin))(spins)
     np.testing.assert_allclose(torque, [[600.0, 600.0, 0.0, 0.0], [600.0, 300.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], rtol=1e-5)
+
+
+def test_others_push_where_they_touch_wherever_the_mass_is():
+    """Force and torque of a contact are about the box's centre; both are at the height of the mass. Air acts at the mass itself."""
+    car = dataclasses.replace(CAR, mass_forward=0.3, air_drag=2.0)
+    turn, zero = 0.7, jnp.zeros(4)
+    qpos = jnp.zeros(17).at[2].set(0.755).at[3].set(np.cos(turn / 2)).at[6].set(np.sin(turn / 2))
+
+    def torque(force, speed):
+        state = states.seen(car, qpos, jnp.zeros(16).at[1].set(speed))
+        command = forces.Command(jnp.float32(0.0), jnp.float32(0.0), zero, zero, jnp.array(force), jnp.float32(500.0))
+        told = forces.applied(car, state, command, zero)
+        return np.array([*told.torque])
+
+    aside = 1000.0 * np.array([np.sin(turn), np.cos(turn)])  # of a push to the north, in the car's axes
+    np.testing.assert_allclose(torque([0.0, 1000.0], 0.0), [-car.mass_height * aside[1], car.mass_height * aside[0], 500.0], rtol=1e-5)
+    drag = -2.0 * 10.0**2 * np.array([np.sin(turn), np.cos(turn)])
+    wanted = [-car.mass_height * drag[1], car.mass_height * drag[0], 500.0 + car.mass_forward * drag[1]]
+    np.testing.assert_allclose(torque([0.0, 0.0], 10.0), wanted, rtol=1e-5)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.dynamics import car as cars
 from scenefactory_jax.dynamics import oracle
 from scenefactory_jax.run.config import load
@@ -18,7 +19,8 @@ del DRIVES["count"], MEETINGS["count"]
 TIMING = dict(physics_hz=120.0, control_hz=30.0)
 ROAD = SETTINGS["road"]
 CONVERGED = dict(**SETTINGS["reference"], nudge=0.0)
-BOUND = dict(**SETTINGS["bound"], control_hz=30.0, bins=40)
+WHEEL = dict(wheel_radius=load("task")["dynamics"]["car"]["wheel_radius"])
+BOUND = dict(**SETTINGS["bound"], **WHEEL, control_hz=30.0, bins=40)
 COLLISION = dict(**SETTINGS["encounters"]["collision"], control_hz=30.0)
 # With a line search of 4 this drive never leaves its first step's forces: engine and brakes nearly cancel, and no step is accepted
 STUCK = sequences.Sequences(
@@ -99,7 +101,7 @@ def test_an_error_put_in_on_purpose_shows(entry, drives, driven, changes, median
 def test_drives_are_not_chaotic(entry, drives, driven):
     """A start 1e-6 m/s faster ends where it must, so errors are the engines' and not the cases'."""
     nudged = engines.drive_c(entry, drives, friction_scale=1.0, **TIMING, **ROAD, **{**CONVERGED, "nudge": 1e-6})
-    assert equivalence.errors(nudged, driven[1]).position.max() < 1e-4
+    assert equivalence.errors(nudged, driven[1], **WHEEL).position.max() < 1e-4
 
 
 def test_too_few_iterations_show(entry, drives, driven):
@@ -219,6 +221,38 @@ def test_encounters_meet_when_they_should(entry):
     np.testing.assert_array_equal((closest < 0)[~slow], meant[~slow])
     assert (closest[~meant & ~slow] < 0.6).all()
     assert all(separation(p, y) > 0 for p, y in zip(many.position, many.yaw, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"speed_max": 0.5}, "speed_max: 0.5; wanted is a number above 1"),
+        ({"closing_min": 25.0}, "speed_max: 20; wanted is a number above 25"),
+        ({"closing_min": -1.0}, "closing_min"),
+        ({"lead_max_s": 0.1}, "lead_max_s: 0.1; wanted is a number of at least 0.3"),
+        ({"friction_max": 0.01}, "friction_max"),
+        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+    ],
+)
+def test_encounters_that_cannot_be_are_refused(changes, named):
+    """The first two drew for ever."""
+    with pytest.raises(ConfigError, match=f"validation.encounters.draw.{named}"):
+        encounters.draw(0, **{**MEETINGS, "count": 2, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"hold_min_s": 0.0}, "hold_min_s: 0; wanted is a number above 0"),
+        ({"hold_min_s": 2.0}, "hold_max_s: 1; wanted is a number of at least 2"),
+        ({"friction_max": 0.01}, "friction_max"),
+        ({"speed_max": -1.0}, "speed_max"),
+        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+    ],
+)
+def test_drives_that_cannot_be_are_refused(changes, named):
+    with pytest.raises(ConfigError, match=f"validation.drives.draw.{named}"):
+        sequences.draw(0, **{**DRIVES, "count": 2, **changes})
 
 
 def separation(position, yaw):

@@ -14,6 +14,7 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.run import results
 from scenefactory_jax.run import weather as command
 from scenefactory_jax.run.config import load
+from scenefactory_jax.types import SURFACES
 from scenefactory_jax.weather import uniform
 
 CONF = ROOT / "conf" / "weather"
@@ -129,11 +130,19 @@ def test_draw_follows_the_weights_and_keep_keeps():
         ({"tyre": {k: v for k, v in BASE["grip"]["tyre"].items() if k != "load"}}, "tyre.load"),
         ({"surfaces": {"AC": SURFACE["AC"]}}, "SMA"),
         ({"surfaces": {**SURFACE, "AC": {"theta": 1.0}}}, "surfaces.AC.texture_mm"),
+        ({"floor": 0.0}, "weather.grip.floor: 0; wanted is a number above 0"),
+        ({"slip_static": -0.15}, "weather.grip.slip_static: -0.15; wanted is a number of at least 0"),
+        ({"reference_speed": -1.0}, "weather.grip.reference_speed"),
+        ({"tyre": {**BASE["grip"]["tyre"], "load": -3469.0}}, "weather.grip.tyre.load"),
+        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"weather.grip.tyre.stribeck_velocity\[3\]"),
+        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, "stribeck_velocity: .*; wanted are b1, b2, b3, b4"),
+        ({"surfaces": {**SURFACE, "ICE": {"theta": 0.1, "texture_mm": 0.0}}}, "weather.grip.surfaces.ICE.texture_mm"),
     ],
 )
 def test_grip_refuses_by_name(change, named):
+    """When it is made, as an environment does, not when it is first asked."""
     with pytest.raises(ConfigError, match=named):
-        grip_of(**change)(uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 2)), jnp.zeros(1))
+        weather.make({**BASE["grip"], **change})
 
 
 @pytest.mark.parametrize(
@@ -143,6 +152,7 @@ def test_grip_refuses_by_name(change, named):
         ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
         ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
         ({"surface": "AC", "weight": 1.0}, "film_mm"),
+        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: nan; wanted is a finite number of at least 0"),
     ],
 )
 def test_draw_refuses_by_name(case, named):
@@ -158,6 +168,17 @@ def test_every_shipped_weather_draws_a_drivable_road(name):
     drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
     mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
     assert mu.min() > 0.5 and mu.max() < 1.4
+
+
+@pytest.mark.parametrize(("name", "least"), [("mixed", "0.80"), ("winter", "0.1")])
+def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
+    text = (CONF / f"{name}.yaml").read_text()
+    cases = yaml.safe_load(text)["draw"]["cases"]
+    roads = [uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
+    mu = [float(grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0]) for road in roads]
+    assert (min(mu), max(mu)) == pytest.approx((float(least), 1.10), abs=0.006)
+    assert f"friction 1.10 down to {least}" in text.splitlines()[0]
+    assert "between 0.80 and 1.10, and" in (ROOT / "conf" / "study" / "friction.yaml").read_text()
 
 
 def test_the_command_tells_what_the_model_says(tmp_path):

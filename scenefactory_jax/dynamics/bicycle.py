@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.build import build
+from scenefactory_jax.build import build, check_number, check_numbers
 from scenefactory_jax.dynamics.car import GRAVITY
 from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
 from scenefactory_jax.geometry import heading, norm, wrap_angle
@@ -70,8 +70,12 @@ def make(
             gravity and exceeds one where a real car would slide.
 
     Raises:
-        ConfigError: an unknown or missing number of `contact`.
+        ConfigError: a number that no car has, or an unknown, missing or wrong one of `contact`, by name.
     """
+    check_numbers({"mass": mass, "wheelbase": wheelbase, "speed_limit": speed_limit}, where="dynamics", above=0.0)
+    check_number(steering_limit, where="dynamics.steering_limit", above=0.0, below=math.pi / 2)
+    pushes = {"acceleration": acceleration, "deceleration": deceleration, "rolling": rolling, "drag": drag, "air_drag": air_drag}
+    check_numbers({"rear_length": rear_length, "centre_height": centre_height, **pushes}, where="dynamics", least=0.0)
     entry = {**contact, "_target_": "make"}
     meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)()
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
@@ -107,8 +111,8 @@ class Limits(NamedTuple):
 def init(key: PRNGKeyArray, scene: Scene) -> Body:
     """Cars at their starts."""
     agents = scene.agents
-    zero = jnp.zeros(agents.yaw.shape, jnp.float32)
-    return Body(agents.position, agents.yaw, agents.speed, zero, zero, zero, zero, zero, zero)
+    zeros = (jnp.zeros(agents.yaw.shape, jnp.float32) for _ in range(6))  # an array each: none may be donated twice
+    return Body(agents.position, agents.yaw, agents.speed, *zeros)
 
 
 def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.dynamics import bounds
 from scenefactory_jax.struct import pytree
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
@@ -70,7 +71,7 @@ class CarParameters:
     spin_limit: float  # above 0.9 of it the drive torque falls, to nothing at it, rad/s
     brake_torque_front: float  # of each front wheel at full brake, N m
     brake_torque_rear: float  # of each rear wheel at full brake, N m
-    brake_impedance: float  # of the brakes' friction (solimp), 0..1: a held wheel creeps by torque x (1 - impedance) / impedance
+    brake_impedance: float  # of the brakes' friction (solimp), 0..1: a held wheel creeps by torque x (1 - impedance)
     body_stiffness: float  # of a corner of the chassis that touches the ground (roll-over), N/m
     body_damping: float  # of the same, N s/m
     body_friction: float  # of the same, Coulomb coefficient
@@ -99,10 +100,13 @@ def numbers(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
     """Car and solver of a config's `dynamics`.
 
     Raises:
-        ConfigError: an unknown, missing or wrong number, by name.
+        ConfigError: an unknown or missing number, or one beyond its `bounds`, by name.
     """
     kinds = {"car": "CarParameters", "solver": "Solver"}
     car, solver = (build({**entry[k], "_target_": t}, builtins=__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
+    bounds.check(car, where="dynamics.car")
+    bounds.check_moments(car, where="dynamics.car")
+    bounds.check(solver, where="dynamics.solver")
     return car, solver
 
 
@@ -276,7 +280,7 @@ def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
     falls by damping dt / impedance of itself in a step, and grows if that is 2 or more.
 
     Raises:
-        ConfigError: naming `where`, the spring, the sum and the bound; or a mass of zero.
+        ConfigError: naming `where`, the spring, the sum and the bound.
     """
     unsprung = car.wheel_mass + car.carrier_mass
     about_steer = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia + car.steering_inertia
@@ -296,8 +300,6 @@ def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
 
 
 def _check_spring(name: str, mass: float, stiffness: float, damping: float, *, physics_dt: float, where: str) -> None:
-    if mass <= 0.0:
-        raise ConfigError(f"{where}: the {name} moves a mass or inertia of {mass:g}; it must be above 0")
     load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
     if load >= 4.0:
         message = f"(k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}; it must stay below 4"

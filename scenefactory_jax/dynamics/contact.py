@@ -15,9 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.build import ConfigError, check_numbers
 from scenefactory_jax.geometry import cross, dot, norm
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Boxes, Motion
+
+OFF_CENTRE = 3.7  # times as much mass moves with a contact in the middle of two cars' faces as with one at their corners
 
 
 class Touch(NamedTuple):
@@ -36,11 +39,39 @@ class Contact(NamedTuple):
 
 
 def make(
-    *, stiffness: float, damping: float, friction: float, mass: float, yield_s: float, nearest: int, height: float
+    *,
+    stiffness: float,
+    damping: float,
+    friction: float,
+    mass: float,
+    yield_s: float,
+    nearest: int,
+    height: float,
+    physics_dt: float | None = None,
 ) -> Contact:
-    """`forces` and `neighbours` with their numbers."""
+    """`forces` and `neighbours` with their numbers.
+
+    Args:
+        nearest: of the others that a car may touch; 0: none.
+        physics_dt: s, of the steps in which the forces move cars; None: they are reported and move nobody.
+
+    Raises:
+        ConfigError: a number out of its range, or a contact too stiff for `physics_dt`, by name.
+    """
+    check_numbers({"stiffness": stiffness, "mass": mass, "yield_s": yield_s}, where="dynamics.contact", above=0.0)
+    check_numbers({"damping": damping, "friction": friction, "nearest": nearest}, where="dynamics.contact", least=0.0)
+    if physics_dt is not None:
+        _check_stable(stiffness, damping, mass / 2, physics_dt=physics_dt)
     numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, yield_s=yield_s, height=height)
     return Contact(functools.partial(neighbours, nearest=nearest), functools.partial(forces, **numbers))
+
+
+def _check_stable(stiffness: float, damping: float, reduced: float, *, physics_dt: float) -> None:
+    """Refuse a contact that the integrator cannot carry, by the bound of `forces` for cars that meet off centre."""
+    load = OFF_CENTRE * (stiffness * physics_dt + 2 * damping) * physics_dt / reduced
+    if load >= 4.0:
+        message = f"{OFF_CENTRE} (k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}, m half the mass; it must stay below 4"
+        raise ConfigError(f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {message}")
 
 
 def boxes_of(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
@@ -79,8 +110,8 @@ def forces(
 
     Stiffness and damping of a pair are those given times its reduced mass over the reduced mass of two cars: 1 between cars, 2 against a
     wall, little against a pedestrian. So every pair bounces alike, with k dt^2 / m of 0.07 at 1e6 N/m and 120 Hz (m its reduced mass) and
-    0.26 where cars meet off centre; semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m stays below 4: 0.58
-    and 2.1 with 3e4 N s/m.
+    `OFF_CENTRE` times that, 0.26, where cars meet off centre; semi-implicit Euler with an explicit damper is stable while that plus
+    2 c dt / m stays below 4: 0.58 and 2.1 with 3e4 N s/m.
 
     Args:
         cars: bodies that are not present, or whose state is not finite, touch nobody. Two that differ by more than `height` in elevation do

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from scenefactory_jax.build import ConfigError, check_range
+from scenefactory_jax.build import ConfigError, check_numbers, check_range
+from scenefactory_jax.dynamics import bounds, solve, tree
 from scenefactory_jax.dynamics import car as cars
-from scenefactory_jax.dynamics import solve, tree
 from scenefactory_jax.dynamics import state as states
 from scenefactory_jax.dynamics.car import CarParameters
 from scenefactory_jax.dynamics.vector import over_wheels
@@ -56,11 +56,14 @@ def drawn(
         ConfigError: an unknown parameter, a bad range, or a spread that the integrator cannot carry, by name.
     """
     spans = {name: check_range(span, where=f"dynamics.fleet.{name}") for name, span in (("length_m", length_m), ("width_m", width_m))}
+    check_numbers({name: span[0] for name, span in spans.items()}, where="dynamics.fleet", above=0.0)
     factors = {}
     for name, span in scale.items():
         if name not in vars(car):
             raise ConfigError(f"dynamics.fleet.scale.{name}: unknown parameter; valid: {', '.join(vars(car))}")
         factors[name] = check_range(span, where=f"dynamics.fleet.scale.{name}")
+        for end in factors[name]:
+            bounds.check(scaled(car, {name: end}), where="dynamics.fleet.scale")
     hardest = worst(car, factors)
     cars.stable_limits(hardest, physics_dt=physics_dt, where="dynamics.fleet.scale")
     if size == "logged":
@@ -99,8 +102,9 @@ def scaled(car: CarParameters, factors: Mapping[str, Any]) -> CarParameters:
 
 
 def worst(car: CarParameters, scale: Mapping[str, tuple[float, float]]) -> CarParameters:
-    """The car that is hardest to integrate: what has mass at its least, all else (springs, dampers, arms) at its most."""
-    return scaled(car, {name: span[0 if "mass" in name or "inertia" in name else 1] for name, span in scale.items()})
+    """The car that is hardest to integrate: masses and what divides the slip's damping at their least, all else at its most."""
+    least = ("mass", "inertia", "tyre_impedance")
+    return scaled(car, {name: span[0 if any(part in name for part in least) else 1] for name, span in scale.items()})
 
 
 FORCES = (

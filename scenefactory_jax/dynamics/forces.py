@@ -23,7 +23,7 @@ class Command(NamedTuple):
     brake: Float[Array, "4"]  # largest torque of each wheel's brake
     mu: Float[Array, "4"]
     force: Float[Array, "2"]  # from other cars, in the world's plane
-    torque: Float[Array, ""]
+    torque: Float[Array, ""]  # of it, about the box's centre
 
 
 class Load(NamedTuple):
@@ -55,12 +55,14 @@ def applied(car: CarParameters, state: State, command: Command, wheel_torque: Fl
 
     east, north = (dot(axis, state.velocity) for axis in (state.east, state.north))
     drag = car.air_drag * length(east, north)
-    force = state.east * (command.force[0] - drag * east) + state.north * (command.force[1] - drag * north)
-    force = force + Vector(0.0, -car.lateral_damping * state.velocity.y, 0.0)
-    # the chassis' joint is at the box's centre; forces act at the centre of mass below it
-    torque = state.up * command.torque + cross(tree.centre(car), force) + Vector(0.0, 0.0, -car.yaw_damping * state.rate.z)
+    slowing = state.east * (-drag * east) + state.north * (-drag * north) + Vector(0.0, -car.lateral_damping * state.velocity.y, 0.0)
+    others = state.east * command.force[0] + state.north * command.force[1]
+    # the chassis' joint is at the box's centre. What slows the car acts at the centre of mass; others push at its height, and where along
+    # the box is in their torque already
+    torque = state.up * command.torque + cross(Vector(0.0, 0.0, car.mass_height), others) + cross(tree.centre(car), slowing)
+    torque = torque + Vector(0.0, 0.0, -car.yaw_damping * state.rate.z)
     ground, ground_torque = scrape(car, state)
-    return Forces(force + ground, torque + ground_torque, suspension=stop, spin=wheel_torque, steer=FRONT * servo)
+    return Forces(slowing + others + ground, torque + ground_torque, suspension=stop, spin=wheel_torque, steer=FRONT * servo)
 
 
 def springs(car: CarParameters, state: State) -> Forces:

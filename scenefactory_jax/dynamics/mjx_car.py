@@ -92,9 +92,9 @@ def make(
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
     parameters, settings = cars.numbers({"car": car, "solver": solver})
-    entry = {**contact, "_target_": "make"}
-    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=parameters.height)()
     plant = compiled(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
+    entry, numbers = {**contact, "_target_": "make"}, {"height": parameters.height, "physics_dt": physics_dt}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", **numbers)()
     context = {"car": parameters, "physics_dt": physics_dt}
     vary = None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)()
     return bind(plant._replace(vary=vary), meet, grip)
@@ -106,12 +106,12 @@ def compiled(
     """The car with all that is derived of it; all cars are this one until `vary` says otherwise.
 
     Raises:
-        ConfigError: a spring too stiff for the time step, time steps that do not fit, a slip speed that is not above 0, or rolling
+        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `arrow` has not, or rolling
             resistance with latched brakes, which have no dry friction.
     """
     cars.stable_limits(car, physics_dt=physics_dt, where="dynamics.car")
-    if car.tyre_slip_speed <= 0.0:
-        raise ConfigError(f"dynamics.car.tyre_slip_speed: {car.tyre_slip_speed:g} m/s; it must be above 0, 1e3 switches it off")
+    if solver.algorithm == "arrow" and solver.integrator != "Euler":
+        raise ConfigError(f"dynamics.solver.integrator: {solver.integrator}; wanted is Euler, or dynamics.solver.algorithm: Newton or CG")
     if brakes == "latched" and car.rolling_torque != 0.0:
         torque = f"dynamics.car.rolling_torque: {car.rolling_torque:g} N m"
         raise ConfigError(f"{torque}; it must be 0 with latched brakes, or dynamics.brakes must be friction")
@@ -165,7 +165,7 @@ def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
         qacc_warmstart=jnp.zeros((count, 16), jnp.float32),
         spin_sign=jnp.ones((count, 4), jnp.float32),
         contact_force=jnp.zeros((count,), jnp.float32),
-        tyres=Tyres(*[jnp.zeros((count, 4), jnp.float32)] * 4),
+        tyres=Tyres(*(jnp.zeros((count, 4), jnp.float32) for _ in range(4))),  # an array each: none may be donated twice
         fleet=fleet,
     )
 

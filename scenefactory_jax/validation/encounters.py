@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.build import check_number, check_numbers
+
 KINDS = ("rear_end", "head_on", "side", "glancing", "near_miss")
 RATIOS = {"rear_end": (0.0, 0.85), "head_on": (0.0, 0.85), "side": (0.0, 0.9), "glancing": (0.85, 0.995), "near_miss": (1.005, 1.1)}
 HEADINGS = {"rear_end": (0.0, 0.2), "head_on": (np.pi, 0.3), "side": (np.pi / 2, 0.6)}  # of the second car: centre, half range, rad
@@ -51,7 +53,16 @@ def draw(
         parked_share: of encounters with the second car at rest.
         braking_share: of cars that brake, at a fifth to the whole of their brakes.
         lead_min_s: the cars meet (or pass) between this and `lead_max_s` after the start, at constant velocity.
+
+    Raises:
+        ConfigError: no encounter, ranges without an end above their start, or a relative speed that no two cars have.
     """
+    where = "validation.encounters.draw"
+    check_number(count, where=f"{where}.count", least=1.0)
+    check_numbers({"closing_min": closing_min, "friction_min": friction_min, "lead_min_s": lead_min_s}, where=where, least=0.0)
+    check_number(speed_max, where=f"{where}.speed_max", above=closing_min)
+    check_number(friction_max, where=f"{where}.friction_max", least=friction_min)
+    check_number(lead_max_s, where=f"{where}.lead_max_s", least=lead_min_s)
     steps = round(seconds * control_hz)
     rows = []
     for index, child in enumerate(np.random.SeedSequence(seed).spawn(count)):

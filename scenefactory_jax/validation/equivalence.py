@@ -5,6 +5,7 @@ arithmetic's alone; `trials` can put a finer time step beside it, to see what ei
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ from scenefactory_jax.validation.sequences import Sequences
 
 PERCENTILES = (50.0, 90.0, 99.0, 100.0)
 SPIN = np.array([8, 11, 13, 15])  # the wheels' rates in qvel; their angles stand one later in qpos
-RIM_M = 0.35  # turns the wheels' rates into rim speeds
 
 
 class Errors(NamedTuple):
@@ -63,15 +63,15 @@ class Trial(NamedTuple):
     fine_m: Float[np.ndarray, "4"] | None  # the same error against the fine time step
 
 
-def errors(run: Run, reference: Run) -> Errors:
-    """Differences at the end of every control step."""
+def errors(run: Run, reference: Run, *, wheel_radius: float) -> Errors:
+    """Differences at the end of every control step; the radius, m, turns the wheels' rates into rim speeds."""
     place, rate = run.qpos - reference.qpos, run.qvel - reference.qvel
     turn = yaw_of(run.qpos) - yaw_of(reference.qpos)
     turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
     counted = np.ones(17, bool)
     counted[SPIN + 1] = False
     weight = np.ones(16)
-    weight[SPIN] = RIM_M
+    weight[SPIN] = wheel_radius
     every = np.concatenate([place[..., counted], rate * weight], axis=-1)
     return Errors(
         position=np.linalg.norm(place[..., :2], axis=-1),
@@ -88,15 +88,18 @@ def yaw_of(qpos: Float[np.ndarray, "*cases 17"]) -> Float[np.ndarray, "*cases"]:
     return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
-def compare(run: Run, reference: Run, *, control_hz: float, bound_m: float, horizon_s: float, bins: int) -> Agreement:
+def compare(
+    run: Run, reference: Run, *, wheel_radius: float, control_hz: float, bound_m: float, horizon_s: float, bins: int
+) -> Agreement:  # fmt: skip
     """Errors over time, force histograms and worst cases of single cars.
 
     Args:
+        wheel_radius: see `errors`.
         bound_m: of the position error.
         horizon_s: until when the bound must hold.
         bins: of the histograms.
     """
-    apart = errors(run, reference)._asdict()
+    apart = errors(run, reference, wheel_radius=wheel_radius)._asdict()
     apart = {name: value[:, :, 0] for name, value in apart.items()}
     horizon = round(horizon_s * control_hz)
     worst_until = apart["position"][:, :horizon].max(1)
@@ -181,14 +184,15 @@ def settings(
         key = (hz, changed["solver"]["integrator"], changed["solver"]["friction_ratio"])
         if key not in references:
             references[key] = reference(changed, cases, physics_hz=hz, **truth)
-        position = errors(run, references[key]).position[:, :, 0]
+        apart = functools.partial(errors, run, wheel_radius=changed["car"]["wheel_radius"])
+        position = apart(references[key]).position[:, :, 0]
         rows.append(
             Trial(
                 **names,
                 refused=None,
                 error_m=np.percentile(position[:, -1], PERCENTILES),
                 share_within=float((position.max(1) < bound_m).mean()),
-                fine_m=None if fine is None else np.percentile(errors(run, fine).position[:, -1, 0], PERCENTILES),
+                fine_m=None if fine is None else np.percentile(apart(fine).position[:, -1, 0], PERCENTILES),
             )
         )
     return rows

@@ -162,9 +162,9 @@ def _begin(
     size = (car.length, car.width)
     worlds = engines.scenes(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
     scene = jax.tree.map(lambda leaf: leaf[0], worlds)
-    walls = np.flatnonzero(["wall" in case.name for case in crowd])
-    scene = replace(scene, boxes=_walls(lanes[walls], wall_m))
     body = jax.jit(backend.init)(jax.random.key(0), scene)
+    walls = np.flatnonzero(["wall" in case.name for case in crowd])
+    scene = replace(scene, boxes=_walls(lanes[walls], wall_m, height=float(body.qpos[0, 2])))
     qpos, qvel = np.array(body.qpos), np.array(body.qvel)
     roll, pitch = (np.array([getattr(case, name) for case in crowd]) / 2 for name in ("roll", "pitch"))
     turn = [np.cos(roll) * np.cos(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch), -np.sin(roll) * np.sin(pitch)]
@@ -175,14 +175,14 @@ def _begin(
     return scene, replace(body, qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel)), lanes
 
 
-def _walls(lanes: Float[np.ndarray, "B 2"], wall_m: float) -> Boxes:
-    """Across the first of these lanes and along the second: boxes that nothing moves."""
+def _walls(lanes: Float[np.ndarray, "B 2"], wall_m: float, *, height: float) -> Boxes:
+    """Across the first of these lanes and along the second, their centres as high as the cars': boxes that nothing moves."""
     count = len(lanes)
     offset = np.array([[wall_m, 0.0], [0.0, -2.0]])[:count]
     zero = jnp.zeros(count, jnp.float32)
     return Boxes(
         position=jnp.asarray(lanes + offset, jnp.float32),
-        elevation=zero + 0.755,
+        elevation=zero + height,
         yaw=zero,
         velocity=jnp.zeros((count, 2), jnp.float32),
         yaw_rate=zero,

@@ -98,7 +98,7 @@ def compare(
     before, after = np.minimum(one.before, other.before), np.maximum(one.after, other.after)
     incoming, outgoing = reference.qvel[row, before, :, :2], reference.qvel[row, after, :, :2]
     closing = np.linalg.norm(incoming[:, 1] - incoming[:, 0], axis=-1)
-    apart = errors(run, reference)
+    apart = errors(run, reference, wheel_radius=entry["car"]["wheel_radius"])
     velocity, yaw_rate = apart.velocity[row, after], apart.yaw_rate[row, after]
     speed, wanted = (np.linalg.norm(r.qvel[row, after, :, :2], axis=-1) for r in (run, reference))
     relative = velocity.max(1) / np.maximum(closing, 1e-9)

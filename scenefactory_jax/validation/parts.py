@@ -47,10 +47,11 @@ def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         spread(functools.partial(engines.drive_c, entry, nudge=nudge, **truth), cases) for nudge in (0.0, settings["drives"]["nudge"])
     )
     options = {"control_hz": rates["control_hz"], "bins": settings["drives"]["bins"], **settings["bound"]}
-    found = equivalence.compare(run, reference, **options)
+    wheel = {"wheel_radius": entry["car"]["wheel_radius"]}
+    found = equivalence.compare(run, reference, **wheel, **options)
     horizon = round(until * rates["control_hz"]) - 1
-    position = equivalence.errors(run, reference).position[..., 0]
-    sensitivity = equivalence.errors(nudged, reference).position[..., 0]
+    position = equivalence.errors(run, reference, **wheel).position[..., 0]
+    sensitivity = equivalence.errors(nudged, reference, **wheel).position[..., 0]
     return {
         "bound": settings["bound"],
         "count": len(cases.speed),

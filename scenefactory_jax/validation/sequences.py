@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.build import check_number, check_numbers
+
 # Wheels (front left, front right, rear left, rear right) that stand on the slippery part of the road
 PATTERNS = np.array(
     [
@@ -55,7 +57,16 @@ def draw(
         patterned_share: of drives on a road that is slippery under some wheels, each pattern as often.
         extreme_share: of holds with full brake, full throttle or full lock; the others are uniform in all three controls.
         hold_min_s: controls are held for a time uniform between this and `hold_max_s`.
+
+    Raises:
+        ConfigError: no drive, or a range whose end is below its start.
     """
+    where = "validation.drives.draw"
+    check_number(count, where=f"{where}.count", least=1.0)
+    check_numbers({"speed_max": speed_max, "friction_min": friction_min}, where=where, least=0.0)
+    check_number(friction_max, where=f"{where}.friction_max", least=friction_min)
+    check_number(hold_min_s, where=f"{where}.hold_min_s", above=0.0)
+    check_number(hold_max_s, where=f"{where}.hold_max_s", least=hold_min_s)
     steps = round(seconds * control_hz)
     rows = []
     for child in np.random.SeedSequence(seed).spawn(count):
