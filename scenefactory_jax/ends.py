@@ -1,11 +1,12 @@
 """Which facts end an agent, and which events are new."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from scenefactory_jax.build import ConfigError
+from scenefactory_jax.build import ConfigError, check_type
 from scenefactory_jax.types import Events, Facts
 
 EVENTS = tuple(field.name for field in dataclasses.fields(Events))
@@ -29,12 +30,13 @@ def judge(facts: Facts, happened: Events, active: Bool[Array, " A"], *, ending: 
     return Events(**new), done
 
 
-def check(ending: list[str], *, where: str) -> None:
-    """Refuse unknown event names in `ending`.
+def check(ending: Any, *, where: str) -> None:
+    """Refuse unknown event names in `ending`, or no list of names.
 
     Raises:
         ConfigError: naming the key, the name, and the events that exist.
     """
+    check_type(ending, list[str], where=f"{where}.ending")
     for name in ending:
         if name not in EVENTS:
             raise ConfigError(f"{where}.ending: unknown event {name!r}; valid: {', '.join(EVENTS)}")

@@ -101,25 +101,26 @@ def play(
     def body(episode: Episode, _: None) -> tuple[Episode, Frame]:
         before = replace(episode.state, active=episode.state.active & ~episode.over)
         action = act(parameters, episode.observation)
-        state, outcome = env.step(scene, before, action)
+        state, outcome = env.transition(scene, before, action)
         seen, boxes = episode.tally, env.now(scene, state).boxes
         found = clues.note(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
         tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
         place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = Frame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
-        return Episode(state, outcome.observation, tally, episode.over | outcome.over), frame
+        return Episode(state, env.observe(scene, state), tally, episode.over | outcome.over), frame
 
     return jax.lax.scan(body, episode, None, length=steps)
 
 
 def _note(tally: Tally, before: State, after: State, outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
-    facts, active = outcome.facts, before.active
+    facts = outcome.facts
+    active = before.active & ~facts.events.fault  # a broken car's facts are no measurements
     seen = active & jnp.isfinite(facts.ttc)
-    happened = jax.tree.map(lambda old, new: old | (new & active), tally.happened, facts.events)
+    happened = jax.tree.map(lambda old, new: old | (new & before.active), tally.happened, facts.events)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
     return Tally(
         happened=happened,
-        ended=tally.ended | (outcome.done & active),
+        ended=tally.ended | (outcome.done & before.active),
         steps=tally.steps + active.astype(jnp.int32),
         goal_distance=jnp.where(active, facts.goal_distance, tally.goal_distance),
         drac_max=jnp.maximum(tally.drac_max, jnp.where(active, facts.drac, 0.0)),

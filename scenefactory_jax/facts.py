@@ -12,6 +12,8 @@ from scenefactory_jax import conflict, roadside
 from scenefactory_jax.geometry import car_circles, cross, dot, heading, norm
 from scenefactory_jax.types import Agents, Events, Facts, Motion, Scene, State
 
+OVERFLOWS = 1e12  # no speed, place or force comes near; beyond, float32 sums of squares end at 3e38
+
 
 def measure(
     scene: Scene,
@@ -96,8 +98,8 @@ def _has_crashed(
 
 
 def is_finite(motion: Motion) -> Bool[Array, " A"]:
-    """Whether every number of a car's motion is finite."""
-    per_leaf = [jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1) for leaf in jax.tree.leaves(motion)]
+    """Whether every number of a car's motion is finite, and far from where its square would not be."""
+    per_leaf = [jnp.all(jnp.abs(leaf.reshape(leaf.shape[0], -1)) < OVERFLOWS, axis=1) for leaf in jax.tree.leaves(motion)]
     return jnp.all(jnp.stack(per_leaf), axis=0)
 
 

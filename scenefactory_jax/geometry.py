@@ -5,7 +5,6 @@ from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.types import Road
 
-CAR_CIRCLES = 3
 CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 

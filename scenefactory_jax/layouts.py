@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.build import ConfigError, check_range, check_type
+from scenefactory_jax.build import ConfigError, check_range, check_share, check_type
 from scenefactory_jax.geometry import CONTIGUOUS_M, heading, locate, running_length
 from scenefactory_jax.patches import join
 from scenefactory_jax.types import SURFACES, Patches, Road, Scene, Weather
@@ -202,8 +202,7 @@ def _cover(
 ) -> Patches:
     """Patches of these shapes: whether each is there, and what covers it."""
     _check(chance=(chance, 0.0), follows=(follows, 0.0))
-    if chance > 1:
-        raise ConfigError(f"chance: {chance}; wanted is a number from 0 to 1")
+    check_share(chance, where="chance")
     count = vertices.shape[0]
     wet, there = jax.random.split(key)
     return Patches(

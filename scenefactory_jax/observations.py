@@ -174,7 +174,9 @@ def encounters(
 
 
 def _squashed(length: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:
-    return length / (scale + jnp.abs(length))
+    """l / (scale + |l|); of what is infinitely far, which there is none of, the limit."""
+    finite = jnp.where(jnp.isinf(length), 0.0, length)
+    return jnp.where(jnp.isinf(length), jnp.sign(length), finite / (scale + jnp.abs(finite)))
 
 
 def _nearest(

@@ -77,8 +77,8 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
     def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], Shot]:
         state, observation, over = carry
         before = replace(state, active=state.active & ~over)
-        after, outcome = env.step(scene, before, act(parameters, observation, key))
-        return (after, outcome.observation, over | outcome.over), shot(env, scene, before, after, outcome)
+        after, outcome = env.transition(scene, before, act(parameters, observation, key))
+        return (after, env.observe(scene, after), over | outcome.over), shot(env, scene, before, after, outcome)
 
     over = ~jnp.any(state.active)
     _, shots = jax.lax.scan(body, (state, observation, over), jax.random.split(key, steps))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.build import ConfigError, build, check_type
+from scenefactory_jax.build import ConfigError, build, check_number, check_range, check_share, check_type
 from scenefactory_jax.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Agents, Boxes, Scene
@@ -16,30 +16,55 @@ from scenefactory_jax.types import Agents, Boxes, Scene
 Draw = Callable[[PRNGKeyArray, Scene], Agents]
 
 
+LEAST = {"candidates": 1, "travel_min_m": 0.0, "margin_m": 0.0, "start_gap_m": 0.0, "goal_gap_m": 0.0}
+PART = ("draw", "share", "respawn_clear_m")  # keys of a mixture's part, which is an entry of the config group
+
+
 def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
-    """A `draw` entry with its numbers bound; those of a mixture are entries of `spawn` themselves, each with a share.
+    """A `draw` entry with its numbers bound; those of a mixture are entries of `spawn` themselves, each with a share, or null.
 
     Raises:
         ConfigError: a key that does not fit, by name; a mixture without parts, with a share below 0 or parts that begin anew on their own.
     """
     if not isinstance(entry, Mapping) or entry.get("_target_") != "mixed":
-        return build(entry, builtins=__name__, where=where)
+        draw = build(entry, builtins=__name__, where=where)
+        if "." not in entry["_target_"]:
+            _check(entry, where=where)
+        return draw
+    if unknown := [key for key in entry if key not in ("_target_", "parts")]:
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key of mixed; valid: parts")
     parts = entry.get("parts")
-    if not isinstance(parts, Mapping) or not parts:
+    chosen = {name: part for name, part in parts.items() if part is not None} if isinstance(parts, Mapping) else {}
+    if not chosen:
         raise ConfigError(f"{where}.parts: {parts!r}; wanted are entries of `spawn` by name, each with a share")
-    shares, draws = [], []
-    for name, part in parts.items():
-        for key in ("draw", "share"):
-            if key not in part:
-                raise ConfigError(f"{where}.parts.{name}.{key}: missing; a part is an entry of `spawn` and its share")
-        check_type(part["share"], float, where=f"{where}.parts.{name}.share")
-        if not part["share"] > 0:
-            raise ConfigError(f"{where}.parts.{name}.share: {part['share']}; wanted is a number above 0")
-        if part.get("respawn_clear_m") is not None:
-            raise ConfigError(f"{where}.parts.{name}.respawn_clear_m: {part['respawn_clear_m']}; it belongs to the whole `spawn`")
-        shares.append(float(part["share"]))
-        draws.append(make(part["draw"], where=f"{where}.parts.{name}.draw"))
-    return build({"_target_": "mixed"}, builtins=__name__, where=where, shares=shares, draws=draws)
+    shares, draws = zip(*(_part(part, where=f"{where}.parts.{name}") for name, part in chosen.items()), strict=True)
+    return build({"_target_": "mixed"}, builtins=__name__, where=where, shares=list(shares), draws=list(draws))
+
+
+def _part(part: Mapping[str, Any], *, where: str) -> tuple[float, Draw]:
+    """Share and draw of one part of a mixture."""
+    for key in ("draw", "share"):
+        if key not in part:
+            raise ConfigError(f"{where}.{key}: missing; a part is an entry of `spawn` and its share")
+    if unknown := [key for key in part if key not in PART]:
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key; valid: draw, share")
+    check_type(part["share"], float, where=f"{where}.share")
+    check_number(part["share"], where=f"{where}.share", above=0.0)
+    if part.get("respawn_clear_m") is not None:
+        raise ConfigError(f"{where}.respawn_clear_m: {part['respawn_clear_m']}; it belongs to the whole `spawn`")
+    return float(part["share"]), make(part["draw"], where=f"{where}.draw")
+
+
+def _check(numbers: Mapping[str, Any], *, where: str) -> None:
+    """Refuse numbers of this module's draws that no start can meet."""
+    for name, least in LEAST.items():
+        if name in numbers:
+            check_number(numbers[name], where=f"{where}.{name}", least=least)
+    check_share(numbers.get("standing_share", 0.0), where=f"{where}.standing_share")
+    if len(numbers.get("car_size_m", (4.0, 2.0))) != 2:
+        raise ConfigError(f"{where}.car_size_m: {numbers['car_size_m']}; wanted is [length, width]")
+    if "travel_max_m" in numbers:
+        check_range([numbers["travel_min_m"], numbers["travel_max_m"]], where=f"{where}.travel_min_m, travel_max_m")
 
 
 def mixed(key: PRNGKeyArray, scene: Scene, *, shares: list[float], draws: list[Draw]) -> Agents:
@@ -67,9 +92,9 @@ def underway(
 ) -> Agents:
     """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
 
-    Starts are rows of `scene.log`, `travel_min` or more before the goal along the way where it is that long; a shorter one is driven whole.
-    They keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates fits stays absent. In a
-    share of the episodes all cars start from rest, in the others at their recorded speeds.
+    Starts are rows of `scene.log` that show the car, `travel_min` or more before the goal along the way where it is that long; a shorter
+    one is driven whole. They keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates
+    fits stays absent. In a share of the episodes all cars start from rest, in the others at their recorded speeds.
     """
     log, cars = scene.log, scene.agents
     place_key, rest_key = jax.random.split(key)
@@ -78,10 +103,11 @@ def underway(
     travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
     whole = travelled[:, -1:]
     begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(whole - travel_min_m, 0.0)
-    row = jax.vmap(jnp.searchsorted)(travelled, begin)  # the first that is so far along the way
+    row = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(travelled, begin) - 1  # the last that is no further along the way
+    row = jnp.maximum(row, jnp.argmax(log.valid, axis=1)[:, None])  # nor before the car is first seen
     read = jax.vmap(lambda track, rows: track[rows])
     start = read(log.position, row)
-    usable = cars.present[:, None] & ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
+    usable = cars.present[:, None] & read(log.valid, row) & ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
     goals = jnp.broadcast_to(cars.goal[:, None], start.shape)
     chosen, present = _choose(start, goals, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
     pick = functools.partial(_pick, chosen=chosen, present=present)

@@ -257,7 +257,7 @@ Observation = dict[str, Any]
 
 @struct
 class Outcome:
-    """What one step gave. `observation` is None where only the transition was asked for."""
+    """What one step gave, of an action or of a control step. `observation` is None where it was not asked for."""
 
     observation: Observation | None
     reward: Float[Array, " A"]
@@ -278,13 +278,17 @@ class Dynamics(NamedTuple):
 
 
 class Env(NamedTuple):
-    """One world as pure functions. `reset` and `step` are the public pair; the next three are their parts, so that a training loop can
-    reset finished worlds before it pays for the observation. `now` gives the scene as it is at a state's moment, for dynamics and
-    viewers. Of the actions of an episode every `hold`-th is read, the first one first, and stands until the next."""
+    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all `hold` control steps that it
+    stands for, their rewards added up.
+
+    The others are their parts: `start` and `observe` divide a reset, so that a training loop can restart finished worlds before it pays
+    for the observation; `transition` is a single control step, for whoever looks closer than the agent acts. It reads every `hold`-th
+    action of an episode, the first one first, which stands until the next. `now` gives the scene as it is at a state's moment.
+    """
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
-    start: Callable[[PRNGKeyArray, Scene], State]
+    start: Callable[..., State]  # (key, scene, control step at which it begins = 0)
     transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
     observe: Callable[[Scene, State], Observation]
     now: Callable[[Scene, State], Scene]

@@ -12,12 +12,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax import conditions, ends, observations, rain, rewards, spawn
-from scenefactory_jax.build import ConfigError, build, check_type
-from scenefactory_jax.struct import choose, replace, strong
+from scenefactory_jax import conditions, ends, observations, rain, rewards, spawn, weather
+from scenefactory_jax.build import ConfigError, build, check_number, check_type
+from scenefactory_jax.struct import choose, replace, strong, unchecked
 from scenefactory_jax.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
 GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # of a config
+
+
+KEYS = {  # of the groups that no one function takes
+    "timing": ("physics_hz", "control_hz", "episode_s"),
+    "controls": ("command", "every"),
+    "spawn": ("draw", "respawn_clear_m"),
+    "weather": ("draw", "grip", "patches", "rain"),
+}
 
 
 def episode_steps(timing: Mapping[str, float | int]) -> int:
@@ -60,17 +68,18 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
-    _require(config, GROUPS)
-    timing = config["timing"]
-    for key in ("physics_hz", "control_hz", "episode_s"):
-        if key not in timing:
-            raise ConfigError(f"timing.{key}: missing; timing needs physics_hz, control_hz, episode_s")
-        check_type(timing[key], float, where=f"timing.{key}")
-        if not timing[key] > 0:
-            raise ConfigError(f"timing.{key}: {timing[key]}; wanted is a number above 0")
-    check_type(config["spawn"]["respawn_clear_m"], float | None, where="spawn.respawn_clear_m")
+    _require(config)
+    timing, clear_m = config["timing"], config["spawn"]["respawn_clear_m"]
+    for key, value in timing.items():
+        check_type(value, float, where=f"timing.{key}")
+        check_number(value, where=f"timing.{key}", above=0.0)
+    if episode_steps(timing) < 1:
+        raise ConfigError(f"timing.episode_s: {timing['episode_s']}; wanted is a control step, {1 / timing['control_hz']:g} s, or more")
+    check_type(clear_m, float | None, where="spawn.respawn_clear_m")
+    if clear_m is not None:
+        check_number(clear_m, where="spawn.respawn_clear_m", least=0.0)
     context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
-    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather", where="weather.grip")
+    grip = weather.make(config["weather"]["grip"])
     dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
     bound = functools.partial(build, builtins="scenefactory_jax.facts")
     ends.check(config["ends"].get("ending", []), where="ends")
@@ -87,7 +96,7 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
         groups=observations.make(config["observe"], **context),
         episode_steps=episode_steps(timing),
         control_dt=context["control_dt"],
-        respawn_clear_m=config["spawn"]["respawn_clear_m"],
+        respawn_clear_m=clear_m,
     )
 
 
@@ -105,10 +114,12 @@ def assemble(parts: Parts) -> Env:
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         state = _start(parts, key, scene)
-        return state, _observe(parts, scene, state)
+        # copies: nothing in the state is anybody else's, so that a step may be given it to keep (`donate_argnums`)
+        return jax.tree.map(jnp.copy, state), _observe(parts, scene, state)
 
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
-        state, outcome = _transition(parts, scene, state, action)
+        control = functools.partial(_transition, parts, scene, action=action)
+        state, _, outcome, _ = act(control, state, None, hold=parts.hold, note=lambda *_: (None, None))
         return state, replace(outcome, observation=_observe(parts, scene, state))
 
     def bind(function: Callable) -> Callable:
@@ -118,42 +129,46 @@ def assemble(parts: Parts) -> Env:
 
 
 def act(
-    transition: Callable[[State], tuple[State, Outcome]],
+    control: Callable[[State], tuple[State, Outcome]],
     state: State,
     noted: Any,
     *,
     hold: int,
     note: Callable[[Any, State, Outcome], tuple[Any, Any]],
-) -> tuple[State, Any, dict[str, Any], Bool[Array, "*W"], Any]:
+) -> tuple[State, Any, Outcome, Any]:
     """All control steps that one action stands for, of one world or of many.
 
     Args:
-        transition: one control step with that action.
+        control: one control step with that action.
         noted: what `note` carries from step to step: (noted, state before the step, its outcome) -> (noted, numbers to add up).
 
     Returns:
-        The state, what was noted, what came of the action for the agents that took it (reward and terms are sums; who begins a new life
-        meanwhile has no part in it), whether a world is over, and the sums of the numbers. Without a restart a world that is over stands
-        still until the next action.
+        The state, what was noted, the outcome of the whole action, and the sums of the numbers. In the outcome reward and terms are sums
+        and events those of any step, for the agents that took the action: who begins a new life meanwhile has no part in it. Facts are
+        those of the last step that an agent drove in, and whether a world is truncated or over is the last step's.
     """
 
-    def control(carry: tuple[State, Any, Array], _: None) -> tuple[tuple[State, Any, Array], tuple]:
+    def body(carry: tuple[State, Any, Array], _: None) -> tuple[tuple[State, Any, Array], tuple]:
         before, noted, taking = carry
-        after, outcome = transition(before)
-        came = {
+        after, outcome = control(before)
+        own = {
             "reward": jnp.where(taking, outcome.reward, 0.0),
             "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
-            "events": {name: new & taking for name, new in vars(outcome.events).items()},
+            "events": jax.tree.map(lambda new: new & taking, outcome.events),
             "done": outcome.done & taking,
-            "truncated": outcome.truncated[..., None] & taking & ~outcome.done,
         }
         noted, numbers = note(noted, before, outcome)
-        return (after, noted, taking & ~outcome.done), (came, outcome.over, numbers)
+        clock = {"truncated": outcome.truncated, "over": outcome.over}
+        return (after, noted, taking & ~outcome.done), (own, taking, outcome.facts, clock, numbers)
 
     # unrolled, a single step is no loop in the program
-    (state, noted, _), (came, over, numbers) = jax.lax.scan(control, (state, noted, state.active), None, length=hold, unroll=hold == 1)
-    came = jax.tree.map(lambda each: each.any(0) if each.dtype == bool else each.sum(0), came)
-    return state, noted, came, over[-1], jax.tree.map(lambda each: each.sum(0), numbers)
+    (state, noted, _), each = jax.lax.scan(body, (state, noted, state.active), None, length=hold, unroll=hold == 1)
+    own, took, facts, clock, numbers = each
+    own, numbers = jax.tree.map(lambda leaf: leaf.any(0) if leaf.dtype == bool else leaf.sum(0), (own, numbers))
+    drove = jnp.maximum(took.sum(0) - 1, 0)[None]
+    facts = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], facts)
+    clock = {name: leaf[-1] for name, leaf in clock.items()}
+    return state, noted, unchecked(Outcome, observation=None, facts=facts, **own, **clock), numbers
 
 
 def _now(parts: Parts, scene: Scene, state: State) -> Scene:
@@ -161,12 +176,14 @@ def _now(parts: Parts, scene: Scene, state: State) -> Scene:
     return replace(scene, agents=state.agents, weather=state.weather, boxes=parts.others(scene, state.step))
 
 
-def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
-    """A fresh episode."""
-    agents_key, weather_key, key = jax.random.split(key, 3)
-    scene = replace(scene, boxes=parts.others(scene, jnp.int32(0)))
-    agents, weather = parts.draw_agents(agents_key, scene), parts.draw_weather(weather_key, scene)
-    body = parts.dynamics.init(jax.random.fold_in(key, 0), replace(scene, agents=agents, weather=weather))
+def _start(parts: Parts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+    """A fresh episode, or one whose clock is already at a later control step: rain and the others are as they are then."""
+    step = jnp.asarray(step, jnp.int32)
+    agents_key, weather_key, key, body_key = jax.random.split(key, 4)
+    scene = replace(scene, boxes=parts.others(scene, step))
+    agents = parts.draw_agents(agents_key, scene)
+    weather = rain.pass_time(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
+    body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
     count = agents.present.shape[0]
     state = State(
         body=body,
@@ -177,7 +194,7 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene) -> State:
         happened=ends.none(count),
         age=jnp.zeros(count, jnp.int32),
         previous_action=jnp.zeros((count, 3), jnp.float32),
-        step=jnp.int32(0),
+        step=step,
         key=key,
     )
     return strong(state)
@@ -242,8 +259,7 @@ def _finite(value: Array) -> Array:
 
 def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
     """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
-    draw_key, key = jax.random.split(state.key)
-    body_key = jax.random.fold_in(draw_key, 0)
+    draw_key, key, body_key = jax.random.split(state.key, 3)
     fresh = draw_agents(draw_key, scene)
     waiting = ~state.active & fresh.present
     clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
@@ -264,6 +280,12 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
     )
 
 
-def _require(config: Mapping[str, Any], groups: tuple[str, ...]) -> None:
-    if missing := [name for name in groups if name not in config]:
-        raise ConfigError(f"config: group {missing[0]!r} is missing; an environment needs {', '.join(groups)}")
+def _require(config: Mapping[str, Any]) -> None:
+    """Refuse a config without a group, and a group with other keys than its own."""
+    if missing := [name for name in GROUPS if name not in config]:
+        raise ConfigError(f"config: group {missing[0]!r} is missing; an environment needs {', '.join(GROUPS)}")
+    for group, names in KEYS.items():
+        if missing := [name for name in names if name not in config[group] and name not in ("patches", "rain")]:
+            raise ConfigError(f"{group}.{missing[0]}: missing; {group} needs {', '.join(names)}")
+        if unknown := [name for name in config[group] if name not in names]:
+            raise ConfigError(f"{group}.{unknown[0]}: unknown key; valid: {', '.join(names)}")

@@ -95,7 +95,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
     def see(task, cue, age):
         return jnp.select([task == 2, task == 3, task == 5], [cue, age.astype(jnp.float32), cue], 0.0)
 
-    def start(key, scene):
+    def start(key, scene, step=0):
         cue_key, key = jax.random.split(key)
         return State(
             body=jax.random.rademacher(cue_key, (AGENTS,), jnp.float32),
@@ -106,7 +106,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
             happened=blank(Events),
             age=jnp.zeros(AGENTS, jnp.int32),
             previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
-            step=jnp.int32(0),
+            step=jnp.asarray(step, jnp.int32),
             key=key,
         )
 

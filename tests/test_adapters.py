@@ -2,7 +2,6 @@
 
 import functools
 import sys
-import textwrap
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from adapting import ALONE, SMOKE, scenes
 
-from scenefactory_jax import adapters, world
+from scenefactory_jax import world
 from scenefactory_jax.adapters import episodes, flat, layout
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
@@ -115,15 +114,3 @@ def test_a_missing_extra_is_named(name, monkeypatch):
     monkeypatch.delitem(sys.modules, f"scenefactory_jax.adapters.{name}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install 'scenefactory_jax\[{name}\]'"):
         __import__(f"scenefactory_jax.adapters.{name}")
-
-
-def test_the_documented_rollout_runs_as_it_stands():
-    text = adapters.__doc__[adapters.__doc__.index("**Without an adapter.**") :]
-    lines = text.splitlines()[2:]
-    code = lines[: next(index for index, line in enumerate(lines) if line and not line.startswith("    "))]
-    place: dict = {}
-    exec(textwrap.dedent("\n".join(code)), place)
-    seen, actions, reward, done, active = place["samples"]
-    assert seen.shape[:3] == (64, 8, 4) and actions.shape == (64, 8, 4, 3) and reward.shape == done.shape == active.shape == (64, 8, 4)
-    assert (np.asarray(place["states"].step) < 64).all()  # of 60 steps: every world has begun anew
-    assert np.isfinite(seen).all() and np.abs(reward[active]).sum() > 0 and active.any()

@@ -126,6 +126,18 @@ def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
+def test_what_is_left_out_is_counted_group_by_group(batch):
+    """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
+    policy, parameters, samples, log_std = batch
+    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
+    numbers = dict(loss=objective, optimiser=adam, rate=update.AdaptiveRate(None, 1e-5, 1e-2, None), epochs=1, minibatches=2, size=6)
+    samples = dataclasses.replace(samples, weight=(jnp.arange(24) < 14).astype(jnp.float32))
+    given = (parameters, adam.init(parameters), samples, log_std, jax.random.key(0), jnp.int32(0))
+    *_, facts = update.learn(*given, **numbers, permute_each_epoch=False, groups=2)
+    assert float(facts["left_out"]) == pytest.approx(6 / 14)
+
+
 @pytest.fixture(scope="module")
 def learn(batch):
     """Two minibatches of 12: (samples, numbers of the rate, iteration) -> (parameters, optimiser state, facts)."""
@@ -275,6 +287,10 @@ def test_mistakes_are_named():
         train.make(env, policy, **{**NUMBERS, "gamma": 1.5})
     with pytest.raises(ConfigError, match=r"ppo\.learning_rate: 1\.0 is outside"):
         train.make(env, policy, **{**NUMBERS, "learning_rate": 1.0})
+    wrong = {"desired_kl": -0.01, "value_clip": 0.0, "entropy": float("nan"), "value": -1.0, "max_grad_norm": 0.0}
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=rf"ppo\.{name}: {value:g}; wanted is a .*number"):
+            train.make(env, policy, **{**NUMBERS, name: value})
 
 
 @pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])

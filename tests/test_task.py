@@ -9,10 +9,11 @@ import pytest
 from conftest import road_of, scene_of
 
 import scenefactory_jax
-from scenefactory_jax import conflict, controls, ends, facts, geometry, observations, others, rewards, roadside, spawn, world
+from scenefactory_jax import conflict, controls, ends, evaluation, facts, geometry, observations, others, rewards, roadside, spawn, world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.conditions import keep
 from scenefactory_jax.struct import replace
+from scenefactory_jax.tracks import nobody
 from scenefactory_jax.types import Dynamics, Motion, Step
 
 CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
@@ -245,7 +246,7 @@ def test_an_action_stands_until_the_next_is_read(config):
     env = build_env(config, hold=3)
     scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]])
     state, _ = env.reset(jax.random.key(0), scene)
-    step, taken = jax.jit(env.step), []
+    step, taken = jax.jit(env.transition), []
     for throttle in range(7):
         state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
         taken.append(float(state.previous_action[0, 0]))
@@ -253,6 +254,28 @@ def test_an_action_stands_until_the_next_is_read(config):
     for every, message in ((7, "controls.every: 7; wanted is a divisor of the 1500 control steps"), (0, "controls.every: 0; wanted")):
         with pytest.raises(ConfigError, match=message):
             world.make({**config, "controls": {**config["controls"], "every": every}})
+
+
+def test_a_step_is_an_action_with_all_its_control_steps(config):
+    """The first car passes its goal in the second of three control steps: it has part in two of them."""
+    env = build_env(config, hold=3)
+    scene = scene_of([[0.0, 0.0], [0.0, 9.0]], [[3.4, 0.0], [90.0, 9.0]], speeds=[10.0, 10.0])
+    state, _ = env.reset(jax.random.key(0), scene)
+    action = jnp.array([[0.5, 0.0, 0.0]] * 2)
+    after, outcome = jax.jit(env.step)(scene, state, action)
+    control, paid, reached = jax.jit(env.transition), np.zeros(2), []
+    for _ in range(3):
+        driving = np.asarray(state.active)
+        state, single = control(scene, state, action)
+        paid += np.where(driving, single.reward, 0.0)
+        reached.append(bool(single.events.reached[0]))
+    assert reached == [False, True, False]
+    np.testing.assert_allclose(outcome.reward, paid, rtol=1e-6)
+    np.testing.assert_allclose(sum(outcome.terms.values()), paid, rtol=1e-5)
+    assert outcome.events.reached.tolist() == outcome.done.tolist() == [True, False] and not outcome.over
+    jax.tree.map(np.testing.assert_array_equal, after.motion, state.motion)
+    assert int(after.step) == 3 and float(outcome.facts.goal_distance[1]) == pytest.approx(float(single.facts.goal_distance[1]))
+    jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
 
 
 def test_a_car_knows_how_it_turns(env):
@@ -282,6 +305,29 @@ def test_the_lane_ahead_by_hand(env):
     np.testing.assert_allclose(seen[0, 5:].reshape(5, 2), squash(places, 20), atol=1e-4)
     np.testing.assert_allclose(seen[1, 5:].reshape(5, 2), squash(np.stack([ahead, np.full(5, -2.0)], 1), 20), atol=1e-4)
     np.testing.assert_allclose(seen[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
+
+
+def test_without_road_edges_every_observation_is_finite():
+    """The nearest edge is then infinitely far, and as far as it can read."""
+    numbers = scenefactory_jax.load("task", "observe=foresight", "dynamics=bicycle")
+    scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
+    scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
+    _, seen = world.make(numbers).reset(jax.random.key(0), scene)
+    assert set(seen) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
+    np.testing.assert_allclose(seen["lane"][:, 3:5], [[1.0, 0.0]] * 2)
+    slope = jax.grad(lambda length: observations._squashed(length, 2.0).sum())(jnp.array([jnp.inf, 1.0]))
+    np.testing.assert_allclose(slope, [0.0, 2 / 9], rtol=1e-6)
+
+
+def test_an_episode_may_begin_at_a_later_moment(config):
+    """Starts are drawn beside the others as they are then, and it has rained until then."""
+    one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), nobody())
+    moving = lambda scene, step: replace(one, position=jnp.array([[1.0, 0.0]]) * step)  # noqa: E731
+    beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.boxes.position[:1], scene.agents.goal.shape))  # noqa: E731
+    env, scene = build_env(config, draw=beside, beside=moving), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
+    late = env.start(jax.random.key(0), scene, 60)
+    assert int(late.step) == 60 and float(late.weather.rain.now_s) == pytest.approx(2.0) and float(late.agents.goal[0, 0]) == 60.0
+    assert float(env.start(jax.random.key(0), scene).agents.goal[0, 0]) == 0.0
 
 
 def drive(env, scene, action, steps, key=0):
@@ -353,6 +399,19 @@ def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
     assert not state.active[0] and state.active[1]
 
 
+def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
+    """It breaks in the first step: nothing is known of it but its start. Nor is a speed a number whose square is none."""
+    notes = scenefactory_jax.load("evaluate", "run=town")["failures"]["notes"]
+    broken = lambda parameters, observation: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
+    episode = evaluation.begin(env, jax.random.key(0), two_cars)
+    far = episode.tally.goal_distance
+    tally = evaluation.play(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
+    assert tally.happened.fault.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
+    assert float(tally.goal_distance[0]) == float(far[0]) and not tally.speed_sum.any()
+    motion = replace(episode.state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
+    assert facts.is_finite(motion).tolist() == [False, True]
+
+
 def test_edges_are_touched_by_circles(config):
     env = build_env(config)
     scene = scene_of([[0, 4.6]], [[50, 0]], yaws=[np.pi / 2], speeds=[3.0])
@@ -413,6 +472,19 @@ def test_se2_equivariance(env, two_cars):
     np.testing.assert_allclose(a[-1].observation["neighbours"].features, b[-1].observation["neighbours"].features, atol=1e-4)
 
 
+def test_a_fresh_state_shares_nothing(env, two_cars):
+    """Neither with itself nor with its scene: a step may be given it to keep (`donate_argnums`)."""
+
+    def buffers(tree):
+        plain = [leaf for leaf in jax.tree.leaves(tree) if leaf.size and not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+        return [leaf.unsafe_buffer_pointer() for leaf in plain]
+
+    scene = jax.tree.map(jnp.asarray, two_cars)
+    state, _ = env.reset(jax.random.key(0), scene)
+    own = buffers(state)
+    assert len(set(own)) == len(own) and not set(own) & set(buffers(scene))
+
+
 def test_steps_trace_once_under_vmap(env, two_cars):
     scenes = jax.tree.map(lambda x: jnp.stack([x, x]), two_cars)
     traces = []
@@ -462,8 +534,8 @@ def test_cars_underway_start_on_their_recorded_ways():
     start, goal = np.asarray(scene.agents.position)[:, None], np.asarray(scene.agents.goal)[:, None]
     position = start + share * (goal - start)
     valid = np.ones((4, 81), bool)
-    valid[0, 30:34] = False
-    position[0, 30:34] = 1e4
+    valid[0, 30:34] = valid[2, :6] = False
+    position[0, 30:34] = position[2, :6] = 1e4  # the last car is first seen when it has driven 0.45 m
     speed = np.broadcast_to((goal - start) / 8.0, position.shape)
     tracks = {"position": jnp.asarray(position, jnp.float32), "velocity": jnp.asarray(speed, jnp.float32)}
     log = replace(scene.log, **tracks, valid=jnp.asarray(valid))
@@ -477,7 +549,7 @@ def test_cars_underway_start_on_their_recorded_ways():
         x, goal_x, route = agents.position[here, car, 0], agents.goal[here, car, 0], agents.route[here, car]
         np.testing.assert_allclose(agents.position[here, car, 1], 4.0 * car, atol=1e-4)
         np.testing.assert_allclose(goal_x - x, route, atol=2.6 if car == 0 else 1e-3)  # the gap in the recording is not counted
-        assert x.min() >= -1e-4 and np.allclose(goal_x, whole) and route.min() >= min(10.0, whole) - 0.6
+        assert x.min() >= -1e-4 and np.allclose(goal_x, whole) and route.min() >= min(10.0, 5.55 if car == 2 else whole) - 1e-3
     assert np.ptp(agents.position[:, 0, 0]) > 20 and np.ptp(agents.position[:, 2, 0]) < 1e-3
     apart = np.linalg.norm(agents.position[:, :, None] - agents.position[:, None], axis=-1) + 1e3 * np.eye(4)
     assert np.where(agents.present[:, :, None] & agents.present[:, None], apart, 1e3).min() >= 4.0 - 1e-4
@@ -503,14 +575,37 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
     [
         ({"parts": None}, "spawn.draw.parts: None; wanted are entries"),
         ({"parts": {"a": {"draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: missing"),
-        ({"parts": {"a": {"share": 0.0, "draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: 0.0; wanted is a number above 0"),
+        ({"parts": {"a": {"share": 0.0, "draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: 0; wanted is a number above 0"),
         ({"parts": {"a": {"share": 1, "draw": {"_target_": "nobody"}}}}, "spawn.draw.parts.a.draw._target_: 'nobody' is not in"),
         ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "respawn_clear_m": 5.0}}}, "a.respawn_clear_m: 5.0; it belongs"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "shar": 3}}}, "spawn.draw.parts.a.shar: unknown key"),
+        ({"parts": {"a": None}}, "spawn.draw.parts: {'a': None}; wanted are entries"),
+        ({"shares": [1.0]}, "spawn.draw.shares: unknown key of mixed"),
     ],
 )
 def test_mistakes_in_a_mixture_are_named(change, message):
     with pytest.raises(ConfigError, match=message):
         spawn.make({"_target_": "mixed", **change})
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("spawn.draw.candidates=0", "spawn.draw.candidates: 0; wanted is a number of at least 1"),
+        ("spawn.draw.travel_min_m=-50", "spawn.draw.travel_min_m: -50; wanted is a number of at least 0"),
+        ("spawn.draw.travel_max_m=5", r"spawn.draw.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
+        ("spawn.draw.car_size_m=[4.0]", r"spawn.draw.car_size_m: \[4.0\]; wanted is \[length, width\]"),
+        ("spawn.respawn_clear_m=-1", "spawn.respawn_clear_m: -1; wanted is a number of at least 0"),
+        ("+spawn.respawn_clear=4", "spawn.respawn_clear: unknown key; valid: draw, respawn_clear_m"),
+        ("~controls.every", "controls.every: missing; controls needs command, every"),
+        ("timing.episode_s=inf", "timing.episode_s: inf; wanted is a finite number above 0"),
+        ("timing.episode_s=0.001", "timing.episode_s: 0.001; wanted is a control step, 0.0333333 s, or more"),
+        ("ends.ending=null", "ends.ending: None is of type NoneType"),
+    ],
+)
+def test_numbers_that_cannot_work_are_refused_by_name(override, message):
+    with pytest.raises(ConfigError, match=message):
+        world.make(scenefactory_jax.load("task", "spawn=random_pairs", "dynamics=bicycle", override))
 
 
 def test_respawn_starts_finished_cars_again(config):

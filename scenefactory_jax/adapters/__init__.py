@@ -20,37 +20,7 @@ What they share:
 - `terms` are the weighted reward terms, which sum to the reward; `events` what happened to the car in this step, for the first time.
 - The same seed gives the same bits, and nothing is compiled again while an environment runs.
 
-**Without an adapter.** For code in the style of purejaxrl, with one `jit` around everything, the functions of the package are all it takes:
-
-    import jax, jax.numpy as jnp, scenefactory_jax as sf
-    from scenefactory_jax.adapters import flat
-    from scenefactory_jax.run.sources import assign
-    from scenefactory_jax.struct import choose
-
-    config = sf.load("train", "experiment=smoke")
-    env = sf.make(config)
-    worlds, _ = assign(sf.load_scenes(config["scenes"]), 8, seed=0)             # a scene for each of 8 worlds, on the device
-
-    def observed(worlds, states):
-        return jax.vmap(lambda world, state: flat(env.observe(world, state)))(worlds, states)                 # [W, A, F]
-
-    def rollout(worlds, key, steps, policy):                                    # policy(observations, key) -> actions [W, A, 3]
-        def step(states, key):
-            act_key, start_key = jax.random.split(key)
-            seen = observed(worlds, states)
-            actions = policy(seen, act_key)
-            after, outcome = jax.vmap(env.transition)(worlds, states, actions)
-            fresh = jax.vmap(env.start)(jax.random.split(start_key, len(states.step)), worlds)
-            return choose(outcome.over, fresh, after), (seen, actions, outcome.reward, outcome.done, states.active)
-        first = jax.vmap(env.start)(jax.random.split(key, len(worlds.agents.present)), worlds)
-        return jax.lax.scan(step, first, jax.random.split(key, steps))
-
-    policy = lambda seen, key: jax.random.uniform(key, (*seen.shape[:2], 3), minval=-1.0, maxval=1.0)
-    states, samples = jax.jit(rollout, static_argnums=(2, 3))(worlds, jax.random.key(0), 64, policy)
-
-Pass the scenes to the jitted function as an argument: what a function closes over becomes a constant of its program. Weight what is learnt
-by `states.active`, for a slot without a driving car earns nothing; `outcome.done` ends a car, `outcome.truncated` a world.
-`ppo/rollout.py` is such a function in full.
+Code in the style of purejaxrl, with one `jit` around everything, needs no adapter: docs/library.md has the rollout.
 """
 
 import jax.numpy as jnp

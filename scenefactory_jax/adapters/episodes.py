@@ -129,10 +129,18 @@ def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
     control = lambda state: env.transition(scene, state, action)  # noqa: E731
-    state, _, came, over, _ = world.act(control, episode.state, None, hold=env.hold, note=lambda *_: (None, None))
-    came["terminated"] = came.pop("done")
-    empty = jnp.zeros((len(state.active), 0), jnp.float32)
-    return Episode(episode.scene, state, episode.key), Moment(observation=empty, active=state.active, over=over, **came)
+    state, _, outcome, _ = world.act(control, episode.state, None, hold=env.hold, note=lambda *_: (None, None))
+    moment = Moment(
+        observation=jnp.zeros((len(state.active), 0), jnp.float32),
+        reward=outcome.reward,
+        terms=outcome.terms,
+        events=vars(outcome.events),
+        terminated=outcome.done,
+        truncated=outcome.truncated & episode.state.active & ~outcome.done,
+        active=state.active,
+        over=outcome.over,
+    )
+    return Episode(episode.scene, state, episode.key), moment
 
 
 class Told(NamedTuple):
@@ -186,3 +194,23 @@ def chosen(options: Mapping[str, Any] | None, count: int) -> int:
     if index != ANY and not 0 <= index < count:
         raise ConfigError(f"options['scene']: {index}; valid: 0 to {count - 1}, or {ANY} for any")
     return int(index)
+
+
+def check_action(action: Any, shape: tuple[int, ...] | None, *, where: str = "action") -> None:
+    """Refuse an action of another shape than the environment's: one that broadcasts would drive cars that nobody meant.
+
+    Raises:
+        ConfigError: naming both shapes.
+    """
+    if np.shape(action) != shape:
+        raise ConfigError(f"{where}: shape {np.shape(action)}; wanted is {shape}, the last axis throttle, steer, brake")
+
+
+def check_render_mode(mode: Any) -> None:
+    """Refuse every way to draw.
+
+    Raises:
+        ConfigError: any but None.
+    """
+    if mode is not None:
+        raise ConfigError(f"render_mode: {mode!r}; valid: None; `replay` and `drive` draw")

@@ -79,7 +79,7 @@ def collect(
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(across.keys(action_key, len(mean), axis))
         action = mean + jnp.exp(log_std) * noise
         control = lambda worlds: jax.vmap(env.transition)(scenes, worlds, action)  # noqa: E731
-        after, lives, came, over, counts = world.act(control, worlds, lives, hold=env.hold, note=_tally)
+        after, lives, outcome, counts = world.act(control, worlds, lives, hold=env.hold, note=_tally)
         sample = Sample(
             observation=observation,
             action=action,
@@ -87,10 +87,12 @@ def collect(
             log_probability=log_probability(action, mean, log_std),
             value=value,
             active=worlds.active,
-            **{name: came[name] for name in ("reward", "done", "truncated")},
+            reward=outcome.reward,
+            done=outcome.done,
+            truncated=outcome.truncated[:, None] & worlds.active & ~outcome.done,
         )
-        fresh = jax.vmap(env.start)(across.keys(start_key, len(over), axis), scenes)
-        worlds = choose(over, fresh, after)
+        fresh = jax.vmap(env.start)(across.keys(start_key, len(outcome.over), axis), scenes)
+        worlds = choose(outcome.over, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
@@ -126,7 +128,7 @@ def _tally(lives: Lives, worlds: State, outcome: Outcome) -> tuple[Lives, Tally]
         "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
         "reward": total(reward, active),
-        "speed": total(outcome.facts.speed, active),
+        "speed": total(outcome.facts.speed, active & ~outcome.facts.events.fault),  # a broken car's is no measurement
         "ended": total(ended, ended),
         "return": total(lives.returns, ended),
         "length": total(lives.steps, ended),

@@ -19,7 +19,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.build import ConfigError
+from scenefactory_jax.build import ConfigError, check_number, check_share
 from scenefactory_jax.ppo import across, gae, loss, rollout, update
 from scenefactory_jax.struct import replace, strong, struct
 from scenefactory_jax.types import Env, Observation, Policy, Scene, State
@@ -122,7 +122,8 @@ def make(
     init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=functools.partial(size, groups=everybody))
     init, size = functools.partial(init, average=average is not None), functools.partial(size, groups=own)
     iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis, average=average)
-    return _compiled(init, iterate, functools.partial(_restart, start=start), functools.partial(_swap, start=start, axis=axis), mesh)
+    swap = functools.partial(_swap, start=functools.partial(_start, env=env, phases=1), axis=axis)
+    return _compiled(init, iterate, functools.partial(_restart, start=start), swap, mesh)
 
 
 def _groups(shards: int | None, mesh: Mesh | None) -> tuple[str | None, int, int]:
@@ -180,8 +181,7 @@ def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[
 
     def one(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         phase_key, start_key = jax.random.split(key)
-        world = env.start(start_key, scene)
-        world = replace(world, step=env.hold * jax.random.randint(phase_key, (), 0, phases, world.step.dtype))
+        world = env.start(start_key, scene, env.hold * jax.random.randint(phase_key, (), 0, phases))
         return world, env.observe(scene, world)
 
     return jax.vmap(one)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
@@ -226,7 +226,10 @@ def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> Trai
 def _swap(
     train_state: TrainState, scenes: Scene, worlds: Int[Array, " N"], fresh: Scene, *, start: Callable, axis: str | None
 ) -> tuple[TrainState, Scene]:
-    """Every device starts all fresh scenes, and keeps those of its own worlds."""
+    """Every device starts all fresh scenes, and keeps those of its own worlds.
+
+    At the beginning of their episodes, whatever `initial_phase` says: a life that its world's clock cuts short would count as a failure.
+    """
     start_key, key = jax.random.split(train_state.key)
     begun, seen = start(start_key, fresh)
     rows = across.own(worlds, len(train_state.worlds.step), axis)
@@ -382,17 +385,16 @@ def _own(tree: Any) -> Any:
 
 
 def _check(numbers: dict[str, Any]) -> None:
-    """Refuse numbers that cannot work, by name."""
+    given = {name: value for name, value in numbers.items() if value is not None}
     for name in ("horizon", "epochs", "minibatches", "episode_steps"):
-        if numbers[name] < 1:
-            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a whole number of at least 1")
-    falls = () if numbers["learning_rate_halved"] is None else ("learning_rate_halved",)
-    for name in ("learning_rate", "max_grad_norm", "clip", "sample_share", *falls):
-        if not numbers[name] > 0:
-            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number above 0")
-    for name in ("gamma", "gae_lambda", "sample_share", *(() if numbers["average"] is None else ("average",))):
-        if not 0 <= numbers[name] <= 1:
-            raise ConfigError(f"ppo.{name}: {numbers[name]}; wanted is a number from 0 to 1")
+        check_number(given[name], where=f"ppo.{name}", least=1)
+    positive = ("learning_rate", "max_grad_norm", "clip", "sample_share", "learning_rate_halved", "desired_kl", "value_clip")
+    for name in filter(given.__contains__, positive):
+        check_number(given[name], where=f"ppo.{name}", above=0)
+    for name in ("entropy", "value"):
+        check_number(given[name], where=f"ppo.{name}", least=0)
+    for name in filter(given.__contains__, ("gamma", "gae_lambda", "sample_share", "average")):
+        check_share(given[name], where=f"ppo.{name}")
     if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
         bounds = f"[{numbers['learning_rate_min']}, {numbers['learning_rate_max']}]"
         raise ConfigError(f"ppo.learning_rate: {numbers['learning_rate']} is outside [learning_rate_min, learning_rate_max] = {bounds}")

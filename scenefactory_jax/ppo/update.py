@@ -80,11 +80,12 @@ def learn(
     (parameters, optimiser_state), facts = jax.lax.scan(epoch, (parameters, optimiser_state), keys)
     moved, broken = facts.pop("moved"), facts.pop("broken")
     means = {name: jnp.sum(jnp.where(moved, fact, 0.0)) / jnp.maximum(jnp.sum(moved), 1) for name, fact in facts.items()}
-    weight, dealt = across.total((jnp.sum(batch.weight), jnp.float32(size)), axis)
+    held = batch.weight.reshape(groups, -1).sum(axis=1)
+    weight, dealt = across.total((held.sum(), jnp.minimum(held, minibatches * (size // groups)).sum()), axis)
     counted = {
         "skipped": jnp.sum(broken, dtype=jnp.float32),
         "learning_rate": optimiser_state[-1].hyperparams["learning_rate"],  # pyright: ignore
-        "left_out": jnp.maximum(1.0 - minibatches * dealt / jnp.maximum(weight, 1.0), 0.0),
+        "left_out": (weight - dealt) / jnp.maximum(weight, 1.0),
     }
     return parameters, optimiser_state, {**means, **counted}
 

@@ -104,8 +104,8 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
         scene: Scene, parameters: Any, state: State, observation: Observation, key: PRNGKeyArray, action: Float[Array, "3"]
     ) -> tuple[State, Observation, Shot]:
         actions = act(parameters, observation, key).at[car].set(action)
-        after, outcome = env.step(scene, state, actions)
-        return after, outcome.observation or {}, shot(env, scene, state, after, outcome)
+        after, outcome = env.transition(scene, state, actions)
+        return after, env.observe(scene, after), shot(env, scene, state, after, outcome)
 
     scene = jax.tree.map(jnp.asarray, scene)
     return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car)

@@ -44,7 +44,8 @@ def make_player(
         worlds: how many of the worlds to record; None: all.
         steps: how many of the steps to record; None: all.
     """
-    env, policy = world.make({**config, "ends": configs.load("task", f"ends={protocol}")["ends"]}), make_policy(config)
+    once = {"spawn": {**config["spawn"], "respawn_clear_m": None}}  # an agent is judged by one life, also of a run that starts it again
+    env, policy = world.make({**config, **once, "ends": configs.load("task", f"ends={protocol}")["ends"]}), make_policy(config)
     index = np.tile(np.arange(len(scenes)), settings["repeats"])
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
