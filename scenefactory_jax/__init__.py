@@ -3,7 +3,7 @@
     import jax, scenefactory_jax as sf
 
     config = sf.load("train", "experiment=demo")    # the same config as on the command line
-    env = sf.make(config)                           # pure functions for one world: env.reset, env.step
+    env = sf.make(config)                           # pure functions for one world: env.reset, env.step (one action)
     scenes = sf.load_scenes(config["scenes"])       # worlds stacked along the first axis
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
     run = sf.train(config)                          # and sf.evaluate(sf.load("evaluate", f"run={run.folder}"))
@@ -42,3 +42,8 @@ def __getattr__(name: str) -> Any:
     if name not in places:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"scenefactory_jax.run.{places[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """For tab completion: also what is not imported yet."""
+    return sorted({*globals(), *__all__})

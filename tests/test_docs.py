@@ -4,13 +4,16 @@ import re
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 import yaml
 from conftest import ROOT
 from pages import commands
 
+import scenefactory_jax as sf
 from scenefactory_jax import __version__
+from scenefactory_jax.adapters import layout
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config, results
 
@@ -67,10 +70,13 @@ def test_results_of_the_readme_are_those_of_the_study():
 
     for label, *place in README_ROWS:
         policy, nobody = (shown(row, *place) for row in ("rigid body", "untrained"))
-        assert f"| {label} | {policy} | {nobody} |" in text
-    assert f"clean on {shown('log replay', 'original', 'invincible', 'clean_bend_rate')} of them" in text
+        drivers = "" if place[0] != "original" else f"{shown('log replay', *place)} "  # they never start from rest
+        assert f"| {label} | {policy} | {nobody} | {drivers}|" in text
     pace = [run["casps"] for run in result["trainings"]["rigid body"]["runs"].values()]
     assert f"trains at {min(pace):,.0f} to {max(pace):,.0f} steps/s" in text
+    speeds = (ROOT / "experiments" / "throughput" / "throughput.md").read_text()
+    alone = re.findall(r"[\d,]{9,10}", text[text.index("The environment alone") : text.index("The recipe of the policies")])
+    assert len(alone) == 4 and all(f"| {speed} (" in speeds for speed in alone)
 
 
 def test_the_ten_lines_of_python_run(quickly):
@@ -81,6 +87,40 @@ def test_the_ten_lines_of_python_run(quickly):
     exec(code.replace('"experiment=demo", "weather=mixed"', '"experiment=smoke", "weather=mixed"'), found)
     outcome = found["outcome"]
     assert outcome.reward.shape == outcome.facts.ttc.shape == (4, 4) and np.isfinite(outcome.reward).all()
+
+
+def test_the_python_of_the_library_page_runs(quickly):
+    """All but the adapters, in the order of the page, at a size that compiles in seconds."""
+    page = (ROOT / "docs" / "library.md").read_text()
+    blocks = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "adapters.gymnasium" not in block]
+    small = {'"experiment=demo"': '"experiment=smoke"', '"scenes.count=4"': '"scenes.count=1", "dynamics=bicycle"', "steps=300": "steps=3"}
+    code = "\n".join(blocks)
+    assert all(code.count(line) for line in small) and len(blocks) == 3
+    for line, other in small.items():
+        code = code.replace(line, other)
+    found = {}
+    exec(code, found)
+    samples = found["samples"]
+    seen, active = samples["seen"], samples["active"]
+    assert seen.shape == samples["next"].shape and seen.shape[:3] == active.shape == samples["done"].shape == (32, 16, 4)
+    assert samples["action"].shape == (32, 16, 4, 3) and samples["truncated"].shape == (32, 16)
+    assert np.isfinite(seen).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
+    assert found["recording"].shots.position.shape[:2] == (1, 3)
+
+
+def test_the_task_page_has_the_numbers_of_the_configs(quickly):
+    page = (ROOT / "docs" / "task.md").read_text()
+    published, wary = (config.load("task", f"reward={name}")["reward"] for name in ("reference", "wary"))
+    for name, term in wary.items():
+        shown = (f"{entry['weight']:g}" if entry else "" for entry in (published.get(name), term))
+        assert f"| `{name}` | {' | '.join(shown)} |".replace("|  |", "| |") in page
+    widths = []
+    for experiment in ("published", "quick", "demo"):
+        settings = config.load("train", f"experiment={experiment}", "scenes=procedural", "scenes.count=1", "dynamics=bicycle")
+        scene = sf.load_scenes(settings["scenes"])[0]
+        _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
+        widths.append(max(columns.stop for columns in layout(seen).values()))
+    assert f"| flat | with the masks | {' | '.join(map(str, widths))} |" in page
 
 
 def test_the_version_is_the_same_everywhere():
