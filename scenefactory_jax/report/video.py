@@ -289,19 +289,21 @@ def _draw_header(sheet: Image.Image, left: int, top: int, panel: int, trajectory
 
 
 def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _Stage, now: int) -> None:
-    """Clock and counters below a panel."""
+    """Clock and counters below a panel, as many as have room: those that are still zero go first."""
     draw, bar, font = ImageDraw.Draw(sheet), _bar(panel), _font(_text_size(panel))
     draw.rectangle((left, top, left + panel, top + bar - 1), fill=(255, 255, 255))
-    draw.text((left, top + bar // 2), f"{now / stage.trajectory.control_hz:.1f} s", font=font, fill=INK, anchor="lm")
+    clock = f"{now / stage.trajectory.control_hz:.1f} s"
+    draw.text((left, top + bar // 2), clock, font=font, fill=INK, anchor="lm")
+    counts = {name: int(stage.counts[name][now]) for name in MARKS if name in stage.counts}
+    total, once = int(stage.trajectory.present.sum()), not canvas.respawns(stage.trajectory)
+    entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "fault"}
+    entries |= {"reached": f"{entries['reached']} of {total}"} if once and "reached" in entries else {}
+    while sum(font.getlength(entry) + 12 for entry in entries.values()) > panel - font.getlength(clock) and len(entries) > 1:
+        others = [name for name in reversed(entries) if name != "reached"]
+        del entries[next((name for name in others if not counts[name]), others[0])]
     right = left + panel
-    total = int(stage.trajectory.present.sum())
-    for name in [name for name in reversed(MARKS) if name in stage.counts]:
-        count = int(stage.counts[name][now])
-        if name == "fault" and not count:
-            continue
-        once = name == "reached" and not canvas.respawns(stage.trajectory)
-        entry = f"{MARKS[name].label} {count}" + (f" of {total}" if once else "")
-        draw.text((right, top + bar // 2), entry, font=font, fill=MARKS[name].colour if count else QUIET, anchor="rm")
+    for name, entry in reversed(entries.items()):
+        draw.text((right, top + bar // 2), entry, font=font, fill=MARKS[name].colour if counts[name] else QUIET, anchor="rm")
         right -= round(font.getlength(entry)) + 12
 
 
