@@ -5,7 +5,11 @@
 """
 
 import importlib
+import json
+import re
 import sys
+from collections.abc import Sequence
+from typing import NoReturn
 
 import hydra
 
@@ -40,16 +44,48 @@ def main() -> None:
         print(USAGE)
         raise SystemExit(0 if arguments else 2)
     command, overrides = arguments[0], arguments[1:]
-    if command not in configs.COMMANDS:
-        raise SystemExit(f"error: unknown command {command!r}; valid: {', '.join(configs.COMMANDS)}")
     try:
-        if not any(flag in overrides for flag in ("-m", "--multirun", "--help", "-h")):
-            configs.load(command, *configs.as_overrides(overrides))  # a wrong key is explained here, with the valid ones
+        if command not in configs.COMMANDS:
+            raise ConfigError(f"unknown command {command!r}; valid: {', '.join(configs.COMMANDS)}")
+        if any(flag in overrides for flag in ("--help", "-h")):
+            overrides = [*overrides, *_help(command, overrides)]
+        else:
+            _check(command, overrides)
         sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, overrides)]
         hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=command)(_job(command))()
-    except (ConfigError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None  # as a shell counts it: 128 and the signal's number
+    except (ConfigError, OSError) as error:
+        _end(error)
+
+
+def _help(command: str, overrides: Sequence[str]) -> list[str]:
+    """Hydra's own help shows the config, given these: what the command is for comes first, and nothing may be missing."""
+    purpose, keys = re.findall(rf"^  {command} +(.*?) +(\S+=.*)$", USAGE, re.MULTILINE)[0]
+    chosen = ["study=navigation"] if command == "study" and not any(word.startswith("study=") for word in overrides) else []
+    return [f"hydra.help.header={json.dumps(f'{command}: {purpose}; {keys}')}", *chosen]
+
+
+def _check(command: str, overrides: Sequence[str]) -> None:
+    """A wrong key is explained here, with the valid ones; and no two jobs of a sweep may judge into one folder."""
+    settings = configs.as_overrides(overrides)
+    if not any(flag in overrides for flag in ("-m", "--multirun")):
+        configs.load(command, *settings)
+        return
+    first, varied = configs.sweep(settings)
+    out = next((word for word in settings if word.startswith("out=")), "")
+    apart = "${" in out or "out" in varied or (not out and varied <= {"run"})
+    if command == "evaluate" and varied and not apart:
+        raise ConfigError("out: the jobs of this sweep would write to one folder; give each its own: 'out=${run}/judged-${hydra:job.num}'")
+    if not any("${hydra:" in word for word in settings):  # it is known within a job alone
+        configs.load(command, *first)
+
+
+def _end(error: Exception | str) -> NoReturn:
+    """One line on stderr, and exit code 2."""
+    text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+    print(f"error: {text}", file=sys.stderr)
+    raise SystemExit(2) from None
 
 
 def _job(command: str):
@@ -62,16 +98,13 @@ def _job(command: str):
         except ValueError as error:  # ConfigError and SceneError; a bug's own ValueError keeps its traceback
             if type(error) is ValueError:
                 raise
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
-        except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
+            _end(error)
+        except OSError as error:
+            _end(error)
         except Exception as error:
             if (told := _trouble(error, config)) is None:
                 raise
-            print(f"error: {told}", file=sys.stderr)
-            raise SystemExit(2) from None
+            _end(told)
 
     return job
 

@@ -164,3 +164,17 @@ def test_gymnasium_makes_both_and_its_wrappers_work():
         many(arrays="torch")
     with pytest.raises(ConfigError, match="seed: 2 seeds for 3 worlds"):
         many().reset(seed=[1, 2])
+
+
+def test_what_cannot_be_stepped_is_refused_in_a_line():
+    for env, shape in ((Drive(None, ALONE, scenes()), (3,)), (many(), (WORLDS, 3))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+            env.step(np.zeros(shape))
+        env.reset(seed=0)
+        for wrong in (shape[:-1], (*shape[:-1], 1), (*shape[:-1], 4)):
+            with pytest.raises(ConfigError, match=r"action: shape .*; wanted is .*3"):
+                env.step(np.zeros(wrong))
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with warnings.catch_warnings(), pytest.raises(ConfigError, match="render_mode: 'human'; valid: None"):
+            warnings.simplefilter("ignore")
+            make(ID, overrides=ALONE, render_mode="human")

@@ -66,6 +66,10 @@ def test_actions_that_are_missing_or_of_nobody_are_named(env):
     given = {name: np.zeros(3, np.float32) for name in env.agents}
     with pytest.raises(ConfigError, match=r"actions: 'lorry': wanted is one of each that drives: car_0"):
         env.step(given | {"lorry": np.zeros(3)})
+    with pytest.raises(ConfigError, match=r"actions: 'car_0': shape \(1,\); wanted is \(3,\)"):
+        env.step(given | {"car_0": np.zeros(1)})
+    with pytest.raises(ConfigError, match="step: no episode has begun; call reset first"):
+        Drive(None, [SMOKE], scenes(agents=4)).step(given)
     del given["car_1"]
     with pytest.raises(ConfigError, match="actions: 'car_1'"):
         env.step(given)

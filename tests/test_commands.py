@@ -62,8 +62,9 @@ def desk(tmp_path_factory):
     scenes(config.load("scenes", f"scenes.path={whole.path}", "op=export", f"out={folder / 'WOMD' / 'train'}", "progress=false"))
     with quick_compilation():
         train(smoke(folder / "runs" / "RUN", "evaluation.enable=false"))
-    for name in ("A-0", "A-1", "B", "wet-0"):
+    for seed, name in enumerate(("A-0", "A-1", "B", "wet-0")):
         shutil.copytree(folder / "runs" / "RUN", folder / "runs" / name)
+        config.write(folder / "runs" / name, {**config.read(folder / "runs" / name), "seed": seed})
     own = {"my_backend.py": textwrap.dedent(BACKEND), "my_reader.py": textwrap.dedent(READER)}
     for name, code in (own | snippets((ROOT / "docs" / "extending.md").read_text())).items():
         (folder / name).write_text(code)

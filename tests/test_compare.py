@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.report import tables
+from scenefactory_jax.report import levels, tables
 from scenefactory_jax.run.compare import compare
 from scenefactory_jax.run.config import load
 
@@ -64,7 +64,10 @@ def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
     first, second = records(reached=3, missed=1), records(reached=1, missed=3)
     runs = [run(tmp_path / "a", seed=0, agents=first), run(tmp_path / "b", seed=1, agents=second)]
     [group] = compare(settings(*runs, out=str(tmp_path / "out")))["groups"].values()
-    assert group["evaluated"]["strict"]["success_rate"]["value"] == 0.5 and group["evaluated"]["strict"]["success_rate"]["count"] == 8
+    found = group["evaluated"]["strict"]["success_rate"]
+    assert (found["value"], found["count"], found["method"]) == (0.5, 8, tables.LEVELS)
+    by_seed = levels.summarise({0: first, 1: second}, bootstrap=100, seed=0)["success_rate"]
+    assert (found["low"], found["high"]) == pytest.approx((by_seed.low, by_seed.high), rel=1e-5)
     text = (tmp_path / "out" / "compare.md").read_text()
     assert "## Evaluation at the end, strict" in text and "| Success rate | 50.0 %" in text
 
@@ -77,7 +80,7 @@ def records():
         count = reached + missed
         good = np.arange(count) < reached
         columns = {name: np.zeros(count, dtype) for name, dtype in tables.COLUMNS.items()}
-        columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "reached": good, "clean": good}
+        columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "reached": good, "clean": good}
         return columns
 
     return made
@@ -91,6 +94,12 @@ def test_what_cannot_be_compared_is_named(tmp_path):
         compare(settings(tmp_path))
     with pytest.raises(ConfigError, match=r"metrics\.csv has no column 'speed'; there are: iteration, minutes"):
         compare(settings(one, metrics=["speed"]))
+    with pytest.raises(ConfigError, match="metrics: none; give columns"):
+        compare(settings(one, metrics=[]))
+    with pytest.raises(ConfigError, match=r"names \S+/a once more; every run counts once"):
+        compare(settings(one, tmp_path / "b" / ".." / "a"))
+    with pytest.raises(ConfigError, match=r"/a and \S+/copy have one setting and one seed, 0"):
+        compare(settings(one, run(tmp_path / "copy", seed=0)))
     (one / "metrics.csv").write_text("iteration\n")
     with pytest.raises(ConfigError, match=r"metrics\.csv: no row"):
         compare(settings(one))

@@ -94,6 +94,11 @@ def test_a_rate_of_all_takes_the_score_interval_of_distinct_agents():
     assert found.value == 1.0 and found.method == tables.WILSON and (found.low, found.high) == tables.wilson(1.0, 20)
 
 
+def test_a_mean_that_does_not_vary_has_no_interval():
+    found = levels.summarise({0: records(np.ones((4, 5)), grip_use=np.full((4, 5), 1.42))}, bootstrap=20, seed=0)["grip_use"]
+    assert tables.text(found) == "142.0 %" and found.method == tables.NONE
+
+
 def test_agents_with_nobody_ahead_have_no_stopping_margin():
     one = records(np.ones((2, 2)), stopping_margin_m=[[1.0, np.inf], [3.0, np.inf]])
     found = levels.summarise({0: one}, bootstrap=10, seed=0)["stopping_margin_m"]

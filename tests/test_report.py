@@ -160,6 +160,27 @@ def test_one_scene_falls_back_and_says_so():
     assert "‡" in tables.text(summary["mean_max_drac"])
 
 
+def test_a_metric_of_which_only_one_scene_knows_has_no_interval_from_scenes():
+    records = make_records(scenes=6, agents=4)
+    first = records["scene"] == records["scene"][0]
+    records |= {"reached": first & (np.arange(len(first)) % 4 < 2), "time_s": np.arange(len(first), dtype=float), "route_m": first * 99.0}
+    found = tables.summarise(records, **BOOTSTRAP)
+    assert found["mean_time_to_goal_s"].method == tables.AGENTS and found["mean_time_to_goal_s"].low < found["mean_time_to_goal_s"].high
+    assert found["clean_bend_rate"].method == tables.WILSON and found["clean_bend_rate"].count == 4
+    change = tables.difference(records, records, **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert (change.value, change.low, change.method) == (0.0, None, tables.NONE)
+    alone = tables.summarise({**records, "reached": np.arange(len(first)) == 0}, **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert (alone.value, alone.low, alone.count, alone.method) == (0.0, None, 1, tables.NONE)
+
+
+def test_a_share_that_is_no_rate_may_exceed_one():
+    records = make_records(scenes=1, agents=8)
+    found = tables.summarise({**records, "grip_use": np.linspace(1.2, 1.6, 8)}, **BOOTSTRAP)["grip_use"]
+    assert found.value == pytest.approx(1.4) and found.method == tables.AGENTS and 1.2 < found.low < 1.4 < found.high < 1.6
+    same = tables.summarise({**records, "grip_use": np.full(8, 1.42)}, **BOOTSTRAP)["grip_use"]
+    assert tables.text(same) == "142.0 %" and same.method == tables.NONE
+
+
 def test_outcomes_are_exclusive_and_add_up():
     records = make_records(seed=2)
     summary = tables.summarise(records, **BOOTSTRAP)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from scenefactory_jax.run import results
+from scenefactory_jax.run import log, results
 
 
 class Row(NamedTuple):
@@ -30,3 +30,17 @@ def test_digits_and_digests(tmp_path):
     assert (tmp_path / "a.json").read_text() == '{"x":[1.2346,3.3333e-10]}\n'
     one, other = results.digest({"a": 1, "b": [2.0]}), results.digest({"b": [2.0], "a": 1})
     assert one == other != results.digest({"a": 1, "b": [2.1]}) and len(one) == 16
+
+
+def test_metrics_that_were_cut_short_are_read_up_to_there(tmp_path, monkeypatch):
+    file = tmp_path / log.FILE
+    file.write_text("iteration,reward\r\n1,0.5\r\n2,\r\n3,0.1")  # of 0.125, perhaps
+    first, second = log.read(tmp_path)
+    assert first == {"iteration": 1.0, "reward": 0.5} and second["iteration"] == 2.0 and np.isnan(second["reward"])
+    before = file.read_bytes()
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(log.csv.DictWriter, "writerows", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        log.MetricsFile(tmp_path, resume_at=2)
+    assert file.read_bytes() == before
+    log.MetricsFile(tmp_path, resume_at=1).add({"iteration": 2, "reward": 0.25})
+    assert log.read(tmp_path) == [first, {"iteration": 2.0, "reward": 0.25}] and sorted(tmp_path.iterdir()) == [file]

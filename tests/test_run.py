@@ -3,6 +3,9 @@
 import csv
 import json
 import re
+import shlex
+import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -22,11 +25,11 @@ from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import failures, opengl, tables
-from scenefactory_jax.run import config, log, policies, sources
+from scenefactory_jax.run import config, log, policies, reporting, results, sources, train_folder
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
-from scenefactory_jax.run.export import export
+from scenefactory_jax.run.export import export, named
 from scenefactory_jax.run.render import render
 from scenefactory_jax.run.replay import replay
 from scenefactory_jax.run.scenes import scenes
@@ -84,7 +87,9 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
 
 
 def test_the_report_compares_and_its_files_are_there(whole):
-    text = (whole.folder / "report.md").read_text()
+    text, settings = (whole.folder / "report.md").read_text(), told(whole.folder / "report.md")
+    assert settings["run"] == str(whole.folder) and settings["invincible"] is False
+    assert {name: settings[name] for name in settings if name in whole.config["evaluation"]}.items() <= whole.config["evaluation"].items()
     assert "| Metric | strict, untrained | strict | difference |" in text
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert {"video.gif", "learning.png", "comparison-strict.png", "agents-strict.csv", "metrics.csv"} <= set(links)
@@ -137,11 +142,92 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, resumed.state.parameters, whole.state.parameters)
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_does_not_go_on_changes_nothing(whole, tmp_path):
+    shutil.copytree(whole.folder, tmp_path / "run")
+    before = contents(tmp_path / "run")
+    for overrides, message in {
+        ("resume=true", "policy.trunk=[32]"): r"policy\.trunk=\[32\] \(the run has \[16\]\)",
+        ("resume=true", "seed=5"): r"; seed=5 \(the run has 0\): .* goes on as it began",
+        ("seed=5",): "holds a run already",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            train(smoke(tmp_path / "run", "iterations=9", *overrides))
+        assert contents(tmp_path / "run") == before
+    (tmp_path / "run" / "checkpoints").rename(tmp_path / "aside")
+    with pytest.raises(ConfigError, match="holds a run already; add resume=true"):  # it never came to its first checkpoint
+        train(smoke(tmp_path / "run"))
+    (tmp_path / "aside").rename(tmp_path / "run" / "checkpoints")
+    free = ["iterations=9", "checkpoint_every=3", "loggers=[]", "evaluation.seed=3", "scenes.heldout.count=2", "scenes.workers=2", "name=b"]
+    with train_folder.opened(smoke(tmp_path / "run", "resume=true", *free)) as (_, goes_on):
+        assert goes_on
+
+
+def test_one_command_at_a_time_trains_in_a_folder(tmp_path):
+    settings = smoke(tmp_path / "a" / "run")
+    refused = pytest.raises(train_folder.Busy, match="another command trains there now")
+    with train_folder.opened(settings), refused, train_folder.opened(settings):
+        pass
+    (tmp_path / "a" / "run").rmdir()  # no lock is left where nothing began
+
+
+def test_a_training_that_cannot_begin_removes_what_it_made_and_nothing_else(tmp_path):
+    (tmp_path / "mine" / "empty").mkdir(parents=True)
+    for place in ("mine/empty", "mine/new/run"):
+        with pytest.raises(KeyError), train_folder.opened(smoke(tmp_path / place)):
+            raise KeyError
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["empty", "mine"]
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"out=\S+file: is a file"), train_folder.opened(smoke(tmp_path / "file")):
+        pass
+
+
+def test_an_interrupt_keeps_the_iteration_that_it_falls_into(whole, tmp_path, capsys):
+    again = lambda *changes: smoke(tmp_path / "run", "evaluation.enable=false", "iterations=4", *changes)  # noqa: E731
+
+    def interrupted(state, row):
+        if row["iteration"] == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train(again(), on_iteration=interrupted)
+    assert f"stopped at iteration 3; goes on with the same settings and out={tmp_path / 'run'} resume=true" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is before
+    same_numbers(train(again("resume=true")).folder, whole.folder)
+
+
+def test_held_out_scenes_are_refused_before_anything_is_read(tmp_path):
+    place = tmp_path / "scenes"
+    place.mkdir()
+    for overrides, message in {
+        ("scenes.heldout.path=/nowhere",): r"scenes\.heldout\.path: /nowhere: no such file or folder",
+        ("scenes.seed=7", "scenes.heldout.seed=7"): r"scenes\.heldout\.seed: 7 is the training seed",
+        ("scenes=womd", f"scenes.path={place}", f"scenes.heldout.path={place}/."): r"is what is trained on",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            train(smoke(tmp_path / "run", *overrides))
+    assert not (tmp_path / "run").exists()
+
+
 # ---- evaluate
 
 
+def asked(run, out, *overrides):
+    return config.load("evaluate", f"run={run.folder}", f"out={out}", "chunk_steps=30", "bootstrap=100", *overrides)
+
+
 def judged(run, out, *overrides):
-    return evaluate(config.load("evaluate", f"run={run.folder}", f"out={out}", "chunk_steps=30", "bootstrap=100", *overrides))
+    return evaluate(asked(run, out, *overrides))
+
+
+def told(report: Path):
+    """The config of the command with which a report says that its numbers are made again."""
+    [line] = re.findall(r"^python -m scenefactory_jax evaluate (.*)$", report.read_text(), re.MULTILINE)
+    return config.load("evaluate", *shlex.split(line))
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
@@ -150,6 +236,10 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
     for again, protocol in ((second, "invincible"), (whole, "strict")):  # strict: what training itself wrote
         assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
     strict, invincible = (first.records[name] for name in ("strict", "invincible"))
+    kept = [file.name for file in sorted(first.folder.glob("agents-*.csv"))]
+    results.begin(first.folder, {"scenes": None})  # as the next evaluation does
+    assert kept == ["agents-invincible.csv", "agents-strict.csv"] and [file.name for file in first.folder.iterdir()] == ["judged.json"]
+    assert results.judged(second.folder)["protocols"] == ["invincible"] and results.judged(second.folder)["seed"] == 1000
     ended = strict["collided"] | strict["crashed"] | strict["touched_edge"]
     assert ended.any() and (invincible["time_s"] >= strict["time_s"]).all()
 
@@ -158,6 +248,9 @@ def test_other_settings_of_a_run(whole, tmp_path):
     short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
     changed = judged(whole, tmp_path / "short", "video.seconds=0.5", "video.panel=120", "video.worlds=1", "invincible=true", short)
     assert set(changed.records) == {"invincible"} and changed.records["invincible"]["time_s"].max() <= 1.0
+    same = ["video.seconds=0.5", "video.panel=120", "video.worlds=1", "invincible=true", short]
+    assert told(changed.report) == {**asked(whole, None, *same), "out": None}
+    assert changed.report.read_text().startswith("# smoke: evaluation on scenes not seen in training\n")
     assert (tmp_path / "short" / "video.gif").is_file()
     assert config.read(whole.folder)["timing"]["episode_s"] == 2
     for override, message in {
@@ -199,6 +292,22 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
         export(config.load("export", "run=handy", f"out={tmp_path / 'other'}", f"card.judged={{nothing: {tmp_path}}}"))
     with pytest.raises(ConfigError, match="holds something already; give a new folder"):
         export(config.load("export", "run=handy", f"out={whole.folder}"))
+
+
+def test_scores_and_titles_name_other_scenes(whole, tmp_path):
+    asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "protocols": ["strict", "invincible"]}
+    results.begin(tmp_path, asked)
+    assert named("unseen", tmp_path) == "unseen (towns.bank, dynamics=bicycle)" and named("unseen", whole.folder) == "unseen"
+    assert reporting.title("mine", asked) == "mine: evaluation on towns.bank"
+    assert reporting.again(asked, config.load("evaluate", "run=mine", "seed=7")) == (
+        "python -m scenefactory_jax evaluate run=mine scenes.path=/data/towns.bank 'overrides=[\"dynamics=bicycle\"]' seed=7")  # fmt: skip
+
+
+def test_a_damaged_config_is_named(tmp_path):
+    for content, message in {"": "holds no config of a run", "- 1": "holds no config", "a: [1": "damaged: while parsing"}.items():
+        (tmp_path / "config.yaml").write_text(content)
+        with pytest.raises(ConfigError, match=message):
+            evaluate(config.load("evaluate", f"run={tmp_path}"))
 
 
 def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
@@ -313,6 +422,28 @@ def test_help_lists_the_commands(monkeypatch, capsys):
     assert stopped.value.code == 0 and all(f"\n  {name} " in printed for name in config.COMMANDS)
 
 
+def test_help_begins_with_what_a_command_is_for():
+    done = shell(ROOT, "study", "--help", timeout=120)  # which has no study to show, if none is named
+    first, *rest = done.stdout.splitlines()
+    assert done.returncode == 0 and first == "study: " + re.sub(" {2,}", "; ", re.findall("^  study +(.*)", command_line.USAGE, re.M)[0])
+    assert len(rest) > 10 and all(command_line._help(name, [])[0].startswith(f'hydra.help.header="{name}: ') for name in config.COMMANDS)
+
+
+def test_an_interrupted_command_ends_as_shells_expect(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "train"])
+    monkeypatch.setattr("hydra.main", lambda **_: lambda job: lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        command_line.main()
+    assert stopped.value.code == 130
+
+
+def test_only_our_own_command_line_counts_as_a_command(monkeypatch):
+    called = {"/lib/scenefactory_jax/__main__.py train": "python -m scenefactory_jax train a=1", "/home/me/train.py": "train(config)"}
+    for program, command in called.items():
+        monkeypatch.setattr(sys, "argv", [program, "a=1", "out=x"])
+        assert config.command("train") == command
+
+
 def test_a_wrong_key_ends_as_one_line():
     done = shell(ROOT, "train", "ppo.horizn=3", timeout=120, JAX_PLATFORMS="cpu")
     assert done.returncode == 2 and not done.stdout and len(done.stderr.splitlines()) == 1
@@ -336,6 +467,10 @@ def test_a_wrong_value_ends_as_one_line():
         (["evaluate", "run=/nowhere"], "error: /nowhere is no run"),
         (["convert", "source=/nowhere"], "error: out: missing"),
         (["convert", "source=/nowhere", "out=x"], "error: /nowhere: no such file or folder"),
+        (["train", "experiment=smoke", f"out={'x' * 300}"], "xxx: File name too long"),
+        (["train", "loggers=[tensorbord]"], "error: loggers: unknown option 'tensorbord'; valid: mlflow, tensorboard, wandb"),
+        (["train", "-m", "ppo.horizn=3,4", "seed=interval(0,1)"], "error: ppo.horizn: unknown key 'horizn'; ppo has: "),
+        (["evaluate", "-m", "run=runs/mine", "seed=1,2"], "error: out: the jobs of this sweep would write to one folder"),
         (["drive-away"], "unknown command 'drive-away'; valid: train, evaluate"),
     ],
 )
@@ -350,7 +485,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
     with pytest.raises(SystemExit) as stopped:
         command_line.main()
     text = capsys.readouterr().err or str(stopped.value)
-    assert message in text and len(text.splitlines()) == 1 and stopped.value.code not in (0, None)
+    assert message in text and len(text.splitlines()) == 1 and stopped.value.code == 2
     assert not list(tmp_path.iterdir())
 
 

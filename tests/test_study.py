@@ -1,6 +1,7 @@
 """Whole studies at the smallest size: they end, go on where they were stopped, do nothing twice, compile once, say what they rest on."""
 
 import json
+import os
 import re
 
 import jax
@@ -9,10 +10,11 @@ import study_parts
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.report import levels, tables
-from scenefactory_jax.run import config, log, sources, study_plan, train
+from scenefactory_jax.report import levels, study_figures, tables
+from scenefactory_jax.run import config, log, sources, study_plan, train, train_folder
 from scenefactory_jax.run import study as command
 from scenefactory_jax.run.study import Clock, study
+from scenefactory_jax.scenes import bank_index
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -97,6 +99,13 @@ def test_looks_are_counted_over_all_calls(whole):
     assert "11 times to judge a policy" in (folder / "out" / "navigation.md").read_text()
 
 
+def test_an_interval_that_misses_its_value_is_drawn_up_to_it():
+    odd = {name: tables.Estimate(0.5, 0.55, 0.6, 9, tables.SHARE, tables.LEVELS) for name in study_figures.SHOWN}
+    whole = study_figures._bars({"odd": odd}, {"odd": "#cc3311"})
+    reach = [bars.get_segments() for axes in whole.axes for bars in axes.collections]
+    assert len(reach) == len(study_figures.SHOWN) and all([end[0] for end in one[0]] == [0.5, 0.6] for one in reach)
+
+
 # ---- nothing twice
 
 
@@ -141,6 +150,14 @@ def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch
     for file in files:
         [same] = (folder / "runs").glob(f"{file.parent.name}/{file.name}")
         assert file.read_bytes() == same.read_bytes()
+
+
+def test_what_another_command_trains_is_left_to_it(tmp_path, capsys):
+    first, second = study_plan.make(toy(tmp_path, **ALONE)).trainings
+    with train_folder.opened({**first.config, "out": str(first.folder)}):
+        result = study(toy(tmp_path, **ALONE))
+    assert "training all terms, seed 3: left to the command that trains in" in capsys.readouterr().out
+    assert not command.is_trained(first) and command.is_trained(second) and result["rows"][0]["seeds"] == [4]
 
 
 def test_processes_divide_a_study_among_them(tmp_path, capfd):
@@ -220,6 +237,22 @@ def test_every_study_is_whole(name, tmp_path):
     minutes = {one.config["minutes"] for one in plan.trainings}
     assert len(minutes) == 1 and (minutes == {None}) == (name != "recipe")  # equal steps; those of the recipe change speed, too
     assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
+
+
+def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
+    (tmp_path / "files").mkdir()
+    bank = tmp_path / "test.bank"
+    bank.mkdir()
+    index = json.dumps({"format": bank_index.FORMAT, "shards": []})
+    entry = toy(tmp_path, "train_scenes=" + str(tmp_path / "files"), f"test_scenes={bank}", **ALONE)
+    found = []
+    for content in ("one", "another", "another"):
+        (tmp_path / "files" / "a.json").write_text(content)
+        os.utime(tmp_path / "files" / "a.json", ns=(0, 0))
+        (bank / bank_index.INDEX).write_text(index if content == "one" else index.replace("[]", '["new"]'))
+        plan = study_plan.make(entry)
+        found.append((plan.trainings[0].digest, plan.judgings[0].program))
+    assert found[0][0] != found[1][0] and found[0][1] != found[1][1] and found[1] == found[2]
 
 
 def test_networks_of_the_studies_fit_their_observations():

@@ -1,13 +1,13 @@
 """The sweeps of docs/sweeps.md, at toy size."""
 
+import contextlib
 import re
 
 import pytest
 from conftest import ROOT
 from running import QUICKLY, shell
 
-from scenefactory_jax.run import config, log
-from scenefactory_jax.run.train import _folder
+from scenefactory_jax.run import config, log, train_folder
 
 PAGE = (ROOT / "docs" / "sweeps.md").read_text()
 TOY = ["experiment=smoke", "evaluation.enable=false", "progress=false", "iterations=1"]
@@ -37,8 +37,9 @@ def test_joblib_runs_them_at_a_time(tmp_path):
 def test_runs_that_begin_in_one_second_do_not_share_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = config.load("train", *TOY)
-    folders = [_folder(settings)[0] for _ in range(4)]
-    assert len(set(folders)) == 4 and all(folder.is_dir() for folder in folders)
+    with contextlib.ExitStack() as stack:
+        folders = [stack.enter_context(train_folder.opened(settings))[0] for _ in range(4)]
+        assert len(set(folders)) == 4 and all(folder.is_dir() for folder in folders)
 
 
 def test_the_optuna_loop_of_the_page(tmp_path, monkeypatch, capsys):

@@ -23,6 +23,7 @@ from scenefactory_jax.run import sources
 try:
     import gymnasium  # an optional dependency  # pyright: ignore[reportMissingImports]
     from gymnasium import spaces  # pyright: ignore[reportMissingImports]
+    from gymnasium.error import ResetNeeded  # pyright: ignore[reportMissingImports]
 
     from scenefactory_jax.adapters.gymnasium_vector import DriveVector
 except ImportError as error:
@@ -41,7 +42,7 @@ class Drive(gymnasium.Env):
         render_mode: none but None.
 
     Raises:
-        ConfigError: scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
+        ConfigError: a render mode, scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
     """
 
     def __init__(
@@ -49,8 +50,9 @@ class Drive(gymnasium.Env):
         config: Mapping[str, Any] | None = None,
         overrides: Sequence[str] = (),
         scenes: sources.Scenes | None = None,
-        render_mode: None = None,
+        render_mode: str | None = None,
     ):
+        episodes.check_render_mode(render_mode)
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode = self.pool.names, render_mode
         self.metadata = {"render_modes": [], "render_fps": self.pool.step_hz}
@@ -77,7 +79,15 @@ class Drive(gymnasium.Env):
         return np.asarray(observation)[0], {"scene": int(episode.scene)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step."""
+        """One control step.
+
+        Raises:
+            ResetNeeded: nothing has begun.
+            ConfigError: an action of another shape.
+        """
+        if self._episode is None:
+            raise ResetNeeded("step: no episode has begun; call reset first")
+        episodes.check_action(action, self.action_space.shape)
         self._episode, rows = self._advance(self.pool.scenes, self._episode, np.asarray(action, np.float32)[None])
         told = episodes.told(self.pool, np.asarray(rows)[0])
         return told.observation, told.reward, told.over and not told.truncated, told.truncated, told.info

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces  # an optional dependency: `adapters.gymnasium` says so  # pyright: ignore[reportMissingImports]
+from gymnasium.error import ResetNeeded  # pyright: ignore[reportMissingImports]
 from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore[reportMissingImports]
 from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
 from jaxtyping import Array, Bool, Float, UInt32
@@ -46,10 +47,11 @@ class DriveVector(VectorEnv):
         scenes: sources.Scenes | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         arrays: str = "numpy",
-        render_mode: None = None,
+        render_mode: str | None = None,
     ):
         if arrays not in ("numpy", "jax"):
             raise ConfigError(f"arrays: {arrays!r}; valid: numpy, jax")
+        episodes.check_render_mode(render_mode)
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode, self.num_envs, self.arrays = self.pool.names, render_mode, num_envs, arrays
         self.mode = AutoresetMode(autoreset_mode)
@@ -94,8 +96,13 @@ class DriveVector(VectorEnv):
         """One control step of every world.
 
         Raises:
+            ResetNeeded: nothing has begun.
+            ConfigError: actions of another shape.
             RuntimeError: an episode that ended was not begun anew, in mode DISABLED with numpy arrays.
         """
+        if self._worlds is None:
+            raise ResetNeeded("step: no episode has begun; call reset first")
+        episodes.check_action(actions, self.action_space.shape)
         if self.mode is AutoresetMode.DISABLED and self.arrays == "numpy" and self._ended.any():
             raise RuntimeError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset(options={{'reset_mask': ...}}) first")
         given = jnp.asarray(actions, jnp.float32)

@@ -86,14 +86,17 @@ class Drive(ParallelEnv):
         """One control step. Actions of cars that have ended count for nothing.
 
         Raises:
-            ConfigError: a driving car without an action, or an action of a car that there is not.
+            ConfigError: nothing has begun, a driving car without an action, one of another shape, or an action of a car that there is not.
         """
+        if self._episode is None:
+            raise ConfigError("step: no episode has begun; call reset first")
         if not self.agents:
             return {}, {}, {}, {}, {}
         if wrong := [name for name in self.agents if name not in actions] + [name for name in actions if name not in self._slot]:
             raise ConfigError(f"actions: {wrong[0]!r}: wanted is one of each that drives: {', '.join(self.agents)}")
         given = np.zeros((self.pool.agents, 3), np.float32)
         for name in self.agents:
+            episodes.check_action(actions[name], (3,), where=f"actions: {name!r}")
             given[self._slot[name]] = actions[name]
         self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
         rows = np.asarray(rows)

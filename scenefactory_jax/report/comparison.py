@@ -13,6 +13,7 @@ from scenefactory_jax.report import plots, tables
 from scenefactory_jax.report.tables import METRICS, Estimate
 
 Result = Mapping[str, Any]
+INTERVALS = "Intervals resample seeds of training, scenes and agents; those of a single seed hold scenes and agents alone."
 
 
 def write(folder: Path, result: Result) -> Path:
@@ -27,7 +28,7 @@ def write(folder: Path, result: Result) -> Path:
     lines = ["# Runs compared", f"`{result['command']}`", words, table(result), f"![Learning curves]({picture.name})"]
     for name in dict.fromkeys(name for group in result["groups"].values() for name in group["evaluated"]):
         shown = {label: _summary(group["evaluated"][name]) for label, group in result["groups"].items() if name in group["evaluated"]}
-        lines += [f"## Evaluation at the end, {name}", tables.markdown(shown)]
+        lines += [f"## Evaluation at the end, {name}", tables.markdown(shown), INTERVALS]
     path = folder / "compare.md"
     path.write_text("\n\n".join(lines) + "\n", encoding="utf-8")
     return path

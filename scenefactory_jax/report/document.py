@@ -159,7 +159,7 @@ def marks(table: Mapping[str, Summary]) -> str:
     if tables.NEWCOMBE in used:
         notes.append("†: Newcombe's score interval over agents, where a difference does not vary between scenes.")
     if tables.AGENTS in used:
-        notes.append("‡: bootstrap over agents, because there is one scene only.")
+        notes.append("‡: bootstrap over agents, where only one scene counts or a mean does not vary between scenes.")
     if used & {tables.WILSON, tables.NEWCOMBE, tables.AGENTS}:
         notes.append("Marked intervals take the agents of a scene for independent, so they may be too narrow.")
     return " ".join(notes)

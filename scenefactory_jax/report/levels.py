@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.report import tables
-from scenefactory_jax.report.tables import LEVELS, METRICS, NEWCOMBE, NONE, SHARE, WILSON, Estimate, Metric, Records, RecordsError
+from scenefactory_jax.report.tables import LEVELS, METRICS, NEWCOMBE, NONE, WILSON, Estimate, Metric, Records, RecordsError
 
 Runs = Mapping[int, Records]  # seed of training -> one row for every spawned agent
 ROOM = 2_000_000  # numbers of one chunk of resamples
@@ -39,7 +39,7 @@ def summarise(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
     """Every metric over all runs, weighing seeds the same, with a 95 % percentile interval.
 
     With one seed the interval holds scenes and agents alone. A rate that does not vary between resamples takes the Wilson score interval
-    over distinct agents. `count` is the number of rows that entered.
+    over distinct agents, a mean none. `count` is the number of rows that entered.
 
     Raises:
         RecordsError: no runs, or see `tables.check`.
@@ -88,7 +88,9 @@ def _estimate(value: float, draws: np.ndarray, metric: Metric, counts: np.ndarra
     if not len(kept):
         return Estimate(value, None, None, count, metric.unit, NONE)
     low, high = (float(x) for x in np.percentile(kept, [2.5, 97.5]))
-    if metric.unit == SHARE and high - low < 1e-9:
+    if high - low < 1e-9 and not metric.rate:
+        return Estimate(value, None, None, count, metric.unit, NONE)
+    if high - low < 1e-9:
         ends = (low, high) if counts is None else tables.wilson(min(max(value, 0.0), 1.0), _agents(counts))
         return Estimate(value, *ends, count, metric.unit, WILSON)
     return Estimate(value, low, high, count, metric.unit, LEVELS)

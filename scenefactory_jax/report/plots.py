@@ -58,7 +58,7 @@ LEARNING: tuple[Panel, ...] = (
     Panel("Learning rate", "learning rate", ("learning_rate",), "log"),
     Panel("Training speed", "controlled-agent steps / s", ("casps",), "lines"),
 )
-_EVENTS = {f"events/{name}": mark.label for name, mark in MARKS.items()}
+_EVENTS = {f"events/{name}": (mark.label, tuple(part / 255 for part in mark.colour)) for name, mark in MARKS.items()}  # as in the videos
 
 
 class PlotError(ValueError):
@@ -121,7 +121,7 @@ def rates_figure(table: Mapping[str, Mapping[str, Estimate]], *, metrics: Sequen
         width = 0.8 / len(table)
         for row, (name, column) in enumerate(table.items()):
             places = np.arange(len(shown)) + (row - (len(table) - 1) / 2) * width
-            values, low, high = _intervals([column[metric] for metric in shown])
+            values, low, high = intervals([column[metric] for metric in shown])
             axes.bar(places, values, 0.92 * width, color=COLOURS[row % len(COLOURS)], alpha=0.85, label=name)
             axes.errorbar(places, values, yerr=[values - low, high - values], fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2.5)
             for place, value, top in zip(places, values, high, strict=True):
@@ -256,25 +256,15 @@ def _transpose(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 def _draw_panel(axes: Axes, panel: Panel, keys: list[str], table: Mapping[str, Any], steps: str) -> None:
     """One panel of the learning curves."""
-    names = [METRICS[key].label if key in METRICS else _EVENTS.get(key, key.rsplit("/", 1)[-1].replace("_", " ")) for key in keys]
-    for index, (key, name) in enumerate(zip(keys, names, strict=True)):
+    looks = [_EVENTS.get(key, (_label(key), COLOURS[index % len(COLOURS)])) for index, key in enumerate(keys)]
+    for key, (name, colour) in zip(keys, looks, strict=True):
         x, y = _series(table, steps, key)
         if panel.kind != "stack":
-            colour = COLOURS[index % len(COLOURS)]
             axes.plot(x, y, color=colour, alpha=0.3, linewidth=0.8)
             axes.plot(x, _running_mean(y), color=colour, label=name)
     if panel.kind == "stack":
         x = _series(table, steps, keys[0])[0]
-        values = [np.interp(x, *_series(table, steps, key)) for key in keys]
-        up, down = np.zeros(len(x)), np.zeros(len(x))
-        for index, (name, value) in enumerate(zip(names, values, strict=True)):
-            smooth = _running_mean(value)
-            new_up, new_down = up + np.maximum(smooth, 0), down + np.minimum(smooth, 0)
-            look = {"color": COLOURS[index % len(COLOURS)], "alpha": 0.75, "linewidth": 0}
-            axes.fill_between(x, up, new_up, label=name, **look)
-            axes.fill_between(x, down, new_down, **look)
-            up, down = new_up, new_down
-        axes.plot(x, up + down, color="#222222", label="sum")
+        _stack(axes, x, {_label(key): _running_mean(np.interp(x, *_series(table, steps, key))) for key in keys})
     axes.set(title=panel.title, ylabel=panel.label, xlabel="agent steps")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if panel.kind == "shares":
@@ -287,6 +277,24 @@ def _draw_panel(axes: Axes, panel: Panel, keys: list[str], table: Mapping[str, A
         axes.set_ylim(bottom=0)
     if len(keys) > 1 or panel.kind == "stack":
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.04), handlelength=1.2, labelspacing=0.35)
+
+
+def _label(key: str) -> str:
+    return METRICS[key].label if key in METRICS else key.rsplit("/", 1)[-1].replace("_", " ")
+
+
+def _stack(axes: Axes, x: np.ndarray, curves: Mapping[str, np.ndarray]) -> None:
+    """What adds up on top of each other, what takes away below, the largest first; what is always zero is left out."""
+    largest = sorted((name for name in curves if np.any(curves[name])), key=lambda name: -np.abs(curves[name]).mean())
+    up, down = np.zeros(len(x)), np.zeros(len(x))
+    for place, name in enumerate(largest):
+        again, colour = divmod(place, len(COLOURS))
+        look = {"facecolor": COLOURS[colour], "alpha": 0.75, "linewidth": 0, "hatch": "////" * again, "edgecolor": "white"}
+        new_up, new_down = up + np.maximum(curves[name], 0), down + np.minimum(curves[name], 0)
+        axes.fill_between(x, up, new_up, label=name, **look)
+        axes.fill_between(x, down, new_down, **look)
+        up, down = new_up, new_down
+    axes.plot(x, up + down, color="#222222", label="sum")
 
 
 def _series(table: Mapping[str, Any], steps: str, key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -305,7 +313,7 @@ def _running_mean(values: np.ndarray) -> np.ndarray:
     return (sums[high] - sums[low]) / (high - low)
 
 
-def _intervals(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def intervals(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values, lower and upper ends; an estimate without an interval gets none drawn."""
     values = np.array([e.value for e in estimates], float)
     low = np.array([e.value if e.low is None else e.low for e in estimates], float)
@@ -316,7 +324,7 @@ def _intervals(estimates: Sequence[Estimate]) -> tuple[np.ndarray, np.ndarray, n
 def _draw_pairs(axes: Axes, pairs: Sequence[tuple[Estimate, Estimate]], names: tuple[str, str]) -> None:
     """Two points with intervals a row, joined by an arrow from the first to the second."""
     for side, shift, colour, marker in ((0, -0.13, "#8a8f96", "o"), (1, 0.13, COLOURS[0], "s")):
-        values, low, high = _intervals([pair[side] for pair in pairs])
+        values, low, high = intervals([pair[side] for pair in pairs])
         rows = np.arange(len(pairs)) + shift
         look = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 2.5, "label": names[side]}
         axes.errorbar(values, rows, xerr=[values - low, high - values], **look)

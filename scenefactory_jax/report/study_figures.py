@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter, PercentFormatter
 
-from scenefactory_jax.report import comparison, levels
+from scenefactory_jax.report import comparison, levels, plots
 from scenefactory_jax.report.plots import COLOURS, STYLE
 from scenefactory_jax.report.tables import Estimate
 
@@ -107,7 +107,7 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]
 def _bar(axes: Axes, place: int, one: Estimate, colour: str, top: float) -> None:
     if one.value is None:
         return
-    low, high = (one.value if end is None else end for end in (one.low, one.high))
+    (_, (low,), (high,)) = plots.intervals([one])
     axes.barh(place, one.value, 0.7, color=colour, alpha=0.85)
     axes.errorbar(one.value, place, xerr=[[one.value - low], [high - one.value]], fmt="none", ecolor="#222222", elinewidth=1.1, capsize=2.5)
     right = high < 0.95 * top or one.value < 0.3 * top
@@ -228,10 +228,9 @@ def _line(axes: Axes, found: Sequence[tuple[float | int, Mapping[str, Estimate]]
     """Some rates of one condition, with their intervals, on a scale of their own."""
     for colour, name in zip(_colours(len(names)), names, strict=True):
         told = [(x, row[name]) for x, row in found if row[name].value is not None]
-        x, values = [one[0] for one in told], np.array([one[1].value for one in told])
-        ends = np.array([[one.value if end is None else end for end in (one.low, one.high)] for _, one in told]).reshape(-1, 2)
+        x, (values, low, high) = [one[0] for one in told], plots.intervals([one[1] for one in told])
         axes.plot(x, values, color=colour, marker="o", markersize=4, label=levels.labels([name])[name].label)
-        axes.fill_between(x, ends[:, 0], ends[:, 1], color=colour, alpha=0.13, linewidth=0)
+        axes.fill_between(x, low, high, color=colour, alpha=0.13, linewidth=0)
     axes.set_xscale("log", base=2)
     axes.set_xticks([x for x, _ in found], [f"{x:g}" for x, _ in found])
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -53,7 +53,8 @@ class Estimate(NamedTuple):
 
 
 class Metric(NamedTuple):
-    """What is averaged (`value`) over which agents (`counted`), and whether worlds weigh the same (`by_world`) or agents do."""
+    """What is averaged (`value`) over which agents (`counted`), and whether worlds weigh the same (`by_world`) or agents do. A `rate`
+    counts agents; what each of them has more or less of is none, also where it is a share."""
 
     label: str
     unit: str
@@ -61,6 +62,7 @@ class Metric(NamedTuple):
     value: Callable[[Records], np.ndarray]
     counted: Callable[[Records], np.ndarray]
     by_world: bool = False
+    rate: bool = False
 
 
 def _spawned(records: Records) -> np.ndarray:
@@ -68,7 +70,7 @@ def _spawned(records: Records) -> np.ndarray:
 
 
 def _share(label: str, definition: str, column: str) -> Metric:
-    return Metric(label, SHARE, definition, lambda records: records[column], _spawned)
+    return Metric(label, SHARE, definition, lambda records: records[column], _spawned, rate=True)
 
 
 def _bends(records: Records) -> np.ndarray:
@@ -86,20 +88,21 @@ METRICS: dict[str, Metric] = {
     "clean_bend_rate": Metric(
         "Clean on bends", SHARE, f"Clean success rate of the agents whose way is at least {100 * (BEND - 1):.0f} % longer than the "
         "straight line to the goal. Most ways are straight, and on those a car that nobody steers arrives, too.",
-        lambda records: records["clean"], _bends),
+        lambda records: records["clean"], _bends, rate=True),
     "collision_rate": _share(
         "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collided"),
     "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "touched_edge"),
     "crash_rate": _share("Crash rate", "Agents that tipped over, fell or strayed too far, of all spawned agents.", "crashed"),
     "fault_rate": _share("Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "fault"),
     "unfinished_rate": Metric(
-        "Out of time", SHARE, "Agents with no event at all when the episode's time was up, of all spawned agents.", _unfinished, _spawned),
+        "Out of time", SHARE, "Agents with no event at all when the episode's time was up, of all spawned agents.",
+        _unfinished, _spawned, rate=True),
     "mean_max_drac": Metric(
         "Mean max DRAC", "m/s²", "Deceleration rate to avoid a crash: each agent's largest value; mean over the agents of a world, then "
         "over worlds with equal weight.", lambda records: records["max_drac"], _spawned, by_world=True),
     "high_drac_rate": Metric(
         f"DRAC > {HIGH_DRAC:g} m/s²", SHARE, f"Agents whose largest DRAC exceeds {HIGH_DRAC:g} m/s², of all spawned agents.",
-        lambda records: records["max_drac"] > HIGH_DRAC, _spawned),
+        lambda records: records["max_drac"] > HIGH_DRAC, _spawned, rate=True),
     "mean_min_ttc_s": Metric(
         "Mean TTC", "s", "Time to collision with the nearest other car, clamped to 10 s: mean over the steps at which it is finite, then "
         "over the agents of a world with any such step, then over worlds with equal weight.",
@@ -107,7 +110,7 @@ METRICS: dict[str, Metric] = {
     "near_miss_rate": Metric(
         f"TTC < {NEAR_MISS_TTC:g} s", SHARE, f"Agents with a time to collision below {NEAR_MISS_TTC:g} s at any step: share of a world's "
         "spawned agents, then mean over worlds with equal weight.",
-        lambda records: records["min_ttc_s"] < NEAR_MISS_TTC, _spawned, by_world=True),
+        lambda records: records["min_ttc_s"] < NEAR_MISS_TTC, _spawned, by_world=True, rate=True),
     "mean_time_to_goal_s": Metric(
         "Time to goal", "s", "Mean time from start to goal of the agents that reached it.",
         lambda records: records["time_s"], lambda records: np.asarray(records["reached"], bool)),
@@ -150,9 +153,9 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
     Rates pool agents (published definition: sum over spawned agents of all worlds). Mean max DRAC, mean TTC and the near-miss rate average
     within a world first and weigh worlds equally, as the published evaluation does.
 
-    Interval: percentile bootstrap over scenes; a rate that does not vary between resamples (all, none, or one scene only) takes the Wilson
-    score interval over agents instead, a mean of one scene a bootstrap over its agents. Both treat the agents of a scene as independent,
-    so they may be too narrow; `Estimate.method` says which was used.
+    Interval: percentile bootstrap over scenes. Where only one scene has agents that qualify, or nothing varies between resamples (all,
+    none), a rate takes the Wilson score interval over agents instead, a mean a bootstrap over agents, or none if they do not vary either.
+    Both treat the agents of a scene as independent, so they may be too narrow; `Estimate.method` says which was used.
 
     Args:
         records: one row per spawned agent.
@@ -175,14 +178,11 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
             result[name] = Estimate(None, None, None, 0, metric.unit, NONE)
             continue
         value = float(sums[:, column].sum() / total)
-        draws = resampled[:, column]
-        low, high = _percentiles(draws)
-        method = BOOTSTRAP
-        if metric.unit == SHARE and (len(scenes) == 1 or _degenerate(low, high)):
-            (low, high), method = wilson(value, count), WILSON
-        elif len(scenes) == 1:
+        (low, high), method = _percentiles(resampled[:, column]), BOOTSTRAP
+        if np.count_nonzero(weights[:, column]) == 1 or _degenerate(low, high):
             values = np.asarray(metric.value(records), float)[mask]
-            low, high, method = (*_agent_interval(values, bootstrap=bootstrap, seed=seed), AGENTS) if count > 1 else (None, None, NONE)
+            ends = wilson(value, count) if metric.rate else _agent_interval(values, bootstrap=bootstrap, seed=seed)
+            (low, high), method = ((None, None), NONE) if _degenerate(*ends) else (ends, WILSON if metric.rate else AGENTS)
         result[name] = Estimate(value, low, high, count, metric.unit, method)
     return result
 
@@ -191,7 +191,7 @@ def difference(before: Records, after: Records, *, bootstrap: int, seed: int) ->
     """`after` minus `before` for every metric, over the same scenes: each resample draws scenes once for both (a paired bootstrap).
 
     A difference of rates that does not vary between resamples takes Newcombe's hybrid score interval (Statistics in Medicine 17, 1998,
-    method 10); a difference of means then has no interval. `count` is the smaller of the two counts.
+    method 10), a difference of means of one scene has none. `count` is the smaller of the two counts.
 
     Raises:
         RecordsError: see `check`; or the two were not made on the same scenes.
@@ -210,13 +210,13 @@ def difference(before: Records, after: Records, *, bootstrap: int, seed: int) ->
             result[name] = Estimate(None, None, None, 0, metric.unit, NONE)
             continue
         old, new = (float(sums[:, column].sum() / weights[:, column].sum()) for sums, weights in tables)
-        low, high = _percentiles(second[:, column] - first[:, column])
-        method = BOOTSTRAP
-        if metric.unit == SHARE and (len(scenes) == 1 or _degenerate(low, high)):
+        (low, high), method = _percentiles(second[:, column] - first[:, column]), BOOTSTRAP
+        alone = min(np.count_nonzero(weights[:, column]) for _, weights in tables) == 1
+        if metric.rate and (alone or _degenerate(low, high)):
             (old_low, old_high), (new_low, new_high) = wilson(old, counts[0]), wilson(new, counts[1])
             low, high = (new - old - np.hypot(new - new_low, old_high - old), new - old + np.hypot(new_high - new, old - old_low))
             method = NEWCOMBE
-        elif len(scenes) == 1:
+        elif alone:
             low, high, method = None, None, NONE
         result[name] = Estimate(new - old, low, high, min(counts), metric.unit, method)
     return result

@@ -8,7 +8,7 @@ import numpy as np
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import comparison as report
-from scenefactory_jax.report import document, tables
+from scenefactory_jax.report import document, levels
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, results
 
@@ -36,9 +36,12 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
         Group -> what differs, seeds, curves over agent steps and evaluations, as they were written.
 
     Raises:
-        ConfigError: no such run, a run without metrics, or a metric that one of them lacks, by name.
+        ConfigError: no such run, a run without metrics, one that is named twice, two of one setting and seed, or a metric that one of them
+            lacks, by name.
     """
     keys.check(config, keys.COMPARE)
+    if not config["metrics"]:
+        raise ConfigError(f"metrics: none; give columns of {log.FILE}, as events/reached")
     runs = [_read(folder) for folder in _find(config["runs"])]
     for run in runs:
         if missing := [name for name in (STEPS, *config["metrics"]) if name not in run.metrics[0]]:
@@ -60,18 +63,21 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _find(patterns: Iterable[str]) -> list[Path]:
-    """Run folders, each once, in the order in which they are named."""
-    found: dict[Path, None] = {}
+    """Run folders in the order in which they are named."""
+    found: dict[Path, Path] = {}
     for pattern in patterns:
         path = Path(pattern)
         base = Path(path.anchor) if path.is_absolute() else Path()
         matches = sorted(base.glob(str(path.relative_to(base)))) if any(sign in pattern for sign in "*?[") else [path]
         if not matches:
             raise ConfigError(f"runs: nothing matches {pattern!r}; give folders that `train` wrote")
-        found |= dict.fromkeys(matches)
+        for match in matches:
+            if match.resolve() in found:
+                raise ConfigError(f"runs: {pattern!r} names {match} once more; every run counts once")
+            found[match.resolve()] = match
     if not found:
         raise ConfigError("runs: none; give folders that `train` wrote")
-    return list(found)
+    return list(found.values())
 
 
 def _read(folder: Path) -> Read:
@@ -94,7 +100,13 @@ def _shown(value: Any) -> str:
 
 
 def _group(runs: list[Read], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Curves of each seed up to the length of the shortest, and the evaluations of all seeds as one."""
+    """Curves of each seed up to the length of the shortest, and the evaluations of all seeds, resampled by seed, scene and agent."""
+    seeds: dict[int, Read] = {}
+    for run in runs:
+        other = seeds.setdefault(run.config["seed"], run)
+        if other is not run:
+            same = f"{other.folder} and {run.folder} have one setting and one seed, {run.config['seed']}"
+            raise ConfigError(f"runs: {same}: they are no two samples; leave one out")
     length = min(len(run.metrics) for run in runs)
     tail = max(1, round(config["last"] * length))
 
@@ -105,8 +117,8 @@ def _group(runs: list[Read], config: Mapping[str, Any]) -> dict[str, Any]:
     evaluated = {}
     for name in runs[0].records:
         if all(name in run.records for run in runs):
-            pooled = {key: np.concatenate([run.records[name][key] for run in runs]) for key in runs[0].records[name]}
-            evaluated[name] = tables.summarise(pooled, bootstrap=config["bootstrap"], seed=config["seed"])
+            each = {seed: run.records[name] for seed, run in seeds.items()}
+            evaluated[name] = levels.summarise(each, bootstrap=config["bootstrap"], seed=config["seed"])
     return {
         "runs": [run.folder.name for run in runs],
         "seeds": [run.config["seed"] for run in runs],

@@ -15,6 +15,7 @@ import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -24,13 +25,16 @@ from scenefactory_jax.build import ConfigError
 COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
 COMMANDS += ("weather", "export")
 LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined")  # keys whose values are lists of overrides
+FILE = "config.yaml"  # of a run's folder
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 
 
 def command(name: str) -> str:
     """How the process was called, for reports; where the files went is nobody else's business."""
     arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
-    return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if name in sys.argv[0] else f"{name}(config)"
+    program, _, called = sys.argv[0].rpartition(" ")  # as `__main__` leaves it
+    ours = called == name and "scenefactory_jax" in Path(program).parts
+    return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if ours else f"{name}(config)"
 
 
 def folder() -> Path:
@@ -105,6 +109,10 @@ def _explain(name: str, error: Exception) -> str:
     text = " ".join(text.split())
     if "provider=hydra.searchpath" not in text:  # the user has named no folder: where ours lie is no news
         text = text.partition(" Config search path:")[0]
+    if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
+        group, option = missing.groups()
+        valid = ", ".join(sorted(path.stem for path in (folder() / group).glob("*.yaml")))
+        return f"{group}: unknown option {option!r}; valid: {valid}"
     match = re.search(r"Could not override '([^']+)'", text)
     if not match:
         return text
@@ -126,16 +134,25 @@ def read(path: Path) -> dict[str, Any]:
     """The config that a run was made with (`config.yaml` of its folder).
 
     Raises:
-        ConfigError: no such run, naming the folder.
+        ConfigError: no such run, naming the folder; or a file that holds no config.
     """
-    file = Path(path) / "config.yaml"
+    file = Path(path) / FILE
     if not file.is_file():
-        raise ConfigError(f"{path} is no run: it has no config.yaml; give the folder that `train` wrote")
-    return yaml.safe_load(file.read_text())
+        raise ConfigError(f"{path} is no run: it has no {FILE}; give the folder that `train` wrote")
+    try:
+        found = yaml.safe_load(file.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: damaged: {' '.join(str(error).split())}; restore it from a copy") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{file}: holds no config of a run; restore it from a copy")
+    return found
 
 
 def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A run's config with other settings: `dynamics=bicycle` replaces a whole group of the environment, `timing.episode_s=20` one number.
+
+    A run's config holds values, no references: what follows another key in `conf/` (`observe.road.kernels` follows `facts.kernels`) does
+    not follow here, and a whole group comes with what the default environment says of such keys, not the run's.
 
     Raises:
         ConfigError: no such group, option or key in the run's config, with the valid ones.
@@ -173,7 +190,9 @@ def _task(override: str) -> dict[str, Any]:
 def write(path: Path, config: Mapping[str, Any]) -> None:
     """Keep a run's config, and the commit and the versions it ran with, beside its results."""
     Path(path).mkdir(parents=True, exist_ok=True)
-    (Path(path) / "config.yaml").write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    half = Path(path) / f"{FILE}.part"  # whole or as it was: a run without its config is lost
+    half.write_text(yaml.safe_dump(dict(config), sort_keys=False))
+    half.replace(Path(path) / FILE)
     (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": commit(), **versions()}, sort_keys=False))
 
 
@@ -224,3 +243,18 @@ def as_overrides(arguments: Sequence[str]) -> list[str]:
     options of one's own lie."""
     settings = [a for a in arguments if a.startswith("~") or ("=" in a and not a.startswith("-"))]
     return [a for a in settings if not a.startswith("hydra") or a.startswith("hydra.searchpath=")]
+
+
+def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
+    """The overrides of a sweep's first job, those left out that only a sweeper understands (`interval(0, 1)`), and the keys that vary.
+
+    Raises:
+        ConfigError: an override that is none.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides([quoted(override) for override in overrides])
+    except HydraException as error:
+        raise ConfigError(" ".join(str(error).split())) from None
+    fixed = [one.input_line for one in parsed if not one.is_sweep_override() and one.input_line]
+    first = [f"{one.get_key_element()}={next(one.sweep_string_iterator())}" for one in parsed if one.is_discrete_sweep()]
+    return [*fixed, *first], {one.key_or_group for one in parsed if one.is_sweep_override()}

@@ -12,7 +12,7 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, playing, policies, sources
+from scenefactory_jax.run import keys, log, playing, policies, results, sources
 
 PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
@@ -42,14 +42,16 @@ def evaluate(config: Mapping[str, Any]) -> Result:
         raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
     scenes = sources.heldout(trained["scenes"], path=config["scenes"]["path"])
     out = Path(config["out"] or (Path("runs") / run.name if policies.is_shipped(run) else run) / "evaluation")
-    return judge(trained, run, scenes, out, settings=config, protocols=PROTOCOLS[wanted])
+    asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"]}
+    return judge(trained, run, scenes, out, asked=asked, settings=config, protocols=PROTOCOLS[wanted])
 
 
 def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     """The evaluation that ends `train`: held-out scenes, the run's own settings."""
     settings = config["evaluation"]
     scenes = sources.heldout(config["scenes"], path=None)
-    return judge(config, folder, scenes, folder, settings=settings, protocols=settings["protocols"])
+    asked = {"run": str(folder), "scenes": None, "overrides": []}
+    return judge(config, folder, scenes, folder, asked=asked, settings=settings, protocols=settings["protocols"])
 
 
 def make_watch(
@@ -82,9 +84,20 @@ def make_watch(
 
 
 def judge(
-    config: Mapping[str, Any], run: Path, scenes: sources.Scenes, out: Path, *, settings: Mapping[str, Any], protocols: list[str]
+    config: Mapping[str, Any],
+    run: Path,
+    scenes: sources.Scenes,
+    out: Path,
+    *,
+    asked: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    protocols: list[str],
 ) -> Result:
-    """Play every protocol with the trained and, if asked for, the untrained policy; write records, report and video to `out`."""
+    """Play every protocol with the trained and, if asked for, the untrained policy; write records, report and video to `out`.
+
+    Args:
+        asked: run, scenes (None: the run's own held-out ones) and overrides, as they were named.
+    """
     from scenefactory_jax.run import failing, reporting
 
     out.mkdir(parents=True, exist_ok=True)
@@ -99,7 +112,11 @@ def judge(
         play = playing.make_player(config, scenes, protocol=protocol, settings=settings, worlds=None if drawn else film, steps=None)
         for name, values in parameters.items():
             label = protocol if name == "trained" else f"{protocol}, {name}"
-            records[label], recording = play(values)
+            played, recording = play(values)
+            if not records:
+                told = {name: settings[name] for name in ("seed", "repeats", "untrained")}
+                results.begin(out, {**asked, "protocols": protocols, **told})
+            records[label] = played
             tables.write_csv(out / f"agents-{label.replace(', ', '-')}.csv", records[label])
             if recording is None or name != "trained":
                 continue
@@ -108,8 +125,9 @@ def judge(
                 pictures[label] = failing.draw(out, label, records[label], recording, settings)
     summary = {label: tables.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for label, rows in records.items()}
     report = reporting.write(
-        out, config=config, run=run, settings=settings, records=records, summary=summary, trajectories=trajectories, failed=pictures
-    )
+        out, config=config, run=run, asked={**asked, "protocols": protocols}, settings=settings, records=records, summary=summary,
+        trajectories=trajectories, failed=pictures,
+    )  # fmt: skip
     print(tables.markdown(summary), f"\nreport {report}", sep="\n", flush=True)
     return Result(out, records, summary, report)
 

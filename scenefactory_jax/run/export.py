@@ -27,7 +27,8 @@ def export(config: Mapping[str, Any]) -> Path:
     out = Path(config["out"])
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"out: {out} holds something already; give a new folder")
-    judged = {what: _summaries(what, Path(folder), config["card"]) for what, folder in (config["card"]["judged"] or {}).items()}
+    folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
+    judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
     trained = policies.load_policy(config["run"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
@@ -44,6 +45,14 @@ def export(config: Mapping[str, Any]) -> Path:
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out
+
+
+def named(what: str, folder: Path) -> str:
+    """What was driven, and with what it differed from the run's own held-out scenes and settings; of paths the names alone."""
+    noted = results.judged(folder)
+    told = [] if noted["scenes"] is None else [Path(noted["scenes"]).name]
+    told += [override for override in noted["overrides"] if "path=" not in override]
+    return f"{what} ({', '.join(told)})" if told else what
 
 
 def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, tables.Estimate]]:

@@ -18,11 +18,13 @@ class MetricsFile:
         rows = [row for row in read(folder, name) if resume_at is not None and row["iteration"] <= resume_at]
         self.rows = rows
         self.columns = list(rows[0]) if rows else []
-        with open(self.path, "w", newline="") as file:
+        half = self.path.with_name(f"{name}.part")  # whole or as it was, wherever the process is killed
+        with open(half, "w", newline="") as file:
             if rows:
                 writer = csv.DictWriter(file, self.columns)
                 writer.writeheader()
                 writer.writerows(rows)
+        half.replace(self.path)
 
     def add(self, row: Mapping[str, float | int]) -> None:
         new = not self.columns
@@ -35,12 +37,12 @@ class MetricsFile:
 
 
 def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
-    """Rows of a run's metrics; none where there is no file yet."""
+    """Rows of a run's metrics; none where there is no file yet. An empty cell is NaN, a last row that was cut short none at all."""
     path = Path(folder) / name
     if not path.is_file():
         return []
-    with open(path, newline="") as file:
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    whole = path.read_text().rpartition("\n")[0]
+    return [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(whole.splitlines())]
 
 
 @contextlib.contextmanager

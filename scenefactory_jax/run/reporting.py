@@ -1,5 +1,8 @@
 """Figures, video and report.md of an evaluation."""
 
+import json
+import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,7 @@ def write(
     *,
     config: Mapping[str, Any],
     run: Path,
+    asked: Mapping[str, Any],
     settings: Mapping[str, Any],
     records: Mapping[str, dict[str, np.ndarray]],
     summary: Mapping[str, Mapping[str, tables.Estimate]],
@@ -25,7 +29,7 @@ def write(
 ) -> Path:
     """Write everything that a reader of the evaluation wants to see to `out`, and return the report's path.
 
-    `failed` has the pictures of failures: name of the records -> kind -> picture.
+    `asked` is as `evaluate.judge` has it, with the protocols; `failed` has the pictures of failures: name of records -> kind -> picture.
     """
     metrics = log.read(run)
     baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
@@ -37,7 +41,7 @@ def write(
         files["Metrics of the training"] = run / log.FILE
     return document.write(
         out,
-        title=f"{config['name']}: evaluation on scenes not seen in training",
+        title=title(config["name"], asked),
         summary=summary,
         records=records,
         config=config,
@@ -50,8 +54,31 @@ def write(
         failed=failed,
         kinds=failures.numbers(settings["failures"]),
         files=files,
-        commands=[f"python -m scenefactory_jax evaluate run={run}"],
+        commands=[again(asked, settings)],
     )
+
+
+def again(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
+    default = configs.load("evaluate", "run=null")
+    invincible = {("strict",): False, ("invincible",): True}.get(tuple(asked["protocols"]), "both")
+    own = {"run": asked["run"], "out": None, "scenes": {"path": asked["scenes"]}, "overrides": asked["overrides"], "invincible": invincible}
+    wanted, usual = document.flatten({name: {**settings, **own}[name] for name in ("run", *default)}), document.flatten(default)
+    words = [f"{key}={_word(value)}" for key, value in wanted.items() if value != usual.get(key)]
+    return f"python -m scenefactory_jax evaluate {shlex.join(words)}"
+
+
+def _word(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    bare = isinstance(value, str) and re.fullmatch(r"[A-Za-z/._][\w/.+-]*", value)
+    return value if bare else json.dumps(value, ensure_ascii=False, separators=(",", ":"), default=str)
+
+
+def title(name: str, asked: Mapping[str, Any]) -> str:
+    """The heading, which says of no other scenes than the run's own held-out ones that training never saw them."""
+    changed = any(override.startswith("scenes") for override in asked["overrides"])
+    own = "other scenes" if changed else "scenes not seen in training"
+    return f"{name}: evaluation on {own if asked['scenes'] is None else Path(asked['scenes']).name}"
 
 
 def _figures(out: Path, metrics, records, summary, baselines, trajectories) -> dict[str, Path]:
@@ -78,4 +105,4 @@ def _videos(out: Path, trajectories: list[Trajectory], settings: Mapping[str, An
     look = {key: settings[key] for key in ("fps", "stride", "columns", "panel", "trail_s")}
     video.write(path, trajectories, **look)
     speed = settings["fps"] * settings["stride"] / trajectories[0].control_hz
-    return {f"Deterministic policy on held-out scenes, {speed:g} x real time": path}
+    return {f"Deterministic policy, {speed:g} x real time": path}

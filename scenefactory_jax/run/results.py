@@ -10,6 +10,11 @@ import numpy as np
 
 from scenefactory_jax.report import tables
 
+JUDGED = "judged.json"  # what an evaluation was asked for, beside its records
+# All that an evaluation writes to its folder
+WRITTEN = (JUDGED, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
+WRITTEN += ("trajectories.png", "video.gif", "video.mp4", "report.md")
+
 
 def digest(settings: Mapping[str, Any]) -> str:
     """Tells whether a result was made with these settings; 16 hexadecimal digits."""
@@ -55,6 +60,18 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return [float("nan") if one is None else _numbers(one) for one in value]
     return value
+
+
+def begin(folder: Path, judged: Mapping[str, Any]) -> None:
+    """Note what is judged, and remove what an evaluation before wrote to the folder: records of two would be read as those of one."""
+    for file in [file for pattern in WRITTEN for file in folder.glob(pattern)]:
+        file.unlink()
+    write(folder / JUDGED, judged, digits=None)
+
+
+def judged(folder: Path) -> dict[str, Any]:
+    """What `begin` noted; nothing of an evaluation that did not yet."""
+    return read(folder / JUDGED) if (folder / JUDGED).is_file() else {"scenes": None, "overrides": []}
 
 
 def records(folder: Path) -> dict[str, dict[str, np.ndarray]]:

@@ -17,7 +17,7 @@ import numpy as np
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import results, sources, study_plan, study_report, together, train
+from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, train_folder
 from scenefactory_jax.run.evaluate import make_examiner
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 from scenefactory_jax.run.study_report import RESULT, TRAINED
@@ -187,7 +187,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
         prepared, examiners = None, {}
         for one in group:
             needs = spent.get(program, _estimate(one))
-            if not shared.claims.take(one.digest):
+            if not shared.claims.take(one.digest) or is_trained(one):  # by another command, meanwhile
                 continue
             if not clock.fits(needs, what=f"training {one.variant}, seed {one.seed}"):
                 return False
@@ -197,7 +197,11 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
             own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
             sharing = min(shared.config["per_gpu"], shared.config["processes"])
-            note = _train_one(one, own) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
+            try:
+                note = _train_one(one, own) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
+            except train_folder.Busy:
+                print(f"training {one.variant}, seed {one.seed}: left to the command that trains in {one.folder}", flush=True)
+                continue
             spent[program] = time.monotonic() - begun
             results.write(one.folder / TRAINED, note, digits=None)
             if shared.config["slim"]:

@@ -1,5 +1,7 @@
 """What a study is to train and to judge, read out of its config: every training and every judging with a digest of all that decides it."""
 
+import functools
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,6 +11,7 @@ from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, results
+from scenefactory_jax.scenes import bank_index, source
 
 TASK = tuple(group for group in world.GROUPS if group != "ends")  # how episodes end is the protocol's
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
@@ -57,6 +60,7 @@ def make(config: Mapping[str, Any]) -> Plan:
         ConfigError: a key, a name or an override that does not fit, naming the variant or condition.
     """
     check(config)
+    scenes_print.cache_clear()  # other scenes may lie there than when this process planned before
     study, runs = config["study"], Path(config["runs"])
     seeds = study["seeds"] if config["seeds"] is None else config["seeds"]
     trainings = [one for variant in study["trainings"] for one in _trainings(config, variant, seeds, runs)]
@@ -76,6 +80,18 @@ def scenes_key(config: Mapping[str, Any], path: str | None) -> str:
     """Tells which settings of a `scenes` entry give the same scenes, before `take`."""
     entry = {name: value for name, value in config.items() if name not in ("take", "heldout", "workers", "path")}
     return results.digest({**entry, "path": None if path is None else str(path)})
+
+
+@functools.lru_cache
+def scenes_print(path: str | None) -> str | None:
+    """Tells other scenes of the same path: a bank's index, which has digests of its files, or name, size and time of every file; None where
+    there are none."""
+    if path is None or not Path(path).exists():
+        return None
+    if bank_index.is_bank(path):
+        return hashlib.sha256((Path(path) / bank_index.INDEX).read_bytes()).hexdigest()[:16]
+    stats = {str(file): file.stat() for file in source.find(path)}
+    return results.digest({name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()})
 
 
 def check(config: Mapping[str, Any]) -> None:
@@ -127,6 +143,7 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
 def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs: Path) -> Training:
     entry = {name: value for name, value in settings.items() if name not in ASIDE}
     entry["scenes"] = {name: value for name, value in settings["scenes"].items() if name not in ("heldout", "workers")}
+    entry |= _printed(settings["scenes"]["path"])
     if settings["scenes"]["take"]["count"] is None:
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = results.digest(entry), settings["seed"]
@@ -163,10 +180,17 @@ def _judging(
     settings = {name: value for name, value in config["evaluation"].items() if name != "bootstrap"}
     parts = {name: examined[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": settings}
     # without a path they are the recipe's own held-out ones
-    source = {"scenes": scenes_key(examined["scenes"], path), "heldout": examined["scenes"]["heldout"] if path is None else None}
-    program = results.digest(parts | source)
+    heldout = examined["scenes"]["heldout"] if path is None else None
+    drawn = {"scenes": scenes_key(examined["scenes"], path), "heldout": heldout}
+    program = results.digest(parts | drawn | _printed(path if heldout is None else heldout["path"]))
     file = training.folder / f"judged-{weights}-{program}.csv"
     return Judging(row, training, weights, condition, protocol, examined, program, file)
+
+
+def _printed(path: str | None) -> dict[str, str]:
+    """What a digest holds of scenes that are not made by a generator."""
+    found = scenes_print(path)
+    return {} if found is None else {"scenes_print": found}
 
 
 def _quoted(path: str) -> str:

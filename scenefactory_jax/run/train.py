@@ -1,8 +1,6 @@
 """`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
 
 import contextlib
-import datetime
-import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -12,12 +10,12 @@ import jax
 from jax.sharding import Mesh
 
 from scenefactory_jax import world
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.build import build
 from scenefactory_jax.policy import late_fusion
 from scenefactory_jax.ppo import across, checkpoint
 from scenefactory_jax.ppo import train as ppo
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, loggers, sources, stream, trouble
+from scenefactory_jax.run import keys, log, loggers, sources, stream, train_folder, train_stop, trouble
 from scenefactory_jax.types import Env, Policy, Scene
 
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
@@ -68,55 +66,67 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
         prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
 
     Raises:
-        ConfigError: a key that does not fit, a run folder that exists, nothing to resume.
+        ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
+        KeyboardInterrupt: an interrupt, once the iteration is whole and kept.
     """
     keys.check_train(config)
+    if config["evaluation"]["enable"]:
+        sources.check_heldout(config["scenes"])
     watching = loggers.make(config["loggers"])
     sources.use_compilation_cache()
     prepared = prepared or prepare(config)
-    trainer, (folder, resume) = prepared.trainer, _folder(config)
-    with _begun(folder), _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
+    with train_folder.opened(config) as (folder, resume):
+        state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
+        if config["evaluation"]["enable"]:
+            if sources.has_heldout(config["scenes"]):
+                from scenefactory_jax.run.evaluate import after_training
+
+                after_training(config, folder)
+            else:
+                print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
+    return Run(folder, config, prepared.env, prepared.policy, state, log.read(folder))
+
+
+def _trained(
+    config: dict[str, Any],
+    folder: Path,
+    prepared: Prepared,
+    watching: Mapping[str, loggers.Logger],
+    on_iteration: OnIteration | None,
+    *,
+    resume: bool,
+) -> ppo.TrainState:
+    """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
+    trainer = prepared.trainer
+    with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
             print(f"resumed at iteration {int(state.iteration)}", flush=True)
-        elif config["evaluation"]["untrained"]:
+        configs.write(folder, config)
+        if not resume and config["evaluation"]["untrained"]:
             checkpoint.save(folder / "untrained", state, keep=1)  # evaluations compare with the policy before training
         watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
         callbacks = [c for c in (watch, on_iteration) if c]
-        state = _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
-    if config["evaluation"]["enable"]:
-        if sources.has_heldout(config["scenes"]):
-            from scenefactory_jax.run.evaluate import after_training
-
-            after_training(config, folder)
-        else:
-            print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
-    return Run(folder, config, prepared.env, prepared.policy, state, log.read(folder))
+        return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
 
 
 @contextlib.contextmanager
 def _scenes(
     config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
 ) -> Iterator[tuple[Scene, stream.Flow | None]]:
-    """The scenes of all worlds on their devices, and where others come from, if they do not stay. What can be read is a run: its config is
-    written."""
-    before = checkpoint.restore_host(folder / "checkpoints") if resume else None
-    if resume and (before is None) != (config["stream"] is None):
-        began = "scenes that stay, stream=none" if before is None else "a stream of scenes"
-        raise ConfigError(f"stream: the run in {folder} began with {began}, and cannot go on otherwise")
+    """The scenes of all worlds on their devices, and where others come from, if they do not stay."""
     if config["stream"] is None:
         given = prepared.scenes
         loaded = sources.training(config["scenes"]) if given is None else sources.taken(given, config["scenes"])
         worlds, chosen = sources.assign(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
-        configs.write(folder, config)
         print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
         yield worlds, None
         return
+    before = checkpoint.restore_host(folder / "checkpoints") if resume else None
     with stream.flowing(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
-        configs.write(folder, config)
         print(f"run {folder}", flush=True)
         yield worlds, flow
 
@@ -164,12 +174,14 @@ def _loop(
 ):
     """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
 
-    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them.
+    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. An interrupt ends it after the
+    iteration that it fell into, with a checkpoint.
     """
     first, total = int(state.iteration), config["iterations"]
     file = log.MetricsFile(folder, resume_at=first if resume else None)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
+        train_stop.deferred() as asked,
         loggers.opened(watching, folder, config, after=first if resume else 0) as note,
         log.progress(total, enable=config["progress"], start=first) as show,
     ):
@@ -186,10 +198,12 @@ def _loop(
             trouble.check_finite(row)
             for callback in callbacks:
                 callback(state, row)
-            late = config["minutes"] is not None and spent >= config["minutes"]
-            if late or iteration == total or iteration % config["checkpoint_every"] == 0:
+            late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
+            if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
                 host = None if flow is None else flow.state()
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
+            if stop:
+                train_stop.end(folder, iteration)
             if late:
                 break
     return state
@@ -215,39 +229,3 @@ def describe(row: Mapping[str, float | int]) -> str:
     names = {"reached": "goal", "collided": "collision", "touched_edge": "edge", "crashed": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
     return f"{rates} | {row['casps']:,.0f} steps/s"
-
-
-@contextlib.contextmanager
-def _begun(folder: Path) -> Iterator[None]:
-    """A folder that is still empty when an error ends the run was no run's: it goes."""
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):  # it holds something, or was never made
-            folder.rmdir()
-            folder.parent.rmdir()
-        raise
-
-
-def _folder(config: Mapping[str, Any]) -> tuple[Path, bool]:
-    """The run's folder, and whether there is something in it to go on from."""
-    if config["out"] is None:
-        if config["resume"]:
-            raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
-        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        base = Path("runs") / f"{config['name']}-{stamp}"
-        for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
-            with contextlib.suppress(FileExistsError):  # the jobs of a parallel sweep start in one second: making it says whose it is
-                folder.mkdir(parents=True)
-                break
-        return folder, False
-    folder = Path(config["out"])
-    if checkpoint.latest(folder / "checkpoints") is None:
-        if config["resume"] and folder.exists() and (folder / "config.yaml").is_file():
-            return folder, False  # killed before its first checkpoint: start over
-        if config["resume"]:
-            raise ConfigError(f"out={folder}: no checkpoint to resume from; valid: a folder that `train` wrote")
-        return folder, False
-    if not config["resume"]:
-        raise ConfigError(f"out={folder}: holds a run already; add resume=true to go on with it, or choose another folder")
-    return folder, True

@@ -1,0 +1,115 @@
+"""The folder of a training: a new one or one to go on in, one command's at a time, and as it was before where nothing could begin."""
+
+import contextlib
+import datetime
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.run import config as configs
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: two commands in one folder are the user's own care there
+    fcntl = None
+
+LOCK = ".train.lock"
+# What may be another when a run goes on, and all below it: nothing that was learnt rests on it
+FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
+FREE += ("loggers", "evaluation", "scenes.heldout")
+
+
+class Busy(ConfigError):
+    """Another command trains in the folder."""
+
+
+@contextlib.contextmanager
+def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
+    """The run's folder, and whether there is a checkpoint in it to go on from. Nobody else trains there meanwhile.
+
+    Raises:
+        ConfigError: a folder that holds a run already, or `resume` where there is none, or one of other settings.
+        Busy: another command trains there.
+    """
+    if config["resume"] and config["out"] is None:
+        raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
+    with _made(config) as folder, _alone(folder):
+        yield folder, _goes_on(folder, config)
+
+
+@contextlib.contextmanager
+def _made(config: Mapping[str, Any]) -> Iterator[Path]:
+    """The folder; what had to be made for it and is still empty when an error ends the run was no run's: it goes."""
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    named, base = config["out"] is not None, Path(config["out"] or f"runs/{config['name']}-{stamp}")
+    for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
+        new = [place for place in (folder, *folder.parents) if not place.exists()]
+        try:
+            folder.mkdir(parents=True, exist_ok=named)
+            break
+        except FileExistsError:  # the jobs of a parallel sweep start in one second: making it says whose it is
+            if named:
+                raise ConfigError(f"out={folder}: is a file; give a folder") from None
+    try:
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):  # it holds something
+            for place in new:
+                place.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """A lock on the folder, which the system takes back however the process ends."""
+    with open(folder / LOCK, "a") as file:
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise Busy(f"out={folder}: another command trains there now; wait for its end, or choose another folder") from None
+        except OSError:  # a file system without locks
+            pass
+        try:
+            yield
+        finally:
+            if not (folder / configs.FILE).is_file():
+                (folder / LOCK).unlink(missing_ok=True)
+
+
+def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is there to go on from; a run that was stopped before its first one begins anew."""
+    begun, last = (folder / configs.FILE).is_file(), checkpoint.latest(folder / "checkpoints")
+    if not config["resume"]:
+        if begun or last is not None:
+            raise ConfigError(f"out={folder}: holds a run already; add resume=true to go on with it, or choose another folder")
+        return False
+    if not begun:
+        raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
+    _check_same(folder, config)
+    return last is not None
+
+
+def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
+    """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
+    differing = _differing(configs.read(folder), config)
+    bound = [one for place, one in differing.items() if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
+    if bound:
+        more = f"; and {len(bound) - 8} more" if len(bound) > 8 else ""
+        raise ConfigError(f"resume=true: {'; '.join(bound[:8])}{more}: {folder} goes on as it began; for other settings choose another out")
+
+
+def _differing(before: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> dict[str, str]:
+    """Dotted keys of which two configs have different values -> both values in words; a group as a whole where one has none."""
+    found = {}
+    for key in {**before, **now}:
+        held, wanted = before.get(key), now.get(key)
+        if isinstance(held, Mapping) and isinstance(wanted, Mapping):
+            found |= _differing(held, wanted, f"{where}{key}.")
+        elif held != wanted:
+            told = ["{...}" if isinstance(value, Mapping) else value for value in (wanted, held)]
+            found[f"{where}{key}"] = f"{where}{key}={told[0]} (the run has {told[1]})"
+    return found
