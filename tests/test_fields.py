@@ -386,7 +386,7 @@ def test_the_report_says_how_the_film_changed():
         ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: -1\.0; wanted is at least 0"),
         ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: 'many' is of type str, wanted int"),
         ("weather.patches=wet", r"weather\.patches: 'wet'"),
-        ("+weather.rian=3", r"weather\.rian: unknown key; weather has: draw, patches, rain, grip"),
+        ("+weather.rian=3", r"weather\.rian: unknown key; valid: draw, grip, patches, rain"),
         ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: drying, onset, pass_time, schedule"),
         ("weather.rain={_target_: drying, tau_s: [-1.0, 2.0], knots: 8}", r"weather\.rain\.tau_s: .*nothing below 0"),
         ("weather.rain={_target_: drying, tau_s: [1.0, 2.0], knots: 1}", r"weather\.rain\.knots: 1; wanted are at least 2"),

@@ -14,7 +14,7 @@ SHORTER = {  # how well it learns is for other tests: notebook -> what a test ru
         "runs/quickstart-*/evaluation/report.md",
     ),
     "02_scenes": ({"scenes.count=24": "scenes.count=8"}, "outputs/scenes/parts/test/bank.json"),
-    "03_own_algorithm": ({"range(80)": "range(2)", "steps=450": "steps=60"}, None),
+    "03_own_algorithm": ({"range(80)": "range(2)", "steps=150": "steps=20"}, None),
     "04_friction": ({"steps = 540": "steps = 90"}, "outputs/weather/weather.md"),
     "05_ppo": (
         {'"name=first"': f'"name=first", {SHORT}', '"iterations=80"': '"iterations=2"', '"iterations=120"': '"iterations=3"'},

@@ -185,18 +185,25 @@ def test_a_training_that_cannot_begin_removes_what_it_made_and_nothing_else(tmp_
         pass
 
 
-def test_an_interrupt_keeps_the_iteration_that_it_falls_into(whole, tmp_path, capsys):
+@pytest.fixture
+def interruptible():
+    """As at a terminal: a script's background commands are born to ignore interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_keeps_the_iteration_that_it_falls_into(whole, interruptible, tmp_path, capsys):
     again = lambda *changes: smoke(tmp_path / "run", "evaluation.enable=false", "iterations=4", *changes)  # noqa: E731
 
     def interrupted(state, row):
         if row["iteration"] == 3:
             signal.raise_signal(signal.SIGINT)
 
-    before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         train(again(), on_iteration=interrupted)
     assert f"stopped at iteration 3; goes on with the same settings and out={tmp_path / 'run'} resume=true" in capsys.readouterr().out
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     same_numbers(train(again("resume=true")).folder, whole.folder)
 
 
@@ -429,7 +436,7 @@ def test_help_begins_with_what_a_command_is_for():
     assert len(rest) > 10 and all(command_line._help(name, [])[0].startswith(f'hydra.help.header="{name}: ') for name in config.COMMANDS)
 
 
-def test_an_interrupted_command_ends_as_shells_expect(monkeypatch):
+def test_an_interrupted_command_ends_as_shells_expect(monkeypatch, interruptible):
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "train"])
     monkeypatch.setattr("hydra.main", lambda **_: lambda job: lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit) as stopped:

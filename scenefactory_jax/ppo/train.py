@@ -95,8 +95,7 @@ def make(
         learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
         learning_rate_halved: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
         gamma, gae_lambda: discount of an action, and the advantage's mix of horizons.
-        clip, value_clip: of the probability ratio, and of the value loss; None leaves the latter unclipped.
-        entropy, value: weights of entropy bonus and value loss.
+        clip, value_clip, entropy, value: bounds of the probability ratio and of the value loss (None: none), weights of entropy and value.
         normalise_advantage: over the active samples of the whole rollout.
         initial_phase: worlds start at random times of their episodes, so that they do not run out of time together.
         average: share of the parameters' running mean that stays at every iteration; the mean is what is judged. None: there is no mean.
@@ -119,11 +118,11 @@ def make(
     act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
-    init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=functools.partial(size, groups=everybody))
-    init, size = functools.partial(init, average=average is not None), functools.partial(size, groups=own)
+    whole, size = functools.partial(size, groups=everybody), functools.partial(size, groups=own)
+    init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=whole, average=average is not None)
     iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis, average=average)
-    swap = functools.partial(_swap, start=functools.partial(_start, env=env, phases=1), axis=axis)
-    return _compiled(init, iterate, functools.partial(_restart, start=start), swap, mesh)
+    restart, swap = functools.partial(_restart, start=start), functools.partial(_swap, env=env, axis=axis)
+    return _compiled(init, iterate, restart, swap, mesh)
 
 
 def _groups(shards: int | None, mesh: Mesh | None) -> tuple[str | None, int, int]:
@@ -224,14 +223,14 @@ def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> Trai
 
 
 def _swap(
-    train_state: TrainState, scenes: Scene, worlds: Int[Array, " N"], fresh: Scene, *, start: Callable, axis: str | None
+    train_state: TrainState, scenes: Scene, worlds: Int[Array, " N"], fresh: Scene, *, env: Env, axis: str | None
 ) -> tuple[TrainState, Scene]:
     """Every device starts all fresh scenes, and keeps those of its own worlds.
 
     At the beginning of their episodes, whatever `initial_phase` says: a life that its world's clock cuts short would count as a failure.
     """
     start_key, key = jax.random.split(train_state.key)
-    begun, seen = start(start_key, fresh)
+    begun, seen = _start(start_key, fresh, env=env, phases=1)
     rows = across.own(worlds, len(train_state.worlds.step), axis)
 
     def put(held: Any, new: Any) -> Any:
