@@ -95,11 +95,9 @@ def _job(command: str):
         module = importlib.import_module(f"scenefactory_jax.run.{command}")
         try:
             getattr(module, command)(configs.plain(config))
-        except ValueError as error:  # ConfigError and SceneError; a bug's own ValueError keeps its traceback
+        except (ValueError, OSError) as error:  # ConfigError and SceneError among them; a bug's own ValueError keeps its traceback
             if type(error) is ValueError:
                 raise
-            _end(error)
-        except OSError as error:
             _end(error)
         except Exception as error:
             if (told := _trouble(error, config)) is None:

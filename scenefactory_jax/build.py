@@ -130,6 +130,18 @@ def check_range(span: Sequence[float | int], *, where: str, least: float | None 
     return span[0], span[1]
 
 
+def differing(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
+    """Dotted keys of which two configs have different values -> both; None, or a group as a whole, where one of them has no such key."""
+    found = {}
+    for key in {**before, **now}:
+        held, wanted = before.get(key), now.get(key)
+        if isinstance(held, Mapping) and isinstance(wanted, Mapping):
+            found |= differing(held, wanted, f"{prefix}{key}.")
+        elif held != wanted:
+            found[f"{prefix}{key}"] = held, wanted
+    return found
+
+
 def _fits(value: Any, hint: Any) -> bool:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or isinstance(hint, typing.TypeVar):

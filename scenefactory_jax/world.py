@@ -119,7 +119,7 @@ def assemble(parts: Parts) -> Env:
 
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
         control = functools.partial(_transition, parts, scene, action=action)
-        state, _, outcome, _ = act(control, state, None, hold=parts.hold, note=lambda *_: (None, None))
+        state, _, outcome, _ = act(control, state, hold=parts.hold)
         return state, replace(outcome, observation=_observe(parts, scene, state))
 
     def bind(function: Callable) -> Callable:
@@ -131,16 +131,17 @@ def assemble(parts: Parts) -> Env:
 def act(
     control: Callable[[State], tuple[State, Outcome]],
     state: State,
-    noted: Any,
+    noted: Any = None,
     *,
     hold: int,
-    note: Callable[[Any, State, Outcome], tuple[Any, Any]],
+    note: Callable[[Any, State, Outcome], tuple[Any, Any]] = lambda *_: (None, None),
 ) -> tuple[State, Any, Outcome, Any]:
     """All control steps that one action stands for, of one world or of many.
 
     Args:
         control: one control step with that action.
-        noted: what `note` carries from step to step: (noted, state before the step, its outcome) -> (noted, numbers to add up).
+        noted: what `note` carries from step to step: (noted, state before the step, its outcome) -> (noted, numbers to add up). By default
+            nothing is noted.
 
     Returns:
         The state, what was noted, the outcome of the whole action, and the sums of the numbers. In the outcome reward and terms are sums
@@ -169,6 +170,11 @@ def act(
     facts = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], facts)
     clock = {name: leaf[-1] for name, leaf in clock.items()}
     return state, noted, unchecked(Outcome, observation=None, facts=facts, **own, **clock), numbers
+
+
+def out_of_time(outcome: Outcome, active: Bool[Array, "*W A"]) -> Bool[Array, "*W A"]:
+    """Who drove before an action, of one world or of many, and was still driving when the time was up."""
+    return outcome.truncated[..., None] & active & ~outcome.done
 
 
 def _now(parts: Parts, scene: Scene, state: State) -> Scene:

@@ -61,7 +61,7 @@ class Drive(Env):
         return State(episode, observation[0], zero, zero, {name: jnp.float32(0.0) for name in names}, {})  # pyright: ignore
 
     def step(self, state: State, action: Array) -> State:
-        """One control step."""
+        """One action."""
         episode, moment = episodes.advance(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
         told = {f"reward/{name}": term[0] for name, term in moment.terms.items()}
         told |= {f"events/{name}": event[0].astype(jnp.float32) for name, event in moment.events.items()}
@@ -106,7 +106,7 @@ class Anew(Wrapper):
         return state
 
     def step(self, state: State, action: Array) -> State:
-        """One control step, and what begins anew after it."""
+        """One action, and what begins anew after it."""
         state.info["steps"] = jnp.where(state.done > 0, 0.0, state.info["steps"])
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)  # pyright: ignore[reportAttributeAccessIssue]
         env, scenes = self.unwrapped.pool.env, self.unwrapped.pool.scenes  # pyright: ignore[reportAttributeAccessIssue]

@@ -129,14 +129,14 @@ def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
     control = lambda state: env.transition(scene, state, action)  # noqa: E731
-    state, _, outcome, _ = world.act(control, episode.state, None, hold=env.hold, note=lambda *_: (None, None))
+    state, _, outcome, _ = world.act(control, episode.state, hold=env.hold)
     moment = Moment(
         observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
         events=vars(outcome.events),
         terminated=outcome.done,
-        truncated=outcome.truncated & episode.state.active & ~outcome.done,
+        truncated=world.out_of_time(outcome, episode.state.active),
         active=state.active,
         over=outcome.over,
     )

@@ -79,7 +79,7 @@ class Drive(gymnasium.Env):
         return np.asarray(observation)[0], {"scene": int(episode.scene)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step.
+        """One action.
 
         Raises:
             ResetNeeded: nothing has begun.

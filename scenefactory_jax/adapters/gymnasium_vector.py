@@ -93,7 +93,7 @@ class DriveVector(VectorEnv):
         return self._out((observation, _paired({"scene": worlds.scene}, mask)))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step of every world.
+        """One action of every world.
 
         Raises:
             ResetNeeded: nothing has begun.
@@ -158,7 +158,7 @@ class Stepped(NamedTuple):
 def _step(
     env: Env, mode: AutoresetMode, scenes: Scene, worlds: Episode, ended: Bool[Any, " W"], actions: Float[Array, "W 3"]
 ) -> tuple[Episode, Stepped]:
-    """One control step, and what begins anew."""
+    """One action, and what begins anew."""
     after, moment = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
     ended, late, every = jnp.asarray(ended), moment.truncated[:, 0], jnp.ones(len(actions), bool)
     anew = {AutoresetMode.SAME_STEP: moment.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]

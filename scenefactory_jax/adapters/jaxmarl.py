@@ -78,7 +78,7 @@ class Drive(MultiAgentEnv):
     def step(
         self, key: Array, state: Episode, actions: Named, reset_state: Episode | None = None
     ) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
-        """One control step; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
+        """One action; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
         place of two."""
         after, moment = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
         fresh = episodes.start(self.pool.env, self.scenes, key) if reset_state is None else reset_state
@@ -86,7 +86,7 @@ class Drive(MultiAgentEnv):
         return self.get_obs(now), now, *self._told(state, moment)
 
     def step_env(self, key: Array, state: Episode, actions: Named) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
-        """One control step, without beginning anew."""
+        """One action, without beginning anew."""
         del key  # the environment draws nothing in a step
         after, moment = episodes.advance(self.pool.env, self.scenes, state, self._stacked(actions))
         return self._named(moment.observation), after, *self._told(state, moment)

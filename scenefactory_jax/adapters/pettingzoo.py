@@ -83,7 +83,7 @@ class Drive(ParallelEnv):
         return {name: seen[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
 
     def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        """One control step. Actions of cars that have ended count for nothing.
+        """One action. Actions of cars that have ended count for nothing.
 
         Raises:
             ConfigError: nothing has begun, a driving car without an action, one of another shape, or an action of a car that there is not.

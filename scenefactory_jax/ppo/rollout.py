@@ -89,7 +89,7 @@ def collect(
             active=worlds.active,
             reward=outcome.reward,
             done=outcome.done,
-            truncated=outcome.truncated[:, None] & worlds.active & ~outcome.done,
+            truncated=world.out_of_time(outcome, worlds.active),
         )
         fresh = jax.vmap(env.start)(across.keys(start_key, len(outcome.over), axis), scenes)
         worlds = choose(outcome.over, fresh, after)

@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
+from scenefactory_jax.run import whole
 
 COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
 COMMANDS += ("weather", "export")
@@ -190,9 +191,8 @@ def _task(override: str) -> dict[str, Any]:
 def write(path: Path, config: Mapping[str, Any]) -> None:
     """Keep a run's config, and the commit and the versions it ran with, beside its results."""
     Path(path).mkdir(parents=True, exist_ok=True)
-    half = Path(path) / f"{FILE}.part"  # whole or as it was: a run without its config is lost
-    half.write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    half.replace(Path(path) / FILE)
+    with whole.replaced(Path(path) / FILE) as half:  # a run without its config is lost
+        half.write_text(yaml.safe_dump(dict(config), sort_keys=False))
     (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": commit(), **versions()}, sort_keys=False))
 
 

@@ -100,6 +100,7 @@ def judge(
     """
     from scenefactory_jax.run import failing, reporting
 
+    asked = {**asked, "protocols": protocols}
     out.mkdir(parents=True, exist_ok=True)
     print(scenes.account, flush=True)
     parameters = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
@@ -112,11 +113,9 @@ def judge(
         play = playing.make_player(config, scenes, protocol=protocol, settings=settings, worlds=None if drawn else film, steps=None)
         for name, values in parameters.items():
             label = protocol if name == "trained" else f"{protocol}, {name}"
-            played, recording = play(values)
-            if not records:
-                told = {name: settings[name] for name in ("seed", "repeats", "untrained")}
-                results.begin(out, {**asked, "protocols": protocols, **told})
-            records[label] = played
+            records[label], recording = play(values)
+            if len(records) == 1:  # it can be judged: what was there before goes
+                results.begin(out, {**asked, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
             tables.write_csv(out / f"agents-{label.replace(', ', '-')}.csv", records[label])
             if recording is None or name != "trained":
                 continue
@@ -125,7 +124,7 @@ def judge(
                 pictures[label] = failing.draw(out, label, records[label], recording, settings)
     summary = {label: tables.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for label, rows in records.items()}
     report = reporting.write(
-        out, config=config, run=run, asked={**asked, "protocols": protocols}, settings=settings, records=records, summary=summary,
+        out, config=config, run=run, asked=asked, settings=settings, records=records, summary=summary,
         trajectories=trajectories, failed=pictures,
     )  # fmt: skip
     print(tables.markdown(summary), f"\nreport {report}", sep="\n", flush=True)

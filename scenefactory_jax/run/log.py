@@ -7,6 +7,8 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from scenefactory_jax.run import whole
+
 FILE, EVALUATIONS = "metrics.csv", "evaluations.csv"
 
 
@@ -18,13 +20,11 @@ class MetricsFile:
         rows = [row for row in read(folder, name) if resume_at is not None and row["iteration"] <= resume_at]
         self.rows = rows
         self.columns = list(rows[0]) if rows else []
-        half = self.path.with_name(f"{name}.part")  # whole or as it was, wherever the process is killed
-        with open(half, "w", newline="") as file:
+        with whole.replaced(self.path) as half, open(half, "w", newline="") as file:
             if rows:
                 writer = csv.DictWriter(file, self.columns)
                 writer.writeheader()
                 writer.writerows(rows)
-        half.replace(self.path)
 
     def add(self, row: Mapping[str, float | int]) -> None:
         new = not self.columns
@@ -41,8 +41,8 @@ def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
     path = Path(folder) / name
     if not path.is_file():
         return []
-    whole = path.read_text().rpartition("\n")[0]
-    return [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(whole.splitlines())]
+    lines = path.read_text().rpartition("\n")[0].splitlines()
+    return [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(lines)]
 
 
 @contextlib.contextmanager

@@ -46,13 +46,13 @@ def find(run: str | Path) -> Path:
     Raises:
         ConfigError: neither is there; the message names the policies that come with the package.
     """
-    if (Path(run) / "config.yaml").is_file():
+    if (Path(run) / configs.FILE).is_file():
         return Path(run)
-    shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/config.yaml"))}
+    shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
     if str(run) in shipped:
         return shipped[str(run)]
     known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
-    raise ConfigError(f"{run} is no run: it has no config.yaml; give the folder that `train` wrote{known}")
+    raise ConfigError(f"{run} is no run: it has no {configs.FILE}; give the folder that `train` wrote{known}")
 
 
 def is_shipped(folder: Path) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.report import tables
+from scenefactory_jax.run import whole
 
 JUDGED = "judged.json"  # what an evaluation was asked for, beside its records
 # All that an evaluation writes to its folder
@@ -27,9 +28,8 @@ def write(path: Path, content: Mapping[str, Any], *, digits: int | None) -> None
     Args:
         digits: significant ones that numbers keep; None keeps all.
     """
-    half = path.with_suffix(".part")
-    half.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
-    half.replace(path)
+    with whole.replaced(path) as half:
+        half.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
 
 
 def plain(value: Any, *, digits: int | None) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, train_folder
+from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, train_folder, whole
 from scenefactory_jax.run.evaluate import make_examiner
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 from scenefactory_jax.run.study_report import RESULT, TRAINED
@@ -234,7 +234,7 @@ def _estimate(one: Training) -> float:
 
 def _train_one(one: Training, prepared: train.Prepared) -> dict[str, Any]:
     """One run, from its last checkpoint if there is one, and what there is to note of it."""
-    resume = (one.folder / "config.yaml").is_file()
+    resume = (one.folder / configs.FILE).is_file()
     print(f"training {one.variant}, seed {one.seed}" + (" (goes on)" if resume else ""), flush=True)
     config = {**one.config, "out": str(one.folder), "resume": resume}
     last = train.train(config, prepared=prepared).metrics[-1]
@@ -264,9 +264,8 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
                 return False
             examine = examine or shared.examiner(one, "policies")
             records, _ = examine(checkpoint.restore_parameters(one.training.folder / one.weights))
-            half = one.file.with_suffix(".part")
-            tables.write_csv(half, records)
-            half.replace(one.file)
+            with whole.replaced(one.file) as half:
+                tables.write_csv(half, records)
             counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("reached", "clean", "collided")]
             print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
         longest = max(longest, time.monotonic() - begun)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.build import ConfigError
+from scenefactory_jax.build import ConfigError, differing
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.run import config as configs
 
@@ -95,21 +95,9 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
 
 def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
     """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
-    differing = _differing(configs.read(folder), config)
-    bound = [one for place, one in differing.items() if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
-    if bound:
-        more = f"; and {len(bound) - 8} more" if len(bound) > 8 else ""
-        raise ConfigError(f"resume=true: {'; '.join(bound[:8])}{more}: {folder} goes on as it began; for other settings choose another out")
-
-
-def _differing(before: Mapping[str, Any], now: Mapping[str, Any], where: str = "") -> dict[str, str]:
-    """Dotted keys of which two configs have different values -> both values in words; a group as a whole where one has none."""
-    found = {}
-    for key in {**before, **now}:
-        held, wanted = before.get(key), now.get(key)
-        if isinstance(held, Mapping) and isinstance(wanted, Mapping):
-            found |= _differing(held, wanted, f"{where}{key}.")
-        elif held != wanted:
-            told = ["{...}" if isinstance(value, Mapping) else value for value in (wanted, held)]
-            found[f"{where}{key}"] = f"{where}{key}={told[0]} (the run has {told[1]})"
-    return found
+    shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
+    found = differing(configs.read(folder), config).items()
+    bound = [place for place in found if not any(f"{place[0]}.".startswith(f"{free}.") for free in FREE)]
+    if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
+        more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
+        raise ConfigError(f"resume=true: {'; '.join(told[:8])}{more}: {folder} goes on as it began; for other settings choose another out")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from scenefactory_jax.build import differing
 from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.scenes.source import BANK_INDEX as INDEX
 
@@ -99,16 +100,9 @@ def require_whole(path: Path, shard: Shard) -> None:
         raise SceneError(f"{path}: {size} bytes, cut short or changed: there were {shard.bytes}; copy or convert the bank again")
 
 
-def differences(here: Mapping[str, Any], there: Mapping[str, Any], prefix: str = "") -> list[str]:
+def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
     """Keys in which two settings differ, with both values."""
-    found = []
-    for name in {**there, **here}:
-        ours, theirs = here.get(name), there.get(name)
-        if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-            found += differences(ours, theirs, f"{prefix}{name}.")
-        elif ours != theirs:
-            found.append(f"{prefix}{name}: {theirs!r} there, {ours!r} here")
-    return found
+    return [f"{name}: {theirs!r} there, {ours!r} here" for name, (theirs, ours) in differing(there, here).items()]
 
 
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
