@@ -16,6 +16,10 @@ def surrounded(index, folder):
     return [os.environ[together.VISIBLE], os.environ[together.MEMORY]]
 
 
+def cores(index, folder):
+    return sorted(os.sched_getaffinity(0))
+
+
 def failing(index, folder):
     if index == 1:
         raise ValueError("this one fails")
@@ -51,6 +55,16 @@ def test_processes_that_share_a_gpu_share_its_memory(tmp_path, monkeypatch):
     assert answers == [["4", "0.450"], ["4", "0.450"], ["5", "0.450"]] and together.MEMORY not in os.environ
     with pytest.raises(RuntimeError, match="`processes` is at most 4"):
         together.run(surrounded, 5, tmp_path, per_gpu=2)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not bind processes to cores")
+def test_without_a_gpu_each_process_has_a_core(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    own = sorted(os.sched_getaffinity(0))
+    assert together.run(cores, 3, tmp_path) == [[own[index % len(own)]] for index in range(3)]
+    assert sorted(os.sched_getaffinity(0)) == own
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    assert together.run(cores, 1, tmp_path) == [own]
 
 
 def test_alone_all_is_ones_own_once():

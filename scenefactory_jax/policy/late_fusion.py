@@ -35,7 +35,7 @@ ACTIVATIONS = {"elu": jax.nn.elu, "relu": jax.nn.relu, "tanh": jnp.tanh}
 def make(
     *,
     vector: list[int],
-    rows: dict[str, list[int]],
+    rows: dict[str, list[int] | None],
     rows_default: list[int],
     trunk: list[int],
     activation: Literal["elu", "relu", "tanh"],
@@ -49,7 +49,7 @@ def make(
 
     Args:
         vector: widths of the encoder of all vector groups together.
-        rows: widths of the row encoder of each named group of rows.
+        rows: widths of the row encoder of each named group of rows; None: as if it were not named, for observations without that group.
         rows_default: widths for groups of rows that `rows` does not name.
         trunk: widths of the layers between fusion and head.
         mean_init: what the actor's last bias starts at: throttle, steer, brake. Around zero, a brake that is stronger than the drive keeps
@@ -64,15 +64,16 @@ def make(
     Raises:
         ConfigError: a width below one; at `init`, an observation without groups, or widths for a group of rows that it does not have.
     """
+    chosen = {group: widths for group, widths in rows.items() if widths is not None}
     named = {"vector": vector, "rows_default": rows_default, "trunk": trunk}
-    for name, widths in {**named, **{f"rows.{group}": widths for group, widths in rows.items()}}.items():
+    for name, widths in {**named, **{f"rows.{group}": widths for group, widths in chosen.items()}}.items():
         if not widths or min(widths) < 1:
             raise ConfigError(f"policy.{name}: {list(widths)} are no layer widths; wanted is a list of positive numbers")
     if len(mean_init) != ACTIONS:
         raise ConfigError(f"policy.mean_init: {list(mean_init)} holds {len(mean_init)} numbers, wanted {ACTIONS}: throttle, steer, brake")
     network = ActorCritic(
         vector=tuple(vector),
-        rows=tuple((name, tuple(widths)) for name, widths in sorted(rows.items())),
+        rows=tuple((name, tuple(widths)) for name, widths in sorted(chosen.items())),
         rows_default=tuple(rows_default),
         trunk=tuple(trunk),
         activation=activation,
@@ -85,7 +86,7 @@ def make(
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
         groups = sorted(name for name, group in observation.items() if isinstance(group, Rows))
-        if unknown := sorted(set(rows) - set(groups)):
+        if unknown := sorted(set(chosen) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such group of rows; valid: {', '.join(groups) or 'none'}")
         if not observation:
             raise ConfigError("policy: the observation has no group at all; add one to `observe`")
