@@ -54,6 +54,12 @@ def test_any_leading_axes_give_the_same_numbers(tiny):
     np.testing.assert_allclose(one[2], value[1], atol=1e-6)
 
 
+def test_widths_of_none_are_widths_that_nobody_named(tiny):
+    _, parameters, observation = tiny
+    same = late_fusion.make(**{**TINY, "rows": {"road": [8, 8], "neighbours": None}}).init(jax.random.key(1), observation)
+    assert jax.tree.map(jnp.shape, same) == jax.tree.map(jnp.shape, parameters)
+
+
 def test_hidden_rows_and_their_order_change_nothing(tiny):
     policy, parameters, observation = tiny
     road, order = observation["road"], jnp.array([3, 1, 4, 0, 2])

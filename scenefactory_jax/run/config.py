@@ -184,8 +184,8 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
 
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
-    """The environment with one other setting; a study asks for the same ones again and again."""
-    return load("task", override)
+    """The environment with one other setting, or with a policy that judges beside it; a study asks for the same ones again and again."""
+    return load("task", f"+{override}" if override.startswith("policy=") else override)
 
 
 def write(path: Path, config: Mapping[str, Any]) -> None:

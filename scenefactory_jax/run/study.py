@@ -255,11 +255,11 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
     ready = [one for one in todo.values() if checkpoint.latest(one.training.folder / one.weights) is not None]
     ready = [one for one in ready if one.weights == study_plan.UNTRAINED or is_trained(one.training)]
     longest = 0.0
-    for program, group in _by_program(ready).items():
-        if not shared.claims.take(program):
-            continue
+    for _, group in shared.claims.shares(_by_program(ready)):
         begun, examine = time.monotonic(), None
         for one in group:
+            if not shared.claims.take(f"{one.training.digest}-{one.file.name}"):
+                continue
             if not clock.fits(longest, what=f"judging {one.row}, {one.condition}, {one.protocol}"):
                 return False
             examine = examine or shared.examiner(one, "policies")
