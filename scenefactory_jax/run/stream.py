@@ -15,11 +15,10 @@ state, it makes a resumed run the unbroken one, bit for bit.
 
 import contextlib
 import functools
-import multiprocessing
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
 from typing import Any, Literal, NamedTuple
 
@@ -211,21 +210,6 @@ def _new(source: batches.Source, sizes: Mapping[str, int], worlds: int) -> dict[
 
 
 @contextlib.contextmanager
-def _processes(count: int) -> Iterator[Executor]:
-    """Processes that load. An error of the run ends them at once, whatever they are waiting for."""
-    others = set(multiprocessing.active_children())
-    pool = workers.pool(count)
-    try:
-        yield pool
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - others:
-            process.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-@contextlib.contextmanager
 def flowing(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[Flow]:
     """The stream of a config, from its beginning or from a `state` of before; its threads and processes end with the context.
 
@@ -243,7 +227,7 @@ def flowing(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str
     with contextlib.ExitStack() as stack:
         thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
         stack.callback(thread.shutdown, wait=True, cancel_futures=True)
-        pool = stack.enter_context(_processes(entry.processes)) if entry.processes else None
+        pool = stack.enter_context(workers.pool(entry.processes)) if entry.processes else None
         if before is None:
             asked = {"sample": entry.sample, "headroom": entry.headroom, "given": entry.capacity, "seed": config["seed"]}
             sizes = batches.measure(source, pool, grid=grid, **asked)

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
@@ -13,9 +14,19 @@ import numpy as np
 from scenefactory_jax.validation.parts import Spread
 
 
-def pool(workers: int) -> ProcessPoolExecutor:
-    """Processes that leave the accelerator to this one."""
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_on_the_host)
+@contextlib.contextmanager
+def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that leave the accelerator, and Ctrl-C, to this one. An error here ends them at once, whatever they are at."""
+    others = set(multiprocessing.active_children())
+    processes = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin)
+    try:
+        yield processes
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()
+        raise
+    finally:
+        processes.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
@@ -45,6 +56,8 @@ def spreading(workers: int) -> Iterator[Spread]:
         yield spread
 
 
-def _on_the_host() -> None:
-    """The accelerator belongs to the process that started this one."""
+def _begin() -> None:
+    """The accelerator belongs to the process that started this one; so does Ctrl-C, which a terminal sends to all of them: a training
+    finishes its iteration first, and needs the scenes of it."""
     jax.config.update("jax_platforms", "cpu")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
