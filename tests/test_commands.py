@@ -19,7 +19,7 @@ from scenefactory_jax.run.train import train
 PAGES = ["README.md", "docs/commands.md", "docs/extending.md", "docs/sweeps.md"]
 INTERACTIVE = {"drive"}  # a window and a keyboard: tests/test_drive.py
 SHORTER = {  # words of the pages, and what stands for them here
-    **{f"experiment={name}": "experiment=smoke" for name in ("demo", "quick", "published")},
+    **{f"experiment={name}": "experiment=smoke" for name in ("demo", "quick", "published", "laptop")},
     "scenes.workers=8": "scenes.workers=2",
     "suite=throughput": "suite=single",  # its rows are what one GPU holds
     "common=[minutes=2]": "common=[iterations=1]",

@@ -97,7 +97,7 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]
             for place, (label, row) in enumerate(rows.items()):
                 _bar(axes, place, row[name], colours[label], top)
             axes.set(title=levels.labels([name])[name].label, xlim=(0, 1.2 * top), xticks=[0, 0.5, 1] if top == 1.0 else [0, round(top, 2)])
-            axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+            axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
             axes.grid(False, axis="y")
         panels[0].set_yticks(range(len(rows)), list(rows))
         panels[0].invert_yaxis()

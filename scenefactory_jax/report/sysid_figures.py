@@ -25,7 +25,7 @@ def search(result: Result) -> Figure:
             axes.plot([0, *generation], [stage["start_loss"], *history[:, 0]], color=COLOURS[0], label="best so far")
             axes.plot(generation, history[:, 1], ".", color=COLOURS[0], label="of a generation")
             axes.plot(generation, history[:, 2], color=GREY, linewidth=1.0, label="median")
-            axes.set(yscale="log", title=stage["name"].replace("_", " "), xlabel="generation")
+            axes.set(yscale="log", title=stage["name"].replace("_", "\n"), xlabel="generation")
         figure.axes[0].set_ylabel("loss")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
