@@ -23,7 +23,8 @@ def write(folder: Path, result: Result) -> Path:
     for caption, (name, figure) in study_figures.all_of(result).items():
         pictures[caption] = plots.save(figure, folder / f"{name}.png")
     parts = [
-        f"# {study['name'].replace('_', ' ').capitalize()}", study["question"], study["reading"] or "", headline(result), _incomplete(result["missing"]),
+        f"# {study['name'].replace('_', ' ').capitalize()}",
+        study["question"], study["reading"] or "", headline(result), _incomplete(result["missing"]),
         *(f"![{caption}]({path.name})\n\n*{caption}*" for caption, path in pictures.items()),
         _section("Results", *_results(result)),
         _section("Differences", *_differences(result["differences"])),
