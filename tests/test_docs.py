@@ -21,7 +21,7 @@ PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"
 SECTIONS = ["What is new", "Install", "Ten lines of Python", "Train, evaluate, sweep", "Results", "Map of the package"]
 SECTIONS += ["Your own reward, observation, dynamics, converter", "Limits", "Terms, contributing, citation"]
 
-NAVIGATION = ROOT / "experiments" / "navigation" / "result.json"
+NAVIGATION, FLOORS = (ROOT / "experiments" / name / "result.json" for name in ("navigation", "floors"))
 README_ROWS = [  # label, condition, protocol, metric
     ("goal reached", "original", "invincible", "success_rate"),
     ("... without any other event", "original", "invincible", "clean_success_rate"),
@@ -60,9 +60,9 @@ def test_commands_of_the_pages_compose(page):
 
 
 def test_results_of_the_readme_are_those_of_the_study():
-    """Every row of the table: of the policy, of the untrained one, and of the log replay."""
-    result = results.read(NAVIGATION)
-    found = {(row["row"], row["condition"], row["protocol"]): row["pooled"] for row in result["rows"]}
+    """Every row of the table: of the policy, of what learns nothing, and of the log replay; and what a laptop's policies do."""
+    result, floors = results.read(NAVIGATION), results.read(FLOORS)
+    found = {(row["row"], row["condition"], row["protocol"]): row["pooled"] for row in [*floors["rows"], *result["rows"]]}
     text = (ROOT / "README.md").read_text()
 
     def shown(row, condition, protocol, metric):
@@ -70,8 +70,11 @@ def test_results_of_the_readme_are_those_of_the_study():
 
     for label, *place in README_ROWS:
         policy, nobody = (shown(row, *place) for row in ("rigid body", "untrained"))
+        straight = "" if place[1] == "strict" else f"{shown('straight for the goal', *place)} "  # floors are judged in one protocol
         drivers = "" if place[0] != "original" else f"{shown('log replay', *place)} "  # they never start from rest
-        assert f"| {label} | {policy} | {nobody} | {drivers}|" in text
+        assert f"| {label} | {policy} | {straight}| {nobody} | {drivers}|" in text
+    laptop = [shown("two minutes of one core", "original", "invincible", metric) for *_, metric in README_ROWS[:4]]
+    assert "reach the goal in {}, without any other event in {} (on bends {}), and {} of them collide".format(*laptop) in " ".join(text.split())
     pace = [run["casps"] for run in result["trainings"]["rigid body"]["runs"].values()]
     assert f"trains at {min(pace):,.0f} to {max(pace):,.0f} steps/s" in text
     speeds = (ROOT / "experiments" / "throughput" / "throughput.md").read_text()
