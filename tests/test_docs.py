@@ -74,7 +74,8 @@ def test_results_of_the_readme_are_those_of_the_study():
         drivers = "" if place[0] != "original" else f"{shown('log replay', *place)} "  # they never start from rest
         assert f"| {label} | {policy} | {straight}| {nobody} | {drivers}|" in text
     laptop = [shown("two minutes of one core", "original", "invincible", metric) for *_, metric in README_ROWS[:4]]
-    assert "reach the goal in {}, without any other event in {} (on bends {}), and {} of them collide".format(*laptop) in " ".join(text.split())
+    said = "reach the goal in {}, without any other event in {} (on bends {}), and {} of them collide"
+    assert said.format(*laptop) in " ".join(text.split())
     pace = [run["casps"] for run in result["trainings"]["rigid body"]["runs"].values()]
     assert f"trains at {min(pace):,.0f} to {max(pace):,.0f} steps/s" in text
     speeds = (ROOT / "experiments" / "throughput" / "throughput.md").read_text()
