@@ -130,7 +130,10 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
         ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, others, road, steps"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': base bicycle mjx_car mjx_published replay"),
-        ("experiment=smok", r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo laptop published"),
+        (
+            "experiment=smok",
+            r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo laptop published quick smoke",
+        ),
         ("dynamics={_target_: mine.make, gain: 1.0}", r"to replace all of dynamics: ~dynamics \+dynamics=\{\.\.\.\}"),
         ("timing=null", r"timing=null: "),
         ("worlds", r"worlds"),

@@ -51,7 +51,7 @@ def make(
         ego = observation["ego"]
         sine, cosine, distance_m = ego[..., 2], ego[..., 3], jnp.maximum(goal_scale_m * ego[..., 4], 1.0)
         bend = jnp.arctan(wheelbase_m * 2.0 * sine / distance_m)
-        steer = jnp.where(cosine > 0.0, bend, jnp.copysign(steering_limit_rad, sine)) / steering_limit_rad
+        steer = jnp.where(cosine > 0.0, bend / steering_limit_rad, jnp.copysign(1.0, sine))
         throttle = (speed_mps - speed_scale_mps * ego[..., 5]) / speed_band_mps
         mean = jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1)
         return jnp.clip(mean, -1.0, 1.0), jnp.zeros(3), jnp.zeros_like(steer)

@@ -97,7 +97,7 @@ def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
     """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
     shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
     found = differing(configs.read(folder), config).items()
-    bound = [place for place in found if not any(f"{place[0]}.".startswith(f"{free}.") for free in FREE)]
+    bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
     if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
         more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
         raise ConfigError(f"resume=true: {'; '.join(told[:8])}{more}: {folder} goes on as it began; for other settings choose another out")
