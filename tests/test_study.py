@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 
 import jax
 import pytest
@@ -97,6 +98,26 @@ def test_looks_are_counted_over_all_calls(whole):
     [look] = result["looks"]
     assert (look["policies"], look["curve points"], look["cut"]) == (11, 12, "test")
     assert "11 times to judge a policy" in (folder / "out" / "navigation.md").read_text()
+
+
+def test_a_report_is_drawn_anew_from_its_numbers(whole, tmp_path):
+    folder, result = whole
+    shutil.copytree(folder / "out", tmp_path / "out")
+    (tmp_path / "out" / "learning.png").unlink()
+    again = study(toy(tmp_path, "parts=draw", reading="What it shows."))
+    assert again == result | {"study": result["study"] | {"reading": "What it shows."}} and not (tmp_path / "runs").exists()
+    before, after = ((place / "out" / "navigation.md").read_text().splitlines() for place in (folder, tmp_path))
+    assert [line for line in after if line not in before] == ["What it shows."] and (tmp_path / "out" / "learning.png").is_file()
+    with pytest.raises(ConfigError, match=r"nowhere: no result\.json to draw"):
+        study(toy(tmp_path, "parts=draw") | {"out": str(tmp_path / "nowhere")})
+
+
+def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path, capsys):
+    folder, result = whole
+    shutil.copytree(folder / "out", tmp_path / "out")
+    assert study(toy(tmp_path, "parts=report"))["rows"] == result["rows"]
+    assert "stay as they are" in capsys.readouterr().out
+    assert (tmp_path / "out" / "result.json").read_bytes() == (folder / "out" / "result.json").read_bytes()
 
 
 def test_an_interval_that_misses_its_value_is_drawn_up_to_it():

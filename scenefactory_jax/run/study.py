@@ -41,9 +41,11 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     clock = Clock(config["until_s"])
     config = _listed(config)
+    out = Path(config["out"] or Path("experiments") / config["study"]["name"])
+    if config["parts"] == ["draw"]:
+        return study_report.draw(config, out)
     plan = study_plan.make(config)
     sources.use_compilation_cache()
-    out = Path(config["out"] or Path("experiments") / plan.name)
     looks = Looks(out / RESULT, command=_command(config), cut=config["cut"])
     do = _do if config["processes"] == 1 else _do_together
     if not all(do(part, config, plan, looks, clock) for part in ("train", "judge") if part in config["parts"]):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import levels, tables
 from scenefactory_jax.report import study as report
 from scenefactory_jax.run import config as configs
@@ -16,15 +17,35 @@ RESULT, TRAINED = "result.json", "trained.json"
 CURVES = ("events/reached", "events/collided", "events/touched_edge", "reward")
 POINTS = 120  # of a learning curve
 DIGITS = 5
+WORDS = ("question", "reading", "figures", "trend")  # of a study's config: they decide no number
 
 
 def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect, and write result.json, NAME.md and figures to `out`."""
+    """Collect, and write result.json, NAME.md and figures to `out`, unless nothing is judged here and `before` holds results of other runs."""
     result = collect(plan, config) | {"looks": before.get("looks", [])}
+    if before.get("rows") and not result["rows"]:
+        print(f"nothing of this study is judged in {config['runs']}: {out / RESULT} and its report stay as they are", flush=True)
+        return dict(before)
     result = results.plain(result, digits=DIGITS)
     out.mkdir(parents=True, exist_ok=True)
     results.write(out / RESULT, result, digits=DIGITS)
     print(f"{report.headline(result)}\n\nreport {report.write(out, result)}", flush=True)
+    return result
+
+
+def draw(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
+    """NAME.md and figures anew from `out`/result.json, with the words and figures that the config has now; the numbers stay.
+
+    Raises:
+        ConfigError: a wrong key of the study; no result.json.
+    """
+    study_plan.check(config)
+    if not (out / RESULT).is_file():
+        raise ConfigError(f"out={out}: no {RESULT} to draw; valid: a folder that the part `report` has written")
+    result = results.read(out / RESULT)
+    result["study"] |= {name: config["study"][name] for name in WORDS}
+    results.write(out / RESULT, result, digits=DIGITS)
+    print(f"report {report.write(out, result)}", flush=True)
     return result
 
 
