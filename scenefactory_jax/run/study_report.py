@@ -21,7 +21,7 @@ WORDS = ("question", "reading", "figures", "trend")  # of a study's config: they
 
 
 def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect, and write result.json, NAME.md and figures to `out`, unless nothing is judged here and `before` holds results of other runs."""
+    """Collect, and write result.json, NAME.md and figures to `out`, unless nothing is judged and `before` holds results of other runs."""
     result = collect(plan, config) | {"looks": before.get("looks", [])}
     if before.get("rows") and not result["rows"]:
         print(f"nothing of this study is judged in {config['runs']}: {out / RESULT} and its report stay as they are", flush=True)
