@@ -1,6 +1,9 @@
 """Processes that divide a work: each piece is done once, each process sees one GPU, and what fails is told."""
 
+import multiprocessing
 import os
+import signal
+import time
 
 import pytest
 
@@ -26,6 +29,26 @@ def failing(index, folder):
     (folder / "done").touch()
 
 
+def beating(index, folder):
+    for beat in range(3000):  # a minute, should nobody end it
+        (folder / f"beat-{index}").write_text(str(beat))
+        time.sleep(0.02)
+
+
+def until(true, *, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "in vain"
+        time.sleep(0.02)
+
+
+def leading(folder):
+    try:
+        together.run(beating, 2, folder)
+    finally:
+        (folder / "gathered").touch()
+
+
 def test_each_piece_is_done_once_and_each_process_sees_a_gpu_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv(together.VISIBLE, "4,GPU-7a")
     pieces = [f"piece-{index}" for index in range(40)]
@@ -40,6 +63,27 @@ def test_a_failing_process_is_told_once_the_others_have_ended(tmp_path, capfd):
     with pytest.raises(RuntimeError, match="1 of 2 processes ended with an error"):
         together.run(failing, 2, tmp_path)
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_nobody_computes_on_when_the_first_is_ended(how, tmp_path):
+    """Told to terminate, it ends the others and does what is left to do with their notes; killed, it can do neither, and they end alone."""
+    first = multiprocessing.get_context("spawn").Process(target=leading, args=(tmp_path,))
+    first.start()
+    beats = [tmp_path / f"beat-{index}" for index in range(2)]
+    until(lambda: all(beat.is_file() for beat in beats))
+    os.kill(first.pid, how)
+    first.join(timeout=60)
+    assert first.exitcode == (143 if how == signal.SIGTERM else -9) and (tmp_path / "gathered").exists() == (how == signal.SIGTERM)
+    seen = {}
+
+    def still():
+        before, now = seen.copy(), {beat: beat.stat().st_mtime_ns for beat in beats}
+        seen.update(now)
+        time.sleep(0.5)
+        return before == now
+
+    until(still)
 
 
 def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):

@@ -3,9 +3,12 @@
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Mapping
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from scenefactory_jax.run import results
 
@@ -50,19 +53,55 @@ def run(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int 
     context = multiprocessing.get_context("spawn")
     surroundings = [_surroundings(index, per_gpu) for index in range(processes)]
     each = [context.Process(target=_one, args=(work, index, arguments)) for index in range(processes)]
-    for variables, process in zip(surroundings, each, strict=True):
-        with _among(variables):
-            process.start()
-    for process in each:
-        process.join()
+    with _ending(each):
+        for variables, process in zip(surroundings, each, strict=True):
+            with _among(variables):
+                process.start()
+        for process in each:
+            process.join()
     if failed := sum(process.exitcode != 0 for process in each):
         raise RuntimeError(f"{failed} of {processes} processes ended with an error, printed above; what the others did is kept")
     return [results.read(_answer(arguments[-1], index))["answer"] for index in range(processes)]
 
 
+@contextlib.contextmanager
+def _ending(processes: Sequence[BaseProcess]) -> Iterator[None]:
+    """What ends this process early ends the others first: SIGTERM at once; Ctrl-C, which a terminal sends to all, when they have obeyed it.
+
+    So what is done with their answers and notes can still be done.
+    """
+
+    def terminated(*_: Any) -> NoReturn:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, terminated) if main else None
+    try:
+        yield
+    except BaseException as error:
+        for process in processes:
+            if process.is_alive() and not isinstance(error, KeyboardInterrupt):
+                process.terminate()
+        for process in processes:
+            if process.pid is not None:
+                process.join()
+        raise
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, before)
+
+
 def _one(work: Callable[..., Any], index: int, arguments: tuple[Any, ...]) -> None:
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
     _keep_to_a_core(index)
     results.write(_answer(arguments[-1], index), {"answer": work(index, *arguments)}, digits=None)
+
+
+def _end_with_the_first() -> None:
+    """A killed process cannot end the others: they watch it."""
+    if (first := multiprocessing.parent_process()) is not None:
+        first.join()
+        os._exit(1)
 
 
 def _keep_to_a_core(index: int) -> None:
