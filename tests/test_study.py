@@ -110,6 +110,8 @@ def test_a_report_is_drawn_anew_from_its_numbers(whole, tmp_path):
     assert [line for line in after if line not in before] == ["What it shows."] and (tmp_path / "out" / "learning.png").is_file()
     with pytest.raises(ConfigError, match=r"nowhere: no result\.json to draw"):
         study(toy(tmp_path, "parts=draw") | {"out": str(tmp_path / "nowhere")})
+    with pytest.raises(ConfigError, match=r"`draw` stands alone"):
+        study(toy(tmp_path, "parts=[draw,train]"))
 
 
 def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path, capsys):

@@ -42,7 +42,7 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     clock = Clock(config["until_s"])
     config = _listed(config)
     out = Path(config["out"] or Path("experiments") / config["study"]["name"])
-    if config["parts"] == ["draw"]:
+    if "draw" in config["parts"]:
         return study_report.draw(config, out)
     plan = study_plan.make(config)
     sources.use_compilation_cache()

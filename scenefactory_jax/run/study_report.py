@@ -37,9 +37,11 @@ def draw(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
     """NAME.md and figures anew from `out`/result.json, with the words and figures that the config has now; the numbers stay.
 
     Raises:
-        ConfigError: a wrong key of the study; no result.json.
+        ConfigError: a wrong key of the study; other parts beside this one; no result.json.
     """
     study_plan.check(config)
+    if config["parts"] != ["draw"]:
+        raise ConfigError(f"parts: {config['parts']}; `draw` stands alone: `report` draws, too")
     if not (out / RESULT).is_file():
         raise ConfigError(f"out={out}: no {RESULT} to draw; valid: a folder that the part `report` has written")
     result = results.read(out / RESULT)
