@@ -112,6 +112,8 @@ def test_a_report_is_drawn_anew_from_its_numbers(whole, tmp_path):
         study(toy(tmp_path, "parts=draw") | {"out": str(tmp_path / "nowhere")})
     with pytest.raises(ConfigError, match=r"`draw` stands alone"):
         study(toy(tmp_path, "parts=[draw,train]"))
+    with pytest.raises(ConfigError, match="parts"):
+        study(toy(tmp_path) | {"parts": None})
 
 
 def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path, capsys):

@@ -41,11 +41,11 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     clock = Clock(config["until_s"])
     config = _listed(config)
-    out = Path(config["out"] or Path("experiments") / config["study"]["name"])
-    if "draw" in config["parts"]:
-        return study_report.draw(config, out)
+    if config["parts"] == ["draw"]:
+        return study_report.draw(config)
     plan = study_plan.make(config)
     sources.use_compilation_cache()
+    out = study_report.folder(config)
     looks = Looks(out / RESULT, command=_command(config), cut=config["cut"])
     do = _do if config["processes"] == 1 else _do_together
     if not all(do(part, config, plan, looks, clock) for part in ("train", "judge") if part in config["parts"]):

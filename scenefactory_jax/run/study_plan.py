@@ -114,6 +114,8 @@ def check(config: Mapping[str, Any]) -> None:
         for name in chosen or []:
             if name not in valid:
                 raise ConfigError(f"{where}: unknown {name!r}; valid: {', '.join(valid)}")
+    if "draw" in config["parts"] and len(config["parts"]) > 1:
+        raise ConfigError(f"parts: {config['parts']}; `draw` stands alone: `report` draws, too")
     if doubled := set(variants) & set(study["floors"]):
         raise ConfigError(f"study.floors: {sorted(doubled)[0]!r} is a variant, too; rows need names of their own")
     if not variants or not conditions:

@@ -20,6 +20,11 @@ DIGITS = 5
 WORDS = ("question", "reading", "figures", "trend")  # of a study's config: they decide no number
 
 
+def folder(config: Mapping[str, Any]) -> Path:
+    """Where a study's result and report lie."""
+    return Path(config["out"] or Path("experiments") / config["study"]["name"])
+
+
 def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[str, Any]) -> dict[str, Any]:
     """Collect, and write result.json, NAME.md and figures to `out`, unless nothing is judged and `before` holds results of other runs."""
     result = collect(plan, config) | {"looks": before.get("looks", [])}
@@ -33,15 +38,14 @@ def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[s
     return result
 
 
-def draw(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
-    """NAME.md and figures anew from `out`/result.json, with the words and figures that the config has now; the numbers stay.
+def draw(config: Mapping[str, Any]) -> dict[str, Any]:
+    """NAME.md and figures anew from result.json, with the words and figures that the config has now; the numbers stay.
 
     Raises:
-        ConfigError: a wrong key of the study; other parts beside this one; no result.json.
+        ConfigError: a wrong key of the study; no result.json.
     """
     study_plan.check(config)
-    if config["parts"] != ["draw"]:
-        raise ConfigError(f"parts: {config['parts']}; `draw` stands alone: `report` draws, too")
+    out = folder(config)
     if not (out / RESULT).is_file():
         raise ConfigError(f"out={out}: no {RESULT} to draw; valid: a folder that the part `report` has written")
     result = results.read(out / RESULT)
