@@ -250,7 +250,7 @@ def test_wrong_keys_of_the_command_are_named(tmp_path):
 
 
 # As the paper's tables, and what a CPU judges
-ONE_PROTOCOL = ("transfer", "friction", "winter", "floors", "network", "rewards_laptop", "network_laptop")
+ONE_PROTOCOL = ("transfer", "friction", "winter", "floors", "network", "rewards", "rewards_laptop", "network_laptop")
 
 
 @pytest.mark.parametrize("name", STUDIES)
