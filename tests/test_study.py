@@ -297,8 +297,9 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
 def test_networks_of_the_studies_fit_their_observations(name, base):
     plan = study_plan.make(config.load("study", f"study={name}", "seeds=[0]", f"study.base=[{base},scenes.count=1]"))
     scene = sources.training(plan.trainings[0].config["scenes"])[0]
-    for one in plan.trainings:
-        env, policy = world.make(one.config), train.make_policy(one.config)
+    networks = {json.dumps([one.config["observe"], one.config["policy"]]): one.config for one in plan.trainings}
+    for entry in networks.values():
+        env, policy = world.make(entry), train.make_policy(entry)
         seen = jax.eval_shape(env.reset, jax.random.key(0), scene)[1]
         jax.eval_shape(policy.init, jax.random.key(0), seen)
 
