@@ -270,7 +270,7 @@ def test_every_study_is_whole(name, tmp_path):
     for built in {one.program: one.config for one in (*plan.trainings, *plan.judgings)}.values():
         assert built["scenes"]["path"] == "train.bank" and built["scenes"]["heldout"]["path"] == "it's.bank"
         world.parts_of(built | {"ends": config.load("task")["ends"]})
-    assert len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
+    assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
     assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
 
 
