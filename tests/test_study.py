@@ -117,6 +117,16 @@ def test_a_report_is_drawn_anew_from_its_numbers(whole, tmp_path):
         study(toy(tmp_path) | {"parts": None})
 
 
+def test_a_report_of_a_validation_cut_says_so_and_how_to_make_it_again(whole, tmp_path):
+    folder, result = whole
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "result.json").write_text(json.dumps(result | {"settings": result["settings"] | {"cut": "validation"}}))
+    study(toy(tmp_path, "parts=draw"))
+    text = (tmp_path / "out" / "navigation.md").read_text()
+    assert "are no test" in text and "study=navigation cut=validation train_scenes=..." in text
+    assert "cut=" not in (folder / "out" / "navigation.md").read_text().split("To do it again")[1]
+
+
 def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path, capsys):
     folder, result = whole
     shutil.copytree(folder / "out", tmp_path / "out")

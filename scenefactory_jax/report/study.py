@@ -193,7 +193,8 @@ def _meaning(result: Result) -> str:
 
 def _again(result: Result) -> list[str]:
     study, made = result["study"], result["made_with"]
-    text = ["```", f"python -m scenefactory_jax study study={study['name']} train_scenes=... test_scenes=...", "```"]
+    cut = "" if result["settings"]["cut"] == "test" else f"cut={result['settings']['cut']} "
+    text = ["```", f"python -m scenefactory_jax study study={study['name']} {cut}train_scenes=... test_scenes=...", "```"]
     variants = [[name, " ".join(f"`{x}`" for x in trained["overrides"])] for name, trained in result["trainings"].items()]
     conditions = [[name, " ".join(f"`{x}`" for x in [*study["examined"], *own])] for name, own in study["conditions"].items()]
     floors = [[name, " ".join([f"untrained, {one['of']}", *(f"`{x}`" for x in one["overrides"])])] for name, one in study["floors"].items()]
@@ -207,4 +208,3 @@ def _again(result: Result) -> list[str]:
         tables.grid(["Floor", "What it is"], floors) if floors else "",
         tables.grid(["The report was made with", ""], [[name, value] for name, value in made.items()]),
     ]
-
