@@ -47,7 +47,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     known = recorded(config, out)
     lessons = [*known["training"], *known["extra"]]
     where = space.make(settings["space"])
-    replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=config["physics_hz"])
+    replay = student.make(config["dynamics"], where, settings["friction"], physics_hz=float(config["physics_hz"]))
     plan = student.suite(lessons)
     score = student.scorer(replay, plan, width=settings["width"])
     outcomes = stages(config, out, lessons, where, score)
@@ -131,7 +131,7 @@ def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], trac
 def published(config: Mapping[str, Any]) -> tuple[Replay, np.ndarray]:
     """The published car, with its own friction of the surfaces and nothing left open."""
     friction = config["sysid"]["published_friction"]
-    return student.make(config["others"]["published"], space.make({}), friction, physics_hz=config["physics_hz"]), np.zeros(0)
+    return student.make(config["others"]["published"], space.make({}), friction, physics_hz=float(config["physics_hz"])), np.zeros(0)
 
 
 def fitted(where: Space, row: np.ndarray) -> dict[str, Any]:
