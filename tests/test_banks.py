@@ -483,7 +483,7 @@ def test_a_hundred_thousand_scenes_open_at_once(tmp_path, street):
     order = rng.integers(0, len(view), 2000)
     start = time.process_time()
     raws = list(bank.raws(view, order))
-    assert time.process_time() - start < 6.0 and [raw.name for raw in raws] == [f"scene-{chosen[i]:06d}" for i in order]
+    assert time.process_time() - start < 2.0 and [raw.name for raw in raws] == [f"scene-{chosen[i]:06d}" for i in order]
 
 
 # ---- MJCF

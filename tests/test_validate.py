@@ -89,9 +89,8 @@ def test_an_engine_against_the_brakes_does_not_creep_in_either_engine(drive, ent
 
 
 @pytest.mark.slow
-def test_latched_brakes_shake(drive, entry):
-    published = {**entry, "brakes": "latched", "car": {**entry["car"], "rolling_torque": 0.0}}
-    latched = laws.driver(published, slippery=0.125, width=4, **RATES)
+def test_latched_brakes_shake(drive):
+    latched = laws.driver({**entry_of("mjx_car", rolling_torque=0.0), "brakes": "latched"}, slippery=0.125, width=4, **RATES)
     held, shaken = laws.standing(drive, **STANDING), laws.standing(latched, **STANDING)
     assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max()
 
