@@ -95,9 +95,9 @@ def _generated(generate: Callable[[int, int], RawScene], ready: Callable[[RawSce
 
 def _alone(opened: bank.Bank, index: int) -> bank.Bank:
     """One scene's bank, without all that the others need: small enough to send to another process."""
-    [[shard, row]] = opened.places[index : index + 1].tolist()
     one = bank.view(opened, [index])
-    return replace(one, shards=(opened.shards[shard],), places=np.array([[0, row]]), readers={})  # its shard has another number
+    shard, *place = one.places[0].tolist()
+    return replace(one, shards=(opened.shards[shard],), places=np.array([[0, *place]]), readers={})  # its shard has another number
 
 
 def _banked(one: bank.Bank, ready: Callable[[RawScene], Packed]) -> Packed:
