@@ -327,9 +327,7 @@ def describe(summary: Summary) -> list[str]:
     lines.append(f"agents: {summary.agents_kept} kept; dropped: {count(summary.agents_dropped)}")
     if summary.refused:
         lines.append(f"packing with these numbers refuses: {count(summary.refused)}; such scenes stay in a bank, for others")
-    lines.append(
-        f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected"
-    )
+    lines.append(f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected")
     return [for_terminal(line) for line in lines]
 
 
