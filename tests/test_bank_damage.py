@@ -118,6 +118,8 @@ def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, sc
     put(one, sizes[1])
     put(two, sizes[0])
     assert outcome(path, wanted, one) == "refused"
+    with pytest.raises(SceneError, match=r"^/.*/scenes-00000\.arrow: "):
+        bank.packed(bank.open(path), [0], check=checker(), pack=packer(), workers=1)
 
 
 def test_a_damaged_index_is_refused(tmp_path, scenes):

@@ -225,6 +225,8 @@ def packed(
     for piece in spread.local(work, pieces, workers=workers if len(pieces) > 1 else 1, timeout_s=None):
         if isinstance(piece, spread.Lost):
             raise SceneError(f"{bank.path}: scenes could not be packed: {piece.reason}; try fewer workers")
+        if isinstance(piece, SceneError):
+            raise piece
         found.extend(piece)
     return found
 
@@ -260,14 +262,22 @@ def load(
 
 def _packed(
     places: Int[np.ndarray, "N 5"], *, shards: Sequence[Shard], check: Callable[..., Any], pack: Callable[..., Any]
-) -> list[Packed | Reject]:
+) -> list[Packed | Reject] | SceneError:
+    """Some scenes of a bank; of a damaged file the error, which another process is to raise."""
     found: list[Packed | Reject] = []
-    for scene in _scenes(shards, places, {}):
-        try:
-            found.append(prepare(scene, check=check, pack=pack))
-        except SceneError as error:
-            found.append(Reject(scene.name, str(error).removeprefix(f"{scene.source}: "), error.kind))
+    try:
+        for scene in _scenes(shards, places, {}):
+            found.append(_prepared(scene, check, pack))
+    except SceneError as error:
+        return error
     return found
+
+
+def _prepared(scene: RawScene, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed | Reject:
+    try:
+        return prepare(scene, check=check, pack=pack)
+    except SceneError as error:
+        return Reject(scene.name, str(error).removeprefix(f"{scene.source}: "), error.kind)
 
 
 def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:
