@@ -15,6 +15,7 @@ import hydra
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config as configs
+from scenefactory_jax.scenes.names import for_terminal
 
 USAGE = f"""usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--help] [--cfg job]
 
@@ -84,7 +85,7 @@ def _check(command: str, overrides: Sequence[str]) -> None:
 def _end(error: Exception | str) -> NoReturn:
     """One line on stderr, and exit code 2."""
     text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
-    print(f"error: {text}", file=sys.stderr)
+    print("\n".join(map(for_terminal, f"error: {text}".split("\n"))), file=sys.stderr)
     raise SystemExit(2) from None
 
 

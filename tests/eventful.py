@@ -40,3 +40,17 @@ def convert_until(number, folder, out, options):
         yield from plainly(path)
 
     convert.convert(folder, out, formats={"dying": reader}, spread=map, **options)
+
+
+def convert_until_placed(number, folder, out, options):
+    """Convert, and die when so many finished files have taken their places and the next is about to: shard, catalogue, index and so on."""
+    place, placed = os.replace, []
+
+    def replace(*paths):
+        if len(placed) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        placed.append(paths)
+        place(*paths)
+
+    os.replace = replace
+    convert.convert(folder, out, formats={"plain": plainly}, spread=map, **options)

@@ -24,7 +24,7 @@ from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, pack
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
-from scenefactory_jax.scenes import arrow, bank, bank_index, columns, convert, mjcf, source, stack, topology
+from scenefactory_jax.scenes import arrow, bank, bank_index, columns, convert, mjcf, operations, source, stack, topology
 from scenefactory_jax.scenes import spread as spreads
 from scenefactory_jax.scenes.raw import Light, Polyline, Reject, SceneError, Track
 from scenefactory_jax.struct import unchecked
@@ -255,11 +255,11 @@ def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
         file.write_bytes(content)
     index = json.loads((path / bank.INDEX).read_text())
     for schema, message in ((2, "a bank of packed scenes, schema 2; .*convert its source again"), (99, "a bank of schema 99; this")):
-        (path / bank.INDEX).write_text(json.dumps(index | {"schema": schema}))
+        (path / bank.INDEX).write_text(json.dumps({**index, "schema": schema, "sha256": None}))
         with pytest.raises(SceneError, match=message):
             bank.open(path)
     del index["shards"]
-    (path / bank.INDEX).write_text(json.dumps(index))
+    (path / bank.INDEX).write_text(json.dumps({**index, "schema": 3, "sha256": None}))
     with pytest.raises(SceneError, match=r"bank\.json: damaged: 'shards'"):
         bank.open(path)
 
@@ -299,15 +299,56 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     seen = []
     summary = convert.convert(folder, tmp_path / "bank", **options(on_file=lambda done, total: seen.append((done, total))))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert (summary.files, summary.scenes, summary.agents_kept) == (4, 2, 3)
-    reasons = {Path(reject["source"]).name: reject["reason"] for reject in summary.rejects}
-    assert set(reasons) == {"b.json", "c.json"} and "cut short" in reasons["b.json"] and "1 too_short" in reasons["c.json"]
+    assert (summary.files, summary.scenes, summary.agents_kept, summary.refused) == (4, 3, 3, {"no_agent_left": 1})
+    [reject] = summary.rejects
+    assert Path(reject["source"]).name == "b.json" and "cut short" in reject["reason"]
     opened = bank.open(tmp_path / "bank")
     assert list(opened.rejects) == list(summary.rejects) and opened.settings["box_m"] == 200.0
     assert opened.index.files == ("a.json", "b.json", "c.json", "deep/d.json.gz") and opened.index.complete
-    assert opened.metadata["format"].to_pylist() == ["gpudrive", "scenefactory"]
+    assert opened.metadata["format"].to_pylist() == ["gpudrive", "gpudrive", "scenefactory"]
     lines = convert.describe(summary)
-    assert lines[-1] == "2 scenes with 3 agents from 4 files, 2 rejected" and any("rejected" in line and "b.json" in line for line in lines)
+    assert lines[-1] == "3 scenes with 3 agents from 4 files, 1 rejected" and any("rejected" in line and "b.json" in line for line in lines)
+    assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for others"
+
+
+def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
+    """The cars have 4 m to go: none of their goals lies in a box of 6 m."""
+    folder, out = streets(tmp_path / "in", "a", "b"), tmp_path / "bank"
+    written(folder, document(name="still", objects=[thing(0, speed=0)]), "c.json")
+    narrow = packer(box_m=6.0)
+    summary = convert.convert(folder, out, **options(pack=narrow))
+    opened = bank.open(out)
+    assert opened.names == ("a", "b", "still") and summary.refused == {"no_agent_left": 3} and not summary.rejects
+    assert opened.metadata["packing"].to_pylist() == ["no_agent_left"] * 3
+    found = operations.statistics(opened.metadata, by=None)["all"]["texts"]
+    assert found["packing"] == {"no_agent_left": 3}
+    wide = bank.packed(opened, range(3), check=checker(), pack=packer(), workers=1)
+    assert [type(one).__name__ for one in wide] == ["Packed", "Packed", "Reject"] and wide[2].kind == "no_agent_left"
+    assert bank.packed(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
+    whole = convert.convert(folder, tmp_path / "wide", **options())
+    assert bank.open(tmp_path / "wide").metadata["packing"].to_pylist() == ["packed", "packed", "no_agent_left"]
+    assert whole.scenes == 3 and whole.agents_kept == 4 and whole.refused == {"no_agent_left": 1}
+
+
+def test_a_folder_that_cannot_be_listed_is_named_and_read_later(tmp_path, monkeypatch):
+    folder, out = streets(tmp_path / "in", "a"), tmp_path / "bank"
+    closed, scandir = streets(folder / "closed", "b"), os.scandir
+    (folder / "pipe").mkdir()
+    os.mkfifo(folder / "pipe" / "endless")
+    (folder / "z.json").symlink_to(folder / "nowhere.json")
+
+    def refuses(path):
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "scandir", refuses)
+        summary = convert.convert(folder, out, **options())
+    reasons = {Path(reject["source"]).name: reject["reason"] for reject in summary.rejects}
+    assert summary.scenes == 1 and set(reasons) == {"closed", "z.json"}
+    assert "a folder that cannot be listed" in reasons["closed"]
+    assert convert.convert(folder, out, **options()).scenes == 2 and bank.open(out).names == ("a", "b")
 
 
 def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path):

@@ -43,16 +43,19 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
         "laneless.json": (document(roads=edge), "no driving lane"),
         "nan.json": (nan, "objects[1].position[4].y: nan is not finite"),
         "infinite.json": (infinite, "roads[1].geometry[2].x: inf is not finite"),
-        "goalless.json": (document(objects=[thing(0, speed=0)]), "no agent is left of 1: 1 too_short"),
         "foreign.json": ({"map": []}, "no reader knows this format"),
         "text.txt": ("hello", "no reader knows this format"),
     }
     for name, (content, _) in files.items():
         written(folder, content, name)
     written(folder, whole, "good.json")
+    written(folder, document(objects=[thing(0, speed=0)]), "goalless.json")
     summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", "progress=false"))
     printed = capsys.readouterr().out
-    assert (summary.files, summary.scenes, len(summary.rejects)) == (8, 1, 7) and "1 scenes" in printed and "7 rejected" in printed
+    assert (summary.files, summary.scenes, len(summary.rejects)) == (8, 2, 6) and "2 scenes" in printed and "6 rejected" in printed
+    assert "packing with these numbers refuses: 1 no agent left" in printed
+    account = sources.from_path(config.load("scenes", "scenes=womd")["scenes"], tmp_path / "bank").account
+    assert "goalless.json (street): tracks: no agent is left of 1: 1 too_short" in account and "refuses: 1 no agent left" in account
     reasons = {reject["source"]: reject["reason"] for reject in bank.open(tmp_path / "bank").rejects}
     for name, (_, reason) in files.items():
         assert reason in reasons[str(folder / name)] and f"rejected {folder / name}" in printed
@@ -69,9 +72,12 @@ def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
 
     alone = written(tmp_path, document(objects=[thing(0, kind="pedestrian"), far]), "alone.json")
     sized = ["progress=false", f"source={alone}", f"out={tmp_path / 'none'}"]
-    message = refused("convert", *sized)
-    assert "no agent is left of 2: 1 not_a_vehicle, 1 goal_outside_box" in message and not (tmp_path / "none").exists()
-    assert convert(config.load("convert", *sized, "scenes.pack.require_agents=false")).agents_kept == 0
+    summary = convert(config.load("convert", *sized))
+    assert (summary.scenes, summary.agents_kept, summary.refused) == (1, 0, {"no_agent_left": 1})
+    message = refused("train", "scenes=womd", f"scenes.path={tmp_path / 'none'}", f"out={tmp_path / 'run'}")
+    assert "no agent is left of 2: 1 not_a_vehicle, 1 goal_outside_box" in message
+    unforced = config.load("scenes", "scenes=womd", "scenes.pack.require_agents=false")["scenes"]
+    assert not sources.from_path(unforced, tmp_path / "none").scene.agents.present.any()
 
 
 def test_nothing_to_train_on_says_why(tmp_path):
@@ -112,7 +118,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
     loaded = scenes(config.load("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_half.png", "sheet.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
     summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", "progress=false"))
     assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair

@@ -134,7 +134,7 @@ def test_gpudrive_json_has_what_gpudrive_reads(street, tmp_path):
 
 
 def test_a_database_holds_plain_data_that_numpy_1_knows(street, tmp_path, readers):
-    assert scenarionet.write_all([street, replace(street, metadata=street.metadata | {"scenario_id": "x/y"})], tmp_path / "db") == 2
+    assert scenarionet.write_all([street, replace(street, metadata=street.metadata | {"scenario_id": "x/y"})], tmp_path / "db", []) == 2
     names = {"sd_waymo_abc.pkl", "sd_waymo_x_y.pkl"}
     assert {path.name for path in (tmp_path / "db").iterdir()} == names | {"dataset_summary.pkl", "dataset_mapping.pkl"}
     for path in (tmp_path / "db").iterdir():
@@ -172,8 +172,10 @@ def test_a_file_is_whole_or_not_there(street, tmp_path):
         gpudrive.write(replace(street, tracks=(broken,)), tmp_path / "scene.json")
     with pytest.raises(SceneError, match="cannot be written"):
         gpudrive.write(street, tmp_path / "nowhere" / "scene.json")
-    with pytest.raises(SceneError, match="is written already"):
-        scenarionet.write_all([street, street], tmp_path)
+    refused = []
+    strange = replace(strange, metadata=street.metadata | {"scenario_id": "strange"})
+    assert scenarionet.write_all([street, strange, street], tmp_path / "db", refused) == 1
+    assert ["no type for the map element 77" in refused[0], "is written already" in refused[1]] == [True, True] and len(refused) == 2
     assert path.read_bytes() == before and not list(tmp_path.glob(".*"))
 
 

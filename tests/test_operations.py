@@ -10,11 +10,13 @@ import pyarrow as pa
 import pytest
 from scene_banks import FEATURES, PROCEDURAL, banked, generated, moved, rounded, window
 
+from scenefactory_jax import __main__ as command_line
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import batches, config
 from scenefactory_jax.run.scenes import scenes
 from scenefactory_jax.scenes import bank as banks
 from scenefactory_jax.scenes import bank_index, duplicates, expressions, operations, places, source
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.raw import SceneError
 
 SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
@@ -301,6 +303,40 @@ def test_what_is_exported_reads_back(town, tmp_path, name, pattern):
         raw = banks.raw(town, index)
         back = next(one for key, one in found.items() if raw.name in key)
         np.testing.assert_allclose(back.tracks[0].xyz[:, :2], raw.tracks[0].xyz[:, :2], atol=0.01)
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("gpudrive", "*.json"), ("scenarionet", "sd_*.pkl")])
+def test_an_export_goes_on_past_what_is_repaired_or_cannot_be_written(tmp_path, capsys, name, pattern):
+    sound = generated(0)
+    boxless = replace(sound.tracks[0], size=(float("nan"), -1.0, 0.0))
+    sizes = replace(sound, name="sizes", tracks=(boxless, *sound.tracks[1:]))
+    laneless = replace(sound, name="laneless", roads=())
+    later = replace(sound, name="later")
+    bank = banked(tmp_path / "bank", [sizes, laneless, later, later], described=False)
+    assert command(bank, "op=export", f"export.format={name}", f"out={tmp_path / 'out'}") == 2
+    told = capsys.readouterr().out
+    assert "not written: laneless: " in told and "no driving lane" in told and "two scenes need two names" in told
+    assert "in 1 scenes: sizes that are not positive replaced by (4.0, 2.0, 1.0)" in told and "2 of 4 scenes in the format" in told
+    formats = source.make(config.load("convert", "scenes=womd")["scenes"]["formats"])
+    found = [raw for file in (tmp_path / "out").glob(pattern) for raw in source.read(file, formats)]
+    back = next(raw for raw in found if "sizes" in raw.name)
+    assert len(found) == 2 and back.tracks[0].size == pytest.approx((4.0, 2.0, 1.0))
+
+
+def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
+    name, spelled = "a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec", r"a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec"
+    assert for_terminal(name) == spelled and for_terminal("straße 北 é") == "straße 北 é"
+    evil = replace(generated(0), name=name, metadata={"dataset": name, "format": "f"})
+    bank = banked(tmp_path / "bank", [evil, replace(evil, source="again")])
+    command(bank, "op=info")
+    command(bank, "op=check")
+    command(bank, "op=dedupe")
+    command(bank, "op=export", "export.format=gpudrive", f"out={tmp_path / 'out'}")
+    with pytest.raises(SystemExit) as ended:
+        command_line._end(SceneError(f"scenes.path: no scene\n{name}"))
+    told = capsys.readouterr()
+    assert ended.value.code == 2 and told.err == f"error: scenes.path: no scene\n{spelled.replace(chr(92) + 'n', chr(10), 1)}\n"
+    assert told.out.count(spelled) >= 5 and "\x1b" not in told.out + told.err and "\x9b" not in told.out + told.err
 
 
 def test_a_bank_is_held_against_its_checksums(tmp_path, capsys):

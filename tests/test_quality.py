@@ -102,6 +102,7 @@ DEFECTS = {
     "uneven times": (street(times=np.concatenate([0.1 * np.arange(50), 5.2 + 0.1 * np.arange(LOG - 50)])), {"times", "jumps"}, ()),
     "nobody recorded it": (street(sdc=None), {"sdc"}, ()),
     "the recorder is absent": (with_car(valid=gone(10)), {"sdc"}, (7,)),
+    "two tracks of one id": (street(tracks=(car(7, 5.0), car(7, 20.0, 3.5))), {"track_ids"}, (7,)),
     "a start in another": (street(tracks=(*street().tracks, car(9, 9.0))), {"overlapping_starts"}, (7, 9)),
     "a jump": (with_car(xyz=pushed(40, 2.0)), {"jumps"}, (7,)),
     "a long jump": (with_car(xyz=pushed(40, 6.0)), {"speed", "jumps"}, (7,)),

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from scenefactory_jax.report import canvas, plots, tables
 from scenefactory_jax.report.canvas import Colour
 from scenefactory_jax.report.others import MOVING
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.quality import Finding
 from scenefactory_jax.scenes.raw import RawScene, Track
 from scenefactory_jax.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES
@@ -93,10 +94,10 @@ def write(
         if chosen:
             with matplotlib.rc_context(plots.STYLE):
                 picture = plots.save(figure(chosen, window_m=window_m), folder / f"{name}.png", dpi=110)
-            lines = [f"- {example.raw.name}: {example.finding.message}" for example in chosen]
+            lines = [f"- {for_terminal(example.raw.name)}: {example.finding.message}" for example in chosen]
             parts += [f"### {name}", f"![{name}]({picture.name})", "\n".join(lines)]
     if unread:
-        parts += ["## Not read", "\n".join(f"- {line}" for line in unread)]
+        parts += ["## Not read", "\n".join(f"- {for_terminal(line)}" for line in unread)]
     path = folder / "quality.md"
     path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
@@ -144,7 +145,7 @@ def _draw(axes: Axes, example: Example, window_m: float) -> None:
         look = {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgecolor": _rgb(MARK), "markeredgewidth": 1.6}
         axes.plot(*finding.xyz[:2], **look)
     label = {"transform": axes.transAxes, "fontsize": 6.5, "bbox": {"facecolor": "white", "alpha": 0.8, "linewidth": 0}, "zorder": 5}
-    axes.text(0.02, 0.98, _wrapped(f"{raw.name}\n{finding.message}"), va="top", **label)
+    axes.text(0.02, 0.98, _wrapped(f"{for_terminal(raw.name)}\n{finding.message}"), va="top", **label)
     axes.text(0.02, 0.02, f"{side:.0f} m, step {step}", **label)
 
 

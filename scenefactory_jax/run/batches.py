@@ -14,6 +14,7 @@ from scenefactory_jax import cells
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import keys, sources
 from scenefactory_jax.scenes import bank, columns, source
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.raw import RawScene, Reject, SceneError
 from scenefactory_jax.scenes.stack import AXES, ROW_MULTIPLE, describe, stack
@@ -81,12 +82,12 @@ def open(config: Mapping[str, Any]) -> Source:
         return Source(None, job, lambda index: f"generated scene {index}", "scenes from the generator")
     if bank.is_bank(path):
         opened = bank.open(path)
-        names = opened.metadata["name"]
+        names, line = opened.metadata["name"], f"{len(opened)} scenes of the bank {path}{opened.unfinished}"
         job = lambda index: functools.partial(_banked, _alone(opened, index), ready)  # noqa: E731
-        return Source(len(opened), job, lambda index: str(names[index]), f"{len(opened)} scenes of the bank {path}{opened.unfinished}")
+        return Source(len(opened), job, lambda index: for_terminal(str(names[index])), line)
     files = source.find(path)
     job = lambda index: functools.partial(_filed, files[index], ready, parts["formats"])  # noqa: E731
-    return Source(len(files), job, lambda index: str(files[index]), f"{len(files)} files of {path}")
+    return Source(len(files), job, lambda index: for_terminal(str(files[index])), f"{len(files)} files of {path}")
 
 
 def _generated(generate: Callable[[int, int], RawScene], ready: Callable[[RawScene], Packed], seed: int, index: int) -> Packed:
@@ -95,9 +96,9 @@ def _generated(generate: Callable[[int, int], RawScene], ready: Callable[[RawSce
 
 def _alone(opened: bank.Bank, index: int) -> bank.Bank:
     """One scene's bank, without all that the others need: small enough to send to another process."""
-    [[shard, row]] = opened.places[index : index + 1].tolist()
     one = bank.view(opened, [index])
-    return replace(one, shards=(opened.shards[shard],), places=np.array([[0, row]]), readers={})  # its shard has another number
+    shard, *place = one.places[0].tolist()
+    return replace(one, shards=(opened.shards[shard],), places=np.array([[0, *place]]), readers={})  # its shard has another number
 
 
 def _banked(one: bank.Bank, ready: Callable[[RawScene], Packed]) -> Packed:

@@ -17,6 +17,7 @@ from scenefactory_jax.report import film, mp4, opengl, replay_data, replay_html,
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, policies, raws, sources
 from scenefactory_jax.run.train import make_policy
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.scenes.stack import stack
@@ -153,4 +154,4 @@ def chosen(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
         raise ConfigError(f"skip: {skip}; valid: 0 to {len(packed) - 1}, for {len(packed)} scenes can be used")
     taken, account = packed[skip:], posts[skip:]
     scene, _ = stack([one.scene for one in taken], capacity=config["capacity"])
-    return Shown(sources.with_cells(scene, config), tuple(one.report.name for one in taken), tuple(account))
+    return Shown(sources.with_cells(scene, config), tuple(for_terminal(one.report.name) for one in taken), tuple(account))

@@ -2,7 +2,8 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,13 @@ from rich.progress import Progress
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.report import tables
+from scenefactory_jax.run import sources
 from scenefactory_jax.scenes import bank as banks
 from scenefactory_jax.scenes import duplicates, operations
 from scenefactory_jax.scenes.bank import Bank
-from scenefactory_jax.scenes.export import gpudrive, scenarionet
+from scenefactory_jax.scenes.export import files, gpudrive, scenarionet
 from scenefactory_jax.scenes.features import COLUMNS, EVERY_BANK
-from scenefactory_jax.scenes.names import for_file
+from scenefactory_jax.scenes.names import for_file, for_terminal
 from scenefactory_jax.scenes.raw import RawScene, SceneError
 
 SHOWN = 10  # groups of duplicates, and values of a text, that are printed
@@ -29,11 +31,12 @@ def info(config: Mapping[str, Any]) -> dict[str, Any]:
         print(json.dumps(found, indent=1), flush=True)
         return found
     for value, summary in found.items():
-        title = "" if config["info"]["by"] is None else f"{config['info']['by']} = {value}: "
+        title = "" if config["info"]["by"] is None else for_terminal(f"{config['info']['by']} = {value}: ")
         print(f"{title}{summary['scenes']} scenes\n{_table(summary)}")
         for name, counts in summary["texts"].items():
             more = f", and {len(counts) - SHOWN} more" if len(counts) > SHOWN else ""
-            print(f"{name}: {', '.join(f'{text} in {number}' for text, number in list(counts.items())[:SHOWN])}{more}", flush=True)
+            shown = ", ".join(f"{text} in {number}" for text, number in list(counts.items())[:SHOWN])
+            print(for_terminal(f"{name}: {shown}{more}"), flush=True)
     return found
 
 
@@ -79,7 +82,7 @@ def dedupe(config: Mapping[str, Any]) -> Bank:
     """One scene of every recording."""
     made = duplicates.dedupe(*_opened(config), **config["dedupe"])
     for group in made.account["groups"][:SHOWN]:
-        print(f"one recording: {', '.join(group)}")
+        print(for_terminal(f"one recording: {', '.join(group)}"))
     if (more := len(made.account["groups"]) - SHOWN) > 0:
         print(f"... and {more} groups more")
     return _written(config, made)
@@ -99,37 +102,64 @@ def verify(config: Mapping[str, Any]) -> Bank:
 
 
 def export(config: Mapping[str, Any]) -> int:
-    """Write the bank's scenes to the folder `out` in another simulator's format. Returns how many.
+    """Write the bank's scenes, as the checks repair them, to the folder `out` in another simulator's format; return how many.
+
+    A scene that cannot be written is listed, and the rest goes on.
 
     Raises:
         ConfigError: no folder, or a format that cannot be written.
+        SceneError: a file of the bank that is damaged, or a place that cannot be written to.
     """
     name, out = config["export"]["format"], config["out"]
     if name not in EXPORTS:
         raise ConfigError(f"export.format: {name!r}; valid: {', '.join(EXPORTS)}")
     if out is None:
         raise ConfigError("out: null; give a folder for the files")
-    bank = _open(_path(config))
-    Path(out).mkdir(parents=True, exist_ok=True)
+    bank, check = _open(_path(config)), sources.readers(config["scenes"])["check"]
+    refused: list[str] = []
+    repaired: Counter[str] = Counter()
+    files.make_folder(Path(out))
     with Progress(disable=not config["progress"], transient=True) as bar:
-        written = EXPORTS[name](bar.track(banks.raws(bank, range(len(bank))), total=len(bank), description="export"), Path(out))
-    print(f"{out}: {written} scenes in the format of {name}", flush=True)
+        whole = bar.track(banks.raws(bank, range(len(bank))), total=len(bank), description="export")
+        written = EXPORTS[name](_checked(whole, check, refused, repaired), Path(out), refused)
+    lines = [f"not written: {reason}" for reason in refused[:SHOWN]]
+    lines += [f"... and {len(refused) - SHOWN} more"] if len(refused) > SHOWN else []
+    lines += [f"in {number} scenes: {repair}" for repair, number in repaired.items()]
+    lines.append(f"{out}: {written} of {len(bank)} scenes in the format of {name}")
+    print("\n".join(map(for_terminal, lines)), flush=True)
     return written
 
 
-def _as_json(scenes: Iterable[RawScene], folder: Path) -> int:
+def _checked(scenes: Iterable[RawScene], check: Callable[..., Any], refused: list[str], repaired: Counter[str]) -> Iterator[RawScene]:
+    """Scenes as the checks repair them, such as sizes that are no numbers; those that they refuse are listed instead."""
+    for raw in scenes:
+        try:
+            whole, lines = check(raw)
+        except SceneError as error:
+            refused.append(f"{raw.name}: {error}")
+            continue
+        repaired.update(line.split(":")[0] for line in lines)
+        yield whole
+
+
+def _as_json(scenes: Iterable[RawScene], folder: Path, refused: list[str]) -> int:
     """A file for each scene, in the layout of GPUDrive."""
     written: set[Path] = set()
     for raw in scenes:
         path = folder / f"{for_file(raw.name)}.json"
-        if path in written:
-            raise SceneError(f"{raw.source}: scene {raw.name!r}: {path} is written already; two scenes need two names")
-        gpudrive.write(raw, path)
+        try:
+            if path in written:
+                raise SceneError(f"{raw.source}: {path} is written already; two scenes need two names")
+            content = gpudrive.encoded(raw)
+        except SceneError as error:
+            refused.append(f"{raw.name}: {error}")
+            continue
+        files.write(path, content)
         written.add(path)
     return len(written)
 
 
-EXPORTS: dict[str, Callable[[Iterable[RawScene], Path], int]] = {"gpudrive": _as_json, "scenarionet": scenarionet.write_all}
+EXPORTS: dict[str, Callable[[Iterable[RawScene], Path, list[str]], int]] = {"gpudrive": _as_json, "scenarionet": scenarionet.write_all}
 
 
 def _path(config: Mapping[str, Any]) -> str:

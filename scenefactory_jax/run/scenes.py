@@ -10,7 +10,7 @@ import numpy as np
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import pictures, plots, sheets, tables
 from scenefactory_jax.run import keys, quality, realism, scene_operations, scene_simulation, sources
-from scenefactory_jax.scenes.names import for_file, for_terminal
+from scenefactory_jax.scenes.names import for_file
 
 Operation = Callable[[Mapping[str, Any]], Any]
 
@@ -34,8 +34,7 @@ def scenes(config: Mapping[str, Any]) -> Any:
 def check(config: Mapping[str, Any]) -> sources.Scenes:
     """Pack the scenes and print what was kept, dropped and refused, scene by scene."""
     loaded = sources.training(config["scenes"])
-    names = map(for_terminal, loaded.names)
-    table = [[name, *_row(jax.tree.map(lambda leaf, i=index: leaf[i], loaded.scene))] for index, name in enumerate(names)]
+    table = [[name, *_row(jax.tree.map(lambda leaf, i=index: leaf[i], loaded.scene))] for index, name in enumerate(loaded.names)]
     print(tables.grid(["scene", "agents", "segments", "lane m", "edge m", "route m"], table))
     print(loaded.account, flush=True)
     return loaded
@@ -51,8 +50,7 @@ def sheet(config: Mapping[str, Any]) -> sources.Scenes:
         raise ConfigError("out: null; give a folder for the pictures")
     loaded, out = check(config), Path(config["out"])
     paths = draw(loaded, out, limit=config["limit"])
-    names = map(for_terminal, loaded.names)
-    shown = [(name, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)) for index, name in enumerate(names)]
+    shown = [(name, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)) for index, name in enumerate(loaded.names)]
     figure = sheets.contact_sheet(shown[: config["limit"]], **config["sheet"])
     for path in [*paths, plots.save(figure, out / "sheet.png")]:
         print(path)
@@ -65,7 +63,7 @@ def draw(loaded: sources.Scenes, folder: Path, *, limit: int) -> list[Path]:
     paths = []
     for index, name in enumerate(loaded.names[:limit]):
         scene = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)
-        paths.append(plots.save(pictures.scene_figure(scene, title=for_terminal(name)), folder / f"{for_file(name)}.png"))
+        paths.append(plots.save(pictures.scene_figure(scene, title=name), folder / f"{for_file(name)}.png"))
     return paths
 
 

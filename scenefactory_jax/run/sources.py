@@ -16,6 +16,7 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import across
 from scenefactory_jax.run import keys
 from scenefactory_jax.scenes import bank, convert, source
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.raw import RawScene, Reject
 from scenefactory_jax.scenes.stack import describe, stack
@@ -26,7 +27,7 @@ CACHE = "SCENEFACTORY_CACHE"  # environment variable: folder of compiled program
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """Scenes stacked along the first axis, their names, and what was kept and dropped on the way."""
+    """Scenes stacked along the first axis, their names as they can be printed, and what was kept and dropped on the way."""
 
     scene: Scene
     names: tuple[str, ...]
@@ -210,7 +211,7 @@ def use_compilation_cache() -> None:
 
 def _stacked(packed: Sequence[Packed], config: Mapping[str, Any], lines: list[str]) -> Scenes:
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
-    return Scenes(with_cells(scene, config), tuple(one.report.name for one in packed), "\n".join([*lines, *describe(cuts)]))
+    return Scenes(with_cells(scene, config), tuple(for_terminal(one.report.name) for one in packed), "\n".join([*lines, *describe(cuts)]))
 
 
 def with_cells(scene: Scene, config: Mapping[str, Any]) -> Scene:

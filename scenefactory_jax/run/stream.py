@@ -30,6 +30,7 @@ from scenefactory_jax.build import ConfigError, build, check_number, check_share
 from scenefactory_jax.ppo import across
 from scenefactory_jax.run import batches, samplers, workers
 from scenefactory_jax.run.batches import Batch
+from scenefactory_jax.scenes.names import for_terminal
 from scenefactory_jax.types import Scene
 
 SHOWN = 10  # scenes left out that are told by name
@@ -190,7 +191,7 @@ class Flow:
         for name, reason in taken.batch.refused.items():
             if name not in self._told and len(self._told) < SHOWN:
                 self._told.add(name)
-                print(f"left out {name}: {reason}", flush=True)
+                print(for_terminal(f"left out {name}: {reason}"), flush=True)
         return taken
 
 

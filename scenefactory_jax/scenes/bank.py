@@ -2,7 +2,7 @@
 
 A bank is a folder with `bank.json` (`bank_index`), shards of scenes (`arrow`: Arrow IPC files, a record batch a scene) and their catalogue
 (`catalogue`: a row a scene). It can be moved. A view is a bank whose shards lie in other banks, by relative path: choosing scenes copies
-none. Shards are mapped when they are first read, and hold no file open.
+none. Shards are mapped when they are first read, and hold no file open; a scene that is not what was written is refused (`shard_files`).
 """
 
 import functools
@@ -17,9 +17,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from scenefactory_jax.scenes import arrow, bank_index, bank_writer, catalogue, columns, spread
+from scenefactory_jax.scenes import arrow, bank_index, bank_writer, catalogue, columns, shard_files, spread
 from scenefactory_jax.scenes.bank_index import Index, Shard
-from scenefactory_jax.scenes.bank_writer import PLACE
 from scenefactory_jax.scenes.catalogue import Features
 from scenefactory_jax.scenes.pack import Packed, prepare
 from scenefactory_jax.scenes.raw import RawScene, Reject, SceneError
@@ -30,7 +29,7 @@ INDEX = bank_index.INDEX
 is_bank = bank_index.is_bank
 PIECE = 16  # scenes that a process packs at a time
 SHARD = 256  # scenes of a shard, where a bank is written at once
-Readers = dict[int, pa.ipc.RecordBatchFileReader]
+Readers = dict[int, shard_files.Reader]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class Bank:
     path: Path  # the folder that was opened; of a view that was never saved: of its first bank
     index: Index
     shards: tuple[Shard, ...]  # by absolute path
-    places: Int[np.ndarray, "N 2"]  # of each scene: shard, and row in it
+    places: Int[np.ndarray, "N 5"]  # of each scene: shard, and where in it, with a checksum (`shard_files.PLACE`)
     metadata: pa.Table  # the catalogue: a row a scene
     readers: Readers = field(default_factory=dict, repr=False)  # of the shards that were mapped so far; views share them
 
@@ -70,7 +69,7 @@ class Bank:
 
 
 def open(path: Path | str) -> Bank:
-    """Open a bank. Its catalogue is mapped, its scenes are not touched.
+    """Open a bank. Its catalogue is read and held against its checksum, its scenes are not touched.
 
     Raises:
         SceneError: no bank, a bank of another schema, or a file that is missing, cut short or damaged, by name.
@@ -81,19 +80,13 @@ def open(path: Path | str) -> Bank:
     for shard in shards:
         bank_index.require_whole(Path(shard.file), shard)
     if not shards or not index.metadata:
-        raise SceneError(f"{path / INDEX}: damaged: it names no shards; copy or convert the bank again")
-    tables = []
-    for part in index.metadata:
-        bank_index.require_whole(path / part.file, part)
-        tables.append(_read_table(path / part.file))
-        if tables[-1].num_rows != part.scenes or not {"name", *PLACE} <= set(tables[-1].column_names):
-            raise SceneError(f"{path / part.file}: {tables[-1].num_rows} rows; there must be {part.scenes}, with {', '.join(PLACE)}")
-    table = pa.concat_tables(tables, promote_options="permissive")
-    places = np.stack([table[name].to_numpy() for name in PLACE], axis=1)
+        raise SceneError(f"{path / INDEX}: damaged: it names no shards; {bank_index.REMEDY}")
+    table = _concatenated([shard_files.table(path / part.file, part) for part in index.metadata], str(path))
+    places = shard_files.places(table)
     limits = np.array([shard.scenes for shard in shards])
-    if (places < 0).any() or (places[:, 0] >= len(shards)).any() or (places[:, 1] >= limits[places[:, 0]]).any():
-        raise SceneError(f"{path}: its catalogue names scenes that its shards do not have; copy or convert the bank again")
-    return Bank(path, index, shards, places, table.drop_columns(list(PLACE)))
+    if (places[:, :2] < 0).any() or (places[:, 0] >= len(shards)).any() or (places[:, 1] >= limits[places[:, 0]]).any():
+        raise SceneError(f"{path}: its catalogue names scenes that its shards do not have; {bank_index.REMEDY}")
+    return Bank(path, index, shards, places, table.select([name for name in table.column_names if name not in shard_files.PLACE]))
 
 
 def verify(path: Path | str) -> None:
@@ -107,7 +100,7 @@ def verify(path: Path | str) -> None:
     shards = (*index.shards, *index.metadata)
     whole = lambda shard: (path / shard.file).is_file() and bank_index.describe(path, shard.file, shard.scenes) == shard  # noqa: E731
     if damaged := [shard.file for shard in shards if not whole(shard)]:
-        raise SceneError(f"{path}: damaged: {', '.join(damaged)}: not what was written; copy or convert the bank again")
+        raise SceneError(f"{path}: damaged: {', '.join(damaged)}: not what was written; {bank_index.REMEDY}")
     open(path)
 
 
@@ -126,7 +119,7 @@ def raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawScene]:
     Raises:
         SceneError: as `raw`.
     """
-    yield from map(arrow.decode, _batches(bank.shards, bank.places[_rows(bank, indices)], bank.readers))
+    yield from _scenes(bank.shards, bank.places[_rows(bank, indices)], bank.readers)
 
 
 def view(bank: Bank, indices: Sequence[int] | np.ndarray) -> Bank:
@@ -154,11 +147,8 @@ def join(banks: Sequence[Bank]) -> Bank:
     places = []
     for bank in banks:
         own = np.array([number[shard.file] for shard in bank.shards])
-        places.append(np.stack([own[bank.places[:, 0]], bank.places[:, 1]], axis=1))
-    try:
-        table = pa.concat_tables([bank.metadata for bank in banks], promote_options="permissive")
-    except pa.ArrowException as error:
-        raise SceneError(f"{', '.join(str(bank.path) for bank in banks)}: their catalogues do not go together: {error}") from error
+        places.append(np.column_stack([own[bank.places[:, 0]], bank.places[:, 1:]]))
+    table = _concatenated([bank.metadata for bank in banks], ", ".join(str(bank.path) for bank in banks))
     settings = {"joined": [dict(bank.index.settings) for bank in banks]}
     return Bank(banks[0].path, _chosen(settings, banks), tuple(shards.values()), np.concatenate(places), table)
 
@@ -235,6 +225,8 @@ def packed(
     for piece in spread.local(work, pieces, workers=workers if len(pieces) > 1 else 1, timeout_s=None):
         if isinstance(piece, spread.Lost):
             raise SceneError(f"{bank.path}: scenes could not be packed: {piece.reason}; try fewer workers")
+        if isinstance(piece, SceneError):
+            raise piece
         found.extend(piece)
     return found
 
@@ -269,43 +261,47 @@ def load(
 
 
 def _packed(
-    places: Int[np.ndarray, "N 2"], *, shards: Sequence[Shard], check: Callable[..., Any], pack: Callable[..., Any]
-) -> list[Packed | Reject]:
+    places: Int[np.ndarray, "N 5"], *, shards: Sequence[Shard], check: Callable[..., Any], pack: Callable[..., Any]
+) -> list[Packed | Reject] | SceneError:
+    """Some scenes of a bank; of a damaged file the error, which another process is to raise."""
     found: list[Packed | Reject] = []
-    for scene in map(arrow.decode, _batches(shards, places, {})):
-        try:
-            found.append(prepare(scene, check=check, pack=pack))
-        except SceneError as error:
-            found.append(Reject(scene.name, str(error).removeprefix(f"{scene.source}: ")))
+    try:
+        for scene in _scenes(shards, places, {}):
+            found.append(_prepared(scene, check, pack))
+    except SceneError as error:
+        return error
     return found
 
 
-def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 2"], readers: Readers) -> Iterator[pa.RecordBatch]:
-    """Scenes as they lie in their shards; a shard is mapped when the first of its scenes is asked for."""
-    for number, row in places.tolist():
-        if number not in readers:
-            bank_index.require_whole(Path(shards[number].file), shards[number])
-            readers[number] = _read(Path(shards[number].file))
-        try:
-            yield readers[number].get_batch(row)
-        except (pa.ArrowException, OSError) as error:
-            raise SceneError(f"{shards[number].file}: scene {row} of {shards[number].scenes}: damaged: {error}") from error
-
-
-def _read(path: Path) -> pa.ipc.RecordBatchFileReader:
-    """A file that is mapped: no descriptor stays open, and the map lives as long as anything that was read from it."""
+def _prepared(scene: RawScene, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed | Reject:
     try:
-        with pa.memory_map(str(path)) as file:
-            return pa.ipc.open_file(pa.BufferReader(file.read_buffer()))
-    except (pa.ArrowException, OSError) as error:
-        raise SceneError(f"{path}: damaged: {error}; copy or convert the bank again") from error
+        return prepare(scene, check=check, pack=pack)
+    except SceneError as error:
+        return Reject(scene.name, str(error).removeprefix(f"{scene.source}: "), error.kind)
 
 
-def _read_table(path: Path) -> pa.Table:
+def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:
+    """Scenes one after another; a shard is mapped when the first of its scenes is asked for."""
+    return (_reader(shards, number, readers).scene(place) for number, *place in places.tolist())
+
+
+def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[pa.RecordBatch]:
+    """Scenes as they lie in their shards."""
+    return (_reader(shards, number, readers).batch(place) for number, *place in places.tolist())
+
+
+def _reader(shards: Sequence[Shard], number: int, readers: Readers) -> shard_files.Reader:
+    if number not in readers:
+        readers[number] = shard_files.Reader(shards[number])
+    return readers[number]
+
+
+def _concatenated(tables: Sequence[pa.Table], where: str) -> pa.Table:
+    """Catalogues one below the other; a column that one lacks is null there."""
     try:
-        return _read(path).read_all()
-    except (pa.ArrowException, OSError) as error:
-        raise SceneError(f"{path}: damaged: {error}; copy or convert the bank again") from error
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise SceneError(f"{where}: catalogues that do not go together: {error}") from error
 
 
 def _rows(bank: Bank, indices: Sequence[int] | np.ndarray) -> Int[np.ndarray, " N"]:

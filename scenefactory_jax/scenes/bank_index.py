@@ -1,4 +1,7 @@
-"""`bank.json`: which files a bank consists of and how the bank came to be. It is replaced as a whole, never changed in place."""
+"""`bank.json`: which files a bank consists of and how the bank came to be. It is replaced as a whole, never changed in place.
+
+Its last line is the SHA-256 of what stands before it.
+"""
 
 import hashlib
 import json
@@ -15,7 +18,10 @@ from scenefactory_jax.scenes.raw import SceneError
 from scenefactory_jax.scenes.source import BANK_INDEX as INDEX
 
 FORMAT = "scenefactory_jax bank"
-SCHEMA = 3  # rises whenever a bank of before can no longer be read
+SCHEMA = 4  # 4: checksums of `bank.json` and of each scene
+READABLE = (3, 4)
+REMEDY = "copy or convert the bank again"
+DIGEST = "sha256"  # key of the checksum
 
 
 @dataclass(frozen=True)
@@ -43,11 +49,21 @@ class Index:
 
 
 def is_bank(path: Path | str) -> bool:
-    """Whether a folder says of itself that it is a bank, of any schema."""
+    """Whether a folder says of itself that it is a bank, of any schema; one whose index is damaged may be."""
     try:
-        return json.loads((Path(path) / INDEX).read_text()).get("format") == FORMAT
-    except (OSError, ValueError, AttributeError):
-        return False
+        return _format(_entries(Path(path))) == FORMAT
+    except SceneError:
+        return True
+
+
+def require_replaceable(path: Path) -> None:
+    """Refuse a folder that is not surely a bank.
+
+    Raises:
+        SceneError: it is none, or its index is damaged.
+    """
+    if _format(_entries(path)) != FORMAT:
+        raise SceneError(f"{path}: exists and is no bank; give another path, or remove it")
 
 
 def read(path: Path) -> Index:
@@ -56,20 +72,61 @@ def read(path: Path) -> Index:
     Raises:
         SceneError: no bank, a bank of another schema, or an index that is damaged.
     """
-    if not is_bank(path):
+    found = _entries(path)
+    if found is None or _format(found) != FORMAT:
         what = "no such folder" if not path.exists() else f"no bank: it has no {INDEX} of this format"
         raise SceneError(f"{path}: {what}; make one with `convert source=FILES out={path}`")
-    found = json.loads((path / INDEX).read_text())
-    if found.get("schema") != SCHEMA:
+    if found.get("schema") not in READABLE:
         what = "a bank of packed scenes, schema 2" if found.get("schema") == 2 else f"a bank of schema {found.get('schema')!r}"
-        raise SceneError(f"{path}: {what}; this version reads {SCHEMA}, whole scenes: convert its source again, to another folder")
+        ours = f"this version reads {' and '.join(map(str, READABLE))}, whole scenes"
+        raise SceneError(f"{path}: {what}; {ours}: convert its source again, to another folder")
     try:
-        shards = {name: tuple(Shard(**shard) for shard in found[name]) for name in ("shards", "metadata")}
+        shards = {name: tuple(map(_shard, found[name])) for name in ("shards", "metadata")}
         lists = {name: tuple(found[name]) for name in ("files", "rejects", "companions")}
         return Index(found["settings"], account=found["account"], complete=found["complete"], **shards, **lists)
     except (KeyError, TypeError) as error:
         wanted = ", ".join(entry.name for entry in fields(Index))
         raise SceneError(f"{path / INDEX}: damaged: {error}; it must hold {wanted}") from error
+
+
+def _entries(path: Path) -> dict[str, Any] | None:
+    """What the index of a folder holds, in whatever format; None where there is none.
+
+    Raises:
+        SceneError: it cannot be read, or is not what was written.
+    """
+    file = path / INDEX
+    try:
+        content = file.read_bytes()
+        found = json.loads(content)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file}: damaged: no JSON: {error}; {REMEDY}") from error
+    if not isinstance(found, dict):
+        return {}
+    wanted, body = found.get(DIGEST), content.rpartition(f'"{DIGEST}"'.encode())[0]
+    missing = wanted is None and found.get("schema") == SCHEMA
+    if missing or (wanted is not None and hashlib.sha256(body).hexdigest() != wanted):
+        raise SceneError(f"{file}: damaged: {'no checksum' if missing else 'its checksum is another'}; {REMEDY}")
+    return found
+
+
+def _format(entries: Mapping[str, Any] | None) -> Any:
+    return None if entries is None else entries.get("format")
+
+
+def _shard(entry: Any) -> Shard:
+    """One file's entry.
+
+    Raises:
+        TypeError: other keys or values than such an entry has.
+    """
+    if not isinstance(entry, dict) or {name: type(value) for name, value in entry.items()} != Shard.__annotations__:
+        raise TypeError(f"{repr(entry)[:80]} in place of {', '.join(Shard.__annotations__)}")
+    return Shard(**entry)
 
 
 def write(folder: Path, index: Index) -> None:
@@ -79,7 +136,8 @@ def write(folder: Path, index: Index) -> None:
     lines = [f'"{name}": {json.dumps(value, default=_plain)}' for name, value in entries.items()]  # a line each: json's indent is slow
     fresh = folder / f".{INDEX}"
     with fresh.open("w") as file:
-        file.write("{\n" + ",\n".join(lines) + "\n}\n")
+        body = "{\n" + ",\n".join(lines) + ",\n"
+        file.write(f'{body}"{DIGEST}": "{hashlib.sha256(body.encode()).hexdigest()}"\n}}\n')
         file.flush()
         os.fsync(file.fileno())
     os.replace(fresh, folder / INDEX)
@@ -87,8 +145,13 @@ def write(folder: Path, index: Index) -> None:
 
 def describe(folder: Path, file: str, scenes: int) -> Shard:
     """A finished file's size and checksum."""
-    with (folder / file).open("rb") as stream:
-        return Shard(file, scenes, os.fstat(stream.fileno()).st_size, hashlib.file_digest(stream, "sha256").hexdigest())
+    return Shard(file, scenes, (folder / file).stat().st_size, digest(folder / file))
+
+
+def digest(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def require_whole(path: Path, shard: Shard) -> None:
@@ -97,7 +160,7 @@ def require_whole(path: Path, shard: Shard) -> None:
     if size is None:
         raise SceneError(f"{path}: missing; a bank needs all of its files, a view also the banks that it refers to: copy them together")
     if size != shard.bytes:
-        raise SceneError(f"{path}: {size} bytes, cut short or changed: there were {shard.bytes}; copy or convert the bank again")
+        raise SceneError(f"{path}: {size} bytes, cut short or changed: there were {shard.bytes}; {REMEDY}")
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:

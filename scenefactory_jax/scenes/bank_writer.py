@@ -16,12 +16,11 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from scenefactory_jax.scenes import arrow, bank_index, catalogue
+from scenefactory_jax.scenes import arrow, bank_index, catalogue, shard_files
 from scenefactory_jax.scenes.bank_index import Index, Shard
 from scenefactory_jax.scenes.raw import SceneError
 
 Compression = Literal["zstd", "lz4"] | None
-PLACE = ("_shard", "_row")  # columns of the catalogue on disk: where each scene lies
 OWN = re.compile(r"\.?(part|scenes|metadata)-\d+\.arrow|\.bank\.json")  # what a conversion leaves that was killed before its first shard
 
 
@@ -56,9 +55,16 @@ def grow(folder: Path, pieces: Iterable[Piece], *, index: Index, shard_scenes: i
     if not index.shards:
         reasons = "; ".join(str(reject["reason"]) for reject in index.rejects[:3])
         raise SceneError(f"no scene to write{f': {len(index.rejects)} were rejected: {reasons}' if index.rejects else ''}")
-    index = replace(index, complete=True)
+    index = replace(_in_order(index), complete=True)
     bank_index.write(folder, index)
     return index
+
+
+def _in_order(index: Index) -> Index:
+    """Source files in the order in which a conversion that is not stopped reads them."""
+    by_source = lambda entries: tuple(sorted(entries, key=lambda entry: Path(entry["source"]).parts))  # noqa: E731
+    files = tuple(sorted(index.files, key=lambda file: Path(file).parts))
+    return replace(index, files=files, rejects=by_source(index.rejects), companions=by_source(index.companions))
 
 
 def _grow_by_shard(folder: Path, pieces: Iterator[Piece], index: Index, shard_scenes: int, compression: Compression) -> Index:
@@ -90,7 +96,7 @@ def _grow_by_shard(folder: Path, pieces: Iterator[Piece], index: Index, shard_sc
 def _with_shard(folder: Path, index: Index, name: str, metadata: pa.Table) -> Index:
     """The index with a shard that is finished; its part of the catalogue is written."""
     number, rows = len(index.shards), metadata.num_rows
-    places = np.stack([np.full(rows, number), np.arange(rows)], axis=1)
+    places = np.column_stack([np.full(rows, number), np.arange(rows), shard_files.spans(folder / name, rows)])
     written = _write_catalogue(folder, f"metadata-{number:05d}.arrow", metadata, places)
     shard = bank_index.describe(folder, name, rows)
     return replace(index, shards=(*index.shards, shard), metadata=(*index.metadata, written))
@@ -151,7 +157,7 @@ def refer(
     folder: Path,
     path: Path,
     shards: Sequence[Shard],
-    places: Int[np.ndarray, "N 2"],
+    places: Int[np.ndarray, "N 5"],
     metadata: pa.Table,
     *,
     settings: Mapping[str, Any],
@@ -159,7 +165,7 @@ def refer(
 ) -> None:
     """A view, in a new folder: the shards' paths relative to `path`, where the folder is to lie."""
     used, own = np.unique(places[:, 0], return_inverse=True)
-    placed = np.stack([own, places[:, 1]], axis=1)
+    placed = np.column_stack([own, places[:, 1:]])
     written = _write_catalogue(folder, "metadata-00000.arrow", metadata, placed)
     chosen = tuple(replace(shards[number], file=os.path.relpath(shards[number].file, path)) for number in used)
     bank_index.write(folder, Index(bank_index.plain(settings), shards=chosen, metadata=(written,), complete=complete))
@@ -189,8 +195,8 @@ def replacing(path: Path) -> Iterator[Path]:
 def require_free(path: Path) -> None:
     """Refuse a path where something else than a bank is."""
     ours = path.is_dir() and all(OWN.fullmatch(file.name) for file in path.iterdir())
-    if path.exists() and not bank_index.is_bank(path) and not ours:
-        raise SceneError(f"{path}: exists and is no bank; give another path, or remove it")
+    if path.exists() and not ours:
+        bank_index.require_replaceable(path)
 
 
 @contextlib.contextmanager
@@ -218,8 +224,8 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
     return (reader.get_batch(number) for number in range(reader.num_record_batches))
 
 
-def _write_catalogue(folder: Path, name: str, table: pa.Table, places: Int[np.ndarray, "N 2"]) -> Shard:
-    for column, values in zip(PLACE, places.T, strict=True):
+def _write_catalogue(folder: Path, name: str, table: pa.Table, places: Int[np.ndarray, "N 5"]) -> Shard:
+    for column, values in zip(shard_files.PLACE, places.T, strict=True):
         table = table.append_column(column, pa.array(np.ascontiguousarray(values), pa.int64()))
     with _finishing(folder / name) as fresh, _writer(fresh, table.schema, None) as writer:
         writer.write_table(table)

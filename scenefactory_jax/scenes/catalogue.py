@@ -12,12 +12,14 @@ from scenefactory_jax.types import CROSSWALK, DRIVABLE, EDGES, LINES, STOP_SIGN
 
 Features = Callable[[RawScene], Mapping[str, Any]]  # more columns; a value is a number, a text, true, false or None
 
+PACKED = "packed"
 COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(("name", "source", "dataset", "format"), pa.string()),
     **{"steps": pa.int64(), "current": pa.int64(), "dt_s": pa.float64()},
     **dict.fromkeys(("lanes", "edges", "lines", "crosswalks", "stop_signs", "lights"), pa.int64()),
     **dict.fromkeys(("vehicles", "pedestrians", "cyclists"), pa.int64()),
     "findings": pa.int64(),  # of the rules of quality; null where nobody judged
+    "packing": pa.string(),  # PACKED, or why packing refused it at conversion (`pack.REFUSALS`); null where nobody tried
     "sdc": pa.int64(),  # id of the car that recorded the log; null without one
     **dict.fromkeys(("min_x", "min_y", "max_x", "max_y"), pa.float64()),  # of the map, in the source's coordinates
 }
@@ -47,6 +49,7 @@ def row(raw: RawScene) -> dict[str, Any]:
         "pedestrians": users["pedestrian"],
         "cyclists": users["cyclist"],
         "findings": sum(raw.metadata["quality"].values()) if "quality" in raw.metadata else None,
+        "packing": None,
         "sdc": None if raw.sdc is None else raw.tracks[raw.sdc].id,
         **{"min_x": low[0], "min_y": low[1], "max_x": high[0], "max_y": high[1]},
     }

@@ -1,7 +1,7 @@
 """Files in any known format -> a bank. What cannot be used is listed with its reason, and the rest goes on.
 
-Scenes go into the bank whole. They are also checked and packed once, to find out which cannot be used with the settings given; what packing
-would keep and drop is counted, and thrown away.
+Scenes go into the bank whole. They are also packed once on trial: what packing keeps and drops is counted and thrown away, and a scene that
+it refuses stays in the bank, with the reason in its row, because other numbers may take it. What the checks refuse is left out.
 """
 
 import functools
@@ -37,6 +37,7 @@ class Summary:
     others_dropped: dict[str, int]  # reason -> count
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count
+    refused: dict[str, int]  # why packing refuses scenes -> how many; those of a bank are in it, and among `scenes`
     repaired: dict[str, int]  # repair -> scenes that had it
     centred_on: dict[str, int]  # what the centre was taken from -> scenes
 
@@ -144,7 +145,7 @@ def convert_file(
     """One file's scenes, in a part of the bank's folder; it raises only `ConfigError`, whatever the file or a reader does."""
     number, path = item
     rows: list[dict[str, Any]] = []
-    reports: list[PackReport] = []
+    tries: list[PackReport | str] = []
     rejects: list[dict[str, Any]] = []
     companions: list[dict[str, Any]] = []
 
@@ -153,14 +154,15 @@ def convert_file(
             try:
                 raw = replace(raw, source=str(path))
                 raw = raw if refine is None else refine(raw)
-                report, row, batch = prepare(raw, check=check, pack=pack).report, catalogue.extended(raw, features), arrow.encode(raw)
+                tried = try_packing(raw, check=check, pack=pack)
+                row, batch = catalogue.extended(raw, features), arrow.encode(raw)
             except ConfigError:
                 raise  # no file is to blame
             except Exception as error:
-                rejects.append({"source": str(path), "scene": raw.name, "reason": _reason(error, path)})
+                rejects.append(_reject(path, raw.name, error))
                 continue
-            reports.append(report)
-            rows.append(row)
+            tries.append(tried)
+            rows.append(row | {"packing": tried if isinstance(tried, str) else catalogue.PACKED})
             yield batch
 
     part = bank_writer.write_part(out, number, batches())
@@ -170,8 +172,22 @@ def convert_file(
         rows=tuple(rows),
         rejects=tuple(rejects),
         companions=tuple(companions),
-        account=account(reports),
+        account=account(tries),
     )
+
+
+def try_packing(raw: RawScene, *, check: Callable[..., Any], pack: Callable[..., Any]) -> PackReport | str:
+    """What packing keeps and drops; of a scene that it refuses, the kind of the refusal, such as those of `pack.REFUSALS`.
+
+    Raises:
+        SceneError: the check refuses it: no packing can use it.
+    """
+    checked, repairs = check(raw)
+    try:
+        report = pack(checked)[1]
+    except SceneError as refusal:
+        return refusal.kind or "other"
+    return replace(report, repairs=(*report.repairs, *repairs))
 
 
 def complete(
@@ -242,8 +258,14 @@ def _read_file(
         except ConfigError:
             raise
         except Exception as error:
-            rejects.append({"source": str(path), "scene": raw.name, "reason": _reason(error, path)})
+            rejects.append(_reject(path, raw.name, error))
     return scenes, rejects, companions
+
+
+def _reject(path: Path, scene: str, error: Exception) -> dict[str, Any]:
+    """A scene that cannot be used; where packing refused it, with the kind."""
+    kind = error.kind if isinstance(error, SceneError) else None
+    return {"source": str(path), "scene": scene, "reason": _reason(error, path)} | ({} if kind is None else {"kind": kind})
 
 
 def _reason(error: Exception, path: Path) -> str:
@@ -252,18 +274,20 @@ def _reason(error: Exception, path: Path) -> str:
     return text if isinstance(error, SceneError) else f"{type(error).__name__}: {text}"
 
 
-def account(reports: Iterable[PackReport]) -> dict[str, Any]:
-    """What packing kept and dropped, as numbers that add up over scenes."""
-    reports = list(reports)
+def account(tries: Iterable[PackReport | str]) -> dict[str, Any]:
+    """What packing kept, dropped and refused (see `try_packing`), as numbers that add up over scenes."""
+    tries = list(tries)
+    reports = [report for report in tries if not isinstance(report, str)]
     total = lambda name, reasons: {reason: sum(getattr(report, name).get(reason, 0) for report in reports) for reason in reasons}  # noqa: E731
     return {
-        "scenes": len(reports),
+        "scenes": len(tries),
         "agents_kept": sum(report.agents_kept for report in reports),
         "agents_dropped": total("agents_dropped", DROPS),
         "others_kept": sum(report.others_kept for report in reports),
         "others_dropped": total("others_dropped", OTHER_DROPS),
         "segments_kept": sum(report.segments_kept for report in reports),
         "segments_cut": total("segments_cut", CUTS),
+        "refused": dict(Counter(kind for kind in tries if isinstance(kind, str))),
         "repaired": dict(Counter(line.split(":")[0] for report in reports for line in report.repairs)),
         "centred_on": dict(Counter(report.centred_on for report in reports)),
     }
@@ -278,7 +302,8 @@ def summarise(
 ) -> Summary:
     """The accounts of many scenes as one."""
     listed = {"rejects": tuple(map(dict, rejects)), "companions": tuple(map(dict, companions))}
-    return Summary(files=files, **listed, **account(reports))
+    refused = dict(Counter(reject["kind"] for reject in rejects if reject.get("kind") is not None))
+    return replace(Summary(files=files, **listed, **account(reports)), refused=refused)
 
 
 def _summary(index: Index) -> Summary:
@@ -300,9 +325,9 @@ def describe(summary: Summary) -> list[str]:
     lines.append(f"segments: {summary.segments_kept} kept; cut: {count(summary.segments_cut)}")
     lines.append(f"others: {summary.others_kept} kept; dropped: {count(summary.others_dropped)}")
     lines.append(f"agents: {summary.agents_kept} kept; dropped: {count(summary.agents_dropped)}")
-    lines.append(
-        f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected"
-    )
+    if summary.refused:
+        lines.append(f"packing with these numbers refuses: {count(summary.refused)}; such scenes stay in a bank, for others")
+    lines.append(f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected")
     return [for_terminal(line) for line in lines]
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes import columns
 from scenefactory_jax.scenes.logs import Logs, joined, lengths, stacked, wrapped
-from scenefactory_jax.scenes.raw import RawScene, SceneError
+from scenefactory_jax.scenes.raw import RawScene, Unpackable
 from scenefactory_jax.types import DRIVABLE, ROAD_USERS, Scene
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
@@ -21,6 +21,7 @@ DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
 )  # fmt: skip
 OTHER_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
+REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 
@@ -96,7 +97,7 @@ def pack(
         others_least_m: shortest and narrowest that they may be.
 
     Raises:
-        SceneError: no lane segment in the box, or no agent where one is required.
+        Unpackable: no lane segment in the box, or no agent where one is required.
         ConfigError: a number that makes no sense.
     """
     _check(box_m, car_size_m, others)
@@ -106,7 +107,7 @@ def pack(
     logs = _around(stacked(raw.tracks, len(raw.times)), origin)
     chosen, dropped = _choose(raw, logs, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
-        raise SceneError(f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped) or 'no tracks'}")
+        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped)}")
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _log(chosen, logs, raw, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
@@ -147,11 +148,11 @@ def _around(logs: Logs, origin: Float[np.ndarray, "3"]) -> Logs:
 
 def _require_lane(raw: RawScene, road: dict[str, np.ndarray], place: str) -> None:
     if not np.isin(road["road.kind"], DRIVABLE).any():
-        raise SceneError(f"{raw.source}: roads: no driving lane within {place}")
+        raise Unpackable("no_lane_in_box", f"{raw.source}: roads: no driving lane within {place}")
 
 
 def _reasons(dropped: dict[str, int]) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
 
 
 def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:

@@ -21,6 +21,8 @@ LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)  # the order of WOMD
 class SceneError(ValueError):
     """A scene, or a bank of scenes, that cannot be used; the message names the file, the key, the value and what would be valid."""
 
+    kind: str | None = None  # a short name for counting, of what packing refuses
+
 
 class OtherFormat(SceneError):
     """The file is not in the format of this reader; the next reader may try."""
@@ -30,11 +32,24 @@ class Companion(SceneError):
     """The file holds no scene of its own but belongs to scenes beside it (a map, an index): neither read nor rejected, but counted."""
 
 
+class Unpackable(SceneError):
+    """A scene that packing refuses with the numbers given, and may take with others; nothing is wrong with its source."""
+
+    def __init__(self, kind: str, message: str):
+        """`kind` is a short name for counting, such as those of `pack.REFUSALS`."""
+        super().__init__(kind, message)
+        self.kind = kind
+
+    def __str__(self) -> str:
+        return self.args[1]
+
+
 class Reject(NamedTuple):
     """What a reader yields in place of a scene that it could not read, when it can go on with the next one of the same file."""
 
     scene: str | None  # its name, where it is known
     reason: str  # with the place in the file, such as a record's number and offset
+    kind: str | None = None  # of what packing refused: see `Unpackable`
 
 
 @dataclass(frozen=True, eq=False)

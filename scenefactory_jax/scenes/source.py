@@ -1,5 +1,7 @@
 """From a path to scenes: which files there are, and which reader reads each."""
 
+import os
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,8 @@ def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
 def find(path: Path | str) -> list[Path]:
     """The file itself, or every file below a folder in sorted order; hidden ones, and banks that lie among them, are left out.
 
+    A folder that cannot be listed stands for what is in it: reading it says why.
+
     Raises:
         SceneError: no such path, a bank, or nothing in it.
     """
@@ -33,12 +37,23 @@ def find(path: Path | str) -> list[Path]:
         raise SceneError(f"{path}: no such file or folder; give a scene file or a folder of them")
     if (path / BANK_INDEX).is_file():
         raise SceneError(f"{path}: a bank already; give the files that it was made from")
-    hidden = lambda file: any(part.startswith(".") for part in file.relative_to(path).parts)  # noqa: E731
-    found = (file for file in path.rglob("*") if file.is_file() and not hidden(file))
-    files = sorted(file for file in found if not (file.parent / BANK_INDEX).is_file())
+    found: list[Path] = []
+    for folder, folders, names in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        if BANK_INDEX not in names:
+            found.extend(file for name in names if not name.startswith(".") and _holds_content(file := Path(folder, name)))
+    files = sorted(found)
     if not files:
         raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
     return files
+
+
+def _holds_content(path: Path) -> bool:
+    """Whether this is a file, no pipe or device; one of which that cannot be found out is, and reading it says why."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError:
+        return True
 
 
 def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene | Reject]:
@@ -46,8 +61,10 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
 
     Raises:
         Companion: the file belongs to scenes beside it.
-        SceneError: no reader knows the format, each with its reason; or what the reader that knows it found wrong.
+        SceneError: a folder that cannot be listed; no reader knows the format, each with its reason; or what the one that does found wrong.
     """
+    if Path(path).is_dir():
+        raise SceneError(f"{path}: a folder that cannot be listed; allow it to be read, or give the files beside it")
     refusals = []
     for name, reader in formats.items():
         scenes = iter(reader(Path(path)))

@@ -26,11 +26,20 @@ def write(raw: RawScene, path: Path | str) -> None:
     Raises:
         SceneError: a map element that the format does not know, a number that is not finite, or a file that cannot be written.
     """
+    files.write(path, encoded(raw))
+
+
+def encoded(raw: RawScene) -> bytes:
+    """The content of a scene's file.
+
+    Raises:
+        SceneError: a map element that the format does not know, or a number that is not finite.
+    """
+    whole = document(raw)
     try:
-        content = json.dumps(document(raw), allow_nan=False)
+        return json.dumps(whole, allow_nan=False).encode()
     except ValueError as error:
         raise SceneError(f"{raw.source}: scene {raw.name!r}: a number that is not finite, which JSON cannot hold: {error}") from error
-    files.write(path, content.encode())
 
 
 def document(raw: RawScene) -> dict[str, Any]:

@@ -39,20 +39,32 @@ def write(raw: RawScene, path: Path | str) -> dict[str, Any]:
     return whole["metadata"]
 
 
-def write_all(scenes: Iterable[RawScene], folder: Path | str) -> int:
+def write_all(scenes: Iterable[RawScene], folder: Path | str, refused: list[str]) -> int:
     """Write a database: a pickle for each scene, and at last the summary and the mapping of all. Returns how many scenes.
 
+    Args:
+        scenes: taken one at a time.
+        folder: to write into.
+        refused: a line is added for each scene that is left out: of a name that was written already, or with a map element that the
+            format does not know.
+
     Raises:
-        SceneError: two scenes of one name, a map element that the format does not know, or a file that cannot be written.
+        SceneError: a file that cannot be written.
     """
     folder = Path(folder)
     files.make_folder(folder)
     summary: dict[str, Any] = {}
     for raw in scenes:
         name = file_name(raw)
-        if name in summary:
-            raise SceneError(f"{raw.source}: scene {raw.name!r}: {folder / name} is written already; two scenes need two names")
-        summary[name] = write(raw, folder / name)
+        try:
+            if name in summary:
+                raise SceneError(f"{raw.source}: {folder / name} is written already; two scenes need two names")
+            whole = scenario(raw)
+        except SceneError as error:
+            refused.append(f"{raw.name}: {error}")
+            continue
+        files.write(folder / name, _pickled(whole))
+        summary[name] = whole["metadata"]
     files.write(folder / SUMMARY, _pickled(summary))
     files.write(folder / MAPPING, _pickled(dict.fromkeys(summary, "")))
     return len(summary)

@@ -1,5 +1,7 @@
 """Rules on the log as a whole: its times, the car that recorded it, and who stands where at its start."""
 
+from collections import Counter
+
 import numpy as np
 import shapely
 
@@ -37,6 +39,16 @@ def sdc(raw: RawScene, *, without: list[str]) -> list[Finding]:
         return []
     message = f"the car that recorded the log (id {track.id}) is absent at the current step {raw.current}"
     return [Finding(message, 0.0, 1.0, step=raw.current, objects=(track.id,))]
+
+
+def track_ids(raw: RawScene) -> list[Finding]:
+    """Ids that several tracks have: what names an object by its id may mean the wrong one."""
+    counts = Counter(track.id for track in raw.tracks)
+    return [
+        Finding(f"{number} tracks have the id {identity}", float(number), 1.0, objects=(identity,))
+        for identity, number in counts.items()
+        if number > 1
+    ]
 
 
 def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
