@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.geometry import cross, dot, heading, norm
+from scenefactory_jax.struct import is_finite
 from scenefactory_jax.types import Boxes, Motion
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
@@ -32,10 +33,11 @@ class Pairs(NamedTuple):
 
 
 def bodies(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> Bodies:
-    """Cars and boxes as one list; its first rows are the cars."""
+    """Cars and boxes as one list; its first rows are the cars. Who has no size, or a number that is not finite, is not present."""
     cars = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], motion.yaw_rate, size, active)
     beside = (boxes.position, boxes.yaw, boxes.velocity, boxes.yaw_rate, boxes.size, boxes.present)
-    return Bodies(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
+    everyone = Bodies(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
+    return everyone._replace(present=everyone.present & is_finite(everyone[:-1]) & jnp.all(everyone.size > 0, axis=1))
 
 
 def pairwise(

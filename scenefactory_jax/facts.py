@@ -4,15 +4,13 @@ Rewards, ends, metrics and reports only read facts, so training and evaluation c
 reads cost nothing: XLA drops them.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax import conflict, roadside
+from scenefactory_jax import conflict, roadside, spawn
 from scenefactory_jax.geometry import car_circles, cross, dot, heading, norm
+from scenefactory_jax.struct import is_finite
 from scenefactory_jax.types import Agents, Events, Facts, Motion, Scene, State
-
-OVERFLOWS = 1e12  # no speed, place or force comes near; beyond, float32 sums of squares end at 3e38
 
 
 def measure(
@@ -47,9 +45,9 @@ def measure(
     Args:
         kernels: Triton kernels for the road where there is an NVIDIA GPU; False: plain JAX everywhere.
     """
-    motion, active, cars, finite = after.motion, before.active, len(before.active), is_finite(after.motion)
+    motion, active, cars, fault = after.motion, before.active, len(before.active), _are_broken(after)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    everyone = conflict.bodies(motion, after.agents.size, active & finite, scene.boxes)  # nobody meets a broken car
+    everyone = conflict.bodies(motion, after.agents.size, active & ~fault, scene.boxes)  # nobody meets a broken car
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position
@@ -59,7 +57,7 @@ def measure(
     strayed = norm(position - after.agents.position)
     limits = {"upright_min": upright_min, "height_min_m": height_min_m, "box_m": box_m, "stray_m": stray_m, "stray_ratio": stray_ratio}
     events = Events(
-        fault=~finite,
+        fault=fault,
         reached=norm(to_goal) <= goal_radius_m,
         collided=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
         crashed=_has_crashed(motion, after.agents, strayed, **limits),
@@ -83,6 +81,11 @@ def measure(
     )
 
 
+def _are_broken(state: State) -> Bool[Array, " A"]:
+    """Agents with a number in their motion, or in where they start and what they must reach, that nothing can be computed with."""
+    return ~(is_finite(state.motion) & spawn.are_usable(state.agents))
+
+
 def _stopping(speed: Float[Array, " A"], grip: Float[Array, " A"], gravity_mps2: float) -> Float[Array, " A"]:
     """The way to a stop with all of the road's friction: v^2 / (2 mu g)."""
     return speed**2 / (2 * gravity_mps2 * jnp.maximum(grip, 1e-3))
@@ -95,12 +98,6 @@ def _has_crashed(
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * box_m
     return fell | outside | (strayed > jnp.maximum(stray_m, stray_ratio * agents.route))
-
-
-def is_finite(motion: Motion) -> Bool[Array, " A"]:
-    """Whether every number of a car's motion is finite, and far from where its square would not be."""
-    per_leaf = [jnp.all(jnp.abs(leaf.reshape(leaf.shape[0], -1)) < OVERFLOWS, axis=1) for leaf in jax.tree.leaves(motion)]
-    return jnp.all(jnp.stack(per_leaf), axis=0)
 
 
 def _measure_lane(

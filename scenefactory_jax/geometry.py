@@ -35,9 +35,9 @@ def norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
 
 
 def root(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Square root whose gradient at zero is zero instead of NaN."""
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    """Square root whose gradient at zero is zero instead of NaN; NaN stays NaN: a distance that is not known is not short."""
+    zero = squared <= 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:

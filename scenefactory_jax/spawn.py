@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError, build, check_number, check_range, check_share, check_type
 from scenefactory_jax.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
-from scenefactory_jax.struct import replace
+from scenefactory_jax.struct import choose, is_finite, replace
 from scenefactory_jax.types import Agents, Boxes, Scene
 
 Draw = Callable[[PRNGKeyArray, Scene], Agents]
@@ -65,6 +65,22 @@ def _check(numbers: Mapping[str, Any], *, where: str) -> None:
         raise ConfigError(f"{where}.car_size_m: {numbers['car_size_m']}; wanted is [length, width]")
     if "travel_max_m" in numbers:
         check_range([numbers["travel_min_m"], numbers["travel_max_m"]], where=f"{where}.travel_min_m, travel_max_m")
+
+
+def are_usable(agents: Agents) -> Bool[Array, " A"]:
+    """Whether each agent has finite starts, speeds, goals and routes, and a length and width above 0."""
+    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route
+    return is_finite(numbers) & jnp.all(agents.size > 0, axis=1)
+
+
+def admit(agents: Agents) -> Agents:
+    """Drawn agents without those that no car can be made of: they are absent, and their numbers zeros with a size of 1 m.
+
+    One NaN would otherwise reach everybody near it.
+    """
+    usable = are_usable(agents)
+    nothing = jax.tree.map(jnp.zeros_like, agents)
+    return choose(usable, agents, replace(nothing, size=jnp.ones_like(agents.size)))
 
 
 def mixed(key: PRNGKeyArray, scene: Scene, *, shares: list[float], draws: list[Draw]) -> Agents:

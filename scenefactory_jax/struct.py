@@ -6,16 +6,22 @@ shapes are checked where people build a value, never where JAX rebuilds one.
 """
 
 import dataclasses
+import types
+import typing
 from collections.abc import Iterable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 T = TypeVar("T")
 
 replace = dataclasses.replace
+
+LARGEST = 1e12  # no length, speed or force of a car comes near; beyond, float32 sums of squares end at 3e38
+KINDS = {"float": jnp.floating, "int": jnp.integer, "bool": jnp.bool_}
 
 
 def choose(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
@@ -25,6 +31,73 @@ def choose(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
         return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(pick, chosen, other)
+
+
+def is_finite(tree: Any) -> Bool[Array, " rows"]:
+    """Row by row of a pytree whose leaves all start with the same axis: whether every number is finite, and so is its square."""
+    per_leaf = [jnp.all(jnp.abs(leaf) < LARGEST, axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
+    return jnp.all(jnp.stack(per_leaf), axis=0)
+
+
+def to_jax(tree: T) -> T:
+    """Leaves as arrays of JAX, those of numpy included that a traced function closes over.
+
+    `vmap` hands numpy arrays on inside its tracers, where `custom_jvp` stumbles over them; a copy makes JAX arrays of them. Compiled, a
+    copy is no operation.
+    """
+    return jax.tree.map(lambda leaf: jnp.copy(leaf) if isinstance(leaf, Tracer) else jnp.asarray(leaf), tree)
+
+
+def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -> None:
+    """Refuse a struct with a field of another shape or kind of number than its annotation says. Only shapes and dtypes are read.
+
+    Args:
+        where: what the caller calls the value, for messages.
+        sizes: axis -> size, None if it is not known yet. These axes have one size in all parts of the value, others in each part its own;
+            sizes that are found are filled in.
+
+    Raises:
+        ValueError: naming the field, what it is, and what was expected.
+    """
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: expected a {kind.__name__}, got {type(value).__name__}")
+    own: dict[str, int | None] = {}
+    for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        leaf, expected = getattr(value, entry.name, None), entry.type
+        if isinstance(expected, types.UnionType):  # a part that may be missing
+            expected = None if leaf is None else typing.get_args(expected)[0]
+        if dataclasses.is_dataclass(expected):
+            check(leaf, expected, where=f"{where}.{entry.name}", sizes=sizes)  # pyright: ignore[reportArgumentType]
+        elif hasattr(expected, "dim_str"):
+            check_array(leaf, expected, where=f"{where}.{entry.name}", sizes=sizes, own=own)
+
+
+def check_array(
+    leaf: Any, expected: Any, *, where: str, sizes: dict[str, int | None], own: dict[str, int | None] | None = None
+) -> None:  # fmt: skip
+    """Refuse an array of another shape or kind of number than a jaxtyping annotation; `own`: sizes of the axes that `sizes` does not name.
+
+    Raises:
+        ValueError: naming the array, what it is, and what was expected.
+    """
+    own, axes = {} if own is None else own, expected.dim_str.split()
+    kind = next(kind for kind in KINDS if expected.dtypes[0].startswith(kind))
+    if leaf is None:
+        raise ValueError(f"{where}: missing; expected {kind} of shape {_shown(axes)}")
+    shape, dtype = jnp.shape(leaf), jnp.result_type(leaf)
+    known = [int(axis) if axis.isdigit() else (sizes if axis in sizes else own).get(axis) for axis in axes]
+    if len(shape) != len(axes) or any(size not in (None, given) for size, given in zip(known, shape, strict=True)):
+        worlds = "; for many worlds map over them with jax.vmap" if len(shape) == len(axes) + 1 else ""
+        wanted = [axis if size is None else size for axis, size in zip(axes, known, strict=True)]
+        raise ValueError(f"{where}: expected shape {_shown(wanted)}, got {_shown(shape)}{worlds}")
+    if not jnp.issubdtype(dtype, KINDS[kind]):
+        raise ValueError(f"{where}: expected {kind}, got {dtype}")
+    for axis, size in zip(axes, shape, strict=True):
+        (sizes if axis in sizes else own)[axis] = size
+
+
+def _shown(shape: Iterable[Any]) -> str:
+    return f"({', '.join(map(str, shape))})"
 
 
 def strong(tree: T) -> T:

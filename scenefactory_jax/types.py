@@ -284,6 +284,10 @@ class Env(NamedTuple):
     The others are their parts: `start` and `observe` divide a reset, so that a training loop can restart finished worlds before it pays
     for the observation; `transition` is a single control step, for whoever looks closer than the agent acts. It reads every `hold`-th
     action of an episode, the first one first, which stands until the next. `now` gives the scene as it is at a state's moment.
+
+    All of them take arrays of numpy or JAX, also closed over, and raise ValueError when they are traced with an argument of another shape
+    or kind of number than is annotated here. Values are not refused: an agent that starts with a number that is not finite, or with a size
+    that is not above 0, is absent; one that comes to have such a number later is a fault.
     """
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]

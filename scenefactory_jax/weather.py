@@ -144,6 +144,7 @@ def grip(
     if mode not in ("static", "dynamic", "speed"):
         raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
     film_mm, surface = condition(weather, position)
+    speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # whole numbers would make whole numbers of the slip: 0
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
     theta, texture = (table[surface] for table in _surfaces(surfaces))

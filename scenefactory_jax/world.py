@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax import conditions, ends, observations, rain, rewards, spawn, weather
 from scenefactory_jax.build import ConfigError, build, check_number, check_type
-from scenefactory_jax.struct import choose, replace, strong, unchecked
+from scenefactory_jax.struct import check, check_array, choose, is_finite, replace, strong, to_jax, unchecked
 from scenefactory_jax.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
 
 GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # of a config
@@ -110,22 +110,52 @@ def _hold(config: Mapping[str, Any]) -> int:
 
 
 def assemble(parts: Parts) -> Env:
-    """Join bound parts into an environment."""
+    """Join bound parts into an environment, whose functions refuse arguments of other shapes than `types` says when they are traced."""
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
+        (scene,) = _checked("env.reset", scene)
         state = _start(parts, key, scene)
         # copies: nothing in the state is anybody else's, so that a step may be given it to keep (`donate_argnums`)
         return jax.tree.map(jnp.copy, state), _observe(parts, scene, state)
 
+    def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+        (scene,) = _checked("env.start", scene)
+        return _start(parts, key, scene, step)
+
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        scene, state, action = _checked("env.step", scene, state, action)
         control = functools.partial(_transition, parts, scene, action=action)
         state, _, outcome, _ = act(control, state, hold=parts.hold)
         return state, replace(outcome, observation=_observe(parts, scene, state))
 
-    def bind(function: Callable) -> Callable:
-        return functools.partial(function, parts)
+    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        return _transition(parts, *_checked("env.transition", scene, state, action))
 
-    return Env(reset, step, bind(_start), bind(_transition), bind(_observe), bind(_now), parts.hold)
+    def observe(scene: Scene, state: State) -> Observation:
+        return _observe(parts, *_checked("env.observe", scene, state))
+
+    def now(scene: Scene, state: State) -> Scene:
+        return _now(parts, *_checked("env.now", scene, state))
+
+    return Env(reset, step, start, transition, observe, now, parts.hold)
+
+
+def _checked(where: str, scene: Scene, *others: Any) -> tuple[Any, ...]:
+    """A scene, or a scene and a state, or those and an action, as JAX arrays that fit each other.
+
+    Raises:
+        ValueError: another kind of thing, or an array of another shape or kind of number, by name.
+    """
+    sizes: dict[str, int | None] = dict.fromkeys("AO")  # L may differ between log and others: nothing compares their rows
+    check(scene, Scene, where=f"{where}: scene", sizes=sizes)
+    if others:
+        check(others[0], State, where=f"{where}: state", sizes=sizes)
+    if len(others) == 2:
+        action = jnp.asarray(others[1])
+        action = action.astype(jnp.promote_types(action.dtype, jnp.float32))  # whole numbers are numbers
+        check_array(action, Float[Array, "A 3"], where=f"{where}: action", sizes=sizes)
+        others = others[0], action.astype(jnp.float32)
+    return to_jax((scene, *others))
 
 
 def act(
@@ -187,13 +217,14 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] |
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
     scene = replace(scene, boxes=parts.others(scene, step))
-    agents = parts.draw_agents(agents_key, scene)
+    agents = spawn.admit(parts.draw_agents(agents_key, scene))
     weather = rain.pass_time(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
-    count = agents.present.shape[0]
+    count, motion = agents.present.shape[0], parts.dynamics.read(body)
+    agents = replace(agents, present=agents.present & is_finite(motion))
     state = State(
         body=body,
-        motion=parts.dynamics.read(body),
+        motion=motion,
         agents=agents,
         weather=weather,
         active=agents.present,
@@ -266,12 +297,12 @@ def _finite(value: Array) -> Array:
 def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
     """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
     draw_key, key, body_key = jax.random.split(state.key, 3)
-    fresh = draw_agents(draw_key, scene)
-    waiting = ~state.active & fresh.present
+    fresh = spawn.admit(draw_agents(draw_key, scene))
+    body = dynamics.init(body_key, replace(scene, agents=fresh))
+    waiting = ~state.active & fresh.present & is_finite(dynamics.read(body))
     clear = spawn.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
     begins = waiting & clear
-    agents = choose(begins, fresh, state.agents)
-    body = choose(begins, dynamics.init(body_key, replace(scene, agents=agents)), state.body)
+    agents, body = choose(begins, (fresh, body), (state.agents, state.body))
     count = begins.shape[0]
     return replace(
         state,

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.build import ConfigError, check_numbers
 from scenefactory_jax.geometry import cross, dot, norm
-from scenefactory_jax.struct import replace
+from scenefactory_jax.struct import is_finite, replace
 from scenefactory_jax.types import Boxes, Motion
 
 OFF_CENTRE = 3.7  # times as much mass moves with a contact in the middle of two cars' faces as with one at their corners
@@ -114,8 +114,8 @@ def forces(
     2 c dt / m stays below 4: 0.58 and 2.1 with 3e4 N s/m.
 
     Args:
-        cars: bodies that are not present, or whose state is not finite, touch nobody. Two that differ by more than `height` in elevation do
-            not meet.
+        cars: bodies that are not present, have no size, or whose state is not finite, touch nobody. Two that differ by more than `height`
+            in elevation do not meet.
         near: what each car may touch, leaves `[A, K, ...]`: see `neighbours`. It is on its way and feels nothing. One of finite mass cannot
             yield as it would, so its push ends where it would have taken on the car's speed within `yield_s`.
         stiffness: of a contact along a whole face of two cars, N/m.
@@ -195,10 +195,9 @@ def _between(
 
 
 def _sound(boxes: Boxes) -> Bool[Array, "*n"]:
-    """Boxes that are there and whose state is finite."""
-    flat = jnp.stack([boxes.elevation, boxes.yaw, boxes.yaw_rate], axis=-1)
-    state = jnp.concatenate([boxes.position, boxes.velocity, boxes.size, flat], axis=-1)
-    return boxes.present & jnp.isfinite(state).all(-1)
+    """Boxes that are there, have a size, and whose state is finite."""
+    state = boxes.position, boxes.velocity, boxes.size, boxes.elevation, boxes.yaw, boxes.yaw_rate
+    return boxes.present & is_finite(state) & (boxes.size > 0).all(-1)
 
 
 def _still(boxes: Boxes, mass: float) -> Boxes:
