@@ -59,7 +59,7 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
 
 
 def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
-    far = thing(30, id=9, speed=600)  # 60 m on in the one step that is left after the tenth
+    far = thing(30, id=9)  # 150 m on in the one step that is left after the tenth
     far["position"] = [{"x": 30.0 + (150 if step == 11 else 0), "y": 0.0, "z": 0.0} for step in range(12)]
     path = written(tmp_path, document(objects=[thing(0, id=7, speed=40), far]))
     summary = convert(config.load("convert", f"source={path}", f"out={tmp_path / 'bank'}", "progress=false"))
