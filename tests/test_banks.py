@@ -23,6 +23,7 @@ import pytest
 import shapely
 from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, packer, parsed, prepared, scenefactory_document, thing, written
 
+from scenefactory_jax import folders
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
 from scenefactory_jax.scenes import arrow, bank, bank_index, columns, convert, mjcf, source, stack, topology
@@ -359,6 +360,43 @@ def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     assert convert.convert(folder, out, **options()).scenes == 8 and bank.open(out).names[-1] == "t7"
     assert convert.convert(folder, out, **options(formats={})).scenes == 8  # nothing is left to read
     assert sorted(path.name[0] for path in out.iterdir())[0] == "b"
+
+
+def test_one_command_at_a_time_writes_a_bank(tmp_path, made):
+    folder, out, raws = streets(tmp_path / "in", "a", "b", "c"), tmp_path / "deep" / "bank", made[0]
+    writers = {
+        "convert": lambda: convert.convert(folder, out, **options()),
+        "write": lambda: bank.write(out, raws, settings={}),
+        "save": lambda: bank.save(made[1], out, copy=True, settings={}),
+        "view": lambda: bank.save(made[1], out, copy=False, settings={}),
+    }
+
+    def refused():
+        for writer in writers.values():
+            with pytest.raises(folders.Busy, match=r"deep/bank: another command writes there now; wait for its end, or choose another"):
+                writer()
+
+    def stop(done, total):
+        refused()
+        raise KeyboardInterrupt
+
+    def scenes():
+        yield raws[0]
+        refused()
+        yield raws[1]
+
+    for unfinished in (lambda: convert.convert(folder, out, **options(on_file=stop)), lambda: bank.write(out, [], settings={})):
+        with pytest.raises((KeyboardInterrupt, SceneError)):
+            unfinished()
+        assert not out.parent.exists()
+    assert bank.write(out, scenes(), settings={}).names == ("street", "straße")
+    assert len(writers["view"]()) == 3  # the lock went with the folder that was replaced
+    shutil.rmtree(out)
+    convert.convert(folder, out, **options(on_file=lambda *_: refused()))
+    assert sorted(path.name for path in out.iterdir())[0] == bank.INDEX and bank.open(out).names == ("a", "b", "c")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/bank: cannot be written: Not a directory; choose another folder"):
+        bank.write(tmp_path / "file" / "bank", raws, settings={})
 
 
 def test_a_file_that_gave_nothing_is_read_again(tmp_path):
