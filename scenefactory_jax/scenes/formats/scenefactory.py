@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents
-from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import ROAD_USERS
 
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
@@ -31,7 +31,7 @@ def read(path: Path, *, step_s: float, size_m: list[float], include_sdc: bool, a
     document = documents.load(path)
     road = document.get("road")
     if not isinstance(road, dict) or "polylines" not in road:
-        raise OtherFormat(f"{path}: no SceneFactory JSON: it has no 'road.polylines', but {', '.join(map(str, document)) or 'nothing'}")
+        raise OtherContent(f"{path}: no SceneFactory JSON: it has no 'road.polylines', but {', '.join(map(str, document)) or 'nothing'}")
     if len(size_m) != 3:
         raise SceneError(f"formats.scenefactory.size_m: {size_m!r} is not [length, width, height]")
     polylines = documents.get(road, "polylines", list, f"{path}: road")
