@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes.raw import SceneError
 
+HERE = "spread=local scenes.workers=1 spread.timeout_s=null does without other processes"
 Work = Callable[[Any], Any]
 Spread = Callable[[Work, Sequence[Any]], Iterable[Any]]
 
@@ -76,7 +77,7 @@ def _packed(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
         return dumps(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises all three for what it cannot send
         wanted = "readers and parts must be functions of a module"
-        raise SceneError(f"spread: the work cannot be sent to another process: {error}; {wanted}") from error
+        raise SceneError(f"spread: the work cannot be sent to another process: {error}; {wanted}; {HERE}") from error
 
 
 def _answer(
@@ -94,8 +95,8 @@ def _answer(
     except (EOFError, OSError):
         process.join()
         if place is None:
-            guard = 'a script needs `if __name__ == "__main__":`; spread.workers=1 spread.timeout_s=null works without processes'
-            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {guard}") from None
+            guard = 'a script needs `if __name__ == "__main__":`'
+            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {guard}; {HERE}") from None
         done[place] = Lost(_death(process, timeout_s))
         if waiting:
             busy.update([_start(packed, timeout_s)])
@@ -166,8 +167,8 @@ def _passed(result: Any) -> Any:
     if isinstance(result, ConfigError):
         raise result
     if isinstance(result, Unloadable):
-        where = "every process, on every machine of a cluster, must be able to import the modules of readers and parts"
-        raise SceneError(f"spread: a process cannot load the work: {result.reason}; {where}")
+        where = "every process, on every machine of a cluster, must be able to import readers and parts"
+        raise SceneError(f"spread: a process cannot load the work: {result.reason}; {where}; {HERE}")
     return result
 
 
