@@ -15,7 +15,7 @@ from scenefactory_jax.scenes.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS,
 from scenefactory_jax.types import ROAD_USERS, STOP_SIGN, Scene
 
 
-def check(raw, *, track_speed_limit_m_s, car_size_m, most_m):  # of scenes without a number beyond the last
+def check(raw, *, track_speed_limit_m_s, car_size_m, **_):  # of scenes without a number beyond the rest
     lines = []
     roads = _repair_roads(raw.roads, lines)
     tracks, sdc = _repair_tracks(raw, tuple(float(x) for x in car_size_m), lines)

@@ -8,11 +8,11 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "scenefactory_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 HOST_ONLY = {"hydra", "omegaconf", "os", "pathlib", "time", "logging", "matplotlib", "shutil", "datetime"}
-HOST_PARTS = ("run", "report", "scenes")
+HOST_PARTS = ("run", "report", "scenes", "folders")
 # every package may import from the ranks below its own
 RANK = {
     "struct": 0, "build": 0, "types": 1, "geometry": 2, "patches": 2, "rain": 2, "weather": 2, "layouts": 3, "conditions": 3, "conflict": 3,
-    "tracks": 3, "cells": 2, "kernels": 0, "road_kernel": 4, "roadside": 4, "clues": 6,
+    "tracks": 3, "cells": 2, "kernels": 0, "road_kernel": 4, "roadside": 4, "clues": 6, "folders": 1,
     "ends": 4, "spawn": 4, "others": 4, "facts": 5, "rewards": 5, "observations": 5, "dynamics": 5,
     "controls": 5, "world": 6, "policy": 7, "ppo": 7, "evaluation": 7, "recording": 7, "validation": 7, "sysid": 7, "report": 8, "run": 9,
     "adapters": 9, "__init__": 9, "__main__": 10,
@@ -59,7 +59,7 @@ def test_imports_point_downwards(path):
             continue
         other = name.split(".")[1]
         if own == "scenes":
-            assert other in ("scenes", "types", "geometry", "struct", "build"), f"scenes imports {name}"
+            assert other in ("scenes", "types", "geometry", "struct", "build", "folders"), f"scenes imports {name}"
         elif other in RANK and other != own:
             assert RANK[other] <= RANK[own], f"{path.name} imports {name}"
 

@@ -2,6 +2,7 @@
 
 import functools
 import gzip
+import importlib
 import json
 import multiprocessing
 import os
@@ -22,6 +23,7 @@ import pytest
 import shapely
 from scene_documents import FORMATS, STEPS, WOMD, checker, curve, document, packer, parsed, prepared, scenefactory_document, thing, written
 
+from scenefactory_jax import folders
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
 from scenefactory_jax.scenes import arrow, bank, bank_index, columns, convert, mjcf, operations, source, stack, topology
@@ -351,9 +353,10 @@ def test_a_folder_that_cannot_be_listed_is_named_and_read_later(tmp_path, monkey
     assert convert.convert(folder, out, **options()).scenes == 2 and bank.open(out).names == ("a", "b")
 
 
-def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     folder = streets(tmp_path / "in", "a", "b_killed", "c_two", "d_endless", "e_map", "f_broken", "g")
-    spread = functools.partial(spreads.local, workers=2, timeout_s=2.0)
+    spread = functools.partial(spreads.local, workers=workers, timeout_s=2.0)
     summary = convert.convert(folder, tmp_path / "bank", **options(formats={"eventful": eventful.read}, spread=spread))
     reasons = {(Path(reject["source"]).stem, reject["scene"]): reject["reason"] for reject in summary.rejects}
     assert reasons == {
@@ -398,6 +401,43 @@ def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     assert convert.convert(folder, out, **options()).scenes == 8 and bank.open(out).names[-1] == "t7"
     assert convert.convert(folder, out, **options(formats={})).scenes == 8  # nothing is left to read
     assert sorted(path.name[0] for path in out.iterdir())[0] == "b"
+
+
+def test_one_command_at_a_time_writes_a_bank(tmp_path, made):
+    folder, out, raws = streets(tmp_path / "in", "a", "b", "c"), tmp_path / "deep" / "bank", made[0]
+    writers = {
+        "convert": lambda: convert.convert(folder, out, **options()),
+        "write": lambda: bank.write(out, raws, settings={}),
+        "save": lambda: bank.save(made[1], out, copy=True, settings={}),
+        "view": lambda: bank.save(made[1], out, copy=False, settings={}),
+    }
+
+    def refused():
+        for writer in writers.values():
+            with pytest.raises(folders.Busy, match=r"deep/bank: another command writes there now; wait for its end, or choose another"):
+                writer()
+
+    def stop(done, total):
+        refused()
+        raise KeyboardInterrupt
+
+    def scenes():
+        yield raws[0]
+        refused()
+        yield raws[1]
+
+    for unfinished in (lambda: convert.convert(folder, out, **options(on_file=stop)), lambda: bank.write(out, [], settings={})):
+        with pytest.raises((KeyboardInterrupt, SceneError)):
+            unfinished()
+        assert not out.parent.exists()
+    assert bank.write(out, scenes(), settings={}).names == ("street", "straße")
+    assert len(writers["view"]()) == 3  # the lock went with the folder that was replaced
+    shutil.rmtree(out)
+    convert.convert(folder, out, **options(on_file=lambda *_: refused()))
+    assert sorted(path.name for path in out.iterdir())[0] == bank.INDEX and bank.open(out).names == ("a", "b", "c")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/bank: cannot be written: Not a directory; choose another folder"):
+        bank.write(tmp_path / "file" / "bank", raws, settings={})
 
 
 def test_a_file_that_gave_nothing_is_read_again(tmp_path):
@@ -448,16 +488,21 @@ def cluster(monkeypatch):
     class RayError(Exception):
         pass
 
+    class RayTaskError(RayError):
+        pass
+
     def get(reference):
         function, arguments = reference
         try:
             return function(*arguments)
         except KeyboardInterrupt as death:
             raise RayError("the worker died\nlong story") from death
+        except SystemError as error:
+            raise RayTaskError(f"ray::_timed() (pid=7)\n  File ...\n{error}\n") from error
 
     remote = lambda **_: lambda function: SimpleNamespace(remote=lambda *arguments: (function, arguments))  # noqa: E731
     fake = SimpleNamespace(init=lambda **_: None, put=lambda value: value, get=get, remote=remote)
-    fake.exceptions = SimpleNamespace(RayError=RayError)
+    fake.exceptions, fake.cloudpickle = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError), pickle
     monkeypatch.setitem(sys.modules, "ray", fake)
 
 
@@ -467,6 +512,10 @@ def dies_of_three(item):
     return 10 * item
 
 
+def missing(*_):
+    raise SystemError("ModuleNotFoundError: No module named 'scenefactory_jax'")  # which the stand-in says in Ray's words
+
+
 def test_a_cluster_is_a_spread_like_any_other(tmp_path, monkeypatch):
     ray = functools.partial(spreads.ray, address=None, pending=2, timeout_s=5.0)
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -474,8 +523,37 @@ def test_a_cluster_is_a_spread_like_any_other(tmp_path, monkeypatch):
         list(ray(dies_of_three, [1]))
     cluster(monkeypatch)
     assert list(ray(dies_of_three, [1, 2, 3, 4])) == [10, 20, spreads.Lost("Ray: RayError: the worker died"), 40]
+    with monkeypatch.context() as without:
+        without.setattr(spreads, "_timed", missing)
+        with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'scenefactory_jax'; "):
+            list(ray(dies_of_three, [1]))
     folder = streets(tmp_path / "in", "a", "b")
     assert convert.convert(folder, tmp_path / "bank", **options(spread=ray)).scenes == 2
+
+
+@pytest.mark.parametrize("over", ["processes", "cluster"])
+def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
+    """A reader in a module that only this process has."""
+    (tmp_path / "here_alone.py").write_text("def read(path):\n    yield from ()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    work = importlib.import_module("here_alone").read
+    pack = spreads._packed
+
+    def pack_and_forget(*given):
+        packed = pack(*given)
+        (tmp_path / "here_alone.py").unlink()
+        del sys.modules["here_alone"]
+        return packed
+
+    monkeypatch.setattr(spreads, "_packed", pack_and_forget)
+    cluster(monkeypatch)
+    spread = spreads.ray if over == "cluster" else spreads.local
+    numbers = {"address": None, "pending": 2} if over == "cluster" else {"workers": 2}
+    with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'here_alone'; every process"):
+        list(spread(work, [1, 2, 3], timeout_s=9.0, **numbers))
+    monkeypatch.setattr(spreads, "_packed", pack)
+    with pytest.raises(SceneError, match=r"cannot be sent to another process: .*; readers and parts must be functions of a module"):
+        list(spreads.local(lambda item: item, [1], workers=1, timeout_s=9.0))
 
 
 # ---- real data

@@ -17,6 +17,7 @@ from scenefactory_jax.run.train import make_policy, make_trainer, train
 from scenefactory_jax.scenes import bank
 from scenefactory_jax.scenes.raw import SceneError
 
+HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this process
 COMMANDS = {"train": train, "bench": bench, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
 
 
@@ -50,7 +51,7 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
         written(folder, content, name)
     written(folder, whole, "good.json")
     written(folder, document(objects=[thing(0, speed=0)]), "goalless.json")
-    summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", "progress=false"))
+    summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     printed = capsys.readouterr().out
     assert (summary.files, summary.scenes, len(summary.rejects)) == (8, 2, 6) and "2 scenes" in printed and "6 rejected" in printed
     assert "packing with these numbers refuses: 1 no agent left" in printed
@@ -62,16 +63,16 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
 
 
 def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
-    far = thing(30, id=9, speed=600)  # 60 m on in the one step that is left after the tenth
+    far = thing(30, id=9)  # 150 m on in the one step that is left after the tenth
     far["position"] = [{"x": 30.0 + (150 if step == 11 else 0), "y": 0.0, "z": 0.0} for step in range(12)]
     path = written(tmp_path, document(objects=[thing(0, id=7, speed=40), far]))
-    summary = convert(config.load("convert", f"source={path}", f"out={tmp_path / 'bank'}", "progress=false"))
+    summary = convert(config.load("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE))
     assert summary.agents_kept == 1 and summary.agents_dropped["goal_outside_box"] == 1
     scene, report = bank.packed(bank.open(tmp_path / "bank"), [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and scene.agents.present.sum() == 1
 
     alone = written(tmp_path, document(objects=[thing(0, kind="pedestrian"), far]), "alone.json")
-    sized = ["progress=false", f"source={alone}", f"out={tmp_path / 'none'}"]
+    sized = [*HERE, f"source={alone}", f"out={tmp_path / 'none'}"]
     summary = convert(config.load("convert", *sized))
     assert (summary.scenes, summary.agents_kept, summary.refused) == (1, 0, {"no_agent_left": 1})
     message = refused("train", "scenes=womd", f"scenes.path={tmp_path / 'none'}", f"out={tmp_path / 'run'}")
@@ -101,7 +102,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
 )
 def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, message):
     path = written(tmp_path, document(), "good.json")
-    assert refused("convert", f"source={path}", f"out={tmp_path / 'bank'}", "progress=false", override).startswith(message)
+    assert refused("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE, override).startswith(message)
     assert not (tmp_path / "bank").exists()
 
 
@@ -120,7 +121,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
-    summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", "progress=false"))
+    summary = convert(config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair
     assert "b.json (\\ud800half): " in capsys.readouterr().out
 

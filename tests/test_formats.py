@@ -356,3 +356,45 @@ def test_real_files_are_told_apart_whatever_they_are_called(shared_data, readers
         if name == "gpudrive":
             content = lzma.decompress(content)
         assert one(written(tmp_path, content, "scene"), readers).metadata["format"] == name
+
+
+def refusal(path, readers):
+    """Why no reader reads a file; two lines of a terminal, whatever is in it."""
+    with pytest.raises(SceneError) as caught:
+        next(source.read(path, readers))
+    reason = str(caught.value).removeprefix(f"{path}: ")
+    assert len(reason) <= 2 * 140
+    return reason
+
+
+def test_a_refusal_names_the_format_of_real_files(shared_data, readers):
+    kinds = {
+        "opendrive/*": "OpenDRIVE",
+        "commonroad/*": "CommonRoad",
+        "interaction/*/*.osm": "OpenStreetMap XML, such as the Lanelet2 maps of INTERACTION",
+        "interaction/*/*/*.csv": "a recording of INTERACTION (CSV)",
+    }
+    for pattern, name in kinds.items():
+        paths = sorted((shared_data / "formats").glob(pattern))
+        assert paths
+        assert all(refusal(path, readers).startswith(f"this is {name}: it is not read; formats: womd, gpudrive, ") for path in paths)
+
+
+def test_a_refusal_says_what_a_file_is_or_what_it_is_not(tmp_path, readers):
+    long = json.dumps({f"key_{number}": 1 for number in range(500)})
+    comment = f"<?xml version='1.0'?>\n<!-- <net> {'x' * 5000} -->\n"
+    cases = {
+        f"{comment}<routes/>": "this is routes of SUMO: it is not read",
+        f"{comment}<kml xmlns='x'>": "this is XML of the root element 'kml': it is not read",
+        "<?xml version='1.0' encoding='utf-16'?><net>".encode("utf-16"): "this is a network of SUMO",
+        "<" + "?" * 9000: "no reader knows this format: it begins with b'<???",
+        b"SQLite format 3\0" + bytes(100): "this is an SQLite database",
+        "": "an empty file; formats: womd, gpudrive, scenefactory, scenarionet, argoverse2, pufferdrive",
+        "frame,id\n1,2\n": "no reader knows this format: it begins with b'frame,id",
+        long: "no reader knows this format: gpudrive: no GPUDrive JSON: it has no 'objects', but key_0, key_1",
+        pickle.dumps([1]): "no reader knows this format: scenarionet: no ScenarioNet pickle: it holds no dict but list",
+    }
+    for content, reason in cases.items():
+        path = tmp_path / "file"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        assert refusal(path, readers).startswith(reason)

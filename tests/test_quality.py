@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_documents import FORMATS, checker, document, written
+from scene_documents import FORMATS, checker, document, prepared, written
 
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.run import config
@@ -175,6 +175,17 @@ def test_the_gate_judges_what_the_check_makes_of_a_scene_and_passes_the_whole():
     }.items():
         with pytest.raises(SceneError, match=message):  # in its words, not in those of a library that stumbles over it
             convert.complete(bad, check=checker(), rebuild=rebuild, gate=gate)
+
+
+def test_a_jitter_is_repaired_and_counted_and_a_missing_step_is_refused():
+    """A step of 111 ms among 90 of 100 was a log that convert refused."""
+    later = lambda seconds: street(times=street().times + seconds * (np.arange(LOG) >= 40))  # noqa: E731
+    passed = gate(later(0.011), reject=QUALITY["reject"])
+    assert passed.metadata["quality"] == {} and passed.times[-1] == pytest.approx(9.011)  # the bank has the log as it was
+    summary = convert.summarise([prepared(passed).report], files=1, rejects=[])
+    assert "in 1 scenes: logs of uneven steps resampled" in convert.describe(summary)
+    with pytest.raises(SceneError, match=r"times: 1 steps of the log are not 0\.1 s long; step 39 is 0\.2 s"):
+        gate(later(0.1), reject=QUALITY["reject"])
 
 
 def test_a_log_of_one_step_can_be_judged():

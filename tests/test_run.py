@@ -21,7 +21,7 @@ from scene_documents import document, thing, written
 
 import scenefactory_jax
 from scenefactory_jax import __main__ as command_line
-from scenefactory_jax import world
+from scenefactory_jax import folders, world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import failures, opengl, tables
@@ -168,10 +168,10 @@ def test_what_does_not_go_on_changes_nothing(whole, tmp_path):
 
 def test_one_command_at_a_time_trains_in_a_folder(tmp_path):
     settings = smoke(tmp_path / "a" / "run")
-    refused = pytest.raises(train_folder.Busy, match="another command trains there now")
+    refused = pytest.raises(folders.Busy, match="another command writes there now")
     with train_folder.opened(settings), refused, train_folder.opened(settings):
         pass
-    (tmp_path / "a" / "run").rmdir()  # no lock is left where nothing began
+    (tmp_path / "a" / "run").rmdir()  # no lock is left
 
 
 def test_a_training_that_cannot_begin_removes_what_it_made_and_nothing_else(tmp_path):

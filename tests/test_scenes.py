@@ -28,8 +28,11 @@ import scenefactory_jax as sf
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import raws
 from scenefactory_jax.scenes import bank, checks, columns, pack, source
-from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.logs import wrapped
+from scenefactory_jax.scenes.raw import Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import EDGES
+
+OLD_CHECK = {"track_speed_limit_m_s": 45.0, "car_size_m": [4.0, 2.0, 1.0]}  # what runs of before 2026-11-24 say
 
 
 @pytest.fixture(scope="module")
@@ -272,15 +275,73 @@ def test_refusals_name_the_element(street):
     refused("current: 40 is no step", current=40)
     far = street.roads[1].xyz.copy()
     far[4, 1] = -1e39  # finite, but not in float32
-    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: -1e\+39 is more than any map has; valid: up to 1e\+07", roads=(
+    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: -1e\+39 is too large; valid: up to 1e\+07", roads=(
         street.roads[0], replace(street.roads[1], xyz=far)))  # fmt: skip
     fast = street.tracks[1].velocity.copy()
     fast[5, 0] = 1e39
-    refused(r"tracks\[1\] \(id 8\): velocity\[5\]: 1e\+39 is more", tracks=(street.tracks[0], replace(street.tracks[1], velocity=fast)))
+    refused(r"tracks\[1\] \(id 8\): velocity\[5\]: 1e\+39 is too large", tracks=(
+        street.tracks[0], replace(street.tracks[1], velocity=fast)))  # fmt: skip
     long = replace(street.tracks[0], size=(1e39, 2.0, 1.0))
-    refused(r"tracks\[0\] \(id 7\): size\[0\]: 1e\+39 is more", tracks=(long, street.tracks[1]))
+    refused(r"tracks\[0\] \(id 7\): size\[0\]: 1e\+39 is too large", tracks=(long, street.tracks[1]))
     refused("times: they must be finite and rise", times=np.zeros(STEPS))
     refused("sdc: 5 is no track", sdc=5)
+    light = Light(lane=1, state=np.zeros(STEPS - 1, int), valid=np.ones(STEPS - 1, bool))
+    refused(rf"lights\[0\] \(lane 1\): {STEPS - 1} steps; the log has {STEPS}", lights=(light,))
+
+
+def test_no_single_number_asks_for_much_work(street):
+    """Every number below is finite and no coordinate is larger than UTM's northings."""
+
+    def refused(message, **changes):
+        with pytest.raises(SceneError, match=message):
+            checker()(replace(street, **changes))
+
+    edge, lane, sign = street.roads
+    car, other = street.tracks
+    far = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e7, 0.0, 0.0]])
+    message = r"roads\[1\] \(id 1\): the segment from xyz\[1\] is 1e\+07 m long; valid: up to 1000 \(scenes\.check\.segment_most_m\)"
+    refused(message, roads=(edge, replace(lane, xyz=far), sign))
+    refused(r"roads\[0\].*segment_most_m", roads=(replace(edge, xyz=far[1:]), lane))
+    to_and_fro = 900.0 * (np.arange(120) % 2)[:, None] * np.array([1.0, 0.0, 0.0])
+    message = r"roads: 107180 m of driving lanes; valid: up to 100000 \(scenes\.check\.lanes_most_m\)"
+    refused(message, roads=(edge, lane, replace(lane, id=5, xyz=to_and_fro)))
+    checker()(replace(street, roads=(replace(edge, xyz=to_and_fro), lane)))  # nothing counts along edges
+    refused(r"tracks\[1\] \(id 8\): velocity\[0\]: 9e\+06 .* 340", tracks=(car, replace(other, velocity=other.velocity + 9e6 - 40)))
+    refused(r"size\[1\]: 1e\+06 is too large; valid: up to 100 \(scenes\.check\.size", tracks=(replace(car, size=(4.0, 1e6, 1.0)),))
+    refused(r"times: 20000 steps; valid: up to 10000 \(scenes\.check\.steps_most\)", times=np.arange(20_000.0))
+    refused(r"times\[11\]: 1e\+06 s after the step before; valid: 0\.001 to 10 s", times=np.append(street.times[:-1], 1e6 + 1.0))
+    refused(r"times\[1\]: 1e-12 s after", times=1e-12 * np.arange(STEPS))
+    checks.check(replace(street, roads=(edge, replace(lane, xyz=far))), **OLD_CHECK)  # a run from before judges as it did
+
+
+def test_a_jitter_of_the_clock_is_resampled_and_counted(street):
+    steps, current = np.arange(199), 50
+    times = 0.1 * steps
+    times[120:] += 0.01
+    x, yaw = 8.0 * times, wrapped(np.pi - 0.05 + 0.01 * times)  # past pi
+    xyz, velocity = np.stack([x, 0 * x, 0 * x], axis=1), np.tile([8.0, 0.0], (199, 1))
+    car = Track(7, "vehicle", (4.0, 2.0, 1.5), xyz, yaw, velocity, np.ones(199, bool))
+    brief = replace(car, id=8, valid=(steps >= 60) & (steps < 150))
+    light = Light(lane=1, state=steps % 9, valid=steps < 190)
+    log = replace(street, tracks=(car, brief), times=times, current=current, sdc=0, lights=(light,))
+    even, lines = checker()(log)
+    assert lines == ["logs of uneven steps resampled: 1 of 198 steps are not 0.1 s long, by up to 10 ms"]
+    assert len(even.times) == 199 and even.times[even.current] == times[current] and even.lights[0].valid.sum() == 191
+    np.testing.assert_allclose(np.diff(even.times), 0.1, atol=1e-9)
+    for track in even.tracks:
+        seen = track.valid
+        np.testing.assert_allclose(track.xyz[seen, 0], 8.0 * even.times[seen], atol=1e-9)
+        np.testing.assert_allclose(wrapped(track.yaw - np.pi - 0.01 * even.times)[seen], -0.05, atol=1e-9)
+        assert not track.xyz[~seen].any() and (track.velocity[seen] == [8.0, 0.0]).all()
+    assert even.tracks[0].valid.all() and np.flatnonzero(even.tracks[1].valid)[[0, -1]].tolist() == [60, 149]
+    once = 0.1 * steps
+    once[120] += 0.01  # one stamp is late, the rest is in time
+    even, lines = checker()(replace(log, times=once))
+    assert len(even.times) == 199 and "2 of 198 steps" in lines[0]
+    np.testing.assert_array_equal(even.tracks[0].xyz[:119], car.xyz[:119])
+    np.testing.assert_array_equal(even.lights[0].state[:119], light.state[:119])
+    for kept in (0.1 * steps + 2e-4 * (steps % 2), 0.1 * steps + 0.1 * (steps >= 120)):  # a clock's noise; a step is missing
+        assert checker()(replace(log, times=kept))[0].times is kept
 
 
 # ---- packing

@@ -14,10 +14,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from scenefactory_jax import folders
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, train_folder, whole
+from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, whole
 from scenefactory_jax.run.evaluate import make_examiner
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 from scenefactory_jax.run.study_report import RESULT, TRAINED
@@ -201,7 +202,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             sharing = min(shared.config["per_gpu"], shared.config["processes"])
             try:
                 note = _train_one(one, own) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
-            except train_folder.Busy:
+            except folders.Busy:
                 print(f"training {one.variant}, seed {one.seed}: left to the command that trains in {one.folder}", flush=True)
                 continue
             spent[program] = time.monotonic() - begun

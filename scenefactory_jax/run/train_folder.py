@@ -7,23 +7,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from scenefactory_jax import folders
 from scenefactory_jax.build import ConfigError, differing
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.run import config as configs
 
-try:
-    import fcntl
-except ImportError:  # not on Windows: two commands in one folder are the user's own care there
-    fcntl = None
-
-LOCK = ".train.lock"
 # What may be another when a run goes on, and all below it: nothing that was learnt rests on it
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
 FREE += ("loggers", "evaluation", "scenes.heldout")
-
-
-class Busy(ConfigError):
-    """Another command trains in the folder."""
 
 
 @contextlib.contextmanager
@@ -32,11 +23,11 @@ def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
 
     Raises:
         ConfigError: a folder that holds a run already, or `resume` where there is none, or one of other settings.
-        Busy: another command trains there.
+        folders.Busy: another command trains there.
     """
     if config["resume"] and config["out"] is None:
         raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
-    with _made(config) as folder, _alone(folder):
+    with _made(config) as folder, folders.alone(folder):
         yield folder, _goes_on(folder, config)
 
 
@@ -46,7 +37,7 @@ def _made(config: Mapping[str, Any]) -> Iterator[Path]:
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     named, base = config["out"] is not None, Path(config["out"] or f"runs/{config['name']}-{stamp}")
     for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
-        new = [place for place in (folder, *folder.parents) if not place.exists()]
+        new = folders.missing(folder)
         try:
             folder.mkdir(parents=True, exist_ok=named)
             break
@@ -56,28 +47,8 @@ def _made(config: Mapping[str, Any]) -> Iterator[Path]:
     try:
         yield folder
     except BaseException:
-        with contextlib.suppress(OSError):  # it holds something
-            for place in new:
-                place.rmdir()
+        folders.remove_empty(new)
         raise
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """A lock on the folder, which the system takes back however the process ends."""
-    with open(folder / LOCK, "a") as file:
-        try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise Busy(f"out={folder}: another command trains there now; wait for its end, or choose another folder") from None
-        except OSError:  # a file system without locks
-            pass
-        try:
-            yield
-        finally:
-            if not (folder / configs.FILE).is_file():
-                (folder / LOCK).unlink(missing_ok=True)
 
 
 def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import tempfile
+import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,12 +17,14 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
+from scenefactory_jax import folders
 from scenefactory_jax.scenes import arrow, bank_index, catalogue, shard_files
 from scenefactory_jax.scenes.bank_index import Index, Shard
 from scenefactory_jax.scenes.raw import SceneError
 
 Compression = Literal["zstd", "lz4"] | None
-OWN = re.compile(r"\.?(part|scenes|metadata)-\d+\.arrow|\.bank\.json")  # what a conversion leaves that was killed before its first shard
+# what a conversion leaves that was killed before its first shard
+OWN = re.compile(rf"\.?(part|scenes|metadata)-\d+(-\w+)?\.arrow|\.bank\.json|{re.escape(folders.LOCK)}")
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_part(folder: Path, number: int, batches: Iterable[pa.RecordBatch]) -> Path:
     """Scenes of one source file, for `grow` to collect."""
-    path = folder / f".part-{number:07d}.arrow"
+    path = folder / f".part-{number:07d}-{uuid.uuid4().hex}.arrow"  # a process whose command was killed may still write its own
     with _writer(path, arrow.SCHEMA, None) as writer:
         for batch in batches:
             writer.write_batch(batch)
@@ -175,21 +178,23 @@ def refer(
 def replacing(path: Path) -> Iterator[Path]:
     """A new folder beside `path` that takes its place at the end; what an error leaves of it vanishes.
 
+    No other command writes to `path` meanwhile.
+
     Raises:
         SceneError: the path exists and is no bank.
+        folders.Busy: another command writes there.
     """
     require_free(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
-        made = workshop / "new"
-        made.mkdir()
-        yield made
-        if path.exists():
+    with folders.alone(path):
+        workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            made = workshop / "new"
+            made.mkdir()
+            yield made
             path.rename(workshop / "old")
-        made.rename(path)
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+            made.rename(path)
+        finally:
+            shutil.rmtree(workshop, ignore_errors=True)
 
 
 def require_free(path: Path) -> None:

@@ -1,11 +1,12 @@
 """What a scene must be before it is packed: refused by name where nothing can be done, repaired and counted where something can."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from scenefactory_jax.scenes.logs import Logs, Points, joined, lengths, stacked
+from scenefactory_jax.scenes.logs import Logs, Points, grid, joined, lengths, sampled, stacked
 from scenefactory_jax.scenes.raw import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import DRIVABLE, STOP_SIGN
 
@@ -15,24 +16,49 @@ NAMED = 5  # how many offenders a line names
 
 
 def check(
-    raw: RawScene, *, track_speed_limit_m_s: float, car_size_m: list[float], most_m: float = 1e7
+    raw: RawScene,
+    *,
+    track_speed_limit_m_s: float,
+    car_size_m: list[float],
+    most_m: float = 1e7,
+    segment_most_m: float = math.inf,
+    lanes_most_m: float = math.inf,
+    size_most_m: float = math.inf,
+    speed_most_m_s: float = math.inf,
+    steps_most: float | int = math.inf,
+    step_s: Sequence[float] = (0.0, math.inf),
+    uneven_share: Sequence[float] = (math.inf, math.inf),
 ) -> tuple[RawScene, list[str]]:
     """A scene that can be packed, and one line for each kind of repair or finding.
+
+    The bounds keep the work on a scene in proportion to its file: one damaged number must not ask for 10^7 points along a lane. The configs
+    of older runs name `most_m` at most; they have no other bound.
 
     Args:
         raw: as a reader or a generator gave it.
         track_speed_limit_m_s: a track whose positions imply more than that in a step is reported as jumping.
         car_size_m: length, width, height given to objects whose logged size is not positive.
-        most_m: no coordinate, size or speed is larger; the configs of older runs do not say it.
+        most_m: largest coordinate, and largest yaw in radians.
+        segment_most_m: largest distance between neighbouring points of a polyline.
+        lanes_most_m: largest length of all driving lanes together.
+        size_most_m: largest length, width and height of an object.
+        speed_most_m_s: largest velocity along x or y.
+        steps_most: most steps of a log.
+        step_s: shortest and longest step of a log.
+        uneven_share: logs whose steps differ from the median step by more than the first share of it, and by no more than the second, are
+            resampled to even steps; logs that are more uneven stay as they are.
 
     Raises:
-        SceneError: steps that disagree, no driving lane, or a number that is not finite or too large, naming the file and the element.
+        SceneError: steps that disagree, no driving lane, or a number that is not finite or beyond a bound, naming the file and the element.
     """
-    _require_steps(raw)
+    _require_steps(raw, steps_most, step_s)
     points, logs = joined(raw.roads), stacked(raw.tracks, len(raw.times))
     _require_map(raw, points, most_m)
-    _require_tracks(raw, logs, most_m)
+    _require_lengths(raw, points, segment_most_m, lanes_most_m)
+    _require_tracks(raw, logs, {"xyz": (most_m, "most_m"), "yaw": (most_m, "most_m"), "velocity": (speed_most_m_s, "speed_most_m_s")})
+    _require_sizes(raw, logs, size_most_m)
     lines: list[str] = []
+    raw, logs = _even_steps(raw, logs, uneven_share, lines)
     whole = _repair_roads(raw.roads, points, lines)
     roads = _known(whole, lines)
     if not any(line.kind in DRIVABLE for line in roads):
@@ -43,11 +69,17 @@ def check(
     return replace(raw, roads=roads, tracks=tracks, sdc=sdc), lines
 
 
-def _require_steps(raw: RawScene) -> None:
-    """Times rise, the current step is one of them, and every track has all of them."""
+def _require_steps(raw: RawScene, most: float | int, step_s: Sequence[float]) -> None:
+    """Times rise by steps that a log can have, the current step is one of them, and every track and light has all of them."""
     steps = len(raw.times)
-    if not np.all(np.isfinite(raw.times)) or np.any(np.diff(raw.times) <= 0):
+    if steps > most:
+        raise SceneError(f"{raw.source}: times: {steps} steps; valid: up to {most:g} (scenes.check.steps_most)")
+    span = np.diff(raw.times)
+    if not np.all(np.isfinite(raw.times)) or np.any(span <= 0):
         raise SceneError(f"{raw.source}: times: they must be finite and rise from step to step")
+    if (bad := np.flatnonzero((span < step_s[0]) | (span > step_s[1]))).size:
+        valid = f"{step_s[0]:g} to {step_s[1]:g} s (scenes.check.step_s)"
+        raise SceneError(f"{raw.source}: times[{bad[0] + 1}]: {span[bad[0]]:g} s after the step before; valid: {valid}")
     if not 0 <= raw.current < steps:
         raise SceneError(f"{raw.source}: current: {raw.current} is no step of the log; valid: 0 to {steps - 1}")
     if raw.sdc is not None and not 0 <= raw.sdc < len(raw.tracks):
@@ -55,6 +87,9 @@ def _require_steps(raw: RawScene) -> None:
     for index, track in enumerate(raw.tracks):
         if not len(track.valid) == len(track.xyz) == len(track.yaw) == len(track.velocity) == steps:
             raise SceneError(f"{raw.source}: tracks[{index}] (id {track.id}): {len(track.valid)} steps; the log has {steps}")
+    for index, light in enumerate(raw.lights):
+        if not len(light.valid) == len(light.state) == steps:
+            raise SceneError(f"{raw.source}: lights[{index}] (lane {light.lane}): {len(light.valid)} steps; the log has {steps}")
 
 
 def _require_map(raw: RawScene, points: Points, most: float) -> None:
@@ -62,32 +97,81 @@ def _require_map(raw: RawScene, points: Points, most: float) -> None:
     bad = ~(np.abs(points.xyz) <= most)
     if bad.any():
         row, axis = np.argwhere(bad)[0]
-        index = int(np.searchsorted(points.bounds, row, side="right")) - 1
-        place = f"roads[{index}] (id {raw.roads[index].id}): xyz[{row - points.bounds[index]}][{axis}]"
-        raise SceneError(f"{raw.source}: {place}: {_fault(float(points.xyz[row, axis]), most)}")
+        place, number = _polyline(raw, points, int(row))
+        raise SceneError(f"{raw.source}: {place}: xyz[{number}][{axis}]: {_fault(float(points.xyz[row, axis]), most, 'most_m')}")
 
 
-def _require_tracks(raw: RawScene, logs: Logs, most: float) -> None:
-    """No NaN, infinity or absurd number in a track's valid steps, and no absurd size."""
+def _require_lengths(raw: RawScene, points: Points, segment_most: float, lanes_most: float) -> None:
+    """No segment, and no sum of driving lanes, so long that a damaged coordinate is the likely cause."""
+    owner = np.repeat(np.arange(len(raw.roads)), np.diff(points.bounds))
+    length = np.linalg.norm(np.diff(points.xyz, axis=0), axis=1) * (owner[1:] == owner[:-1])
+    if (bad := np.flatnonzero(length > segment_most)).size:
+        place, number = _polyline(raw, points, int(bad[0]))
+        fault = f"{length[bad[0]]:g} m long; valid: up to {segment_most:g} (scenes.check.segment_most_m)"
+        raise SceneError(f"{raw.source}: {place}: the segment from xyz[{number}] is {fault}")
+    drivable = np.array([line.kind in DRIVABLE for line in raw.roads], bool)
+    if (total := float(length[drivable[owner[1:]]].sum())) > lanes_most:
+        raise SceneError(f"{raw.source}: roads: {total:g} m of driving lanes; valid: up to {lanes_most:g} (scenes.check.lanes_most_m)")
+
+
+def _polyline(raw: RawScene, points: Points, row: int) -> tuple[str, int]:
+    """The polyline that a point belongs to, in words, and the point's number on it."""
+    index = int(np.searchsorted(points.bounds, row, side="right")) - 1
+    return f"roads[{index}] (id {raw.roads[index].id})", int(row - points.bounds[index])
+
+
+def _require_tracks(raw: RawScene, logs: Logs, most: Mapping[str, tuple[float, str]]) -> None:
+    """No NaN, infinity or absurd number in a track's valid steps.
+
+    Args:
+        most: column of the log -> the largest number in it, and the bound's name in the config.
+    """
     found = []
-    for name in ("xyz", "yaw", "velocity"):
+    for name, (bound, key) in most.items():
         table = getattr(logs, name).reshape(*logs.valid.shape, -1)
-        bad = ~(np.abs(table) <= most) & logs.valid[..., None]
+        bad = ~(np.abs(table) <= bound) & logs.valid[..., None]
         if bad.any():
             index, step, axis = np.argwhere(bad)[0]
-            found.append((int(index), f"{name}[{step}]: {_fault(float(table[index, step, axis]), most)}"))
-    huge = np.isfinite(logs.size) & (logs.size > most)  # what is not finite is repaired
-    found += [(int(index), f"size[{axis}]: {_fault(float(logs.size[index, axis]), most)}") for index, axis in np.argwhere(huge)[:1]]
+            found.append((int(index), f"{name}[{step}]: {_fault(float(table[index, step, axis]), bound, key)}"))
     if found:
         index, place = min(found, key=lambda one: one[0])
         raise SceneError(f"{raw.source}: tracks[{index}] (id {raw.tracks[index].id}): {place}")
 
 
-def _fault(value: float, most: float) -> str:
+def _require_sizes(raw: RawScene, logs: Logs, most: float) -> None:
+    """No absurd size; what is not finite is repaired."""
+    huge = np.argwhere(np.isfinite(logs.size) & (logs.size > most))
+    if len(huge):
+        index, axis = huge[0]
+        fault = _fault(float(logs.size[index, axis]), most, "size_most_m")
+        raise SceneError(f"{raw.source}: tracks[{index}] (id {raw.tracks[index].id}): size[{axis}]: {fault}")
+
+
+def _fault(value: float, most: float, key: str) -> str:
     """What is wrong with a number."""
     if not np.isfinite(value):
         return f"{value} is not finite"
-    return f"{value:g} is more than any map has; valid: up to {most:g} (scenes.check.most_m)"
+    return f"{value:g} is too large; valid: up to {most:g} (scenes.check.{key})"
+
+
+def _even_steps(raw: RawScene, logs: Logs, share: Sequence[float], lines: list[str]) -> tuple[RawScene, Logs]:
+    """A log whose steps are somewhat uneven, at even steps; any other as it is."""
+    span = np.diff(raw.times)
+    usual = float(np.median(span)) if len(span) else 1.0
+    off = np.abs(span - usual) / usual
+    if not share[0] < off.max(initial=0.0) <= share[1]:
+        return raw, logs
+    times, current = grid(raw.times, raw.current, step_s=usual, near=share[0])
+    even = sampled(logs, raw.times, times, near=share[0])
+    tracks = tuple(
+        replace(track, xyz=even.xyz[row], yaw=even.yaw[row], velocity=even.velocity[row], valid=even.valid[row])
+        for row, track in enumerate(raw.tracks)
+    )
+    last = np.searchsorted(raw.times, times + share[0] * usual, side="right") - 1  # a light holds from one step to the next
+    lights = tuple(replace(light, state=light.state[last], valid=light.valid[last]) for light in raw.lights)
+    count, worst = int((off > share[0]).sum()), 1e3 * usual * off.max()
+    lines.append(f"logs of uneven steps resampled: {count} of {len(span)} steps are not {usual:.3g} s long, by up to {worst:.3g} ms")
+    return replace(raw, times=times, current=current, tracks=tracks, lights=lights), even
 
 
 def _known(roads: tuple[Polyline, ...], lines: list[str]) -> tuple[Polyline, ...]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from scenefactory_jax import folders
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.scenes import arrow, bank, bank_index, bank_writer, catalogue, source
 from scenefactory_jax.scenes import spread as spreads
@@ -77,37 +78,35 @@ def convert(
     Raises:
         SceneError: no files, `out` is no bank or one made with other settings, or not one usable scene, with the first reasons.
         ConfigError: a number that a part refuses.
+        folders.Busy: another command writes to `out`.
     """
     root, out = Path(path).absolute(), Path(out).resolve()
     files = source.find(root)
-    index = _begun(root, out, bank_index.plain({"source": str(root), **settings}))
-    known = set(index.files)
-    waiting = [file for file in files if _name(file, root) not in known]
-    done = len(files) - len(waiting)
-    fresh = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
+    bank_writer.require_free(out)
     work = functools.partial(convert_file, root=root, out=out, formats=dict(formats), check=check, pack=pack)
     work = functools.partial(work, refine=refine, features=features)
 
-    def pieces() -> Iterator[Piece]:
+    def pieces(waiting: Sequence[Path]) -> Iterator[Piece]:
+        done = len(files) - len(waiting)
         for number, (file, piece) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
             lost = isinstance(piece, spreads.Lost)
             yield Piece(_name(file, root), rejects=({"source": str(file), "scene": None, "reason": piece.reason},)) if lost else piece
             if on_file is not None:
                 on_file(number, len(files))
 
-    try:
-        index = bank_writer.grow(out, pieces(), index=index, shard_scenes=shard_scenes, compression=compression)
-    finally:
-        bank_writer.remove_parts(out)
-        if fresh and not any(out.iterdir()):
-            out.rmdir()
+    with folders.alone(out):
+        index = _begun(root, out, bank_index.plain({"source": str(root), **settings}))
+        known = set(index.files)
+        waiting = [file for file in files if _name(file, root) not in known]
+        try:
+            index = bank_writer.grow(out, pieces(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
+        finally:
+            bank_writer.remove_parts(out)
     return _summary(index)
 
 
 def _begun(root: Path, out: Path, settings: dict[str, Any]) -> Index:
     """The index of the bank that is there, if these settings made it, without the files that gave nothing; else that of a new one."""
-    bank_writer.require_free(out)
     if not bank_index.is_bank(out):
         return Index(settings)
     index = bank_index.read(out)

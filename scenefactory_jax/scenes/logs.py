@@ -36,6 +36,40 @@ def stacked(tracks: Sequence[Track], steps: int) -> Logs:
     return Logs(**{name: np.array(rows[name], types[name]).reshape(len(tracks), *tail) for name, tail in tails.items()})
 
 
+def grid(times: Float[np.ndarray, " L"], current: int, *, step_s: float, near: float) -> tuple[Float[np.ndarray, " K"], int]:
+    """Times at even steps within a log, one of which is the current step's; and the number of that one.
+
+    Args:
+        near: share of a step by which the grid may reach beyond the log's ends, where it is cut.
+    """
+    before = int(np.floor((times[current] - times[0]) / step_s + near))
+    after = int(np.floor((times[-1] - times[current]) / step_s + near))
+    return np.clip(times[current] + step_s * np.arange(-before, after + 1), times[0], times[-1]), before
+
+
+def sampled(logs: Logs, times: Float[np.ndarray, " L"], wanted: Float[np.ndarray, " K"], *, near: float) -> Logs:
+    """The tracks at other times, in straight lines between steps; valid where the steps on both sides are, zeros elsewhere.
+
+    Args:
+        times: of the logs' two steps or more, rising.
+        wanted: within these.
+        near: share of a step; at a time so near to a step that step alone counts.
+    """
+    before = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(times) - 2)
+    share = (wanted - times[before]) / (times[before + 1] - times[before])
+    share = np.where(share <= near, 0.0, np.where(share >= 1 - near, 1.0, share))
+    valid = (logs.valid[:, before] | (share == 1)) & (logs.valid[:, before + 1] | (share == 0))
+
+    def between(table: Float[np.ndarray, "T L D"], turn: bool = False) -> Float[np.ndarray, "T K D"]:
+        known = np.where(logs.valid[..., None], table, 0.0)
+        step = known[:, before + 1] - known[:, before]
+        found = known[:, before] + share[:, None] * (wrapped(step) if turn else step)
+        return np.where(valid[..., None], found, 0.0)
+
+    yaw = between(logs.yaw[..., None], turn=True)[..., 0]
+    return Logs(between(logs.xyz), yaw, between(logs.velocity), valid, logs.size)
+
+
 def joined(lines: Sequence[Polyline]) -> Points:
     """The points of polylines, and where each begins."""
     xyz = [line.xyz for line in lines]

@@ -28,6 +28,10 @@ class OtherFormat(SceneError):
     """The file is not in the format of this reader; the next reader may try."""
 
 
+class OtherContent(OtherFormat):
+    """The file is of this reader's container (JSON, pickle, parquet, TFRecord), but what it holds is of another format."""
+
+
 class Companion(SceneError):
     """The file holds no scene of its own but belongs to scenes beside it (a map, an index): neither read nor rejected, but counted."""
 

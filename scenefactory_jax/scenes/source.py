@@ -2,13 +2,16 @@
 
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.build import build
-from scenefactory_jax.scenes.raw import OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.scenes.formats import foreign
+from scenefactory_jax.scenes.raw import OtherContent, OtherFormat, RawScene, Reject, SceneError
 
+REASON = 80  # characters of what one reader says of a file that is not its own
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
 Reader = Callable[[Path], Iterator[RawScene | Reject]]
 
@@ -61,22 +64,35 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
 
     Raises:
         Companion: the file belongs to scenes beside it.
-        SceneError: a folder that cannot be listed; no reader knows the format, each with its reason; or what the one that does found wrong.
+        SceneError: a folder that cannot be listed; no reader knows the format, which is named if it can be told; or what the reader that knows
+            it found wrong.
     """
     if Path(path).is_dir():
         raise SceneError(f"{path}: a folder that cannot be listed; allow it to be read, or give the files beside it")
-    refusals = []
+    near: list[str] = []
     for name, reader in formats.items():
         scenes = iter(reader(Path(path)))
         try:
             first = next(scenes, None)
-        except OtherFormat as refusal:
-            reason = str(refusal).removeprefix(f"{path}: ")
-            refusals.append(f"{name}: {reason}")
+        except OtherContent as refusal:
+            near.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", REASON))
+            continue
+        except OtherFormat:
             continue
         if first is None:
             raise SceneError(f"{path}: no scene in it, says the reader {name!r}")
         yield first
         yield from scenes
         return
-    raise SceneError(f"{path}: no reader knows this format ({'; '.join(refusals) or 'there are no readers'})")
+    raise SceneError(f"{path}: {_refusal(Path(path), near)}; formats: {', '.join(formats) or 'none'}")
+
+
+def _refusal(path: Path, near: Sequence[str]) -> str:
+    """Why no reader reads a file: what it is, or else what those say that read other files of its kind, or else how it begins."""
+    with path.open("rb") as file:
+        head = file.read(foreign.HEAD)
+    if not head:
+        return "an empty file"
+    if name := foreign.find_name(head):
+        return f"this is {name}: it is not read"
+    return f"no reader knows this format: {'; '.join(near) or f'it begins with {head[:16]!r}'}"

@@ -1,11 +1,14 @@
 """Work spread over processes or machines, whose results come in order, and which a death does not end.
 
 A spread is a function `(work, items) -> results`, bound to its numbers; `map` is one. A process that dies or takes too long loses its item
-and nothing else: a `Lost` comes in place of the result. Entries of `conf/spread/` name the functions here.
+and nothing else: a `Lost` comes in place of the result. Work that a process cannot load, for want of a module, ends everything with the
+reason. Entries of `conf/spread/` name the functions here.
 """
 
+import functools
 import importlib
 import multiprocessing
+import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,6 +19,7 @@ from typing import Any, NamedTuple
 from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes.raw import SceneError
 
+HERE = "spread=local scenes.workers=1 spread.timeout_s=null does without other processes"
 Work = Callable[[Any], Any]
 Spread = Callable[[Work, Sequence[Any]], Iterable[Any]]
 
@@ -26,33 +30,40 @@ class Lost(NamedTuple):
     reason: str
 
 
+class Unloadable(NamedTuple):
+    """What comes in place of every result where the work itself cannot be loaded."""
+
+    reason: str
+
+
 def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | None) -> Iterator[Any]:
     """Over processes of this machine, started fresh: forking a process in which JAX runs may hang it.
 
     Args:
         work: a function of a module, bound to what can be sent to another process.
         items: each goes to a process that is free.
-        workers: processes; 1 works in this one, and dies with it.
+        workers: processes; 1 without a limit of time works in this process, and dies with it.
         timeout_s: an item that takes longer is lost; null: no limit.
 
     Raises:
-        SceneError: a process cannot be started.
+        SceneError: a process cannot be started, or cannot load the work.
         ConfigError: numbers with which nothing would be done, or what an item's work says of the config.
     """
     check_number(workers, where="spread.workers", least=1)
     if timeout_s is not None:
         check_number(timeout_s, where="spread.timeout_s", above=0)
-    if workers == 1:
+    if workers == 1 and timeout_s is None:
         yield from map(work, items)
         return
+    packed = _packed(work, pickle.dumps)
     waiting, done = deque(enumerate(items)), {}
     busy: dict[Connection, tuple[BaseProcess, int | None]] = {}  # and the item that the process has; None while it starts
     try:
-        busy.update(_start(work, timeout_s) for _ in range(min(workers, len(items))))
+        busy.update(_start(packed, timeout_s) for _ in range(min(workers, len(items))))
         for number in range(len(items)):
             while number not in done:
                 for connection in wait(list(busy)):
-                    _answer(connection, busy, waiting, done, work, timeout_s)  # pyright: ignore[reportArgumentType]
+                    _answer(connection, busy, waiting, done, packed, timeout_s)  # pyright: ignore[reportArgumentType]
             yield _passed(done.pop(number))
     finally:
         for connection, (process, _) in busy.items():
@@ -60,12 +71,21 @@ def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | 
             process.terminate()
 
 
+def _packed(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
+    """The work as bytes, which a process loads where it can say what goes wrong."""
+    try:
+        return dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises all three for what it cannot send
+        wanted = "readers and parts must be functions of a module"
+        raise SceneError(f"spread: the work cannot be sent to another process: {error}; {wanted}; {HERE}") from error
+
+
 def _answer(
     connection: Connection,
     busy: dict[Connection, tuple[BaseProcess, int | None]],
     waiting: deque[tuple[int, Any]],
     done: dict[int, Any],
-    work: Work,
+    packed: bytes,
     timeout_s: float | None,
 ) -> None:
     """Take a result, or the news of a death, and give the process or its successor the next item."""
@@ -75,10 +95,11 @@ def _answer(
     except (EOFError, OSError):
         process.join()
         if place is None:
-            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; try workers=1") from None
+            guard = 'a script needs `if __name__ == "__main__":`'
+            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {guard}; {HERE}") from None
         done[place] = Lost(_death(process, timeout_s))
         if waiting:
-            busy.update([_start(work, timeout_s)])
+            busy.update([_start(packed, timeout_s)])
         return
     if place is not None:
         done[place] = answer
@@ -91,29 +112,30 @@ def _answer(
         busy[connection] = process, following
     except OSError:  # it died without work: the item is not to blame
         waiting.appendleft((following, item))
-        busy.update([_start(work, timeout_s)])
+        busy.update([_start(packed, timeout_s)])
 
 
-def _start(work: Work, timeout_s: float | None) -> tuple[Connection, tuple[BaseProcess, None]]:
+def _start(packed: bytes, timeout_s: float | None) -> tuple[Connection, tuple[BaseProcess, None]]:
     context = multiprocessing.get_context("spawn")
     ours, its = context.Pipe()
-    process = context.Process(target=_serve, args=(its, work, timeout_s), daemon=True)
+    process = context.Process(target=_serve, args=(its, packed, timeout_s), daemon=True)
     process.start()
     its.close()  # only the process has it now: the pipe breaks when the process dies
     return ours, (process, None)
 
 
-def _serve(connection: Connection, work: Work, timeout_s: float | None) -> None:
+def _serve(connection: Connection, packed: bytes, timeout_s: float | None) -> None:
     """A process's life: it says that it is there, then answers until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the one that started this one ends it
     try:
         connection.send(None)
         while True:
-            connection.send(_timed(work, timeout_s, connection.recv()))
+            connection.send(_timed(packed, timeout_s, connection.recv()))
     except (EOFError, OSError):
         return
 
 
-def _timed(work: Work, timeout_s: float | None, item: Any) -> Any:
+def _timed(packed: bytes, timeout_s: float | None, item: Any) -> Any:
     """The result, or why there is none; of a mistake in the config the error itself.
 
     Past its time the kernel's alarm ends the process, whatever code it hangs in.
@@ -121,7 +143,8 @@ def _timed(work: Work, timeout_s: float | None, item: Any) -> Any:
     if timeout_s is not None:
         signal.setitimer(signal.ITIMER_REAL, timeout_s)
     try:
-        return work(item)
+        work = _loaded(packed)
+        return work if isinstance(work, Unloadable) else work(item)
     except ConfigError as error:
         return error
     except Exception as error:
@@ -130,10 +153,22 @@ def _timed(work: Work, timeout_s: float | None, item: Any) -> Any:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
+@functools.cache
+def _loaded(packed: bytes) -> Work | Unloadable:
+    """The work, loaded once in a process; or why it cannot be: loading imports modules, and whatever these raise is the reason."""
+    try:
+        return pickle.loads(packed)
+    except Exception as error:
+        return Unloadable(f"{type(error).__name__}: {error}")
+
+
 def _passed(result: Any) -> Any:
-    """The result; a mistake in the config is no item's own, and ends the work."""
+    """The result; a mistake in the config, and work that cannot be loaded, are no item's own, and end the work."""
     if isinstance(result, ConfigError):
         raise result
+    if isinstance(result, Unloadable):
+        where = "every process, on every machine of a cluster, must be able to import readers and parts"
+        raise SceneError(f"spread: a process cannot load the work: {result.reason}; {where}; {HERE}")
     return result
 
 
@@ -156,7 +191,7 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
         timeout_s: as for `local`.
 
     Raises:
-        SceneError: Ray is not installed.
+        SceneError: Ray is not installed, or its workers cannot load the work.
         ConfigError: as for `local`.
     """
     check_number(pending, where="spread.pending", least=1)
@@ -168,12 +203,14 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
         raise SceneError('spread=ray: Ray is not installed; `pip install "scenefactory_jax[ray]"`, or spread=local') from error
     cluster.init(address=address, ignore_reinit_error=True)
     task = cluster.remote(num_cpus=1, max_retries=0)(_timed)
-    shared, waiting, ahead = cluster.put(work), deque(items), deque()
+    shared, waiting, ahead = cluster.put(_packed(work, cluster.cloudpickle.dumps)), deque(items), deque()
     while waiting or ahead:
         while waiting and len(ahead) < pending:
             ahead.append(task.remote(shared, timeout_s, waiting.popleft()))
         try:
             result = cluster.get(ahead.popleft())
+        except cluster.exceptions.RayTaskError as error:  # `_timed` raises nothing: it could not be loaded, and the last line says why
+            result = Unloadable(str(error).strip().splitlines()[-1])
         except cluster.exceptions.RayError as error:
             result = Lost(f"Ray: {type(error).__name__}: {str(error).strip().splitlines()[0]}")
         yield _passed(result)

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.scenes.formats import argoverse2_map, documents, identities
 from scenefactory_jax.scenes.logs import wrapped
-from scenefactory_jax.scenes.raw import Companion, OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import Companion, OtherContent, OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import RoadUser
 
 MAGIC = b"PAR1"
@@ -99,7 +99,7 @@ def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int) -> 
     try:
         file = pyarrow.parquet.ParquetFile(io.BytesIO(content), page_checksum_verification=True)
         if missing := [name for name in COLUMNS if name not in file.schema_arrow.names]:
-            raise OtherFormat(f"{path}: a parquet file, but no Argoverse 2 scenario: no column {missing[0]!r}")
+            raise OtherContent(f"{path}: a parquet file, but no Argoverse 2 scenario: no column {missing[0]!r}")
         if file.metadata.num_rows > row_limit:
             raise SceneError(f"{path}: {file.metadata.num_rows} rows; formats.argoverse2.row_limit is {row_limit}")
         table = file.read(columns=list(COLUMNS), use_threads=False).select(list(COLUMNS)).cast(pa.schema(list(COLUMNS.items())))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents, identities
 from scenefactory_jax.scenes.logs import FULL_TURN, wrapped
-from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import ROAD_USERS
 
 # the map element that a type's name stands for where `map_element_id` is missing
@@ -39,7 +39,7 @@ def read(
     """
     document = documents.load(path)
     if missing := [key for key in ("objects", "roads") if key not in document]:
-        raise OtherFormat(f"{path}: no GPUDrive JSON: it has no {missing[0]!r}, but {', '.join(map(str, document)) or 'nothing'}")
+        raise OtherContent(f"{path}: no GPUDrive JSON: it has no {missing[0]!r}, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "
     objects = documents.expect(document["objects"], list, f"{where}objects")
     roads = documents.expect(document["roads"], list, f"{where}roads")

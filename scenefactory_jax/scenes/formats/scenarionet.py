@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents, identities, lines, pickles, scenarionet_layouts
 from scenefactory_jax.scenes.logs import wrapped
-from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, Light, OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, Light, OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import (
     CROSSWALK,
     DRIVEWAY,
@@ -75,11 +75,11 @@ def read(
     """
     document = pickles.load(path, file_limit_mb=file_limit_mb, opcode_limit=opcode_limit)
     if not isinstance(document, dict):
-        raise OtherFormat(f"{path}: no ScenarioNet pickle: it holds no dict but {type(document).__name__}")
+        raise OtherContent(f"{path}: no ScenarioNet pickle: it holds no dict but {type(document).__name__}")
     if document and all(isinstance(key, str) and key.endswith(".pkl") for key in document):
         raise Companion(f"{path}: ScenarioNet's summary or mapping of {len(document)} scenarios")
     if "tracks" not in document or not {"map_features", "map"} & set(document):
-        raise OtherFormat(f"{path}: no ScenarioNet pickle: no 'tracks' and map, but {', '.join(map(str, document)) or 'nothing'}")
+        raise OtherContent(f"{path}: no ScenarioNet pickle: no 'tracks' and map, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "
     document = scenarionet_layouts.today(document, where)
     metadata, features = document["metadata"], document["map_features"]

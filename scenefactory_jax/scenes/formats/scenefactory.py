@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.scenes.formats import documents
-from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import ROAD_USERS
 
+STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.steps_most` less the first step
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 
 
@@ -31,7 +32,7 @@ def read(path: Path, *, step_s: float, size_m: list[float], include_sdc: bool, a
     document = documents.load(path)
     road = document.get("road")
     if not isinstance(road, dict) or "polylines" not in road:
-        raise OtherFormat(f"{path}: no SceneFactory JSON: it has no 'road.polylines', but {', '.join(map(str, document)) or 'nothing'}")
+        raise OtherContent(f"{path}: no SceneFactory JSON: it has no 'road.polylines', but {', '.join(map(str, document)) or 'nothing'}")
     if len(size_m) != 3:
         raise SceneError(f"formats.scenefactory.size_m: {size_m!r} is not [length, width, height]")
     polylines = documents.get(road, "polylines", list, f"{path}: road")
@@ -92,8 +93,8 @@ def _end(record: dict[str, Any], where: str) -> tuple[int, Float[np.ndarray, "4"
         return 0, None
     documents.expect(end, dict, f"{where}.end")
     step = documents.expect(end.get("t_idx", 0), int, f"{where}.end.t_idx")
-    if not 0 <= step < 100_000:
-        raise SceneError(f"{where}.end.t_idx: {step} is no step; valid: 0 or more, counted from the first future sample")
+    if not 0 <= step < STEPS_MOST:
+        raise SceneError(f"{where}.end.t_idx: {step} is no step; valid: 0 to {STEPS_MOST - 1}, counted from the first future sample")
     return step + 1, _pose(end, f"{where}.end")
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scenefactory_jax.scenes.formats import tfrecord, womd_example, womd_scenario
-from scenefactory_jax.scenes.raw import OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.scenes.raw import OtherContent, OtherFormat, RawScene, Reject, SceneError
 
 
 def read(path: Path, *, jump_m: float) -> Iterator[RawScene | Reject]:
@@ -32,7 +32,7 @@ def read(path: Path, *, jump_m: float) -> Iterator[RawScene | Reject]:
                 name = womd_scenario.find_name(scenario)
                 yield womd_scenario.make(scenario, path=path, record=record)
             elif record.number == 0:
-                raise OtherFormat(f"{path}: {record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset")
+                raise OtherContent(f"{path}: {record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset")
             else:
                 yield Reject(None, f"{record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset")
         except OtherFormat:
