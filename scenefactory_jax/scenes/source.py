@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.build import build
+from scenefactory_jax.scenes.formats import documents
 from scenefactory_jax.scenes.raw import OtherFormat, RawScene, Reject, SceneError
 
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
@@ -48,9 +49,17 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
         Companion: the file belongs to scenes beside it.
         SceneError: no reader knows the format, each with its reason; or what the reader that knows it found wrong.
     """
+    with documents.unpacked_once():
+        first, scenes = _begin(Path(path), formats)
+    yield first
+    yield from scenes
+
+
+def _begin(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
+    """What the first reader that knows the format yields first, and the rest of it. See `read`."""
     refusals = []
     for name, reader in formats.items():
-        scenes = iter(reader(Path(path)))
+        scenes = iter(reader(path))
         try:
             first = next(scenes, None)
         except OtherFormat as refusal:
@@ -59,7 +68,5 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
             continue
         if first is None:
             raise SceneError(f"{path}: no scene in it, says the reader {name!r}")
-        yield first
-        yield from scenes
-        return
+        return first, scenes
     raise SceneError(f"{path}: no reader knows this format ({'; '.join(refusals) or 'there are no readers'})")

@@ -35,6 +35,7 @@ from scenefactory_jax.types import (
     STOP_SIGN,
 )
 
+SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"  # beside the scenarios of a database
 LANE_UNKNOWN, LINE_UNKNOWN, EDGE_UNKNOWN = 0, 5, 14  # map elements of WOMD that say no more
 ELEMENTS = {  # MetaDriveType -> WOMD map element
     "LANE_UNKNOWN": LANE_UNKNOWN, "LANE_FREEWAY": LANE_FREEWAY, "LANE_SURFACE_STREET": LANE_STREET, "LANE_BIKE_LANE": LANE_BIKE,
@@ -70,14 +71,14 @@ def read(
 
     Raises:
         OtherFormat: no pickle, or no scenario in it.
-        Companion: a dataset's summary or mapping.
+        Companion: a database's summary or mapping, told by its name: those of large databases are larger than any scenario.
         SceneError: more than data in it, or a value that is missing, of a wrong type or not finite, naming its key.
     """
+    if Path(path).name in (SUMMARY, MAPPING):
+        raise Companion(f"{path}: ScenarioNet's {'summary' if Path(path).name == SUMMARY else 'mapping'} of a database")
     document = pickles.load(path, file_limit_mb=file_limit_mb, opcode_limit=opcode_limit)
     if not isinstance(document, dict):
         raise OtherFormat(f"{path}: no ScenarioNet pickle: it holds no dict but {type(document).__name__}")
-    if document and all(isinstance(key, str) and key.endswith(".pkl") for key in document):
-        raise Companion(f"{path}: ScenarioNet's summary or mapping of {len(document)} scenarios")
     if "tracks" not in document or not {"map_features", "map"} & set(document):
         raise OtherFormat(f"{path}: no ScenarioNet pickle: no 'tracks' and map, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "
