@@ -30,6 +30,7 @@ from scenefactory_jax.types import (
     LANE_FREEWAY,
     LANE_STREET,
     LINES,
+    POLYGONS,
     ROAD_USERS,
     SPEED_BUMP,
     STOP_SIGN,
@@ -102,7 +103,8 @@ def read(
         if kind is not None
     ]
     if dataset != "waymo":
-        roads = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) if len(line.xyz) else line for line in roads]
+        sparse = [len(line.xyz) > 0 and line.kind not in POLYGONS for line in roads]
+        roads = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) if s else line for line, s in zip(roads, sparse, strict=True)]
     left_out = Counter(record["type"] for key, record in features.items() if kinds[key] is None)
     left_out.update("TRAFFIC_LIGHT" for light in lights if light is None)
     yield RawScene(
