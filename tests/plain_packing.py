@@ -3,6 +3,7 @@
 Each function does to one polyline or track after another what `scenes.checks`, `scenes.pack` and `cells` do to all at once.
 """
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -83,10 +84,12 @@ def _report_jumps(raw, limit_m_s, lines):
         lines.append(f"track jumps above {limit_m_s:g} m/s: {steps} steps (ids {_some(ids)})")
 
 
-def pack(raw, *, box_m, centre, gap_m, agents, min_travel_m, car_size_m, start_speed, log_from, require_agents, others, others_least_m):
+def pack(
+    raw, *, box_m, centre, gap_m, outline_m, agents, min_travel_m, car_size_m, start_speed, log_from, require_agents, others, others_least_m
+):
     origin, centred_on = _centre(raw, centre)
     half = box_m / 2
-    road, cut, relief = _segments(raw, origin, half, gap_m)
+    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
     first = raw.current if log_from == "current" else 0
     tracks = [raw.tracks[i] for i in chosen]
@@ -114,19 +117,21 @@ def pack(raw, *, box_m, centre, gap_m, agents, min_travel_m, car_size_m, start_s
     return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
 
 
-def _segments(raw, origin, half, gap_m):
+def _segments(raw, origin, half, gap_m, outline_m):
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
     rows = {name: [] for name in ("midpoint", "direction", "half_length", "arc", "kind", "polyline")}
     cut, heights = dict.fromkeys(CUTS, 0), [np.zeros(0)]
     for index in order:
         line = raw.roads[index]
-        points = line.xyz[:, :2] - origin[:2]
+        polygon = line.kind in (18, 19, 20)
+        xyz = outline(line.xyz, outline_m) if polygon else line.xyz
+        points = xyz[:, :2] - origin[:2]
         delta = np.diff(points, axis=0)
         length = np.linalg.norm(delta, axis=1)
         within = np.abs(points).max(axis=1) <= half
         inside = within[1:] & within[:-1]
-        degenerate, gap = length <= DEGENERATE_M, length > gap_m
+        degenerate, gap = length <= DEGENERATE_M, (length > gap_m) & (not polygon)
         kept = inside & ~degenerate & ~gap
         for reason, mask in zip(CUTS, (~inside, inside & gap, inside & degenerate), strict=True):
             cut[reason] += int(mask.sum())
@@ -136,12 +141,24 @@ def _segments(raw, origin, half, gap_m):
         rows["arc"].append((np.cumsum(length) - length / 2)[kept])
         rows["kind"].append(np.full(kept.sum(), line.kind))
         rows["polyline"].append(np.full(kept.sum(), index))
-        heights.append(line.xyz[1:][kept, 2])
+        heights.append(xyz[1:][kept, 2])
     road = {f"road.{name}": np.concatenate(parts) for name, parts in rows.items()}
     road = {name: leaf.astype(columns.COLUMNS[name].dtype) for name, leaf in road.items()}
     road["road.valid"] = np.ones(len(road["road.kind"]), bool)
     height = np.concatenate(heights)
     return road, cut, float(np.ptp(height)) if len(height) else 0.0
+
+
+def outline(xyz, outline_m):
+    """The way around a polygon, from corner to corner in even steps."""
+    corners = list(xyz)
+    if len(xyz) > 2 and np.hypot(*(xyz[-1] - xyz[0])[:2]) > DEGENERATE_M:
+        corners.append(xyz[0])
+    points = []
+    for here, there in itertools.pairwise(corners):
+        steps = max(int(np.ceil(np.linalg.norm(there - here) / outline_m)), 1)
+        points += [here + step / steps * (there - here) for step in range(steps)]
+    return np.array([*points, corners[-1]])
 
 
 def _choose(raw, origin, half, min_travel_m, slots, car_size_m):

@@ -77,6 +77,14 @@ def test_roads_are_told_apart():
     assert all(kinds[index]["intersections"] == 1 for index in (2, 3, 8, 9))  # a crossing is one, however many lanes cross
 
 
+@pytest.mark.parametrize("places", [(0,), (3,), (7,), (0, 0, 3, 7, 7)], ids=["first", "middle", "last", "several"])
+@pytest.mark.parametrize("kind", [2, 15, 18])
+def test_lines_without_points_add_nothing_but_themselves(small, kind, places):
+    roads = list(np.insert(np.array(small.roads, object), list(places), Polyline(kind=kind, xyz=np.zeros((0, 3)), id=99)))
+    found, wanted = FEATURES(replace(small, roads=tuple(roads))), FEATURES(small)
+    assert found == wanted | {"map_features": 7 + len(places)}
+
+
 def test_order_and_place_change_nothing():
     raw = generated(3)
     here, there = FEATURES(raw), FEATURES(moved(rounded(raw), (5432.1, -987.6, 50.0)))

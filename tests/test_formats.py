@@ -27,7 +27,7 @@ from scenefactory_jax.scenes import source
 from scenefactory_jax.scenes.formats import lines, pickles
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, OtherFormat, SceneError
 
-LIMITS = {"file_limit_mb": 64, "opcode_limit": 10_000_000}
+LIMITS = {key: FORMATS["scenarionet"][key] for key in ("file_limit_mb", "opcode_limit")}
 METRES = 0.01  # positions agree to this
 
 
@@ -136,7 +136,7 @@ def test_the_summary_of_a_database_is_no_scene(shared_data, readers, tmp_path):
     with pytest.raises(Companion, match="summary"):
         one(shared_data / "formats" / "scenarionet" / "dataset_summary.pkl", readers)
     with pytest.raises(Companion, match="mapping"):
-        one(written(tmp_path, dumped({"sd_a.pkl": "", "sd_b.pkl": "part"})), readers)
+        one(written(tmp_path, dumped({"sd_a.pkl": "", "sd_b.pkl": "part"}), "dataset_mapping.pkl"), readers)
 
 
 @pytest.mark.parametrize("layout", [lambda whole: whole, in_spring_2023, in_march_2023], ids=["today", "April 2023", "March 2023"])
@@ -193,7 +193,11 @@ def test_a_hostile_pickle_is_refused_by_name_and_does_nothing(tmp_path, readers)
         (b"\x80\x04\x8a\xff" + b"\x7f" * 255 + b".", "an integer of"),
         (b"\x80\x04" + b"".join([b"]\x94", *[b"](" + b"h" + bytes([n]) + (b"h" + bytes([n])) * 9 + b"e\x94" for n in range(30)]]) + b".",
          "shared over and over|damaged"),  # ten times ten times ten ...
+        (b"\x80\x04](" + b"".join(b"J" + struct.pack("<i", n) for n in range(999)) + b"e\x94cbuiltins\nset\n\x94("
+         + b"h\x01h\x00\x85R" * 500 + b"t.", "shared over and over"),  # half a million values, copied from 999
         (b"\x80\x04Vtext\n.", "opcode UNICODE is refused"),
+        (pickle.dumps(np.array(["a"]), protocol=4).replace(b"a\0\0\0", struct.pack("<I", 0x110000)), "code point 0x110000"),
+        (pickle.dumps(np.str_("a"), protocol=4).replace(b"a\0\0\0", struct.pack("<I", 0xFFFFFFFF)), "code point 0xffffffff"),
         (pickle.dumps(np.array([object], object), protocol=4), "builtins.object is refused"),
         (pickle.dumps(np.array([{}], object), protocol=4), "'O8'|type list"),
         (pickle.dumps(np.zeros(3, "f4,i4"), protocol=4), "'V8'|records"),
@@ -211,6 +215,7 @@ def test_a_pickle_has_limits(tmp_path):
         pickles.load(path, file_limit_mb=0, opcode_limit=10**6)
     with pytest.raises(SceneError, match="more than 100 opcodes"):
         pickles.load(path, file_limit_mb=1, opcode_limit=100)
+    assert LIMITS["opcode_limit"] <= 10**6  # nine million empty lists took a minute and 1.7 GB; a scenario of 20 s has 141,000
     with pytest.raises(OtherFormat, match="no pickle of protocol 3, 4, 5"):
         pickles.load(written(tmp_path, pickle.dumps([], protocol=0)), **LIMITS)
 

@@ -1,5 +1,7 @@
 """Damaged and hostile files: every reader refuses them by a SceneError that names the file, and asks for little memory."""
 
+import gzip
+import lzma
 import struct
 
 import fuzzing
@@ -15,9 +17,10 @@ from format_documents import (
     pufferdrive_map,
     scenarionet_document,
 )
-from scene_documents import FORMATS, document, thing
+from scene_documents import FORMATS, document, scenefactory_document, thing
 
-from scenefactory_jax.scenes import source
+from scenefactory_jax.scenes import convert, source
+from scenefactory_jax.scenes.formats import documents, tfrecord
 from scenefactory_jax.scenes.raw import SceneError
 
 JSON_JUNK = tuple(value for value in fuzzing.JUNK if not isinstance(value, (bytes, set, np.ndarray)))
@@ -101,6 +104,35 @@ def test_a_claim_of_much_is_not_believed(files, readers, name, claim):
     path, content = files[name]
     path.write_bytes(claim(content))
     assert fuzzing.peak_of(readers[name], path) < PEAK_BYTES
+
+
+@pytest.mark.parametrize("compress", [lzma.compress, gzip.compress], ids=["xz", "gzip"])
+@pytest.mark.parametrize("start", [b'{"objects": [', struct.pack("<iiii", 1, 0, 1, 10**7)], ids=["JSON", "PufferDrive"])
+def test_what_unpacks_to_more_than_the_limit_is_refused_on_the_way(tmp_path, compress, start):
+    path = tmp_path / "bomb"
+    path.write_bytes(compress(start + b" " * 40_000_000))
+    readers = source.make({name: entry | ({"file_limit_mb": 1} if "file_limit_mb" in entry else {}) for name, entry in FORMATS.items()})
+    with pytest.raises(SceneError, match="holds more than 1 MB, unpacked if it is compressed; file_limit_mb"):
+        list(source.read(path, readers))
+    assert fuzzing.peak_of(lambda path: source.read(path, readers), path) < 16_000_000  # xz itself asks for 8 MB
+
+
+@pytest.mark.parametrize("document", [scenefactory_document(), {"a": 1}], ids=["the second reader's", "none's"])
+def test_a_file_is_unpacked_once_however_many_readers_try_it(tmp_path, monkeypatch, readers, document):
+    path, read, counts = tmp_path / "a.xz", documents._read, []
+    path.write_bytes(lzma.compress(encoded(document)))
+    monkeypatch.setattr(documents, "_read", lambda path, count: counts.append(count) or read(path, count))
+    found = convert.examine(path, readers, rejects := [], [])
+    assert (len(list(found)), len(rejects)) == ((1, 0) if "road" in document else (0, 1))
+    assert sum(count > documents.HEAD for count in counts) == 1
+
+
+def test_a_record_of_any_length_is_not_read(tmp_path, readers):
+    path, length = tmp_path / "a.tfrecord.gz", 100_000_000
+    head = struct.pack("<Q", length)
+    path.write_bytes(gzip.compress(head + struct.pack("<I", tfrecord.mask(head)) + bytes(length)))
+    (reject,) = readers["womd"](path)
+    assert reject.reason == "record 0 at byte 0: it declares 100000000 bytes of data; formats.womd.record_limit_mb is 64"
 
 
 shared = {"type": "ROAD_EDGE_BOUNDARY", "polyline": np.zeros((2000, 3))}  # pickled once, and named two thousand times

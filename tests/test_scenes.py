@@ -2,6 +2,7 @@
 
 import copy
 import gzip
+import itertools
 import json
 import lzma
 from dataclasses import replace
@@ -30,7 +31,7 @@ from scenefactory_jax.run import raws
 from scenefactory_jax.scenes import bank, checks, columns, pack, source
 from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.raw import Light, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.types import EDGES
+from scenefactory_jax.types import EDGES, POLYGONS
 
 OLD_CHECK = {"track_speed_limit_m_s": 45.0, "car_size_m": [4.0, 2.0, 1.0]}  # what runs of before 2026-11-24 say
 
@@ -378,6 +379,29 @@ def test_cut_segments_are_counted_by_reason(street):
         prepared(raw, box_m=40.0)
     doubled = replace(raw, roads=(replace(raw.roads[0], xyz=np.repeat(points, 2, axis=0)),))  # and not repaired by the checks
     assert packer(require_agents=False)(doubled)[1].segments_cut == {"outside_box": 2, "gap": 2, "degenerate": 6}
+
+
+@pytest.mark.parametrize("kind", POLYGONS)
+def test_polygons_keep_their_outline(street, kind):
+    centre = street.tracks[0].xyz[street.current]
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [10, 4, 0], [0, 4, 0.0]]) + centre
+    closed = np.concatenate([corners, corners[:1]])
+    dense = np.concatenate([np.linspace(a, b, 9)[:-1] for a, b in itertools.pairwise(closed)])
+    rims = {"open": corners, "closed": closed, "dense": dense, "line": corners[:2], "across the box": corners + np.array([95.0, 0, 0])}
+    found = {}
+    for name, xyz in rims.items():
+        raw = replace(street, roads=(*street.roads, Polyline(kind, xyz, 99)))
+        (scene, report), (bare, _) = prepared(raw, require_agents=False), prepared(street, require_agents=False)
+        rows = scene.road.kind == kind
+        assert report.segments_cut["gap"] == report.segments_cut["degenerate"] == 0
+        assert (len(scene.lanes.kind), len(scene.edges.kind)) == (len(bare.lanes.kind), len(bare.edges.kind))
+        half, arc = scene.road.half_length[rows], scene.road.arc[rows]
+        if name != "across the box":
+            np.testing.assert_allclose(arc, np.cumsum(2 * half) - half, rtol=1e-5)
+        assert 2 * half.max() <= 2.0 + 1e-5
+        found[name] = round(float(2 * half.sum()), 3), int(rows.sum())
+    assert found == {"open": (28, 14), "closed": (28, 14), "dense": (28, 32), "line": (10, 5), "across the box": (12, 6)}
+    assert raw.roads[-1].xyz is xyz  # an export has the corners that its source had
 
 
 def test_agents_are_dropped_by_reason_and_ordered_from_the_centre(tmp_path, readers):

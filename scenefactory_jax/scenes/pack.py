@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes import columns
+from scenefactory_jax.scenes.formats.lines import densify
 from scenefactory_jax.scenes.logs import Logs, joined, lengths, stacked, wrapped
-from scenefactory_jax.scenes.raw import RawScene, Unpackable
-from scenefactory_jax.types import DRIVABLE, ROAD_USERS, Scene
+from scenefactory_jax.scenes.raw import Polyline, RawScene, Unpackable
+from scenefactory_jax.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -79,6 +80,7 @@ def pack(
     require_agents: bool,
     others: int,
     others_least_m: float,
+    outline_m: float = 2.0,
 ) -> tuple[Scene, PackReport]:
     """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
 
@@ -86,7 +88,7 @@ def pack(
         raw: a checked scene.
         box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
         centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (facts 4.3).
-        gap_m: longer steps between two points of a polyline are gaps, not segments (facts 4.4).
+        gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (facts 4.4).
         agents: slots. Cars are taken nearest to the centre first.
         min_travel_m: a car whose goal is not farther than that from its start is no agent.
         car_size_m: length and width of every car; null: as logged.
@@ -95,14 +97,16 @@ def pack(
         require_agents: refuse a scene in which no agent is left.
         others: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
         others_least_m: shortest and narrowest that they may be.
+        outline_m: longest segment of the outline of a crosswalk, speed bump or driveway, of which sources have the corners only; the
+            configs of older runs do not say it.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
         ConfigError: a number that makes no sense.
     """
-    _check(box_m, car_size_m, others)
+    _check(box_m, car_size_m, others, outline_m)
     (origin, centred_on), half = _centre(raw, centre), box_m / 2
-    road, cut, relief = _segments(raw, origin, half, gap_m)
+    road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
     logs = _around(stacked(raw.tracks, len(raw.times)), origin)
     chosen, dropped = _choose(raw, logs, half, min_travel_m, agents, car_size_m)
@@ -133,9 +137,10 @@ def pack(
     return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
 
 
-def _check(box_m: float, car_size_m: list[float] | None, others: int) -> None:
+def _check(box_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:
     """Refuse numbers that make no sense."""
     check_number(box_m, where="scenes.pack.box_m", above=0)
+    check_number(outline_m, where="scenes.pack.outline_m", above=0)
     if car_size_m is not None and not (len(car_size_m) == 2 and min(car_size_m) > 0):
         raise ConfigError(f"scenes.pack.car_size_m: {car_size_m}; wanted are length and width, both above 0, or null")
     check_number(others, where="scenes.pack.others", least=0)
@@ -169,11 +174,12 @@ def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:
 
 
 def _segments(
-    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float
+    raw: RawScene, origin: Float[np.ndarray, "3"], half: float, gap_m: float, outline_m: float
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
-    xyz, bounds = joined([raw.roads[i] for i in order])
+    xyz, bounds = joined([_outlined(raw.roads[i], outline_m) for i in order])
+    kind = np.array([raw.roads[i].kind for i in order], int)
     x, y = xyz[:, 0] - origin[0], xyz[:, 1] - origin[1]
     along_x, along_y = np.diff(x), np.diff(y)
     length = np.sqrt(along_x * along_x + along_y * along_y)
@@ -181,7 +187,8 @@ def _segments(
     joints[bounds[1:-1] - 1] = False  # from a line's last point to the next one's first
     within = (np.abs(x) <= half) & (np.abs(y) <= half)
     inside = within[1:] & within[:-1]
-    degenerate, gap = length <= DEGENERATE_M, length > gap_m
+    outline = np.repeat(np.isin(kind, POLYGONS), np.diff(bounds))[:-1]
+    degenerate, gap = length <= DEGENERATE_M, (length > gap_m) & ~outline
     kept = joints & inside & ~degenerate & ~gap
     masks = (~inside, inside & gap, inside & degenerate)
     cut = {reason: int((joints & mask).sum()) for reason, mask in zip(CUTS, masks, strict=True)}
@@ -197,10 +204,20 @@ def _segments(
         "direction": np.stack([along_x[rows] / own, along_y[rows] / own], axis=1),
         "half_length": own / 2,
         "arc": arc[rows] - own / 2,
-        "kind": np.array([raw.roads[i].kind for i in order])[line],
+        "kind": kind[line],
         "polyline": np.array(order)[line],
     }
     return _road(road), cut, float(np.ptp(xyz[rows + 1, 2])) if len(rows) else 0.0
+
+
+def _outlined(line: Polyline, outline_m: float) -> Polyline:
+    """A polygon with its side from the last point to the first, in segments of at most `outline_m`; other lines as they are."""
+    if line.kind not in POLYGONS:
+        return line
+    xyz = line.xyz
+    if len(xyz) > 2 and np.hypot(*(xyz[-1, :2] - xyz[0, :2])) > DEGENERATE_M:
+        xyz = np.concatenate([xyz, xyz[:1]])
+    return replace(line, xyz=densify(xyz, outline_m))
 
 
 def _road(leaves: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -40,10 +40,13 @@ class Samples(NamedTuple):
 
 
 def lengths(lines: Sequence[np.ndarray]) -> Float[np.ndarray, " N"]:
-    """Length in the plane of each of many lines of points."""
+    """Length in the plane of each of many lines of points; zero of a line without points."""
     arc, first = _arcs(lines)
-    last = np.maximum(first[1:] - 1, first[:-1])
-    return arc[last] - arc[np.minimum(first[:-1], len(arc) - 1)] if len(arc) else np.zeros(len(lines))
+    begin, end = first[:-1], first[1:]
+    filled = end > begin
+    found = np.zeros(len(lines))
+    found[filled] = arc[end[filled] - 1] - arc[begin[filled]]
+    return found
 
 
 def _arcs(lines: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, " P"], Int[np.ndarray, " N1"]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.build import build
-from scenefactory_jax.scenes.formats import foreign
+from scenefactory_jax.scenes.formats import documents, foreign
 from scenefactory_jax.scenes.raw import OtherContent, OtherFormat, RawScene, Reject, SceneError
 
 REASON = 80  # characters of what one reader says of a file that is not its own
@@ -64,14 +64,22 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
 
     Raises:
         Companion: the file belongs to scenes beside it.
-        SceneError: a folder that cannot be listed; no reader knows the format, which is named if it can be told; or what the reader that knows
-            it found wrong.
+        SceneError: a folder that cannot be listed; a format that no reader knows, named if it can be told; or what the reader that knows
+            the format found wrong.
     """
     if Path(path).is_dir():
         raise SceneError(f"{path}: a folder that cannot be listed; allow it to be read, or give the files beside it")
+    with documents.unpacked_once():
+        first, scenes = _begin(Path(path), formats)
+    yield first
+    yield from scenes
+
+
+def _begin(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
+    """What the first reader that knows the format yields first, and the rest of it. See `read`."""
     near: list[str] = []
     for name, reader in formats.items():
-        scenes = iter(reader(Path(path)))
+        scenes = iter(reader(path))
         try:
             first = next(scenes, None)
         except OtherContent as refusal:
@@ -81,10 +89,8 @@ def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene |
             continue
         if first is None:
             raise SceneError(f"{path}: no scene in it, says the reader {name!r}")
-        yield first
-        yield from scenes
-        return
-    raise SceneError(f"{path}: {_refusal(Path(path), near)}; formats: {', '.join(formats) or 'none'}")
+        return first, scenes
+    raise SceneError(f"{path}: {_refusal(path, near)}; formats: {', '.join(formats) or 'none'}")
 
 
 def _refusal(path: Path, near: Sequence[str]) -> str:

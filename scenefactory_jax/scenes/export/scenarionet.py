@@ -15,15 +15,13 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.scenes.export import files
-from scenefactory_jax.scenes.formats.scenarionet import DATASETS, ELEMENTS, KEPT, LANES, UNITS
+from scenefactory_jax.scenes.formats.scenarionet import DATASETS, ELEMENTS, KEPT, LANES, MAPPING, SUMMARY, UNITS
 from scenefactory_jax.scenes.names import for_file
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.types import CROSSWALK, DRIVEWAY, LINES, SPEED_BUMP, STOP_SIGN
+from scenefactory_jax.types import LINES, POLYGONS, STOP_SIGN
 
 VERSION = "MetaDrive v0.3.0.1"  # of the format, as WOMD's converter writes it
-SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 NAMES = {element: name for name, element in ELEMENTS.items()}
-POLYGONS = (CROSSWALK, SPEED_BUMP, DRIVEWAY)
 MOVES_M = 1.0  # MetaDrive counts an object as moving that goes farther
 PROTOCOL = 3  # the last one whose module names stand as lines of text, not in frames of a known length
 

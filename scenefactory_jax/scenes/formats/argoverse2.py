@@ -37,7 +37,13 @@ Columns = Mapping[str, np.ndarray]
 
 
 def read(
-    path: Path, *, sizes_m: dict[str, list[float]], point_spacing_m: float, cut_m: float, row_limit: int
+    path: Path,
+    *,
+    sizes_m: dict[str, list[float]],
+    point_spacing_m: float,
+    cut_m: float,
+    row_limit: int,
+    file_limit_mb: int = documents.FILE_LIMIT_MB,
 ) -> Iterator[RawScene]:
     """The one scene of a parquet file and the map beside it. Tracks whose names are no numbers (the recording car's, "AV") get one.
 
@@ -46,15 +52,15 @@ def read(
         sizes_m: type -> length, width and height, with an entry `other` for types that have none of their own.
         point_spacing_m: between the points of the map's lines, at most.
         cut_m: an outline of the drivable area that comes so near to a lane's centre was cut there, and is no road edge.
-
         row_limit: longer tables are refused unread.
+        file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
         OtherFormat: no parquet file of such columns, and no such map.
         Companion: the map.
         SceneError: the map is missing, or a value is missing, of a wrong type or not finite, naming its column or key.
     """
-    columns = _columns(path, sizes_m, row_limit)
+    columns = _columns(path, sizes_m, row_limit, file_limit_mb)
     where = f"{path}: "
     steps, step = int(_only(columns, "num_timestamps", where)), columns["timestep"]
     if not 0 < steps <= STEPS or step.min() < 0 or step.max() >= steps:
@@ -63,7 +69,8 @@ def read(
     seconds = (float(_only(columns, "end_timestamp", where)) - float(_only(columns, "start_timestamp", where))) * 1e-9
     if not columns["observed"].any():
         raise SceneError(f"{where}observed: no step is; the last one that is would be the current step")
-    roads, groups = argoverse2_map.roads(_map_beside(path, scenario), point_spacing_m=point_spacing_m, cut_m=cut_m)
+    beside = _map_beside(path, scenario)
+    roads, groups = argoverse2_map.roads(beside, point_spacing_m=point_spacing_m, cut_m=cut_m, file_limit_mb=file_limit_mb)
     names, owner = np.unique(columns["track_id"], return_inverse=True)
     ids = identities.number(names)
     ground = _ground(roads)
@@ -87,13 +94,14 @@ def read(
     )
 
 
-def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int) -> Columns:
+def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int, file_limit_mb: int) -> Columns:
     """The parquet file's columns as arrays."""
-    content = documents.unpack(path)
-    if content[:64].lstrip()[:1] == b"{" and argoverse2_map.is_map(documents.load(path)):
+    start = documents.head(path)
+    if start.lstrip()[:1] == b"{" and argoverse2_map.is_map(documents.load(path, file_limit_mb=file_limit_mb)):
         raise Companion(f"{path}: the map of an Argoverse 2 scenario")
-    if not content.startswith(MAGIC):
-        raise OtherFormat(f"{path}: no parquet file and no map of Argoverse 2; it begins with {content[:16]!r}")
+    if not start.startswith(MAGIC):
+        raise OtherFormat(f"{path}: no parquet file and no map of Argoverse 2; it begins with {start[:16]!r}")
+    content = documents.unpack(path, file_limit_mb=file_limit_mb)
     if "other" not in sizes_m or any(len(size) != 3 for size in sizes_m.values()):
         raise SceneError(f"formats.argoverse2.sizes_m: {sizes_m!r} is no mapping of types, with `other`, to [length, width, height]")
     try:

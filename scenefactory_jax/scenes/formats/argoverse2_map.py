@@ -38,18 +38,21 @@ def is_map(document: Mapping[str, Any]) -> bool:
     return all(section in document for section in SECTIONS)
 
 
-def roads(path: Path, *, point_spacing_m: float, cut_m: float) -> tuple[tuple[Polyline, ...], dict[str, list[int]]]:
+def roads(
+    path: Path, *, point_spacing_m: float, cut_m: float, file_limit_mb: int
+) -> tuple[tuple[Polyline, ...], dict[str, list[int]]]:
     """The map's lanes, painted lines, road edges and crosswalks; and which lanes lie on an intersection, and which are for buses.
 
     Args:
         path: of the JSON file.
-        point_spacing_m: between the points of a line, at most; the file has little more than corners.
+        point_spacing_m: between the points of a lane, line or edge, at most; the file has little more than corners.
         cut_m: an outline that comes so near to a lane's centre was cut there.
+        file_limit_mb: larger files are refused.
 
     Raises:
         SceneError: no such file, no such map, or a value that is missing, of a wrong type or not finite, naming its key.
     """
-    document = documents.load(path)
+    document = documents.load(path, file_limit_mb=file_limit_mb)
     if not is_map(document):
         raise SceneError(f"{path}: no map of Argoverse 2: it has {', '.join(document) or 'nothing'}, not all of {', '.join(SECTIONS)}")
     tables = {section: documents.get(document, section, dict, f"{path}: ") for section in SECTIONS}
@@ -66,13 +69,13 @@ def roads(path: Path, *, point_spacing_m: float, cut_m: float) -> tuple[tuple[Po
     ids = [line.id for line in (*lanes, *crossings)]
     drawn = [*_marks(segments, borders), *((EDGE_BOUNDARY, xyz) for xyz in edges(areas, list(centres.values()), cut_m, f"{path}: "))]
     painted = [Polyline(kind=kind, xyz=xyz, id=max(ids, default=0) + 1 + place) for place, (kind, xyz) in enumerate(drawn)]
-    corners = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) for line in (*painted, *crossings)]
+    dense = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) for line in painted]
     crossed = [documents.get(record, "is_intersection", bool, where) for record, where in segments]
     groups = {
         "intersection_lanes": [lane for lane, inside in zip(lane_ids, crossed, strict=True) if inside],
         "bus_lanes": [lane for lane, (record, _) in zip(lane_ids, segments, strict=True) if record["lane_type"] == "BUS"],
     }
-    return (*lanes, *corners), groups
+    return (*lanes, *dense, *crossings), groups
 
 
 def _id(record: Mapping[str, Any], where: str) -> int:

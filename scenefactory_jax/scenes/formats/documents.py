@@ -7,7 +7,9 @@ import lzma
 import operator
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from io import BufferedIOBase, BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -16,43 +18,100 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.scenes.raw import OtherFormat, SceneError
 
-MAGIC = {b"\x1f\x8b": ("gzip", gzip.decompress), b"\xfd7zXZ\x00": ("xz", lzma.decompress)}
+MAGIC = {b"\x1f\x8b": ("gzip", gzip.open), b"\xfd7zXZ\x00": ("xz", lzma.open)}
+DAMAGE = (OSError, EOFError, lzma.LZMAError, zlib.error)  # what unpacking says of a damaged file
+CHUNK = 2**20  # bytes read at a time: memory follows what a file holds, not what it declares
+HEAD = 4096  # bytes by which a format is told
+FILE_LIMIT_MB = 32  # of readers whose config is older than the limit
 NAMES = {dict: "an object", list: "a list", str: "a text", int: "an integer", float: "a number", bool: "true or false"}
 
 
-def load(path: Path) -> dict[str, Any]:
+_kept: ContextVar[dict[Path, bytes] | None] = ContextVar("kept", default=None)
+
+
+@contextlib.contextmanager
+def unpacked_once() -> Iterator[None]:
+    """Within it, `unpack` reads each file once, however many readers ask for its content; the files must not change meanwhile."""
+    token = _kept.set({})
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+
+
+def load(path: Path, *, file_limit_mb: int) -> dict[str, Any]:
     """The JSON object in a file: plain, gzip or xz, told apart by their first bytes and not by the suffix.
 
     Raises:
-        SceneError: unreadable, damaged or truncated.
+        SceneError: unreadable, damaged or truncated, or larger than the limit.
         OtherFormat: no JSON object at all.
     """
-    text = unpack(path)
-    if not text.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        raise OtherFormat(f"{path}: no JSON object (plain, gzip or xz); it begins with {text[:16]!r}")
+    start = head(path)
+    if not start.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        raise OtherFormat(f"{path}: no JSON object (plain, gzip or xz); it begins with {start[:16]!r}")
+    text = unpack(path, file_limit_mb=file_limit_mb)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{path}: no valid JSON, damaged or cut short after {len(text)} bytes: {error}") from error
 
 
-def unpack(path: Path) -> bytes:
-    """What a file holds, without its compression.
+def head(path: Path) -> bytes:
+    """The first HEAD bytes of what a file holds, without its compression.
 
     Raises:
         SceneError: no such file, or a compressed file that is damaged or truncated.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
-    for magic, (name, decompress) in MAGIC.items():
-        if content.startswith(magic):
-            try:
-                return decompress(content)
-            except (OSError, EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
-                raise SceneError(f"{path}: begins as {name} but cannot be unpacked, damaged or cut short: {error}") from error
+    kept = (_kept.get() or {}).get(Path(path))
+    return _read(path, HEAD) if kept is None else kept[:HEAD]
+
+
+def unpack(path: Path, *, file_limit_mb: int) -> bytes:
+    """What a file holds, without its compression. No more than the limit is ever unpacked.
+
+    Raises:
+        SceneError: no such file, a compressed file that is damaged or truncated, or one that holds more than the limit.
+    """
+    kept = _kept.get()
+    content = None if kept is None else kept.get(Path(path))
+    if content is None:
+        content = _read(path, file_limit_mb * 10**6 + 1)
+    if len(content) > file_limit_mb * 10**6:
+        limit = f"more than {file_limit_mb} MB, unpacked if it is compressed"
+        raise SceneError(f"{path}: holds {limit}; file_limit_mb of its reader sets the limit")
+    if kept is not None:
+        kept[Path(path)] = content
     return content
+
+
+def _read(path: Path, count: int) -> bytes:
+    """The first `count` bytes of what a file holds, unpacked as they are read."""
+    name = None
+    try:
+        with open(path, "rb") as stream:
+            name, opener = _packing(stream)
+            with opener(stream) as unpacked:
+                return take(unpacked, count)
+    except DAMAGE as error:
+        unread = f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        damaged = f"begins as {name} but cannot be unpacked, damaged or cut short: {error}"
+        raise SceneError(f"{path}: {unread if name is None else damaged}") from error
+
+
+def _packing(stream: BufferedReader) -> tuple[str | None, Callable[[Any], Any]]:
+    """How a file is compressed, by its first bytes, and what opens it."""
+    start = stream.peek(max(map(len, MAGIC)))
+    found = (entry for magic, entry in MAGIC.items() if start.startswith(magic))
+    return next(found, (None, contextlib.nullcontext))
+
+
+def take(stream: BufferedIOBase, count: int) -> bytes:
+    """The next `count` bytes of a stream, or as many as there are."""
+    parts = []
+    while count > 0 and (part := stream.read(min(count, CHUNK))):
+        parts.append(part)
+        count -= len(part)
+    return b"".join(parts)
 
 
 def is_number(value: Any) -> bool:

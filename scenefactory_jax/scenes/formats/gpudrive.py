@@ -22,7 +22,13 @@ ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crossw
 
 
 def read(
-    path: Path, *, step_s: float, current: int, headings: Literal["layout", "degrees", "radians"], height_m: float
+    path: Path,
+    *,
+    step_s: float,
+    current: int,
+    headings: Literal["layout", "degrees", "radians"],
+    height_m: float,
+    file_limit_mb: int = documents.FILE_LIMIT_MB,
 ) -> Iterator[RawScene]:
     """The one scene of a file.
 
@@ -32,12 +38,13 @@ def read(
         current: the step at which the simulation takes over; the format does not say it (10 in WOMD).
         headings: their unit; `layout`: degrees in the old layout (no map elements, no metadata), else radians.
         height_m: height of objects that have none (old layout).
+        file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
         OtherFormat: the file has no `objects` and `roads`.
         SceneError: it has, but a value is missing, of a wrong type or not finite, naming its key.
     """
-    document = documents.load(path)
+    document = documents.load(path, file_limit_mb=file_limit_mb)
     if missing := [key for key in ("objects", "roads") if key not in document]:
         raise OtherContent(f"{path}: no GPUDrive JSON: it has no {missing[0]!r}, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "

@@ -42,7 +42,9 @@ VALUES = {  # opcodes that hold their value
     "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8",
 }  # fmt: skip
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+LAST_CODE_POINT = 0x10FFFF  # of Unicode
 DEPTH = 64  # of containers in containers; a scenario's are 7 deep
+SHARED = "parts that are shared over and over are refused"
 DAMAGE = (ValueError, IndexError, KeyError, TypeError, AttributeError, AssertionError, OverflowError)
 
 
@@ -70,9 +72,16 @@ class _Dtype:
 class _Machine:
     """The state of the stack machine."""
 
+    copies_left: int  # values and bytes that calls may still copy: each byte of the file is worth one
     stack: list[Any] = field(default_factory=list)
     marks: list[int] = field(default_factory=list)
     memo: dict[int, Any] = field(default_factory=dict)
+
+    def spend_copies(self, count: int) -> None:
+        """Refuse to copy more than the file holds: a part that is shared is stored once, but a call copies it each time."""
+        self.copies_left -= count
+        if self.copies_left < 0:
+            raise SceneError(SHARED)
 
     def since_mark(self) -> list[Any]:
         """What lies above the last mark, taken off."""
@@ -95,7 +104,7 @@ def load(path: Path, *, file_limit_mb: int, opcode_limit: int) -> Any:
         SceneError: too large, damaged, cut short, or more than data, naming the global or the opcode that was refused.
     """
     data = _content(path, file_limit_mb)
-    machine, place = _Machine(), 0
+    machine, place = _Machine(len(data)), 0
     try:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):  # noqa: B007
             if count >= opcode_limit:
@@ -162,10 +171,10 @@ def _execute(machine: _Machine, name: str, argument: Any) -> None:
         stack.append(_find(f"{module}.{member}"))
     elif name == "REDUCE":
         arguments, function = _of(stack.pop(), tuple), _of(stack.pop(), _Global)
-        stack.append(_reduce(function.meaning, arguments))
+        stack.append(_reduce(machine, function.meaning, arguments))
     elif name == "BUILD":
         state = _of(stack.pop(), tuple)
-        _build(stack[-1], state)
+        _build(machine, stack[-1], state)
     elif name not in ("PROTO", "FRAME", "STOP"):
         raise SceneError(f"the opcode {name} is refused: plain data needs none of it")
 
@@ -193,25 +202,27 @@ def _find(name: str) -> _Global:
     return _Global(GLOBALS[known])
 
 
-def _reduce(meaning: str, arguments: tuple[Any, ...]) -> Any:
+def _reduce(machine: _Machine, meaning: str, arguments: tuple[Any, ...]) -> Any:
     """What calling a global would give."""
     if meaning == "array":
         return np.empty(0)  # BUILD fills it
     if meaning == "dtype":
         return _Dtype(_of(arguments[0], str))
     if meaning == "scalar":
-        return _array((), _of(arguments[0], _Dtype), "C", arguments[1]).item()
+        return _array(machine, (), _of(arguments[0], _Dtype), "C", arguments[1]).item()
     if meaning == "buffer":
         raw, dtype, shape, order = arguments
-        return _array(shape, _of(dtype, _Dtype), order, raw)
+        return _array(machine, shape, _of(dtype, _Dtype), order, raw)
     if meaning == "set":
-        return set(_plain(_of(arguments[0], list))) if arguments else set()
+        items = _of(arguments[0], list) if arguments else []
+        machine.spend_copies(len(items))
+        return set(_plain(items))
     if meaning == "dict":
         return {}
     raise SceneError(f"a call of the global {meaning!r} is refused")
 
 
-def _build(target: Any, state: tuple[Any, ...]) -> None:
+def _build(machine: _Machine, target: Any, state: tuple[Any, ...]) -> None:
     """The second step of what numpy pickles: fills a dtype or an array."""
     if isinstance(target, _Dtype):
         _, target.order, _, names, fields, *_ = state
@@ -219,13 +230,13 @@ def _build(target: Any, state: tuple[Any, ...]) -> None:
             raise SceneError("a dtype of records or of an unknown byte order is refused")
     elif isinstance(target, np.ndarray):
         _, shape, dtype, fortran, raw = state
-        filled = _array(shape, _of(dtype, _Dtype), "F" if fortran else "C", raw)
+        filled = _array(machine, shape, _of(dtype, _Dtype), "F" if fortran else "C", raw)
         target.__setstate__((1, filled.shape, filled.dtype, bool(fortran), bytes(raw)))  # pyright: ignore[reportArgumentType]
     else:
         raise SceneError(f"the opcode BUILD on {type(target).__name__} is refused")
 
 
-def _array(shape: Any, dtype: _Dtype, order: Any, raw: Any) -> np.ndarray:
+def _array(machine: _Machine, shape: Any, dtype: _Dtype, order: Any, raw: Any) -> np.ndarray:
     """An array from its bytes, of which there must be exactly as many as its shape says."""
     kind = dtype.numpy()
     if not isinstance(raw, (bytes, bytearray)):
@@ -237,7 +248,16 @@ def _array(shape: Any, dtype: _Dtype, order: Any, raw: Any) -> np.ndarray:
         count *= size
     if count * kind.itemsize != len(raw):
         raise SceneError(f"an array of the shape {shape} and {len(raw)} bytes; that shape needs {count * kind.itemsize}")
+    machine.spend_copies(len(raw))
+    if kind.kind == "U":
+        _require_characters(np.frombuffer(raw, f"{dtype.order}u4"))
     return np.ndarray(shape, kind, buffer=raw if raw else None, order="F" if order == "F" else "C")
+
+
+def _require_characters(codes: np.ndarray) -> None:
+    """Refuse numbers that stand for no character: numpy would keep them, and Python's texts fail on them later."""
+    if (bad := codes[codes > LAST_CODE_POINT]).size:
+        raise SceneError(f"a text with the code point {bad[0]:#x}; valid: up to {LAST_CODE_POINT:#x}")
 
 
 def _require_own_size(whole: Any, limit: int) -> None:
@@ -247,7 +267,7 @@ def _require_own_size(whole: Any, limit: int) -> None:
     def size(value: Any, depth: int) -> int:
         if isinstance(value, np.ndarray):
             return value.size
-        if not isinstance(value, (list, tuple, dict, set)):
+        if not isinstance(value, (list, tuple, dict, set)) or not value:
             return 1
         if id(value) not in sizes:
             if depth > DEPTH:
@@ -257,7 +277,7 @@ def _require_own_size(whole: Any, limit: int) -> None:
         return sizes[id(value)]
 
     if (found := size(whole, 0)) > limit:
-        raise SceneError(f"{found} values from {limit} bytes: parts that are shared over and over are refused")
+        raise SceneError(f"{found} values from {limit} bytes: {SHARED}")
 
 
 def table(value: Any, where: str, *, columns: tuple[int, ...]) -> Float[np.ndarray, "N D"]:

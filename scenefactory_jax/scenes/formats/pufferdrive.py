@@ -36,7 +36,9 @@ class _Entity:
     start: int  # of its columns
 
 
-def read(path: Path, *, step_s: float, current: int, point_spacing_m: float) -> Iterator[RawScene]:
+def read(
+    path: Path, *, step_s: float, current: int, point_spacing_m: float, file_limit_mb: int = documents.FILE_LIMIT_MB
+) -> Iterator[RawScene]:
     """The one scene of a file. Its objects and roads are numbered in their order.
 
     Args:
@@ -44,12 +46,14 @@ def read(path: Path, *, step_s: float, current: int, point_spacing_m: float) -> 
         step_s: time between two steps; the format does not say it.
         current: the step at which the simulation takes over; the format does not say it (10 in WOMD).
         point_spacing_m: between the points of lanes, lines and edges, at most; the format has dropped those on straight pieces.
+        file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
         OtherFormat: the head and the first object are not of this layout.
         SceneError: they are, but the file is cut short, has more than its head says, or a value that cannot be.
     """
-    content = documents.unpack(path)
+    _require_start(path)
+    content = documents.unpack(path, file_limit_mb=file_limit_mb)
     words = np.frombuffer(content, "<i4", len(content) // WORD)
     objects, roads = _layout(words, len(content), path)
     steps = {entity.count for entity in objects}
@@ -67,6 +71,14 @@ def read(path: Path, *, step_s: float, current: int, point_spacing_m: float) -> 
         current=current,
         metadata={"dataset": "WOMD", "format": "pufferdrive", "experts": experts},
     )
+
+
+def _require_start(path: Path) -> None:
+    """Refuse what cannot be such a map by its first numbers, before the whole file is read."""
+    start = documents.head(path)[: WORD * (HEAD + 1)]
+    numbers = np.frombuffer(start, "<i4", len(start) // WORD).tolist()
+    if len(numbers) <= HEAD or numbers[0] < 1 or numbers[1] < 0 or numbers[HEAD] not in OBJECTS:
+        raise OtherFormat(f"{path}: no PufferDrive map: it begins with the numbers {numbers}")
 
 
 def _layout(words: np.ndarray, size: int, path: Path) -> tuple[list[_Entity], list[_Entity]]:

@@ -30,11 +30,13 @@ from scenefactory_jax.types import (
     LANE_FREEWAY,
     LANE_STREET,
     LINES,
+    POLYGONS,
     ROAD_USERS,
     SPEED_BUMP,
     STOP_SIGN,
 )
 
+SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"  # beside the scenarios of a database
 LANE_UNKNOWN, LINE_UNKNOWN, EDGE_UNKNOWN = 0, 5, 14  # map elements of WOMD that say no more
 ELEMENTS = {  # MetaDriveType -> WOMD map element
     "LANE_UNKNOWN": LANE_UNKNOWN, "LANE_FREEWAY": LANE_FREEWAY, "LANE_SURFACE_STREET": LANE_STREET, "LANE_BIKE_LANE": LANE_BIKE,
@@ -70,14 +72,14 @@ def read(
 
     Raises:
         OtherFormat: no pickle, or no scenario in it.
-        Companion: a dataset's summary or mapping.
+        Companion: a database's summary or mapping, told by its name: those of large databases are larger than any scenario.
         SceneError: more than data in it, or a value that is missing, of a wrong type or not finite, naming its key.
     """
+    if Path(path).name in (SUMMARY, MAPPING):
+        raise Companion(f"{path}: ScenarioNet's {'summary' if Path(path).name == SUMMARY else 'mapping'} of a database")
     document = pickles.load(path, file_limit_mb=file_limit_mb, opcode_limit=opcode_limit)
     if not isinstance(document, dict):
         raise OtherContent(f"{path}: no ScenarioNet pickle: it holds no dict but {type(document).__name__}")
-    if document and all(isinstance(key, str) and key.endswith(".pkl") for key in document):
-        raise Companion(f"{path}: ScenarioNet's summary or mapping of {len(document)} scenarios")
     if "tracks" not in document or not {"map_features", "map"} & set(document):
         raise OtherContent(f"{path}: no ScenarioNet pickle: no 'tracks' and map, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "
@@ -101,7 +103,8 @@ def read(
         if kind is not None
     ]
     if dataset != "waymo":
-        roads = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) if len(line.xyz) else line for line in roads]
+        sparse = [len(line.xyz) > 0 and line.kind not in POLYGONS for line in roads]
+        roads = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) if s else line for line, s in zip(roads, sparse, strict=True)]
     left_out = Counter(record["type"] for key, record in features.items() if kinds[key] is None)
     left_out.update("TRAFFIC_LIGHT" for light in lights if light is None)
     yield RawScene(

@@ -15,7 +15,15 @@ STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 
 
-def read(path: Path, *, step_s: float, size_m: list[float], include_sdc: bool, all_vehicles: bool) -> Iterator[RawScene]:
+def read(
+    path: Path,
+    *,
+    step_s: float,
+    size_m: list[float],
+    include_sdc: bool,
+    all_vehicles: bool,
+    file_limit_mb: int = documents.FILE_LIMIT_MB,
+) -> Iterator[RawScene]:
     """The one scene of a file. Each agent is a track of two valid steps: its start at step 0, its end at step `t_idx + 1`.
 
     Args:
@@ -24,12 +32,13 @@ def read(path: Path, *, step_s: float, size_m: list[float], include_sdc: bool, a
         size_m: length, width and height of every agent; the format has none.
         include_sdc: whether the recording car is an agent too (the published loader leaves it out).
         all_vehicles: whether every agent is a vehicle (the published loader makes cars of pedestrians and cyclists).
+        file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
         OtherFormat: the file has no `road.polylines`.
         SceneError: it has, but a value is missing, of a wrong type or not finite, naming its key.
     """
-    document = documents.load(path)
+    document = documents.load(path, file_limit_mb=file_limit_mb)
     road = document.get("road")
     if not isinstance(road, dict) or "polylines" not in road:
         raise OtherContent(f"{path}: no SceneFactory JSON: it has no 'road.polylines', but {', '.join(map(str, document)) or 'nothing'}")

@@ -14,13 +14,12 @@ from typing import NamedTuple
 
 import google_crc32c
 
+from scenefactory_jax.scenes.formats.documents import take
 from scenefactory_jax.scenes.raw import OtherFormat, Reject, SceneError
 
 HEADER = struct.Struct("<QI")  # length of the data, masked checksum of the length
 FOOTER = struct.Struct("<I")  # masked checksum of the data
 GZIP = b"\x1f\x8b"
-LARGEST = 2**31 - 1  # bytes; protobuf has no longer messages (protobuf.dev/programming-guides/proto-limits)
-CHUNK = 2**20  # bytes read at a time: memory follows what a file holds, not what it declares
 
 
 class Record(NamedTuple):
@@ -45,10 +44,14 @@ class _Frame(NamedTuple):
     last: bool = False  # nothing can be read behind it
 
 
-def read(path: Path) -> Iterator[Record | Reject]:
+def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
     """The records of a file, plain or gzip (told by its first bytes), and a `Reject` for each that is damaged.
 
     Reading goes on behind a damaged record as long as its length can be trusted: the length's checksum matches, or the data's does.
+
+    Args:
+        path: of the file, which may be larger than memory.
+        record_limit_mb: a longer record is rejected unread, and what follows it with it.
 
     Raises:
         OtherFormat: the file does not begin as a TFRecord.
@@ -63,7 +66,7 @@ def read(path: Path) -> Iterator[Record | Reject]:
         while True:
             place = f"record {number} at byte {offset}"
             try:
-                frame = _read_frame(stream, None if size is None else size - offset)
+                frame = _read_frame(stream, None if size is None else size - offset, record_limit_mb)
             except (OSError, EOFError, zlib.error) as error:
                 frame = _Frame(fault=f"damaged or cut short: {error}", known=number > 0, last=True)
             if number == 0 and (frame is None or not frame.known):
@@ -93,18 +96,9 @@ def _open(path: Path) -> tuple[BufferedIOBase, int | None]:
     return gzip.open(path), None
 
 
-def _take(stream: BufferedIOBase, count: int) -> bytes:
-    """The next `count` bytes, or as many as there are."""
-    parts = []
-    while count > 0 and (part := stream.read(min(count, CHUNK))):
-        parts.append(part)
-        count -= len(part)
-    return b"".join(parts)
-
-
-def _read_frame(stream: BufferedIOBase, left: int | None) -> _Frame | None:
+def _read_frame(stream: BufferedIOBase, left: int | None, limit_mb: int) -> _Frame | None:
     """The next frame of a file of which `left` bytes are left, if that is known; none at its end."""
-    header = _take(stream, HEADER.size)
+    header = take(stream, HEADER.size)
     if not header:
         return None
     if len(header) < HEADER.size:
@@ -112,12 +106,14 @@ def _read_frame(stream: BufferedIOBase, left: int | None) -> _Frame | None:
     length, checksum = HEADER.unpack(header)
     sound = checksum == mask(header[:8])
     lost = f"the checksum of its length ({length}) does not match, so where the next record begins is not known"
-    room = LARGEST if left is None else min(left - HEADER.size - FOOTER.size, LARGEST)
-    if length > room:
-        fault = f"truncated, or no message: it declares {length} bytes of data, and there can be {max(room, 0)} at most"
+    if left is not None and length > (room := left - HEADER.size - FOOTER.size):
+        fault = f"truncated: it declares {length} bytes of data, and there can be {max(room, 0)} at most"
         return _Frame(fault=fault if sound else lost, known=sound, last=True)
-    data = _take(stream, length)
-    footer = _take(stream, FOOTER.size)
+    if length > limit_mb * 10**6:
+        fault = f"it declares {length} bytes of data; formats.womd.record_limit_mb is {limit_mb}"
+        return _Frame(fault=fault if sound else lost, known=sound, last=True)
+    data = take(stream, length)
+    footer = take(stream, FOOTER.size)
     if len(data) + len(footer) < length + FOOTER.size:
         fault = f"truncated: it declares {length} bytes of data, and there are {len(data)}"
         return _Frame(fault=fault if sound else lost, known=sound, last=True)

@@ -7,17 +7,18 @@ from scenefactory_jax.scenes.formats import tfrecord, womd_example, womd_scenari
 from scenefactory_jax.scenes.raw import OtherContent, OtherFormat, RawScene, Reject, SceneError
 
 
-def read(path: Path, *, jump_m: float) -> Iterator[RawScene | Reject]:
+def read(path: Path, *, jump_m: float, record_limit_mb: int = 64) -> Iterator[RawScene | Reject]:
     """The scenes of a file, one a record, and a `Reject` for each record that is damaged or holds a value that cannot be used.
 
     Args:
         path: TFRecord, plain or gzip.
         jump_m: tf.Example: consecutive samples of one lane, line or edge that are farther apart begin a new polyline.
+        record_limit_mb: longer records are rejected unread; the configs of older runs do not say it.
 
     Raises:
         OtherFormat: no TFRecord, or its first record holds neither message.
     """
-    for record in tfrecord.read(path):
+    for record in tfrecord.read(path, record_limit_mb=record_limit_mb):
         if isinstance(record, Reject):
             yield record
             continue

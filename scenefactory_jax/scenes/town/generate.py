@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.build import ConfigError, build, check_number
@@ -19,7 +18,6 @@ from scenefactory_jax.scenes.town.traffic import Actor
 from scenefactory_jax.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 
 PACKAGE = "scenefactory_jax.scenes.town"
-SIDE_M = 2.0  # between the points of a polygon's sides: longer ones would be taken for gaps
 REDRAWS = 40  # towns that are tried until one can be built and holds the fewest cars asked for
 
 
@@ -118,9 +116,7 @@ def _roads(
     ]
     features = [(line.kind, resample(line.points, line_spacing)) for line in network.lines]
     features += [(EDGE_BOUNDARY, points) for points in outer] + [(EDGE_MEDIAN, points) for points in islands]
-    polygons = [(CROSSWALK, np.concatenate([walk.outline, walk.outline[:1]])) for walk in network.crosswalks]
-    polygons += [(DRIVEWAY, outline) for outline in aprons]
-    features += [(kind, shapely.get_coordinates(shapely.segmentize(shapely.LineString(points), SIDE_M))) for kind, points in polygons]
+    features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in aprons]
     features += [(STOP_SIGN, stop.post[None]) for stop in network.stops if stop.kind == "stop"]
     return (*found, *(Polyline(kind, _flat(points), len(found) + i) for i, (kind, points) in enumerate(features)))
 
