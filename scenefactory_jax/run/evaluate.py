@@ -30,13 +30,13 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     """Evaluate a run as a config says (`load("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
 
     Raises:
-        ConfigError: no such run, no checkpoint in it, a setting that the run does not have.
+        ConfigError: no such run, no checkpoint in it, a setting that the run does not have, code of others without `trust`.
         SceneError: scenes that cannot be read.
     """
     keys.check_evaluate(config)
     sources.use_compilation_cache()
     run = policies.find(config["run"])
-    trained = configs.amend(configs.read(run), config["overrides"])
+    trained = configs.amend(configs.read(run, trust=config["trust"]), config["overrides"])
     wanted = {True: "invincible", False: "strict"}.get(config["invincible"], config["invincible"])
     if wanted not in PROTOCOLS:
         raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
