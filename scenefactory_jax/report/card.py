@@ -32,7 +32,8 @@ def markdown(
     parts = [f"# {name}", about or "", "## Training", tables.grid(["", ""], _training(config, versions, training))]
     if judged:
         parts += ["## Scores", *_scores(judged)]
-    parts += ["## Files", f"`config.yaml` has every setting of the training, `checkpoints/policy.npz` what was learnt. {_code(outside)}"]
+    learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
+    parts += ["## Files", f"`config.yaml` has every setting of the training, {learnt}. {_code(outside)}"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
