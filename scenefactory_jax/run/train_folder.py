@@ -90,6 +90,8 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
     if not begun:
         raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
     _check_same(folder, config)
+    if last is None:
+        print(f"{folder} has no checkpoint to go on from: the run begins anew", flush=True)
     return last is not None
 
 
