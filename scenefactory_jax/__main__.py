@@ -7,6 +7,7 @@
 import importlib
 import json
 import re
+import signal
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -54,8 +55,8 @@ def main() -> None:
             _check(command, overrides)
         sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, overrides)]
         hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=command)(_job(command))()
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None  # as a shell counts it: 128 and the signal's number
+    except KeyboardInterrupt as stopped:  # a training that another signal ended says which
+        raise SystemExit(128 + (stopped.args[0] if stopped.args else signal.SIGINT)) from None  # as a shell counts it
     except (ConfigError, OSError) as error:
         _end(error)
 

@@ -1,7 +1,8 @@
 """A config entry -> a function with its numbers bound.
 
 The one extension mechanism. An entry is a mapping with `_target_` and numbers: `{_target_: my_terms.jerk, limit: 3.0}`. A target without a
-dot is looked up among the built-ins of a module, a dotted one is imported. The numbers must be the function's keyword-only parameters, all
+dot is looked up among the built-ins of a module, a dotted one is imported; of the package's own modules only what they define counts, not
+what they import. The numbers must be the function's keyword-only parameters, all
 of them, with the annotated types: a misspelt, missing or mistyped key fails here, by name, with what would be valid.
 """
 
@@ -51,9 +52,13 @@ def build(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: 
 
 
 def find(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
-    """The function that `target` names: a public name of `builtins`, or a dotted path to import."""
+    """The function that `target` names: a public one of `builtins`, or a dotted path to import.
+
+    Raises:
+        ConfigError: no such function, or one that a module of the package only imports.
+    """
     module = importlib.import_module(builtins) if isinstance(builtins, str) else builtins
-    if not isinstance(target, str):
+    if not isinstance(target, str) or not all(map(str.isidentifier, target.split("."))):
         raise ConfigError(f"{where}._target_: {target!r} is no name of a function")
     if "." in target:
         path, name = target.rsplit(".", 1)
@@ -64,7 +69,7 @@ def find(target: str, *, builtins: types.ModuleType | str, where: str) -> Callab
     else:
         name = target
     function = getattr(module, name, None)
-    if not callable(function) or name.startswith("_"):
+    if not callable(function) or name.startswith("_") or not _is_own(function, module):
         valid = ", ".join(names(module))
         raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path of your own")
     return function
@@ -74,6 +79,12 @@ def names(module: types.ModuleType) -> list[str]:
     """Public functions that a module defines itself."""
     own = [n for n, f in vars(module).items() if inspect.isfunction(f) and inspect.unwrap(f).__module__ == module.__name__]
     return sorted(n for n in own if not n.startswith("_"))
+
+
+def _is_own(function: Callable[..., Any], module: types.ModuleType) -> bool:
+    """Whether a module of the package defines the function itself; modules of others may gather theirs as they like."""
+    package = __name__.partition(".")[0]
+    return module.__name__.partition(".")[0] != package or getattr(inspect.unwrap(function), "__module__", None) == module.__name__
 
 
 def check_type(value: Any, hint: Any, *, where: str) -> None:

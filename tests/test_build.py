@@ -45,6 +45,15 @@ def test_refuses_by_name(change, message):
         build({**ENTRY, **change}, builtins=_module(), where="x")
 
 
+IMPORTED = ["build", "scenefactory_jax.rewards.build", "scenefactory_jax.rewards.Mapping", "event.func", ".event", ""]
+
+
+@pytest.mark.parametrize("target", IMPORTED)
+def test_a_part_is_what_a_module_defines_not_what_it_imports(target):
+    with pytest.raises(ConfigError, match=r"^x\._target_: "):
+        build({"_target_": target}, builtins=rewards, where="x")
+
+
 def test_missing_key_lists_what_is_needed():
     with pytest.raises(ConfigError, match=r"x.factor: missing; scale needs dt, factor, names, steps"):
         build({"_target_": "scale", "steps": 1, "names": []}, builtins=_module(), where="x")

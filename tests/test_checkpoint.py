@@ -116,6 +116,79 @@ def test_an_unfinished_checkpoint_is_not_there(saved):
     assert int(checkpoint.restore(folder, third).iteration) == 3
 
 
+def put(file, content):
+    file.write_bytes(content)
+
+
+DAMAGE = {
+    "a manifest cut short": ("parameters/manifest.ocdbt", lambda file: put(file, file.read_bytes()[:20]), "is not as it was written"),
+    "metadata cut short": ("averaged/_METADATA", lambda file: put(file, file.read_bytes()[:99]), "is not as it was written"),
+    "a flipped bit": ("rest/ocdbt.process_0/d/*", lambda file: put(file, flipped(file.read_bytes())), "is not as it was written"),
+    "a lost file": ("averaged/d/*", lambda file: file.unlink(), "is missing"),
+    "the digests cut short": (checkpoint.SUMS, lambda file: put(file, file.read_bytes()[:30]), "is cut short"),
+}
+
+
+def flipped(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize(("pattern", "damage", "told"), DAMAGE.values(), ids=DAMAGE)
+def test_damage_is_named_and_the_one_before_goes_on(saved, tmp_path, pattern, damage, told):
+    folder, third, _ = saved
+    for name in ("2", "3"):
+        shutil.copytree(folder / name, tmp_path / name)
+    file = next((tmp_path / "3").glob(pattern))
+    damage(file)
+    for read in (lambda: checkpoint.restore(tmp_path, third), lambda: checkpoint.restore_parameters(tmp_path)):
+        with pytest.raises(ConfigError) as caught:
+            read()
+        where = f"{tmp_path / '3'}: damaged: {file.relative_to(tmp_path / '3').as_posix()} {told}; checkpoint 2 before it is whole: remove"
+        assert str(caught.value).startswith(where) and "\n" not in str(caught.value)
+    shutil.rmtree(tmp_path / "3")  # what the message says
+    assert int(checkpoint.restore(tmp_path, third).iteration) == 2
+
+
+def test_a_checkpoint_without_digests_is_read_and_its_damage_is_named(saved, tmp_path):
+    folder, third, _ = saved
+    shutil.copytree(folder / "3", tmp_path / "3")
+    (tmp_path / "3" / checkpoint.SUMS).unlink()  # of an older version
+    assert_same(checkpoint.restore(tmp_path, third), third)
+    put(tmp_path / "3" / "averaged" / "_METADATA", b"{")
+    with pytest.raises(ConfigError, match=r"3: damaged: .*the folder holds no whole checkpoint before it: restore it from a copy"):
+        checkpoint.restore_parameters(tmp_path)
+
+
+def test_what_was_handed_on_has_a_digest(saved, tmp_path):
+    parameters = checkpoint.restore_parameters(saved[0])
+    file = checkpoint.write_parameters(tmp_path, parameters)
+    assert_same(checkpoint.restore_parameters(tmp_path), parameters)
+    put(file, flipped(file.read_bytes()))
+    with pytest.raises(ConfigError, match=r"policy\.npz: damaged: policy\.npz is not as it was written; restore it from a copy"):
+        checkpoint.restore_parameters(tmp_path)
+    (tmp_path / checkpoint.SUMS).unlink()
+    for content in (b"", file.read_bytes()[:500], file.read_bytes()):
+        put(file, content)
+        with pytest.raises(ConfigError, match=r"policy\.npz: damaged: "):
+            checkpoint.restore_parameters(tmp_path)
+
+
+def test_a_full_disk_leaves_the_checkpoints_before_it(saved, tmp_path):
+    resource = pytest.importorskip("resource")  # a limit on files stands for a full disk: the same path, with another reason
+    folder, third, fourth = saved
+    shutil.copytree(folder / "3", tmp_path / "3")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1500, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large; checkpoint 3 is whole: with resume=true training goes on from it") as caught:
+            checkpoint.save(tmp_path, fourth, keep=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "4") and [place.name for place in tmp_path.iterdir()] == ["3"]
+    assert_same(checkpoint.restore(tmp_path, third), third)
+
+
 def test_mistakes_are_named(saved, tmp_path):
     folder, third, _ = saved
     with pytest.raises(FileNotFoundError, match="nowhere: no checkpoint there"):
@@ -160,5 +233,7 @@ def test_a_stripped_checkpoint_drives_but_does_not_go_on(saved, trainer, tmp_pat
     assert checkpoint.latest(tmp_path / "run") == checkpoint.latest(folder)
     assert sum(file.stat().st_size for file in (tmp_path / "run").rglob("*")) < 0.5 * before
     assert_same(checkpoint.restore_parameters(tmp_path / "run"), whole)
+    listed = (tmp_path / "run" / "3" / checkpoint.SUMS).read_text()
+    assert "averaged/_METADATA\n" in listed and "rest/" not in listed
     with pytest.raises(ConfigError, match="was stripped to what the policy learnt; training cannot go on"):
         checkpoint.restore(tmp_path / "run", begin(trainer))

@@ -25,7 +25,7 @@ from scenefactory_jax import folders, world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import failures, opengl, tables
-from scenefactory_jax.run import config, log, policies, reporting, results, sources, train_folder
+from scenefactory_jax.run import config, log, policies, reporting, results, sources, train_folder, train_stop
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
@@ -187,24 +187,42 @@ def test_a_training_that_cannot_begin_removes_what_it_made_and_nothing_else(tmp_
 
 @pytest.fixture
 def interruptible():
-    """As at a terminal: a script's background commands are born to ignore interrupts."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+    """As at a terminal: a script's background commands are born to ignore interrupts, those of `nohup` to ignore SIGHUP."""
+    own = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {one: signal.signal(one, handler) for one, handler in own.items()}
+    yield own
+    for one, handler in before.items():
+        signal.signal(one, handler)
 
 
-def test_an_interrupt_keeps_the_iteration_that_it_falls_into(whole, interruptible, tmp_path, capsys):
+def test_a_signal_to_stop_keeps_the_iteration_that_it_falls_into(whole, interruptible, tmp_path, capsys):
     again = lambda *changes: smoke(tmp_path / "run", "evaluation.enable=false", "iterations=4", *changes)  # noqa: E731
 
-    def interrupted(state, row):
-        if row["iteration"] == 3:
-            signal.raise_signal(signal.SIGINT)
+    for iteration, number in enumerate((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), start=1):
 
-    with pytest.raises(KeyboardInterrupt):
-        train(again(), on_iteration=interrupted)
-    assert f"stopped at iteration 3; goes on with the same settings and out={tmp_path / 'run'} resume=true" in capsys.readouterr().out
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        def stopped(state, row, number=number):
+            signal.raise_signal(number)
+            if number != signal.SIGINT:
+                signal.raise_signal(number)  # `timeout` sends it twice
+
+        with pytest.raises(KeyboardInterrupt) as caught:
+            train(again(*["resume=true"] * (iteration > 1)), on_iteration=stopped)
+        assert caught.value.args == (number,) and checkpoint.latest(tmp_path / "run" / "checkpoints") == iteration
+        told = f"stopped at iteration {iteration}; goes on with the same settings and out={tmp_path / 'run'} resume=true"
+        assert told in capsys.readouterr().out
+        assert {one: signal.getsignal(one) for one in interruptible} == interruptible
     same_numbers(train(again("resume=true")).folder, whole.folder)
+
+
+def test_a_second_interrupt_ends_at_once_and_what_is_ignored_stays_so(interruptible):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under `nohup`
+    with train_stop.deferred() as asked:
+        signal.raise_signal(signal.SIGHUP)
+        assert asked() is None
+        signal.raise_signal(signal.SIGTERM)
+        assert asked() == signal.SIGTERM
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_held_out_scenes_are_refused_before_anything_is_read(tmp_path):
@@ -302,12 +320,15 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
 
 
 def test_scores_and_titles_name_other_scenes(whole, tmp_path):
-    asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "protocols": ["strict", "invincible"]}
+    asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "trust": True}
+    asked |= {"protocols": ["strict", "invincible"]}
     results.begin(tmp_path, asked)
     assert named("unseen", tmp_path) == "unseen (towns.bank, dynamics=bicycle)" and named("unseen", whole.folder) == "unseen"
     assert reporting.title("mine", asked) == "mine: evaluation on towns.bank"
     assert reporting.again(asked, config.load("evaluate", "run=mine", "seed=7")) == (
-        "python -m scenefactory_jax evaluate run=mine scenes.path=/data/towns.bank 'overrides=[\"dynamics=bicycle\"]' seed=7")  # fmt: skip
+        "python -m scenefactory_jax evaluate run=mine trust=true scenes.path=/data/towns.bank 'overrides=[\"dynamics=bicycle\"]'"
+        " seed=7"
+    )
 
 
 def test_a_damaged_config_is_named(tmp_path):
@@ -436,12 +457,14 @@ def test_help_begins_with_what_a_command_is_for():
     assert len(rest) > 10 and all(command_line._help(name, [])[0].startswith(f'hydra.help.header="{name}: ') for name in config.COMMANDS)
 
 
-def test_an_interrupted_command_ends_as_shells_expect(monkeypatch, interruptible):
-    monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "train"])
-    monkeypatch.setattr("hydra.main", lambda **_: lambda job: lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(SystemExit) as stopped:
-        command_line.main()
-    assert stopped.value.code == 130
+def test_an_interrupted_command_ends_as_shells_expect(monkeypatch, interruptible, tmp_path):
+    ways = {130: lambda: signal.raise_signal(signal.SIGINT), 143: lambda: train_stop.end(tmp_path, 1, signal.SIGTERM)}
+    for code, end in ways.items():
+        monkeypatch.setattr(sys, "argv", ["scenefactory_jax", "train"])
+        monkeypatch.setattr("hydra.main", lambda end=end, **_: lambda job: end)
+        with pytest.raises(SystemExit) as stopped:
+            command_line.main()
+        assert stopped.value.code == code
 
 
 def test_only_our_own_command_line_counts_as_a_command(monkeypatch):

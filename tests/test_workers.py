@@ -1,4 +1,4 @@
-"""Processes that work for this one: what a terminal's Ctrl-C and an error do to them."""
+"""Processes that work for this one: what signals to stop and an error do to them."""
 
 import multiprocessing
 import os
@@ -11,8 +11,9 @@ from scenefactory_jax.run import workers
 
 
 def interrupted(seconds):
-    """What a terminal does to every process of a command, and then some work."""
-    os.kill(os.getpid(), signal.SIGINT)
+    """What terminals and schedulers do to every process of a command, and then some work."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(os.getpid(), number)
     time.sleep(seconds)
     return "done"
 
@@ -20,6 +21,41 @@ def interrupted(seconds):
 def test_an_interrupt_is_for_the_process_that_started_them():
     with workers.pool(1) as processes:
         assert processes.submit(interrupted, 0.2).result(timeout=120) == "done"
+
+
+def lead(beat):
+    """Starts a worker that works on and on, and tells it by a file."""
+    with workers.pool(1) as processes:
+        processes.submit(beats, beat).result()
+
+
+def beats(beat):
+    while True:
+        beat.touch()
+        time.sleep(0.05)
+
+
+def test_they_end_with_the_process_that_started_them(tmp_path):
+    first = multiprocessing.get_context("spawn").Process(target=lead, args=(tmp_path / "beat",))
+    first.start()
+    until(lambda: (tmp_path / "beat").is_file())
+    first.kill()
+    first.join(timeout=60)
+    seen = [0]
+
+    def still():
+        time.sleep(0.5)
+        seen.append((tmp_path / "beat").stat().st_mtime_ns)
+        return seen[-1] == seen[-2]
+
+    until(still)
+
+
+def until(true, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_an_error_ends_them_whatever_they_are_at():

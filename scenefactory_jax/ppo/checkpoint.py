@@ -2,11 +2,18 @@
 
 A checkpoint is written aside and renamed when it is whole, so that an interrupted save leaves the ones before it as they were. On disk
 stand plain nested dicts of arrays, named as the fields and keys of the train state; random keys as their data, empty arrays not at all.
+SHA256SUMS beside them, as `sha256sum` writes it, has the digest of each file; it is checked before anything is read. What older versions
+wrote has none, and is read unchecked.
 """
 
 import contextlib
+import errno
+import hashlib
+import os
 import shutil
-from collections.abc import Iterator, Mapping
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +29,8 @@ LEARNT, AVERAGED, REST = "parameters", "averaged", "rest"  # apart, so that an e
 PREFIX = {LEARNT: LEARNT, AVERAGED: AVERAGED, REST: ""}  # of the names of their arrays in a train state
 FILE = "policy.npz"  # in place of checkpoints: what a policy learnt, alone
 HOST = "host"  # what the loop around the train state carries
+SUMS = "SHA256SUMS"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, one's share of it, or a file is full
 
 
 def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, Any] | None = None) -> Path:
@@ -34,26 +43,26 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
 
     Raises:
         ConfigError: `keep` below one.
+        OSError: the disk is full; what was written of the checkpoint is removed, those before it are as they were.
     """
     if keep < 1:
         raise ConfigError(f"keep: {keep} checkpoints; wanted is at least 1")
     iteration = int(train_state.iteration)
     parts = _parts(_stored(train_state))
-    with _manager(Path(folder), keep=keep) as manager:
+    place = Path(folder) / str(iteration)
+    with _fitting(place), _manager(Path(folder), keep=keep) as manager:
         if iteration in manager.all_steps():
             manager.delete(iteration)
         items: dict[str, Any] = {name: ocp.args.StandardSave(part) for name, part in parts.items()}
         items |= {} if host is None else {HOST: ocp.args.JsonSave(dict(host))}
         manager.save(iteration, args=ocp.args.Composite(**items), force=True)
-    return Path(folder) / str(iteration)
+        _write_sums(place, [file for file in sorted(place.rglob("*")) if file.is_file()])
+    return place
 
 
 def latest(folder: Path | str) -> int | None:
     """Iteration of the newest whole checkpoint; None if the folder holds none."""
-    if not Path(folder).is_dir():
-        return None
-    with _manager(Path(folder)) as manager:
-        return manager.latest_step()
+    return max(_steps(Path(folder)), default=None)
 
 
 def strip(folder: Path | str) -> None:
@@ -63,6 +72,9 @@ def strip(folder: Path | str) -> None:
         if place.name == str(newest):
             for item in (REST, HOST):
                 shutil.rmtree(place / item, ignore_errors=True)
+            if (place / SUMS).is_file():
+                lines = (place / SUMS).read_text().splitlines()
+                _replace(place / SUMS, [line for line in lines if (place / line.partition("  ")[2]).is_file()])
         elif place.name.isdigit():
             shutil.rmtree(place)
 
@@ -75,11 +87,10 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
 
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
-        ConfigError: the checkpoint was made with another config; the message names the arrays that differ.
+        ConfigError: the checkpoint was made with another config, the message names the arrays that differ; or it is damaged.
     """
     wanted = _stored(like)
-    with _manager(Path(folder)) as manager:
-        step = _find(manager, Path(folder), iteration)
+    with _opened(Path(folder), iteration) as (manager, step):
         if not (Path(folder) / str(step) / REST).is_dir():
             raise ConfigError(f"{folder}: checkpoint {step} was stripped to what the policy learnt; training cannot go on from it")
         held = manager.item_metadata(step)
@@ -97,9 +108,9 @@ def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, 
 
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
+        ConfigError: it is damaged.
     """
-    with _manager(Path(folder)) as manager:
-        step = _find(manager, Path(folder), iteration)
+    with _opened(Path(folder), iteration) as (manager, step):
         if not (Path(folder) / str(step) / HOST).is_dir():
             return None
         return manager.restore(step, args=ocp.args.Composite(host=ocp.args.JsonRestore()))[HOST]
@@ -112,12 +123,11 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
 
     Raises:
         FileNotFoundError: the folder holds no such checkpoint; the message lists those it holds.
+        ConfigError: it is damaged.
     """
     if iteration is None and (Path(folder) / FILE).is_file():
-        with np.load(Path(folder) / FILE) as file:
-            return _nest({name: jnp.asarray(file[name]) for name in file.files})
-    with _manager(Path(folder)) as manager:
-        step = _find(manager, Path(folder), iteration)
+        return _read_parameters(Path(folder))
+    with _opened(Path(folder), iteration) as (manager, step):
         held = manager.item_metadata(step)
         name = AVERAGED if AVERAGED in held else LEARNT
         plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), held[name], is_leaf=_is_metadata)
@@ -130,7 +140,20 @@ def write_parameters(folder: Path | str, parameters: Any) -> Path:
     file = Path(folder) / FILE
     numbers: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named(parameters)}
     np.savez_compressed(file, **numbers)
+    _write_sums(Path(folder), [file])
     return file
+
+
+def _read_parameters(folder: Path) -> Any:
+    """What `write_parameters` wrote."""
+    damage = _damage(folder)
+    try:
+        if damage is None:
+            with np.load(folder / FILE) as file:
+                return _nest({name: jnp.asarray(file[name]) for name in file.files})
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
+        damage = " ".join(str(error).split())
+    raise ConfigError(f"{folder / FILE}: damaged: {damage}; restore it from a copy")
 
 
 @contextlib.contextmanager
@@ -142,8 +165,85 @@ def _manager(folder: Path, *, keep: int | None = None) -> Iterator[ocp.Checkpoin
         yield manager
 
 
-def _find(manager: ocp.CheckpointManager, folder: Path, iteration: int | None) -> int:
-    held = sorted(manager.all_steps())
+@contextlib.contextmanager
+def _opened(folder: Path, iteration: int | None) -> Iterator[tuple[ocp.CheckpointManager, int]]:
+    """What reads a checkpoint of the folder (None: the newest), and the iteration of that, once its files are as they were written."""
+    step = _find(folder, iteration)
+    place = folder / str(step)
+    if damage := _damage(place):
+        raise ConfigError(_told(folder, step, damage))
+    try:
+        with _manager(folder) as manager:
+            yield manager, step
+    except (ValueError, OSError) as error:
+        if isinstance(error, ConfigError) or (place / SUMS).is_file():
+            raise
+        raise ConfigError(_told(folder, step, " ".join(str(error).split()))) from error  # of an older version: nothing else would tell
+
+
+def _told(folder: Path, step: int, damage: str) -> str:
+    """What is damaged, and which checkpoint to use instead."""
+    place, before = folder / str(step), [one for one in _steps(folder) if one < step and _damage(folder / str(one)) is None]
+    if not before:
+        return f"{place}: damaged: {damage}; the folder holds no whole checkpoint before it: restore it from a copy"
+    return f"{place}: damaged: {damage}; checkpoint {before[-1]} before it is whole: remove {place}, and the same command uses that one"
+
+
+def _damage(place: Path) -> str | None:
+    """Which file is not as it was written, of those that SHA256SUMS lists; None: none is, or there are no digests."""
+    if not (place / SUMS).is_file():
+        return None
+    lines = (place / SUMS).read_text(errors="replace").splitlines()
+    for line in lines or [""]:
+        wanted, _, name = line.partition("  ")
+        if not name:
+            return f"{SUMS} is cut short"
+        if not (place / name).is_file():
+            return f"{name} is missing"
+        if _sha256(place / name) != wanted:
+            return f"{name} is not as it was written"
+    return None
+
+
+def _write_sums(place: Path, files: Sequence[Path]) -> None:
+    _replace(place / SUMS, [f"{_sha256(file)}  {file.relative_to(place).as_posix()}" for file in files if file.name != SUMS])
+
+
+def _replace(file: Path, lines: Sequence[str]) -> None:
+    """The lines as a file that is whole or as it was before."""
+    half = file.with_name(f"{file.name}.part")
+    half.write_text("".join(f"{line}\n" for line in lines))
+    half.replace(file)
+
+
+def _sha256(file: Path) -> str:
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+@contextlib.contextmanager
+def _fitting(place: Path) -> Iterator[None]:
+    """Say that the disk is full in one line: orbax hands on tensorstore's ValueError, which has the system's reason in its text."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        code = next((code for code in FULL if os.strerror(code) in str(error)), None)
+        if code is None:
+            raise
+        for half in place.parent.glob(f"{place.name}.orbax-checkpoint-tmp*"):
+            shutil.rmtree(half, ignore_errors=True)
+        held = latest(place.parent)
+        kept = "no checkpoint is whole" if held is None else f"checkpoint {held} is whole: with resume=true training goes on from it"
+        raise OSError(code, f"{os.strerror(code)}; {kept}", str(place)) from None
+
+
+def _steps(folder: Path) -> list[int]:
+    """Iterations of the whole checkpoints, ascending; unfinished ones have other names."""
+    return sorted(int(place.name) for place in folder.iterdir() if place.name.isdecimal()) if folder.is_dir() else []
+
+
+def _find(folder: Path, iteration: int | None) -> int:
+    held = _steps(folder)
     if not held:
         raise FileNotFoundError(f"{folder}: no checkpoint there")
     if iteration is not None and iteration not in held:

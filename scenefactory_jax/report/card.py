@@ -16,6 +16,7 @@ def markdown(
     versions: Mapping[str, str],
     training: Sequence[Mapping[str, float]],
     judged: Mapping[str, Mapping[str, Mapping[str, tables.Estimate]]],
+    outside: Sequence[str] = (),
 ) -> str:
     """The card as Markdown.
 
@@ -26,12 +27,25 @@ def markdown(
         versions: of packages and device, and the commit, of the training.
         training: rows of its metrics, first to last; none: the training left no record.
         judged: what was driven -> protocol -> `tables.summarise` of its records.
+        outside: functions that the config names and the package does not have.
     """
     parts = [f"# {name}", about or "", "## Training", tables.grid(["", ""], _training(config, versions, training))]
     if judged:
         parts += ["## Scores", *_scores(judged)]
-    parts.append("`config.yaml` has every setting of the training, `checkpoints/policy.npz` what was learnt.")
+    learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
+    parts += ["## Files", f"`config.yaml` has every setting of the training, {learnt}. {_code(outside)}"]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _code(outside: Sequence[str]) -> str:
+    """What whoever loads the policy lets run."""
+    if not outside:
+        return "The config names functions of scenefactory_jax alone: loading the policy runs no other code."
+    named = ", ".join(f"`{target}`" for target in outside)
+    return (
+        f"The config names functions outside of scenefactory_jax: {named}. They are not in this folder. Whoever loads the policy needs them"
+        " on the Python path, and allows them by `trust=true` (in Python `trust=True`): read them first."
+    )
 
 
 def _training(config: Mapping[str, Any], versions: Mapping[str, str], training: Sequence[Mapping[str, float]]) -> list[list[str]]:

@@ -81,7 +81,7 @@ def _find(patterns: Iterable[str]) -> list[Path]:
 
 
 def _read(folder: Path) -> Read:
-    config, metrics = configs.read(folder), log.read(folder)
+    config, metrics = configs.values(folder), log.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / log.FILE}: no row; the run has not finished an iteration")
     settings = {key: value for key, value in document.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import whole
+from scenefactory_jax.run import targets, whole
 
 COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
 COMMANDS += ("weather", "export")
@@ -131,8 +131,22 @@ def _explain(name: str, error: Exception) -> str:
     return f"{text}; to replace all of {match.group(1)}: ~{match.group(1)} +{match.group(1)}={{...}}"
 
 
-def read(path: Path) -> dict[str, Any]:
-    """The config that a run was made with (`config.yaml` of its folder).
+def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
+    """The config that a run was made with (`config.yaml` of its folder), to build from.
+
+    Args:
+        trust: whether it may name functions outside of the package (`run/targets.py`); they are printed.
+
+    Raises:
+        ConfigError: no such run, naming the folder; a file that holds no config; or one that names such functions without `trust`.
+    """
+    found = values(path)
+    targets.check(found, Path(path) / FILE, trust=trust)
+    return found
+
+
+def values(path: Path) -> dict[str, Any]:
+    """What a run's `config.yaml` says, to compare or to show: nothing may be built from it, for its targets are not checked.
 
     Raises:
         ConfigError: no such run, naming the folder; or a file that holds no config.

@@ -12,7 +12,7 @@ from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, playing, policies, results, sources
+from scenefactory_jax.run import keys, log, playing, policies, results, sources, targets
 
 PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
@@ -30,19 +30,19 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     """Evaluate a run as a config says (`load("evaluate", "run=...")`): deterministic policy, one episode a scene and repeat.
 
     Raises:
-        ConfigError: no such run, no checkpoint in it, a setting that the run does not have.
+        ConfigError: no such run, no checkpoint in it, a setting that the run does not have, code of others without `trust`.
         SceneError: scenes that cannot be read.
     """
     keys.check_evaluate(config)
     sources.use_compilation_cache()
     run = policies.find(config["run"])
-    trained = configs.amend(configs.read(run), config["overrides"])
+    trained = configs.amend(configs.read(run, trust=config["trust"]), config["overrides"])
     wanted = {True: "invincible", False: "strict"}.get(config["invincible"], config["invincible"])
     if wanted not in PROTOCOLS:
         raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
     scenes = sources.heldout(trained["scenes"], path=config["scenes"]["path"])
     out = Path(config["out"] or (Path("runs") / run.name if policies.is_shipped(run) else run) / "evaluation")
-    asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"]}
+    asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"], "trust": config["trust"]}
     return judge(trained, run, scenes, out, asked=asked, settings=config, protocols=PROTOCOLS[wanted])
 
 
@@ -50,7 +50,7 @@ def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     """The evaluation that ends `train`: held-out scenes, the run's own settings."""
     settings = config["evaluation"]
     scenes = sources.heldout(config["scenes"], path=None)
-    asked = {"run": str(folder), "scenes": None, "overrides": []}
+    asked = {"run": str(folder), "scenes": None, "overrides": [], "trust": bool(targets.outside(config))}
     return judge(config, folder, scenes, folder, asked=asked, settings=settings, protocols=settings["protocols"])
 
 
@@ -96,7 +96,7 @@ def judge(
     """Play every protocol with the trained and, if asked for, the untrained policy; write records, report and video to `out`.
 
     Args:
-        asked: run, scenes (None: the run's own held-out ones) and overrides, as they were named.
+        asked: run, scenes (None: the run's own held-out ones), overrides and trust, as they were named.
     """
     from scenefactory_jax.run import failing, reporting
 

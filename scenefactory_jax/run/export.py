@@ -11,7 +11,7 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import card, tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import keys, log, policies, results
+from scenefactory_jax.run import keys, log, policies, results, targets
 
 
 def export(config: Mapping[str, Any]) -> Path:
@@ -21,7 +21,8 @@ def export(config: Mapping[str, Any]) -> Path:
     it.
 
     Raises:
-        ConfigError: no such run, no checkpoint in it, a folder that holds something, or one of `card.judged` that `evaluate` did not write.
+        ConfigError: no such run, no checkpoint in it, code of others in its config without `trust`, a folder that holds something, or
+            one of `card.judged` that `evaluate` did not write.
     """
     keys.check_export(config)
     out = Path(config["out"])
@@ -29,7 +30,7 @@ def export(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"out: {out} holds something already; give a new folder")
     folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
-    trained = policies.load_policy(config["run"])
+    trained = policies.load_policy(config["run"], trust=config["trust"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config
@@ -40,8 +41,9 @@ def export(config: Mapping[str, Any]) -> Path:
     shutil.copy(trained.folder / "versions.yaml", out)
     versions = yaml.safe_load((out / "versions.yaml").read_text())
     text = card.markdown(
-        out.name, config["card"]["about"], config=own, versions=versions, training=log.read(trained.folder), judged=judged
-    )
+        out.name, config["card"]["about"], config=own, versions=versions, training=log.read(trained.folder), judged=judged,
+        outside=sorted(set(targets.outside(own).values())),
+    )  # fmt: skip
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out

@@ -55,14 +55,14 @@ TREND = {"label": Key(str), "values": Key(dict[str, float | None])}
 WEATHER = {"out": Key(str), "films_mm": Key(list[float]), "speeds_mps": Key(list[float]), "slips": Key(list[float])}
 WEATHER |= {"film_most_mm": Key(float, 0)}
 RENDER = {"index": SEED, "seed": SEED, "out": Key(str)}
-REPLAY = {"run": PLACE, "overrides": Key(list[str]), "act": Key(Literal["policy", "coast", "random"]), "worlds": COUNT, "skip": SEED}
-REPLAY |= {"seconds": Key(float, 0.1), "seed": SEED, "out": Key(str), "title": PLACE}
+REPLAY = {"run": PLACE, "trust": FLAG, "overrides": Key(list[str]), "act": Key(Literal["policy", "coast", "random"])}
+REPLAY |= {"worlds": COUNT, "skip": SEED, "seconds": Key(float, 0.1), "seed": SEED, "out": Key(str), "title": PLACE}
 FILM = {"view": Key(Literal["chase", "bird", "both"]), "car": Key(int | None, 0), "width": Key(int, 64), "height": Key(int, 64)}
 VIEW = {"distance_m": Key(float, 1), "pitch_deg": Key(float, -90), "lag_s": Key(float, 0)}
 FILM |= {"fps": Key(float, 0.1), "stride": COUNT, "at_s": Key(float, 0), "trail_s": Key(float, 0), **VIEW}
-HANDING_ON = {"run": Key(str), "out": Key(str)}
+HANDING_ON = {"run": Key(str), "trust": FLAG, "out": Key(str)}
 CARD = {"about": PLACE, "judged": Key(dict[str, str] | None), "bootstrap": COUNT, "seed": SEED}
-DRIVE = {"run": PLACE, "overrides": Key(list[str]), "skip": SEED, "car": Key(int | None, 0), "seed": SEED}
+DRIVE = {"run": PLACE, "trust": FLAG, "overrides": Key(list[str]), "skip": SEED, "car": Key(int | None, 0), "seed": SEED}
 DRIVE_KEYS = {name: Key(str) for name in ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")}
 FEEL = {name: Key(float, 0.01) for name in ("rise_s", "fall_s", "turn_s", "centre_s", "calm_mps", "tap_s")}
 SCENES = {"op": Key(str), "out": PLACE, "copy": FLAG, "limit": SEED, "seed": SEED, "progress": FLAG, "filter": PLACE}
@@ -127,7 +127,7 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: naming the key, the value and what would be valid.
     """
-    check(config, {"run": Key(str), "out": PLACE, "overrides": Key(list[str]), **JUDGE})
+    check(config, {"run": Key(str), "trust": FLAG, "out": PLACE, "overrides": Key(list[str]), **JUDGE})
     check_video(config["video"], where="video")
     check_failures(config, where="failures")
 

@@ -21,7 +21,7 @@ class Trained(NamedTuple):
     parameters: Any
 
 
-def load_policy(run: str | Path) -> Trained:
+def load_policy(run: str | Path, *, trust: bool = False) -> Trained:
     """A trained policy to act with, to judge or to train on.
 
         trained = sf.load_policy("runs/demo-...")
@@ -30,13 +30,14 @@ def load_policy(run: str | Path) -> Trained:
 
     Args:
         run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package.
+        trust: whether its config may name functions outside of the package, which are then imported and called; they are printed.
 
     Raises:
-        ConfigError: neither.
+        ConfigError: neither; or a config that names such functions without `trust`.
         FileNotFoundError: a run without a checkpoint.
     """
     folder = find(run)
-    config = configs.read(folder)
+    config = configs.read(folder, trust=trust)
     return Trained(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
 
 

@@ -105,7 +105,7 @@ def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
     for group in world.GROUPS:  # what a run has of its own
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
-    trained = configs.amend(configs.read(policies.find(config["run"])), config["overrides"])
+    trained = configs.amend(configs.read(policies.find(config["run"]), trust=config["trust"]), config["overrides"])
     own, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
     if asked["path"] is not None:
         return trained | {"scenes": own | {"path": asked["path"]}}

@@ -62,7 +62,8 @@ def again(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
     default = configs.load("evaluate", "run=null")
     invincible = {("strict",): False, ("invincible",): True}.get(tuple(asked["protocols"]), "both")
-    own = {"run": asked["run"], "out": None, "scenes": {"path": asked["scenes"]}, "overrides": asked["overrides"], "invincible": invincible}
+    own = {name: asked[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": asked["scenes"]}}
+    own |= {"out": None, "invincible": invincible}
     wanted, usual = document.flatten({name: {**settings, **own}[name] for name in ("run", *default)}), document.flatten(default)
     words = [f"{key}={_word(value)}" for key, value in wanted.items() if value != usual.get(key)]
     return f"python -m scenefactory_jax evaluate {shlex.join(words)}"

@@ -66,7 +66,9 @@ def run(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int 
 
 @contextlib.contextmanager
 def _ending(processes: Sequence[BaseProcess]) -> Iterator[None]:
-    """What ends this process early ends the others first: SIGTERM at once; Ctrl-C, which a terminal sends to all, when they have obeyed it.
+    """What ends this process early ends the others first, a training once its iteration is kept.
+
+    SIGTERM is sent on to them; Ctrl-C a terminal sends to all.
 
     So what is done with their answers and notes can still be done.
     """
@@ -92,12 +94,12 @@ def _ending(processes: Sequence[BaseProcess]) -> Iterator[None]:
 
 
 def _one(work: Callable[..., Any], index: int, arguments: tuple[Any, ...]) -> None:
-    threading.Thread(target=_end_with_the_first, daemon=True).start()
+    threading.Thread(target=end_with_the_first, daemon=True).start()
     _keep_to_a_core(index)
     results.write(_answer(arguments[-1], index), {"answer": work(index, *arguments)}, digits=None)
 
 
-def _end_with_the_first() -> None:
+def end_with_the_first() -> None:
     """A killed process cannot end the others: they watch it."""
     if (first := multiprocessing.parent_process()) is not None:
         first.join()

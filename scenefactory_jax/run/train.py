@@ -68,7 +68,7 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
     Raises:
         ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
-        KeyboardInterrupt: an interrupt, once the iteration is whole and kept.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
     """
     keys.check_train(config)
     if config["evaluation"]["enable"]:
@@ -174,8 +174,8 @@ def _loop(
 ):
     """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
 
-    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. An interrupt ends it after the
-    iteration that it fell into, with a checkpoint.
+    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. A signal to stop ends it after
+    the iteration that it fell into, with a checkpoint.
     """
     first, total = int(state.iteration), config["iterations"]
     file = log.MetricsFile(folder, resume_at=first if resume else None)
@@ -203,7 +203,7 @@ def _loop(
                 host = None if flow is None else flow.state()
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
             if stop:
-                train_stop.end(folder, iteration)
+                train_stop.end(folder, iteration, stop)
             if late:
                 break
     return state

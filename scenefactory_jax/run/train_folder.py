@@ -61,13 +61,15 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
     if not begun:
         raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
     _check_same(folder, config)
+    if last is None:
+        print(f"{folder} has no checkpoint to go on from: the run begins anew", flush=True)
     return last is not None
 
 
 def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
     """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
     shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
-    found = differing(configs.read(folder), config).items()
+    found = differing(configs.values(folder), config).items()
     bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
     if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
         more = f"; and {len(told) - 8} more" if len(told) > 8 else ""

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import multiprocessing
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from scenefactory_jax.run.together import end_with_the_first
+from scenefactory_jax.run.train_stop import STOPPING
 from scenefactory_jax.validation.parts import Spread
 
 
@@ -57,7 +60,9 @@ def spreading(workers: int) -> Iterator[Spread]:
 
 
 def _begin() -> None:
-    """The accelerator belongs to the process that started this one; so does Ctrl-C, which a terminal sends to all of them: a training
-    finishes its iteration first, and needs the scenes of it."""
+    """The accelerator belongs to the process that started this one; so do the signals to stop, which terminals and schedulers send to all:
+    a training finishes its iteration first, and needs the scenes of it. When that process ends, this one does."""
     jax.config.update("jax_platforms", "cpu")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for one in STOPPING:
+        signal.signal(one, signal.SIG_IGN)
+    threading.Thread(target=end_with_the_first, daemon=True).start()

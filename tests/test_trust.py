@@ -1,0 +1,114 @@
+"""A folder that holds a run or a policy runs no code of its own: its config may name parts of the package, and others only with `trust`."""
+
+import shutil
+
+import pytest
+import yaml
+
+import scenefactory_jax as sf
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import card
+from scenefactory_jax.run import config, policies, replay, targets, train_folder
+from scenefactory_jax.run.compare import _read
+from scenefactory_jax.run.evaluate import evaluate
+from scenefactory_jax.run.export import export
+from scenefactory_jax.run.replay import of_run
+
+PLANTED = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\nfrom scenefactory_jax.policy.late_fusion import make\n"
+FOREIGN = ["planted.make", "os.system", "runpy.run_path", "scenefactory_jax.run.config.subprocess.run", "scenefactory_jax.build.find"]
+FOREIGN += ["scenefactory_jax.ppo.checkpoint.strip", "scenefactory_jax.run.whole.replaced"]
+FOREIGN += ["scenefactory_jax_evil.rewards.event", ".planted.make", 7]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The package's policy in a folder with a module beside it, importable from where the command is called."""
+    shutil.copytree(policies.SHIPPED / "town", tmp_path / "theirs")
+    (tmp_path / "theirs" / "planted.py").write_text(PLANTED)
+    monkeypatch.chdir(tmp_path / "theirs")
+    monkeypatch.syspath_prepend(tmp_path / "theirs")
+    return tmp_path / "theirs"
+
+
+def change(folder, edit):
+    own = yaml.safe_load((folder / "config.yaml").read_text())
+    edit(own)
+    (folder / "config.yaml").write_text(yaml.safe_dump(own))
+
+
+@pytest.mark.parametrize("target", FOREIGN, ids=str)
+def test_a_run_names_parts_of_the_package_alone(folder, target):
+    change(folder, lambda own: own["reward"]["goal"].update(_target_=target))
+    with pytest.raises(ConfigError) as caught:
+        sf.load_policy(folder)
+    told = str(caught.value)
+    assert told.startswith(f"{folder / 'config.yaml'}: reward.goal._target_: {target!r}: outside of scenefactory_jax")
+    assert "trust=true" in told and "\n" not in told and not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "door",
+    [
+        lambda run, out: sf.load_policy(run),
+        lambda run, out: export(config.load("export", f"run={run}", f"out={out}")),
+        lambda run, out: evaluate(config.load("evaluate", f"run={run}", f"out={out}")),
+        lambda run, out: replay.replay(config.load("replay", f"run={run}", f"out={out}.html")),
+        lambda run, out: of_run(config.load("drive", f"run={run}"), command="drive"),
+    ],
+    ids=["load_policy", "export", "evaluate", "replay", "drive"],
+)
+def test_every_door_is_the_same(folder, tmp_path, door):
+    change(folder, lambda own: own["scenes"]["formats"].update(mine={"_target_": "planted.make", "more": [{"_target_": "os.system"}]}))
+    named = r"scenes\.formats\.mine\._target_: 'planted\.make'; scenes\.formats\.mine\.more\.0\._target_: 'os\.system'"
+    with pytest.raises(ConfigError, match=named):
+        door(folder, tmp_path / "out")
+    assert not (folder / "ran").exists() and not (tmp_path / "out").exists()
+
+
+def test_what_is_trusted_is_named_and_runs(folder, tmp_path, capsys):
+    change(folder, lambda own: own["policy"].update(_target_="planted.make"))
+    trained = sf.load_policy(folder, trust=True)
+    assert (folder / "ran").exists() and trained.config["policy"]["_target_"] == "planted.make"
+    assert f"{folder / 'config.yaml'}: trusted, and runs planted.make (policy._target_)\n" == capsys.readouterr().out
+    kept = export(config.load("export", f"run={folder}", f"out={tmp_path / 'mine'}", "trust=true"))
+    assert "names functions outside of scenefactory_jax: `planted.make`." in (kept / "README.md").read_text()
+    with pytest.raises(ConfigError, match=r"policy\._target_: 'planted\.make'"):
+        sf.load_policy(kept)
+
+
+def test_a_policy_of_the_package_needs_no_trust(capsys):
+    assert targets.outside(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
+    assert card._code(()) in (policies.SHIPPED / "town" / "README.md").read_text()
+
+
+def test_whatever_a_training_can_choose_may_be_named():
+    whole = config.load("train")
+    groups = [group for group in whole if (config.folder() / group).is_dir()]
+    files = [file for group in groups for file in (config.folder() / group).rglob("*.yaml")]
+    assert {"dynamics", "reward", "observe", "scenes", "policy", "loggers", "weather"} <= set(groups) and len(files) > 40
+    for name in [*files, config.folder() / "formats.yaml"]:
+        assert targets.outside(yaml.safe_load(name.read_text()) or {}) == {}, name
+
+
+def test_yaml_that_names_itself_is_read_once(tmp_path):
+    (tmp_path / "config.yaml").write_text('a: &a [*a, {_target_: os.system}]\n"\\e[2J": {_target_: x.y}\n')
+    with pytest.raises(ConfigError) as caught:
+        config.read(tmp_path)
+    assert "a.1._target_: 'os.system'" in str(caught.value) and "\x1b" not in str(caught.value)
+
+
+def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path):
+    mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
+    before = config.load("train", mine, f"out={tmp_path}")
+    config.write(tmp_path, before)
+    with train_folder.opened(before | {"resume": True}) as (folder, resume):  # what is built is the command's config, never the folder's
+        assert folder == tmp_path and not resume
+    other = config.load("train", f"out={tmp_path}", "resume=true")
+    with pytest.raises(ConfigError, match=r"reward\.mine=None"), train_folder.opened(other):
+        pass
+
+
+def test_runs_are_compared_without_trust(tmp_path):
+    config.write(tmp_path, config.load("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
+    (tmp_path / "metrics.csv").write_text("iteration\n1\n")
+    assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"
