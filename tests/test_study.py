@@ -13,6 +13,7 @@ import study_parts
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import levels, study_figures, tables
+from scenefactory_jax.report import study as report
 from scenefactory_jax.run import config, log, sources, study_plan, train, train_folder
 from scenefactory_jax.run import study as command
 from scenefactory_jax.run.study import Clock, study
@@ -91,6 +92,12 @@ def test_the_report_shows_what_it_rests_on_and_no_place_of_this_machine(whole):
     assert "Collision rate" in text and "Clean success rate" in text and "| all terms | 3 | 2 (" in text
     assert str(folder) not in text and str(folder) not in (folder / "out" / "result.json").read_text()
     assert result["made_with"]["commit"] in text and result["made_with"]["jax"] == jax.__version__
+    assert "| dry | logged | dry | ignore | as trained |" in text and "| at random | random_pairs | snow | ignore | as trained |" in text
+    ends = [one["change"][name] for one in result["differences"] for name in report.CHANGES]
+    without_zero = sum(end["low"] is not None and not end["low"] <= 0 <= end["high"] for end in ends)
+    counted = sum(end["low"] is not None for end in ends)
+    assert f"{counted / 20:.1f} of the {counted} in this table. {without_zero} of them do" in text
+    assert "judged on the recipe's own: the test scenes." in text and "chose no setting" not in text  # nothing here knows that
 
 
 def test_looks_are_counted_over_all_calls(whole):
