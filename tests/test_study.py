@@ -291,6 +291,19 @@ def test_every_study_is_whole(name, tmp_path):
     assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
 
 
+def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
+    """`recorded` and `strict` judge as navigation's first condition does, `paper` as its second: by name what the study spells out."""
+    entry = config.load("study", "study=navigation", f"runs={tmp_path}", "seeds=[0]")
+    conditions = {"recorded": "original", "strict": "original", "paper": "original, from rest"}
+    plan = study_plan.make(entry)
+    for name, condition in conditions.items():
+        asked = config.load("evaluate", "run=x", f"protocol={name}")
+        rows = [one for one in plan.judgings if (one.row, one.condition) == ("rigid body", condition)]
+        assert {one.protocol for one in rows} >= set(asked["protocol"]["ends"])
+        assert rows[0].config == config.amend(rows[0].training.config, asked["protocol"]["settings"])
+        assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
+
+
 def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
     (tmp_path / "files").mkdir()
     bank = tmp_path / "test.bank"

@@ -17,7 +17,7 @@ TASK = tuple(group for group in world.GROUPS if group != "ends")  # how episodes
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
 ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
-TRAINED, UNTRAINED = "checkpoints", "untrained"  # folders of a run
+TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, and what it began with
 
 
 class Training(NamedTuple):
@@ -134,7 +134,7 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
     scenes += [] if config["test_scenes"] is None else [f"scenes.heldout.path={_quoted(config['test_scenes'])}"]
     overrides = later_wins([*study["base"], *scenes, *study["common"], *study["trainings"][variant], *config["common"]])
-    fixed = ["loggers=[]", "evaluation.enable=false", "evaluation.untrained=true", f"progress={str(config['progress']).lower()}"]
+    fixed = ["loggers=[]", "evaluation.enable=false", f"progress={str(config['progress']).lower()}"]
     try:
         each = configs.load_each("train", *later_wins([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:
