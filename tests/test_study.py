@@ -100,6 +100,22 @@ def test_the_report_shows_what_it_rests_on_and_no_place_of_this_machine(whole):
     assert "judged on the recipe's own: the test scenes." in text and "chose no setting" not in text  # nothing here knows that
 
 
+def test_every_agent_is_listed_beside_the_report(whole):
+    """The tables give the report's own numbers, and are as small as a repository wants them."""
+    folder, result = whole
+    text = (folder / "out" / "navigation.md").read_text()
+    assert {path.name for path in (folder / "out" / "agents").iterdir()} == {row["agents_file"].split("/")[1] for row in result["rows"]}
+    for row in result["rows"]:
+        file = folder / "out" / row["agents_file"]
+        agents = tables.read_csv(file)
+        runs = {seed: tables.select(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
+        assert sum(len(one["scene"]) for one in runs.values()) == len(agents["scene"]) and {"surface", "failure"} <= set(agents)
+        found = levels.summarise(runs, bootstrap=20, seed=1000)
+        for name in ("success_rate", "collision_rate", "mean_max_drac", "mean_time_to_goal_s"):
+            assert found[name].value == pytest.approx(row["pooled"][name]["value"], rel=1e-3, nan_ok=True), name
+        assert f"({row['agents_file']})" in text and file.stat().st_size < 200 * len(agents["scene"]) + 2000
+
+
 def test_looks_are_counted_over_all_calls(whole):
     """11 judgings of policies, and a point after each of two iterations of six trainings, in the one call that did something."""
     folder, result = whole

@@ -85,7 +85,15 @@ def _results(result: Result) -> list[str]:
         "they hold scenes and agents alone, with few they are rather too narrow. †: Wilson's or Newcombe's score interval over distinct "
         "agents, where a rate does not vary."
     )
-    return [_episodes(result["study"]), *parts, note] if parts else []
+    return [_episodes(result["study"]), *parts, note, _agents(result["rows"])] if parts else []
+
+
+def _agents(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Where the agents of every row are listed."""
+    if not any("agents_file" in row for row in rows):
+        return "The tables of single agents behind these numbers were not kept."
+    places = ", ".join(f"[{row['row']}, {row['condition']}, {row['protocol']}]({row['agents_file']})" for row in rows)
+    return f"Every agent with its events, one table a row, condition and protocol (CSV, `pandas.read_csv` opens it): {places}."
 
 
 def _episodes(study: Mapping[str, Any]) -> str:

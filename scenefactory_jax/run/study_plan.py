@@ -150,7 +150,7 @@ def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = results.digest(entry), settings["seed"]
     known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it, under a name of its own
-    folder = known[0] if known else runs / f"{_slug(variant)}-{seed}-{digest}"
+    folder = known[0] if known else runs / f"{slug(variant)}-{seed}-{digest}"
     program = results.digest({name: settings[name] for name in LEARNER})
     return Training(variant, seed, overrides, settings, folder, digest, program)
 
@@ -200,5 +200,6 @@ def _quoted(path: str) -> str:
     return "'" + str(path).replace("'", "\\'") + "'"
 
 
-def _slug(name: str) -> str:
+def slug(name: str) -> str:
+    """A name as part of a file's."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
