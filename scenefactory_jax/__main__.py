@@ -22,7 +22,7 @@ USAGE = f"""usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--he
 
 commands: {", ".join(configs.COMMANDS)}
   train     train a policy            experiment=demo|quick|published|smoke scenes=womd scenes.path=FOLDER ...
-  evaluate  judge a trained run       run=RUN_DIR scenes.path=FOLDER invincible=true|false|both
+  evaluate  judge a trained run       run=RUN_DIR scenes.path=FOLDER protocol=recorded|paper|strict|trained
   compare   several runs              runs='[runs/A-*,runs/B]' out=FOLDER
   convert   scenes -> a bank          source=FILE_OR_FOLDER out=BANK
   scenes    look at, choose, divide   op=info|filter|split|merge|dedupe|... scenes.path=BANK out=BANK

@@ -1,5 +1,6 @@
 """`bench`: scopes, phases that add up, variants, suites."""
 
+import re
 from pathlib import Path
 
 import jax
@@ -86,7 +87,12 @@ def test_there_must_be_something_to_resume(tmp_path):
 
 def test_the_readme_shows_what_was_measured():
     result = results.read(ROOT / "experiments" / "throughput" / "bench.json")
-    assert report.versus(result).count("\n") >= 2 and report.versus(result) in (ROOT / "README.md").read_text()
+    text = (ROOT / "README.md").read_text()
+    assert report.versus(result).count("\n") >= 2 and report.versus(result) in text
+    shares, said = re.findall(r"67,426 steps/s|[\d.]+ times", report.split(result)), " ".join(text.split())
+    assert len(shares) == 3 and all(share in said for share in shares)
+    devices = report.over_devices(results.read(ROOT / "experiments" / "devices" / "bench.json"))
+    assert f"{devices.splitlines()[-1].split(' | ')[-1].strip(' |')} times the slots" in said
 
 
 def test_only_the_whole_configuration_stands_beside_published_figures():
@@ -100,6 +106,25 @@ def test_only_the_whole_configuration_stands_beside_published_figures():
         "| 4,096 x 1 | 38,500 (38,400 to 38,600) | 41,742 | 0.9 |",
     ]
     assert report.versus({"rows": [{**row, **others[0]}], "versions": {"device": "a GPU"}}) == ""
+
+
+def test_the_ratio_is_split_into_plain_jax_and_kernels():
+    row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "horizon": 8, "fits": True}
+    row |= {"changes": {"phases": True}, "per_s": 77000.0}
+    plain = {**row, "changes": {"policy": {"kernels": False}, "facts": {"kernels": False}}, "per_s": 38500.0}
+    assert report.split({"rows": [row, plain]}) == (
+        "At 256 x 16 plain JAX alone makes 38,500 steps/s, 2.0 times the published figure; the kernels make that 2.0 times faster."
+    )
+    for other in ({"changes": {"phases": False}}, {"worlds": 255}, {"changes": {"facts": {"kernels": False}, "seed": 0}}):
+        assert report.split({"rows": [row, {**plain, **other}]}) == ""
+
+
+def test_devices_are_compared_by_slots():
+    """Steps count spawned slots, whose share differs between worlds."""
+    one = {"name": "one", "devices": 1, "scope": "training", "fits": True, "slots_per_s": 100.0, "per_s": 40.0}
+    two = {**one, "name": "two", "devices": 2, "slots_per_s": 194.0, "per_s": 100.0}
+    assert report.over_devices({"rows": [one, two]}).splitlines()[-1] == "| two | 2 | 194 | 1.94 |"
+    assert report.over_devices({"rows": [one]}) == report.over_devices({"rows": [two]}) == ""
 
 
 def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):

@@ -14,7 +14,7 @@ from pages import commands
 import scenefactory_jax as sf
 from scenefactory_jax import __version__
 from scenefactory_jax.adapters import layout
-from scenefactory_jax.report import tables
+from scenefactory_jax.report import study, tables
 from scenefactory_jax.run import config, results
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").rglob("*.md"))
@@ -27,6 +27,7 @@ README_ROWS = [  # label, condition, protocol, metric
     ("... without any other event", "original", "invincible", "clean_success_rate"),
     ("... and of ways that bend, those alone", "original", "invincible", "clean_bend_rate"),
     ("agents in a collision", "original", "invincible", "collision_rate"),
+    ("largest DRAC, mean", "original", "invincible", "mean_max_drac"),
     ("goal reached, any event ends an agent", "original", "strict", "success_rate"),
     ("goal reached from rest", "original, from rest", "invincible", "success_rate"),
     ("agents in a collision, from rest", "original, from rest", "invincible", "collision_rate"),
@@ -81,6 +82,21 @@ def test_results_of_the_readme_are_those_of_the_study():
     speeds = (ROOT / "experiments" / "throughput" / "throughput.md").read_text()
     alone = re.findall(r"[\d,]{9,10}", text[text.index("The environment alone") : text.index("The recipe of the policies")])
     assert len(alone) == 4 and all(f"| {speed} (" in speeds for speed in alone)
+
+
+PARTS_TAKEN_OUT = ("friction", "winter", "recipe", "rewards", "network", "diversity")
+
+
+def test_the_readme_counts_intervals_and_looks():
+    """All intervals of the studies that take a part out, those of them without zero, and how often studies judged on the test scenes."""
+    folders = {path.parent.name: results.read(path) for path in sorted((ROOT / "experiments").glob("*/result.json"))}
+    counts = [study.count_intervals(folders[name]["differences"]) for name in PARTS_TAKEN_OUT]
+    intervals, without_zero = map(sum, zip(*counts, strict=True))
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert f"{intervals} intervals of differences, {without_zero} without zero; chance alone gives about {intervals / 20:.0f}" in text
+    looks = [look for result in folders.values() for look in result.get("looks", []) if look["cut"] == "test"]
+    policies, points = (sum(look[name] for look in looks) for name in ("policies", "curve points"))
+    assert f"{policies} judgings and {points} points of curves" in text
 
 
 def test_the_ten_lines_of_python_run(quickly):

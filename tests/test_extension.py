@@ -13,8 +13,7 @@ from scene_documents import checker, document, packer, written
 
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.run import config
+from scenefactory_jax.run import config, policies, sources
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.train import train
 from scenefactory_jax.scenes import bank
@@ -149,8 +148,8 @@ def test_a_reward_term_is_one_file_and_one_entry(run):
 
 
 def test_an_observation_group_is_one_file_and_one_entry(run):
-    before, after = checkpoint.restore_parameters(run.folder / "untrained"), run.state.parameters
-    towers = before["params"], jax.device_get(after)["params"]
+    before, after = policies.draw_untrained(run.config, sources.training(run.config["scenes"])[0]), run.state.parameters
+    towers = jax.device_get(before)["params"], jax.device_get(after)["params"]
     vectors = 7 + 4 + 2  # ego, weather, and the clock
     for tower in ("actor", "critic"):
         old, new = (parameters[tower] for parameters in towers)

@@ -29,8 +29,10 @@ def test_a_policy_learnt_on_generated_scenes(folder):
 
 def test_town_drives_where_it_has_never_been(tmp_path, quickly):
     overrides = "overrides=[spawn=logged,weather=dry,scenes.heldout.count=2,timing.episode_s=12]"
-    plainly = ["invincible=false", "video.enable=false", "failures.pictures.enable=false"]
-    records = sf.evaluate(sf.load("evaluate", "run=town", f"out={tmp_path}", overrides, *plainly)).records["strict"]
+    plainly = ["protocol.ends=[strict]", "untrained=true", "video.enable=false", "failures.pictures.enable=false"]
+    found = sf.evaluate(sf.load("evaluate", "run=town", f"out={tmp_path}", overrides, *plainly)).records
+    records, before = found["strict"], found["strict, untrained"]  # which came with no checkpoint
+    assert len(before["reached"]) == len(records["reached"]) and before["clean"].mean() < records["clean"].mean()
     bends = records["route_m"] >= tables.BEND * records["start_distance_m"]
     assert len(records["reached"]) >= 8 and bends.any()
     assert records["reached"].mean() > 0.75 and records["reached"][bends].any()

@@ -24,8 +24,8 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax import folders, world
 from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.report import failures, opengl, tables
-from scenefactory_jax.run import config, log, policies, reporting, results, sources, train_folder, train_stop
+from scenefactory_jax.report import circumstances, failures, opengl, tables
+from scenefactory_jax.run import config, keys, log, policies, reporting, results, sources, train_folder, train_stop
 from scenefactory_jax.run import render as rendering
 from scenefactory_jax.run.convert import convert
 from scenefactory_jax.run.evaluate import evaluate
@@ -64,11 +64,18 @@ def test_a_run_folder_holds_what_it_promises(whole):
     assert kept == whole.config and kept["name"] == "smoke" and kept["iterations"] == 4
     versions = yaml.safe_load((whole.folder / "versions.yaml").read_text())
     assert versions["commit"] and versions["jax"] == jax.__version__ and versions["platform"] == "cpu"
-    assert checkpoint.latest(whole.folder / "checkpoints") == 4 and checkpoint.latest(whole.folder / "untrained") == 0
+    assert checkpoint.latest(whole.folder / "checkpoints") == 4
     for trained, stored in zip(
         jax.tree.leaves(whole.state.parameters), jax.tree.leaves(checkpoint.restore_parameters(whole.folder / "checkpoints")), strict=True
     ):
         np.testing.assert_array_equal(trained, stored)
+
+
+def test_the_untrained_policy_is_the_one_that_training_began_with(whole):
+    scenes, trainer = sources.training(whole.config["scenes"]), make_trainer(whole.config, whole.env, whole.policy)
+    worlds, _ = sources.assign(scenes, whole.config["worlds"], seed=whole.config["seed"])
+    begun = trainer.init(jax.random.key(whole.config["seed"]), worlds).parameters
+    jax.tree.map(np.testing.assert_array_equal, policies.draw_untrained(whole.config, scenes[0]), begun)
 
 
 def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
@@ -88,7 +95,10 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
 
 def test_the_report_compares_and_its_files_are_there(whole):
     text, settings = (whole.folder / "report.md").read_text(), told(whole.folder / "report.md")
-    assert settings["run"] == str(whole.folder) and settings["invincible"] is False
+    assert settings["run"] == str(whole.folder) and settings["protocol"]["ends"] == ["strict"]
+    # every report says how its episodes began and in what weather
+    shown = "| Starts | as recorded, at the recorded speed |\n| Weather | AC 0 mm |\n| Background traffic | none |\n| Dynamics | `"
+    assert f"| Protocol | `trained` |\n{shown}" in text
     assert {name: settings[name] for name in settings if name in whole.config["evaluation"]}.items() <= whole.config["evaluation"].items()
     assert "| Metric | strict, untrained | strict | difference |" in text
     links = re.findall(r"\]\(([^)]+)\)", text)
@@ -256,7 +266,9 @@ def told(report: Path):
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
-    first, second = (judged(whole, tmp_path / kind, "video.enable=false", f"invincible={kind}") for kind in ("both", "true"))
+    first, second = (
+        judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.ends=[invincible]"])
+    )
     assert set(first.records) == {"strict", "invincible"} and set(second.records) == {"invincible"} and first.report.is_file()
     for again, protocol in ((second, "invincible"), (whole, "strict")):  # strict: what training itself wrote
         assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
@@ -271,10 +283,10 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
 
 def test_other_settings_of_a_run(whole, tmp_path):
     short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
-    changed = judged(whole, tmp_path / "short", "video.seconds=0.5", "video.panel=120", "video.worlds=1", "invincible=true", short)
+    small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
+    changed = judged(whole, tmp_path / "short", *small, "protocol.ends=[invincible]", short)
     assert set(changed.records) == {"invincible"} and changed.records["invincible"]["time_s"].max() <= 1.0
-    same = ["video.seconds=0.5", "video.panel=120", "video.worlds=1", "invincible=true", short]
-    assert told(changed.report) == {**asked(whole, None, *same), "out": None}
+    assert told(changed.report) == {**asked(whole, None, *small, "protocol.ends=[invincible]", short), "out": None}
     assert changed.report.read_text().startswith("# smoke: evaluation on scenes not seen in training\n")
     assert (tmp_path / "short" / "video.gif").is_file()
     assert config.read(whole.folder)["timing"]["episode_s"] == 2
@@ -282,7 +294,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
         "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
-        "invincible=perhaps": "invincible: 'perhaps'; valid: true, false, both",
+        "protocol.ends=[perhaps]": r"protocol\.ends: \['perhaps'\]; valid: one or more of invincible, strict",
     }.items():
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
@@ -308,7 +320,7 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     trained = scenefactory_jax.load_policy("handy")
     assert trained.folder == kept and trained.config["observe"] == whole.config["observe"]
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
-    again = evaluate(config.load("evaluate", "run=handy", "invincible=false", "video.enable=false", "failures.pictures.enable=false"))
+    again = evaluate(config.load("evaluate", "run=handy", "protocol.ends=[strict]", "video.enable=false", "failures.pictures.enable=false"))
     assert again.folder == Path("runs/handy/evaluation")
     assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
     with pytest.raises(ConfigError, match=r"hand is no run: .*, or one of the package's own: handy"):
@@ -320,14 +332,15 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
 
 
 def test_scores_and_titles_name_other_scenes(whole, tmp_path):
-    asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "trust": True}
-    asked |= {"protocols": ["strict", "invincible"]}
+    asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "protocol": "recorded", "trust": True}
+    asked["protocols"] = ["invincible", "strict"]
     results.begin(tmp_path, asked)
-    assert named("unseen", tmp_path) == "unseen (towns.bank, dynamics=bicycle)" and named("unseen", whole.folder) == "unseen"
+    assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
+    assert named("unseen", whole.folder) == "unseen"
     assert reporting.title("mine", asked) == "mine: evaluation on towns.bank"
-    assert reporting.again(asked, config.load("evaluate", "run=mine", "seed=7")) == (
-        "python -m scenefactory_jax evaluate run=mine trust=true scenes.path=/data/towns.bank 'overrides=[\"dynamics=bicycle\"]'"
-        " seed=7"
+    assert reporting.again(asked, config.load("evaluate", "run=mine", "protocol=recorded", "seed=7")) == (
+        "python -m scenefactory_jax evaluate run=mine protocol=recorded trust=true scenes.path=/data/towns.bank"
+        " 'overrides=[\"dynamics=bicycle\"]' seed=7"
     )
 
 
@@ -523,7 +536,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 
 def options():
-    others = ("experiment", "spread", "study", "suite", "sysid", "validation")
+    others = ("experiment", "protocol", "spread", "study", "suite", "sysid", "validation")
     groups = [folder for folder in sorted(config.folder().iterdir()) if folder.is_dir() and folder.name not in others]
     return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
 
@@ -560,6 +573,40 @@ def test_what_a_suite_says_counts(name):
     found = config.load("bench", f"suite={name}")
     assert said["variants"].keys() <= found["variants"].keys()
     assert {key: found[key] for key in said if key != "variants"} == {key: said[key] for key in said if key != "variants"}
+
+
+RUNS = (["experiment=quick", "scenes=womd"], ["experiment=published", "dynamics=bicycle", "weather=ice", "others=replay", "spawn=mixed"])
+
+
+@pytest.mark.parametrize("name", names("protocol"))
+def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(name):
+    """Two runs with nothing in common are judged alike; `trained` leaves each as it is."""
+    settings = config.load("evaluate", "run=x", f"protocol={name}")
+    keys.check_evaluate(settings)
+    runs = [config.load("train", *words) for words in RUNS]
+    judged = [config.amend(run, settings["protocol"]["settings"]) for run in runs]
+    assert settings["protocol"]["name"] == name and (settings["seed"], settings["repeats"]) == (1000, 1)
+    if name == "trained":
+        assert judged == runs
+        return
+    own = ("observe", "controls", "ends")  # what the policy learnt to see and to do; how agents end is `protocol.ends`
+    for group in set(world.GROUPS) - set(own):
+        assert judged[0][group] == judged[1][group], group
+    assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == config.load("train", "scenes=womd")["scenes"]["pack"]
+    told = circumstances.describe(judged[0])
+    assert told["Starts"] == ("as recorded, from rest" if name == "paper" else "as recorded, at the recorded speed")
+    assert (told["Weather"], told["Background traffic"]) == ("AC 0 mm", "none") and told["Dynamics"].startswith("`mjx_car`")
+
+
+def test_episodes_are_described():
+    tell = lambda *words: circumstances.describe(config.load("train", *words))  # noqa: E731
+    found = tell("spawn=varied", "weather=storm", "others=replay", "dynamics=bicycle", "scenes=town")
+    along = "40% somewhere on the recorded way; 40% random, start and goal along lanes"
+    assert found["Starts"] == f"20% as recorded, from rest; {along}" and found["Dynamics"] == "`bicycle`"
+    assert found["Weather"].startswith("40% AC 0 mm, 15% AC 0.3 mm, ") and found["Weather"].endswith("; patches: puddles; rain: `onset`")
+    assert found["Background traffic"] == "as recorded, it does not react" and found["Longest episode"] == "50 s"
+    assert found["Scenes"] == "up to 16 agents in 200 m x 200 m, centre sdc"
+    assert circumstances.describe({"seed": 3}) == {}
 
 
 @pytest.mark.parametrize("name", names("experiment"))

@@ -13,6 +13,7 @@ import study_parts
 from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.report import levels, study_figures, tables
+from scenefactory_jax.report import study as report
 from scenefactory_jax.run import config, log, sources, study_plan, train, train_folder
 from scenefactory_jax.run import study as command
 from scenefactory_jax.run.study import Clock, study
@@ -91,6 +92,28 @@ def test_the_report_shows_what_it_rests_on_and_no_place_of_this_machine(whole):
     assert "Collision rate" in text and "Clean success rate" in text and "| all terms | 3 | 2 (" in text
     assert str(folder) not in text and str(folder) not in (folder / "out" / "result.json").read_text()
     assert result["made_with"]["commit"] in text and result["made_with"]["jax"] == jax.__version__
+    assert "| dry | logged | dry | ignore | as trained |" in text and "| at random | random_pairs | snow | ignore | as trained |" in text
+    ends = [one["change"][name] for one in result["differences"] for name in report.CHANGES]
+    without_zero = sum(end["low"] is not None and not end["low"] <= 0 <= end["high"] for end in ends)
+    counted = sum(end["low"] is not None for end in ends)
+    assert f"{counted / 20:.1f} of the {counted} in this table. {without_zero} of them do" in text
+    assert "judged on the recipe's own: the test scenes." in text and "chose no setting" not in text  # nothing here knows that
+
+
+def test_every_agent_is_listed_beside_the_report(whole):
+    """The tables give the report's own numbers, and are as small as a repository wants them."""
+    folder, result = whole
+    text = (folder / "out" / "navigation.md").read_text()
+    assert {path.name for path in (folder / "out" / "agents").iterdir()} == {row["agents_file"].split("/")[1] for row in result["rows"]}
+    for row in result["rows"]:
+        file = folder / "out" / row["agents_file"]
+        agents = tables.read_csv(file)
+        runs = {seed: tables.select(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
+        assert sum(len(one["scene"]) for one in runs.values()) == len(agents["scene"]) and {"surface", "failure"} <= set(agents)
+        found = levels.summarise(runs, bootstrap=20, seed=1000)
+        for name in ("success_rate", "collision_rate", "mean_max_drac", "mean_time_to_goal_s"):
+            assert found[name].value == pytest.approx(row["pooled"][name]["value"], rel=1e-3, nan_ok=True), name
+        assert f"({row['agents_file']})" in text and file.stat().st_size < 200 * len(agents["scene"]) + 2000
 
 
 def test_looks_are_counted_over_all_calls(whole):
@@ -282,6 +305,19 @@ def test_every_study_is_whole(name, tmp_path):
         world.parts_of(built | {"ends": config.load("task")["ends"]})
     assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
     assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
+
+
+def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
+    """`recorded` and `strict` judge as navigation's first condition does, `paper` as its second: by name what the study spells out."""
+    entry = config.load("study", "study=navigation", f"runs={tmp_path}", "seeds=[0]")
+    conditions = {"recorded": "original", "strict": "original", "paper": "original, from rest"}
+    plan = study_plan.make(entry)
+    for name, condition in conditions.items():
+        asked = config.load("evaluate", "run=x", f"protocol={name}")
+        rows = [one for one in plan.judgings if (one.row, one.condition) == ("rigid body", condition)]
+        assert {one.protocol for one in rows} >= set(asked["protocol"]["ends"])
+        assert rows[0].config == config.amend(rows[0].training.config, asked["protocol"]["settings"])
+        assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
 
 
 def test_other_scenes_of_the_same_path_are_another_study(tmp_path):

@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.build import ConfigError, check_number, check_share
-from scenefactory_jax.ppo import across, gae, loss, rollout, update
+from scenefactory_jax.ppo import across, gae, initial, loss, rollout, update
 from scenefactory_jax.struct import replace, strong, struct
 from scenefactory_jax.types import Env, Observation, Policy, Scene, State
 
@@ -196,10 +196,10 @@ def _init(
     size: Callable,
     average: bool,
 ) -> TrainState:
-    policy_key, start_key, key = jax.random.split(key, 3)
+    _, start_key, later_key = initial.split_key(key)
     worlds, observation = start(start_key, scenes)
     size(worlds)
-    parameters = policy.init(policy_key, jax.tree.map(lambda leaf: leaf[:1], observation))
+    parameters = initial.draw_parameters(key, policy, observation)
     train_state = TrainState(
         parameters=parameters,
         averaged=parameters if average else None,
@@ -208,7 +208,7 @@ def _init(
         observation=observation,
         lives=rollout.no_lives(worlds),
         record=rollout.no_record(worlds),
-        key=key,
+        key=later_key,
         iteration=jnp.int32(0),
         steps=jnp.zeros(2, jnp.int32),
     )

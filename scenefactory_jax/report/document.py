@@ -48,6 +48,7 @@ def write(
     key_numbers: Sequence[str] = KEY_NUMBERS,
     failed: Mapping[str, Mapping[str, Path]] | None = None,
     kinds: Mapping[str, float] | None = None,
+    episodes: Mapping[str, str] | None = None,
 ) -> Path:
     """Write `folder`/report.md and return its path. Sections without content are left out.
 
@@ -68,6 +69,7 @@ def write(
         key_numbers: dotted config keys shown in a table of their own.
         failed: name of records with kinds of failures -> kind -> picture of the worst; "film" -> their video.
         kinds: the numbers that the definitions of `failures.KINDS` name.
+        episodes: what decided the episodes, "Starts" -> "as recorded, from rest".
 
     Raises:
         DocumentError: nothing to report, names that do not match, a file that does not exist.
@@ -81,6 +83,7 @@ def write(
     sections = [
         f"# {title}",
         _headline(first, summary[first], records[first]),
+        _section("Episodes", tables.grid(["", ""], list(episodes.items())) if episodes else ""),
         _section("Results", _results({name: summary[name] for name in measured}, records)),
         _section("Comparison", *(_comparison(n, b, summary, records, bootstrap=bootstrap, seed=seed) for n, b in baselines.items())),
         _section("Video", *(_show(folder, caption, path) for caption, path in (videos or {}).items())),

@@ -14,6 +14,8 @@ RATES = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rat
 SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
           "grip_use", "stopping_margin_m")  # fmt: skip
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
+GROUPS = {"spawn": "Starts", "weather": "Weather", "others": "Background traffic", "dynamics": "Dynamics"}  # of an episode
+AS_TRAINED = "as trained"
 
 
 def write(folder: Path, result: Result) -> Path:
@@ -83,7 +85,25 @@ def _results(result: Result) -> list[str]:
         "they hold scenes and agents alone, with few they are rather too narrow. †: Wilson's or Newcombe's score interval over distinct "
         "agents, where a rate does not vary."
     )
-    return [*parts, note] if parts else []
+    return [_episodes(result["study"]), *parts, note, _agents(result["rows"])] if parts else []
+
+
+def _agents(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Where the agents of every row are listed."""
+    if not any("agents_file" in row for row in rows):
+        return "The tables of single agents behind these numbers were not kept."
+    places = ", ".join(f"[{row['row']}, {row['condition']}, {row['protocol']}]({row['agents_file']})" for row in rows)
+    return f"Every agent with its events, one table a row, condition and protocol (CSV, `pandas.read_csv` opens it): {places}."
+
+
+def _episodes(study: Mapping[str, Any]) -> str:
+    """What decides the episodes of each condition: options of `conf/`, the last of each group that the overrides name."""
+    cells, varied = [], {override.partition("=")[0] for own in study["trainings"].values() for override in own}
+    common = [override for override in study["common"] if override.partition("=")[0] not in varied]
+    for name, own in study["conditions"].items():
+        chosen = dict(override.partition("=")[::2] for override in [*common, *study["examined"], *own])
+        cells.append([name, *(chosen.get(group, AS_TRAINED) for group in GROUPS)])
+    return "Judged in these episodes:\n\n" + tables.grid(["Condition", *GROUPS.values()], cells)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], wanted: Sequence[str]) -> str:
@@ -105,11 +125,20 @@ def _differences(found: Sequence[Mapping[str, Any]]) -> list[str]:
          *(tables.text(Estimate(**one["change"][name]), signed=True) for name in labels)]
         for one in found
     ]  # fmt: skip
+    intervals, without_zero = count_intervals(found)
     words = (
-        "The second less the first, on the same scenes, cars and seeds. An interval without zero is beyond what chance explains; but of "
-        "twenty differences that are none, one looks like one."
+        "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
+        f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. No correction "
+        "for multiple comparisons is applied."
     )
     return [words, tables.grid(["From", "To", "Condition", "Protocol", *(metric.label for metric in labels.values())], cells)]
+
+
+def count_intervals(found: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """How many intervals the table of differences shows, and how many of them exclude zero."""
+    shown = [Estimate(**one["change"][name]) for one in found for name in CHANGES]
+    ends = [(one.low, one.high) for one in shown if one.low is not None and one.high is not None]
+    return len(ends), sum(low > 0 or high < 0 for low, high in ends)
 
 
 def _each_seed(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -171,7 +200,7 @@ def _scenes(result: Result) -> list[str]:
     cut, scenes = result["settings"]["cut"], result["scenes"]
     named = f"Trained on {scenes['train_scenes']}, judged on {scenes['test_scenes']}"
     kind = {
-        "test": "the test scenes, which chose no setting.",
+        "test": "the test scenes.",
         "validation": "**a validation cut of the training scenes**: these figures choose settings and are no test.",
     }[cut]
     looks = result["looks"]
@@ -181,7 +210,8 @@ def _scenes(result: Result) -> list[str]:
     table = tables.grid(["Date", "Cut", "Policies judged", "Points of learning curves", "Minutes", "Command"], cells) if cells else ""
     counted = (
         f"This study looked at them {times['policies']} times to judge a policy (under one condition and protocol) and "
-        f"{times['curve points']} times for a point of a learning curve, in all the calls below."
+        f"{times['curve points']} times for a point of a learning curve, in all the calls below. Other studies and other commands "
+        "(`evaluate`, `train`) are not counted here."
     )
     return [f"{named}: {kind}", counted, table]
 

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.report import text_file
+
 Records = Mapping[str, np.ndarray]
 
 COLUMNS: dict[str, type] = {
@@ -166,13 +168,12 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
         RecordsError: see `check`; or `bootstrap` is not positive.
     """
     check(records)
-    names = list(METRICS)
     scenes, cluster = np.unique(records["scene"], return_inverse=True)
     sums, weights = _cluster_sums(records, cluster, len(scenes))
     resampled = _resample(sums, weights, bootstrap=bootstrap, seed=seed)
     result = {}
-    for column, name in enumerate(names):
-        metric, mask = METRICS[name], METRICS[name].counted(records)
+    for column, (name, metric) in enumerate(METRICS.items()):
+        mask = metric.counted(records)
         count, total = int(mask.sum()), weights[:, column].sum()
         if count == 0:
             result[name] = Estimate(None, None, None, 0, metric.unit, NONE)
@@ -293,7 +294,7 @@ def grid(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def write_csv(path: Path, records: Records) -> None:
-    """Write records as plain CSV, one row per agent; every number reads back to the same value.
+    """Write records as CSV (`.csv`, or `.csv.xz`), one row per agent; every number reads back to the same value.
 
     Raises:
         RecordsError: see `check`.
@@ -301,7 +302,7 @@ def write_csv(path: Path, records: Records) -> None:
     check(records)
     names = list(records)
     columns = [np.asarray(records[name]).tolist() for name in names]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with text_file.opened(path, "w") as file:
         writer = csv.writer(file)
         writer.writerow(names)
         writer.writerows(zip(*columns, strict=True))
@@ -315,7 +316,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     """
     if not path.is_file():
         raise RecordsError(f"{path}: no such file; wanted the CSV of an evaluation")
-    with path.open(newline="", encoding="utf-8") as file:
+    with text_file.opened(path, "r") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
@@ -364,9 +365,7 @@ def _cluster_sums(records: Records, cluster: np.ndarray, clusters: int) -> tuple
     return sums, weights
 
 
-def _resample(
-    sums: Float[np.ndarray, "S M"], weights: Float[np.ndarray, "S M"], *, bootstrap: int, seed: int
-) -> Float[np.ndarray, "B M"]:
+def _resample(sums: Float[np.ndarray, "S M"], weights: Float[np.ndarray, "S M"], *, bootstrap: int, seed: int) -> Float[np.ndarray, "B M"]:
     """Each metric on `bootstrap` draws of scenes with replacement; NaN where a draw holds no agent that qualifies."""
     if bootstrap < 1:
         raise RecordsError(f"bootstrap: {bootstrap} resamples; wanted at least 1, 1000 or more for a steady interval")

@@ -25,7 +25,8 @@ from scenefactory_jax.run import targets, whole
 
 COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
 COMMANDS += ("weather", "export")
-LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined")  # keys whose values are lists of overrides
+# Keys whose values are lists of overrides
+LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined", r"protocol\.settings")
 FILE = "config.yaml"  # of a run's folder
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 

@@ -7,14 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, playing, policies, results, sources, targets
-
-PROTOCOLS = {"strict": ["strict"], "invincible": ["invincible"], "both": ["strict", "invincible"]}
 
 
 class Result(NamedTuple):
@@ -36,21 +33,20 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     keys.check_evaluate(config)
     sources.use_compilation_cache()
     run = policies.find(config["run"])
-    trained = configs.amend(configs.read(run, trust=config["trust"]), config["overrides"])
-    wanted = {True: "invincible", False: "strict"}.get(config["invincible"], config["invincible"])
-    if wanted not in PROTOCOLS:
-        raise ConfigError(f"invincible: {config['invincible']!r}; valid: true, false, both")
+    protocol = config["protocol"]
+    trained = configs.amend(configs.read(run, trust=config["trust"]), [*protocol["settings"], *config["overrides"]])
     scenes = sources.heldout(trained["scenes"], path=config["scenes"]["path"])
     out = Path(config["out"] or (Path("runs") / run.name if policies.is_shipped(run) else run) / "evaluation")
-    asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"], "trust": config["trust"]}
-    return judge(trained, run, scenes, out, asked=asked, settings=config, protocols=PROTOCOLS[wanted])
+    asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"]}
+    asked |= {"protocol": protocol["name"], "trust": config["trust"]}
+    return judge(trained, run, scenes, out, asked=asked, settings=config, protocols=protocol["ends"])
 
 
 def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     """The evaluation that ends `train`: held-out scenes, the run's own settings."""
     settings = config["evaluation"]
     scenes = sources.heldout(config["scenes"], path=None)
-    asked = {"run": str(folder), "scenes": None, "overrides": [], "trust": bool(targets.outside(config))}
+    asked = {"run": str(folder), "scenes": None, "overrides": [], "protocol": "trained", "trust": bool(targets.outside(config))}
     return judge(config, folder, scenes, folder, asked=asked, settings=settings, protocols=settings["protocols"])
 
 
@@ -96,7 +92,8 @@ def judge(
     """Play every protocol with the trained and, if asked for, the untrained policy; write records, report and video to `out`.
 
     Args:
-        asked: run, scenes (None: the run's own held-out ones), overrides and trust, as they were named.
+        asked: run, scenes (None: the run's own held-out ones), overrides, protocol and trust, as they were named.
+        protocols: options of the group `ends`, each of them played.
     """
     from scenefactory_jax.run import failing, reporting
 
@@ -105,7 +102,7 @@ def judge(
     print(scenes.account, flush=True)
     parameters = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
     if settings["untrained"]:
-        parameters["untrained"] = checkpoint.restore_parameters(run / "untrained")
+        parameters["untrained"] = policies.draw_untrained(config, scenes[0])
     records, trajectories, pictures = {}, [], {}
     for number, protocol in enumerate(protocols):
         film = settings["video"]["worlds"] if settings["video"]["enable"] and number == 0 else 0

@@ -53,6 +53,7 @@ def named(what: str, folder: Path) -> str:
     """What was driven, and with what it differed from the run's own held-out scenes and settings; of paths the names alone."""
     noted = results.judged(folder)
     told = [] if noted["scenes"] is None else [Path(noted["scenes"]).name]
+    told += [] if (protocol := noted.get("protocol", "trained")) == "trained" else [f"protocol={protocol}"]
     told += [override for override in noted["overrides"] if "path=" not in override]
     return f"{what} ({', '.join(told)})" if told else what
 

@@ -28,6 +28,7 @@ FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck
 FAILURE_PICTURES = {"enable": FLAG, "panels": COUNT, "before_s": Key(float, 0), "video": FLAG}
 FAILURES = {"notes": FAILURE_NOTES, "kinds": FAILURE_KINDS, "pictures": FAILURE_PICTURES}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
+PROTOCOL = {"name": Key(str), "settings": Key(list[str]), "ends": Key(list[str]), "seed": SEED, "repeats": COUNT}
 EVALUATION = {"enable": FLAG, "every": Key(int | list[int] | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
 TRAIN |= {"devices": Key(int | None, 1), "stream": Key(dict | None)}
@@ -128,6 +129,8 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
         ConfigError: naming the key, the value and what would be valid.
     """
     check(config, {"run": Key(str), "trust": FLAG, "out": PLACE, "overrides": Key(list[str]), **JUDGE})
+    check(config["protocol"], PROTOCOL, where="protocol")
+    _check_protocols(config["protocol"]["ends"], where="protocol.ends")
     check_video(config["video"], where="video")
     check_failures(config, where="failures")
 

@@ -1,13 +1,18 @@
 """Trained policies by where they are: a folder that `train` or `export` wrote, or the name of one that comes with the package."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+
+from scenefactory_jax import world
 from scenefactory_jax.build import ConfigError
-from scenefactory_jax.ppo import checkpoint
+from scenefactory_jax.ppo import checkpoint, initial
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run.train import make_policy
-from scenefactory_jax.types import Policy
+from scenefactory_jax.types import Policy, Scene
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
@@ -39,6 +44,18 @@ def load_policy(run: str | Path, *, trust: bool = False) -> Trained:
     folder = find(run)
     config = configs.read(folder, trust=trust)
     return Trained(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
+
+
+def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
+    """What a run's policy was before training, drawn anew from its config and seed as training draws it.
+
+    Args:
+        scene: one world, for the shapes of what is observed.
+    """
+    key = jax.random.key(config["seed"])
+    seen = jax.eval_shape(world.make(config).reset, key, scene)[1]
+    blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
+    return initial.draw_parameters(key, make_policy(config), blank)
 
 
 def find(run: str | Path) -> Path:

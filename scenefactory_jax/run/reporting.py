@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.report import document, failures, pictures, plots, tables, video
+from scenefactory_jax.report import circumstances, document, failures, pictures, plots, tables, video
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import failing, log
@@ -55,18 +55,20 @@ def write(
         kinds=failures.numbers(settings["failures"]),
         files=files,
         commands=[again(asked, settings)],
+        episodes={"Protocol": f"`{asked['protocol']}`", **circumstances.describe(config)},
     )
 
 
 def again(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
-    default = configs.load("evaluate", "run=null")
-    invincible = {("strict",): False, ("invincible",): True}.get(tuple(asked["protocols"]), "both")
+    default = configs.load("evaluate", "run=null", f"protocol={asked['protocol']}")
+    protocol = {**settings.get("protocol", default["protocol"]), "ends": asked["protocols"]}
     own = {name: asked[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": asked["scenes"]}}
-    own |= {"out": None, "invincible": invincible}
+    own |= {"out": None, "protocol": protocol}
     wanted, usual = document.flatten({name: {**settings, **own}[name] for name in ("run", *default)}), document.flatten(default)
     words = [f"{key}={_word(value)}" for key, value in wanted.items() if value != usual.get(key)]
-    return f"python -m scenefactory_jax evaluate {shlex.join(words)}"
+    named = [] if asked["protocol"] == "trained" else [f"protocol={asked['protocol']}"]
+    return f"python -m scenefactory_jax evaluate {shlex.join([*words[:1], *named, *words[1:]])}"
 
 
 def _word(value: Any) -> str:

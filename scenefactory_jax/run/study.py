@@ -18,7 +18,7 @@ from scenefactory_jax import folders
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.report import tables
 from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import results, sources, study_plan, study_report, together, train, whole
+from scenefactory_jax.run import policies, results, sources, study_plan, study_report, together, train, whole
 from scenefactory_jax.run.evaluate import make_examiner
 from scenefactory_jax.run.study_plan import Judging, Plan, Training
 from scenefactory_jax.run.study_report import RESULT, TRAINED
@@ -208,8 +208,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             spent[program] = time.monotonic() - begun
             results.write(one.folder / TRAINED, note, digits=None)
             if shared.config["slim"]:
-                for weights in (study_plan.TRAINED, study_plan.UNTRAINED):
-                    checkpoint.strip(one.folder / weights)
+                checkpoint.strip(one.folder / study_plan.TRAINED)
     return True
 
 
@@ -255,8 +254,7 @@ def _train_one(one: Training, prepared: train.Prepared) -> dict[str, Any]:
 def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
     """Judge what is not judged yet, all policies of one program after the other; whether all could be done."""
     todo = {one.file: one for one in plan.judgings if shared.wanted(one.training.variant) and not one.file.is_file()}
-    ready = [one for one in todo.values() if checkpoint.latest(one.training.folder / one.weights) is not None]
-    ready = [one for one in ready if one.weights == study_plan.UNTRAINED or is_trained(one.training)]
+    ready = [one for one in todo.values() if _is_ready(one)]
     longest = 0.0
     for _, group in shared.claims.shares(_by_program(ready)):
         begun, examine = time.monotonic(), None
@@ -266,13 +264,24 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
             if not clock.fits(longest, what=f"judging {one.row}, {one.condition}, {one.protocol}"):
                 return False
             examine = examine or shared.examiner(one, "policies")
-            records, _ = examine(checkpoint.restore_parameters(one.training.folder / one.weights))
+            records, _ = examine(_weights(one, shared))
             with whole.replaced(one.file) as half:
                 tables.write_csv(half, records)
             counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("reached", "clean", "collided")]
             print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
         longest = max(longest, time.monotonic() - begun)
     return True
+
+
+def _is_ready(one: Judging) -> bool:
+    """Whether there is what is to be judged; what learns nothing has its place in the folder of a run that was begun."""
+    return (one.training.folder / configs.FILE).is_file() if one.weights == study_plan.UNTRAINED else is_trained(one.training)
+
+
+def _weights(one: Judging, shared: Shared) -> Any:
+    if one.weights == study_plan.UNTRAINED:
+        return policies.draw_untrained(one.config, shared.heldout(one.config)[0])
+    return checkpoint.restore_parameters(one.training.folder / one.weights)
 
 
 # ---- the command

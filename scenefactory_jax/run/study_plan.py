@@ -17,7 +17,7 @@ TASK = tuple(group for group in world.GROUPS if group != "ends")  # how episodes
 LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
 ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
-TRAINED, UNTRAINED = "checkpoints", "untrained"  # folders of a run
+TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, and what it began with
 
 
 class Training(NamedTuple):
@@ -134,7 +134,7 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
     scenes += [] if config["test_scenes"] is None else [f"scenes.heldout.path={_quoted(config['test_scenes'])}"]
     overrides = later_wins([*study["base"], *scenes, *study["common"], *study["trainings"][variant], *config["common"]])
-    fixed = ["loggers=[]", "evaluation.enable=false", "evaluation.untrained=true", f"progress={str(config['progress']).lower()}"]
+    fixed = ["loggers=[]", "evaluation.enable=false", f"progress={str(config['progress']).lower()}"]
     try:
         each = configs.load_each("train", *later_wins([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:
@@ -150,7 +150,7 @@ def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = results.digest(entry), settings["seed"]
     known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it, under a name of its own
-    folder = known[0] if known else runs / f"{_slug(variant)}-{seed}-{digest}"
+    folder = known[0] if known else runs / f"{slug(variant)}-{seed}-{digest}"
     program = results.digest({name: settings[name] for name in LEARNER})
     return Training(variant, seed, overrides, settings, folder, digest, program)
 
@@ -200,5 +200,6 @@ def _quoted(path: str) -> str:
     return "'" + str(path).replace("'", "\\'") + "'"
 
 
-def _slug(name: str) -> str:
+def slug(name: str) -> str:
+    """A name as part of a file's."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

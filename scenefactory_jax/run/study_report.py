@@ -11,12 +11,15 @@ from scenefactory_jax.report import levels, tables
 from scenefactory_jax.report import study as report
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import log, results, study_plan
-from scenefactory_jax.run.study_plan import Judging, Plan, Training
+from scenefactory_jax.run.study_plan import Plan, Training
 
 RESULT, TRAINED = "result.json", "trained.json"
 CURVES = ("events/reached", "events/collided", "events/touched_edge", "reward")
 POINTS = 120  # of a learning curve
 DIGITS = 5
+AGENTS = "agents"  # folder of the tables of agents
+Place = tuple[str, str, str]  # row, condition, protocol
+Judged = dict[Place, dict[int, dict[str, np.ndarray]]]  # seed of training -> agents
 WORDS = ("question", "reading", "figures", "trend")  # of a study's config: they decide no number
 
 
@@ -26,13 +29,18 @@ def folder(config: Mapping[str, Any]) -> Path:
 
 
 def write(plan: Plan, config: Mapping[str, Any], out: Path, *, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect, and write result.json, NAME.md and figures to `out`, unless nothing is judged and `before` holds results of other runs."""
-    result = collect(plan, config) | {"looks": before.get("looks", [])}
+    """Collect, and write result.json, NAME.md, figures and tables of agents to `out`.
+
+    Nothing is written if nothing is judged and `before` holds results of other runs.
+    """
+    records = _records(plan)
+    result = collect(plan, config, records) | {"looks": before.get("looks", [])}
     if before.get("rows") and not result["rows"]:
         print(f"nothing of this study is judged in {config['runs']}: {out / RESULT} and its report stay as they are", flush=True)
         return dict(before)
     result = results.plain(result, digits=DIGITS)
     out.mkdir(parents=True, exist_ok=True)
+    _write_agents(out, records)
     results.write(out / RESULT, result, digits=DIGITS)
     print(f"{report.headline(result)}\n\nreport {report.write(out, result)}", flush=True)
     return result
@@ -55,20 +63,54 @@ def draw(config: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def collect(plan: Plan, config: Mapping[str, Any]) -> dict[str, Any]:
+def _records(plan: Plan) -> Judged:
+    """The agents of every judging that is done; a place without any has no seeds."""
+    found: Judged = {}
+    for one in plan.judgings:
+        runs = found.setdefault((one.row, one.condition, one.protocol), {})
+        if one.file.is_file():
+            runs[one.training.seed] = tables.read_csv(one.file)
+    return found
+
+
+def _write_agents(out: Path, records: Judged) -> None:
+    """A table of all agents for each row, condition and protocol, seeds of training one after the other; those of before are removed."""
+    for old in (out / AGENTS).glob("*.csv.xz"):
+        old.unlink()
+    for place, runs in records.items():
+        if not runs:
+            continue
+        (out / AGENTS).mkdir(exist_ok=True)
+        seeds = np.concatenate([np.full(len(rows["scene"]), seed) for seed, rows in runs.items()])
+        first = next(iter(runs.values()))
+        columns = {name: _rounded(np.concatenate([rows[name] for rows in runs.values()])) for name in first}
+        tables.write_csv(out / agents_file(place), {"training_seed": seeds, **columns})
+
+
+def agents_file(place: Place) -> str:
+    """Where the table of a row's agents lies in the study's folder."""
+    return f"{AGENTS}/{'--'.join(study_plan.slug(name) for name in place)}.csv.xz"
+
+
+def _rounded(column: np.ndarray) -> np.ndarray:
+    """Numbers with as many digits as the result has."""
+    return np.array([float(f"{value:.{DIGITS}g}") for value in column]) if column.dtype.kind == "f" else column
+
+
+def collect(plan: Plan, config: Mapping[str, Any], records: Judged) -> dict[str, Any]:
     """Everything that the report says, as plain values.
+
+    Args:
+        records: row, condition and protocol -> seed -> agents.
 
     Returns:
         study: its config; scenes: names of the sources; missing: what is not trained or judged yet; rows: one for each row, condition and
         protocol; differences; trainings: variant -> durations, versions and curves.
     """
     study, settings = config["study"], config["evaluation"]
-    judged: dict[tuple[str, str, str], dict[int, Judging]] = {}
+    judged: dict[Place, list[int]] = {}
     for one in plan.judgings:
-        judged.setdefault((one.row, one.condition, one.protocol), {})[one.training.seed] = one
-    records = {
-        place: {seed: tables.read_csv(one.file) for seed, one in seeds.items() if one.file.is_file()} for place, seeds in judged.items()
-    }
+        judged.setdefault((one.row, one.condition, one.protocol), []).append(one.training.seed)
     missing = [f"judging {row}, {condition}, {protocol}, seed {seed}" for (row, condition, protocol), seeds in judged.items()
                for seed in seeds if seed not in records[row, condition, protocol]]  # fmt: skip
     missing = [f"training {one.variant}, seed {one.seed}" for one in plan.trainings if not (one.folder / TRAINED).is_file()] + missing
@@ -90,12 +132,13 @@ def _named(path: str | None) -> str:
     return "the recipe's own" if path is None else Path(path).name
 
 
-def _row(place: tuple[str, str, str], runs: levels.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
+def _row(place: Place, runs: levels.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
     row, condition, protocol = place
     first = next(iter(runs.values()))
     return {
         "row": row, "condition": condition, "protocol": protocol, "seeds": list(runs), "agents": len(first["scene"]),
-        "scenes": len(np.unique(first["scene"])), "pooled": levels.summarise(runs, **resampling), "each": levels.per_seed(runs),
+        "scenes": len(np.unique(first["scene"])), "agents_file": agents_file(place),
+        "pooled": levels.summarise(runs, **resampling), "each": levels.per_seed(runs),
     }  # fmt: skip
 
 

@@ -105,8 +105,6 @@ def _trained(
             state = checkpoint.restore(folder / "checkpoints", state)
             print(f"resumed at iteration {int(state.iteration)}", flush=True)
         configs.write(folder, config)
-        if not resume and config["evaluation"]["untrained"]:
-            checkpoint.save(folder / "untrained", state, keep=1)  # evaluations compare with the policy before training
         watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
         callbacks = [c for c in (watch, on_iteration) if c]
         return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)

@@ -1,0 +1,66 @@
+"""What decides the episodes of an evaluation, in words, from its config: starts, weather, background traffic, dynamics, scenes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+STARTS = {
+    "logged": "as recorded, at the recorded speed",
+    "standing": "as recorded, from rest",
+    "underway": "somewhere on the recorded way",
+    "random_pairs": "random, start and goal along lanes",
+}
+TRAFFIC = {"ignore": "none", "static": "parked cars stand", "replay": "as recorded, it does not react"}
+
+
+def describe(config: Mapping[str, Any]) -> dict[str, str]:
+    """Label -> words, of the groups that the config has; an entry of the user's own shows its `_target_`.
+
+    Args:
+        config: of an environment with its scenes, resolved.
+    """
+    found = {}
+    if "spawn" in config:
+        found["Starts"] = _starts(config["spawn"]["draw"])
+    if "weather" in config:
+        found["Weather"] = _weather(config["weather"])
+    if "others" in config:
+        name = config["others"]["_target_"]
+        found["Background traffic"] = TRAFFIC.get(name, f"`{name}`")
+    if "dynamics" in config:
+        found["Dynamics"] = _dynamics(config["dynamics"])
+    if "timing" in config:
+        found["Longest episode"] = f"{config['timing']['episode_s']:g} s"
+    if "pack" in config.get("scenes", {}):
+        pack = config["scenes"]["pack"]
+        if {"agents", "centre", "box_m"} <= set(pack):
+            found["Scenes"] = f"up to {pack['agents']} agents in {pack['box_m']:g} m x {pack['box_m']:g} m, centre {pack['centre']}"
+    return found
+
+
+def _starts(draw: Mapping[str, Any]) -> str:
+    name = draw["_target_"]
+    if name != "mixed":
+        return STARTS.get(name, f"`{name}`")
+    return "; ".join(f"{part['share']:.0%} {_starts(part['draw'])}" for part in draw["parts"].values())
+
+
+def _weather(weather: Mapping[str, Any]) -> str:
+    """Surfaces and films with their shares, then patches and rain."""
+    cases = weather["draw"].get("cases")
+    if cases is None:
+        told = f"`{weather['draw']['_target_']}`"
+    else:
+        whole = sum(case["weight"] for case in cases)
+        shares = [f"{case['weight'] / whole:.0%} " if len(cases) > 1 else "" for case in cases]
+        told = ", ".join(f"{share}{case['surface']} {case['film_mm']:g} mm" for share, case in zip(shares, cases, strict=True))
+    patches = [name for name, entry in weather["patches"].items() if entry is not None]
+    told += f"; patches: {', '.join(patches)}" if patches else ""
+    return told + (f"; rain: `{weather['rain']['_target_']}`" if weather["rain"] else "")
+
+
+def _dynamics(dynamics: Mapping[str, Any]) -> str:
+    """The module of one of the package's own, with what varies between its cars."""
+    target = dynamics["_target_"]
+    name = target.removeprefix("scenefactory_jax.dynamics.").removesuffix(".make")
+    told = f"`{name}`" + (f", brakes {dynamics['brakes']}" if "brakes" in dynamics else "")
+    return told + (", every car another" if dynamics.get("fleet") else "")

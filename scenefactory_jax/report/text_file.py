@@ -1,0 +1,13 @@
+"""Text files that are compressed where their name says so."""
+
+import io
+import lzma
+from pathlib import Path
+from typing import IO, Literal
+
+
+def opened(path: Path, mode: Literal["r", "w"]) -> IO[str]:
+    """A UTF-8 file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
+    if path.suffix == ".xz":
+        return io.TextIOWrapper(lzma.LZMAFile(path, mode), newline="", encoding="utf-8")
+    return path.open(mode, newline="", encoding="utf-8")
