@@ -149,11 +149,13 @@ def test_scenes_and_options_that_do_not_fit_say_so():
     assert changed.steps == 30
 
 
-@pytest.mark.parametrize("name", ["gymnasium", "pettingzoo", "jaxmarl"])
-def test_a_missing_extra_is_named(name, monkeypatch):
-    for loaded in [module for module in sys.modules if module.split(".")[0] == name]:
+@pytest.mark.parametrize(
+    ("name", "package"), [("gymnasium", "gymnasium"), ("pettingzoo", "pettingzoo"), ("jaxmarl", "jaxmarl"), ("sb3", "stable_baselines3")]
+)
+def test_a_missing_extra_is_named(name, package, monkeypatch):
+    for loaded in [module for module in sys.modules if module.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.setitem(sys.modules, name, None)  # what `import` takes for not installed
+    monkeypatch.setitem(sys.modules, package, None)  # what `import` takes for not installed
     monkeypatch.delitem(sys.modules, f"scenefactory_jax.adapters.{name}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install 'scenefactory_jax\[{name}\]'"):
         __import__(f"scenefactory_jax.adapters.{name}")
