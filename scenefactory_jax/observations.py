@@ -20,7 +20,23 @@ from scenefactory_jax.types import SURFACES, Motion, Observation, Rows, Scene, S
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | Rows]
 
+ANY, LENGTH, SIGNED, SHARE = (-jnp.inf, jnp.inf), (0.0, jnp.inf), (-1.0, 1.0), (0.0, 1.0)  # bounds of a column
 
+
+def bounded(*columns: tuple[float, float]) -> Callable[[Callable], Callable]:
+    """Declare the bounds of a group's columns, (low, high) each, for interfaces that ask for them (`adapters.bounds`).
+
+    The last bounds hold for all columns that follow. An infinite one says that nothing bounds the column; so does a group without this.
+    """
+
+    def declare(group: Callable) -> Callable:
+        group.columns = columns  # pyright: ignore[reportFunctionMemberAccess]
+        return group
+
+    return declare
+
+
+@bounded(ANY, ANY, SIGNED, SIGNED, LENGTH, ANY, ANY)
 def ego(scene: Scene, state: State, *, distance_scale_m: float, speed_scale_mps: float) -> Float[Array, "A 7"]:
     """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's own velocity x, y (paper, section 4)."""
     motion = state.motion
@@ -32,6 +48,7 @@ def ego(scene: Scene, state: State, *, distance_scale_m: float, speed_scale_mps:
     return jnp.concatenate(parts, axis=1)
 
 
+@bounded(LENGTH, SHARE)
 def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[str]) -> Float[Array, "A F"]:
     """Water film and one-hot surface at each car's place, [film, AC, SMA, OGFC] in Eq. 2 of the paper.
 
@@ -55,6 +72,7 @@ def turning(scene: Scene, state: State, *, turn_scale_radps: float, steer_scale_
     return jnp.stack([state.motion.yaw_rate / turn_scale_radps, state.motion.steer / steer_scale_rad], axis=1)
 
 
+@bounded(SIGNED, SIGNED, LENGTH, SIGNED, SIGNED)
 def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale: float, kernels: bool) -> Rows:
     """Road segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y.
 
@@ -68,6 +86,7 @@ def road(scene: Scene, state: State, *, count: int, radius_m: float, kind_scale:
     return roadside.around(scene, state.motion.position[:, :2], state.motion.yaw, state.active, **numbers)
 
 
+@bounded(SIGNED, SIGNED, SIGNED, SIGNED, SHARE, SIGNED)
 def lane(
     scene: Scene,
     state: State,
@@ -119,6 +138,7 @@ def _held(places: Float[Array, "A N 2"], on_lane: Bool[Array, "A N"]) -> Float[A
     return jnp.take_along_axis(places, jnp.minimum(jnp.arange(places.shape[1]), last[:, None])[..., None], axis=1)
 
 
+@bounded(ANY, ANY, LENGTH, LENGTH, SIGNED, LENGTH, SHARE)
 def neighbours(
     scene: Scene, state: State, *, count: int, distance_scale_m: float, speed_scale_mps: float, ttc_scale_s: float, circles: dict[str,
     float]
@@ -133,6 +153,7 @@ def neighbours(
     return _rows(jnp.concatenate(columns, axis=-1), mask, count)
 
 
+@bounded(SIGNED, SIGNED, ANY, ANY, SIGNED, SIGNED, ANY, LENGTH, LENGTH, SIGNED, SHARE, SHARE, SHARE)
 def encounters(
     scene: Scene,
     state: State,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from adapting import ALONE, SMOKE, scenes
 
-from scenefactory_jax import world
-from scenefactory_jax.adapters import episodes, flat, layout
+from scenefactory_jax import observations, world
+from scenefactory_jax.adapters import bounds, episodes, flat, layout
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config
 from scenefactory_jax.types import Rows
@@ -28,6 +28,48 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(vector[:, columns["ego"]], [[5], [5]])
     many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), observation)
     np.testing.assert_array_equal(flat(many), jnp.stack([vector] * 7))
+
+
+@pytest.mark.parametrize("observe", ["reference", "foresight"])  # together all groups of the package
+def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
+    settings = config.load("train", SMOKE, f"observe={observe}", "dynamics=bicycle", "ends=invincible", "scenes.pack.agents=4")
+    env, given = world.make(settings), scenes(agents=4).scene
+
+    def step(given, carry, key):
+        states, action = carry
+        drawn = jax.random.uniform(key, action.shape, minval=-1.0)
+        drawn = jnp.where(jax.random.bernoulli(key, 0.1), drawn, action)  # for a third of a second at a time
+        states, outcome = jax.vmap(env.step)(given, states, drawn)
+        return (states, drawn), flat(outcome.observation)
+
+    def drive(given, key):
+        states, seen = jax.vmap(env.reset)(jax.random.split(key, 4), given)
+        full = jnp.tile(jnp.array([1.0, 0.05, -1.0]), (4, 4, 1))
+        return flat(seen), jax.lax.scan(functools.partial(step, given), (states, full), jax.random.split(key, 120))[1]
+
+    first, seen = jax.jit(drive)(given, jax.random.key(0))
+    observation = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 4), given)[1]
+    low, high = bounds.flat_bounds(world.parts_of(settings).groups, observation)
+    assert np.isfinite(low).all() and np.isfinite(high).all() and low.shape == seen.shape[-1:]
+    seen = np.concatenate([np.asarray(first)[None], np.asarray(seen)])
+    outside = (seen < low - 1e-5) | (seen > high + 1e-5)
+    assert not outside.any(), [(name, at, seen[..., at].min(), seen[..., at].max()) for name, at in layout(observation).items()]
+    assert np.ptp(seen, axis=(0, 1, 2))[layout(observation)["ego"]].min() > 0.2  # the cars went somewhere
+
+
+def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
+    @observations.bounded(observations.SHARE, observations.ANY)
+    def mine(scene, state, *, scale: float):
+        return scale * jnp.array([[0.25, 30.0, -4.0]])
+
+    unbound = lambda scene, state: Rows(jnp.array([[[-20.0, 20.0], [0.0, 1.0]]]), jnp.array([[True, True]]))  # noqa: E731
+    groups = {"mine": functools.partial(mine, scale=2.0), "yours": unbound}
+    seen = {name: bounds.clip(group)(None, None) for name, group in groups.items()}
+    limit = bounds.LIMIT
+    np.testing.assert_array_equal(flat(seen), [[0.5, limit, -8.0, -limit, limit, 0.0, 1.0, 1.0, 1.0]])
+    low, high = bounds.flat_bounds(groups, seen)
+    np.testing.assert_array_equal(low, [0, -limit, -limit, *[-limit] * 4, 0, 0])
+    np.testing.assert_array_equal(high, [1, limit, limit, *[limit] * 4, 1, 1])
 
 
 def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
@@ -102,15 +144,18 @@ def test_scenes_and_options_that_do_not_fit_say_so():
     with pytest.raises(ConfigError, match=r"options\['scene'\]: 4; valid: 0 to 3"):
         episodes.chosen({"scene": 4}, 4)
     assert episodes.chosen(None, 4) == episodes.ANY and episodes.chosen({"scene": 3, "other": 1}, 4) == 3
+    assert episodes.chosen({"scene": [3, -1]}, 4, 2).tolist() == [3, -1] and episodes.chosen({"scene": 1}, 4, 2).tolist() == [1, 1]
     changed = episodes.pool(config.load("train", *ALONE), ["timing.episode_s=1"], scenes(), alone=True)
     assert changed.steps == 30
 
 
-@pytest.mark.parametrize("name", ["gymnasium", "pettingzoo", "jaxmarl"])
-def test_a_missing_extra_is_named(name, monkeypatch):
-    for loaded in [module for module in sys.modules if module.split(".")[0] == name]:
+@pytest.mark.parametrize(
+    ("name", "package"), [("gymnasium", "gymnasium"), ("pettingzoo", "pettingzoo"), ("jaxmarl", "jaxmarl"), ("sb3", "stable_baselines3")]
+)
+def test_a_missing_extra_is_named(name, package, monkeypatch):
+    for loaded in [module for module in sys.modules if module.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.setitem(sys.modules, name, None)  # what `import` takes for not installed
+    monkeypatch.setitem(sys.modules, package, None)  # what `import` takes for not installed
     monkeypatch.delitem(sys.modules, f"scenefactory_jax.adapters.{name}", raising=False)
     with pytest.raises(ImportError, match=rf"pip install 'scenefactory_jax\[{name}\]'"):
         __import__(f"scenefactory_jax.adapters.{name}")

@@ -11,10 +11,12 @@ gymnasium = pytest.importorskip("gymnasium", reason="the extra [gymnasium] is no
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
-from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
+from gymnasium.wrappers import RecordVideo, RenderCollection  # noqa: E402
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics  # noqa: E402
 
 from scenefactory_jax.adapters.gymnasium import ID, Drive, DriveVector  # noqa: E402
 from scenefactory_jax.build import ConfigError  # noqa: E402
+from scenefactory_jax.report import canvas  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -23,10 +25,10 @@ WORLDS, STEPS = 3, 70  # an episode takes 60
 
 @pytest.fixture(scope="module")
 def single():
-    return gymnasium.make(f"scenefactory_jax.adapters.gymnasium:{ID}", overrides=ALONE)
+    return gymnasium.make(f"scenefactory_jax.adapters.gymnasium:{ID}", overrides=ALONE, render_mode="rgb_array")
 
 
-def many(mode=AutoresetMode.SAME_STEP, **options):
+def many(mode=AutoresetMode.NEXT_STEP, **options):
     return DriveVector(WORLDS, None, ALONE, scenes(), mode, **options)
 
 
@@ -49,7 +51,6 @@ def same(ours, theirs, *, where=""):
 def test_check_env_passes(single):
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*WARN.*")
-        warnings.filterwarnings("ignore", message=".*(minimum|maximum) value is -?infinity")
         check_env(single.unwrapped)
 
 
@@ -57,13 +58,14 @@ def test_an_episode_ends_by_event_or_by_time_and_says_why(single):
     single.reset(seed=1, options={"scene": 0})
     for _ in range(60):
         observation, reward, terminated, truncated, info = single.step(np.array([1.0, 0.6, -1.0]))
-        assert observation in single.observation_space and sum(info["terms"].values()) == pytest.approx(reward, abs=1e-4)
+        assert observation in single.observation_space and observation.flags.writeable
+        assert sum(info["terms"].values()) == pytest.approx(reward, abs=1e-4)
         assert any(info["events"].values()) == terminated  # strict: every event ends
         if terminated:
             break
     assert terminated and not truncated and not observation.any()  # a car that ended sees nothing
     observation, info = single.reset(options={"scene": 2})
-    assert info == {"scene": 2} and observation.any()
+    assert info == {"scene": 2} and observation.any() and observation.flags.writeable
     for step in range(60):
         observation, _, terminated, truncated, info = single.step(np.array([0.0, 0.0, 1.0]))
         assert not terminated and truncated == (step == 59)
@@ -91,6 +93,8 @@ def test_the_vector_environment_is_gymnasiums_own_over_single_ones(mode):
             np.testing.assert_allclose(own, one, atol=1e-4)
         same(info, told)
         ended += ours[1] | ours[2]
+        for array in (seen, *ours, *jax.tree.leaves(info)):
+            array[...] = True  # a caller's own: none is read-only, and the worlds do not read it
     assert (ended >= 1).all() and envs._step._cache_size() == 1 and envs._begin._cache_size() == 1
     (seen, info), (wanted, told) = envs.reset(), oracle.reset()  # the next episodes of the seeds before
     np.testing.assert_allclose(seen, wanted, atol=1e-5)
@@ -113,7 +117,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_others():
 
 
 def test_arrays_of_jax_stay_on_the_device_and_hold_what_those_of_numpy_hold():
-    envs, plain = many(arrays="jax"), many()
+    envs, plain = many(AutoresetMode.SAME_STEP, arrays="jax"), many(AutoresetMode.SAME_STEP)
     seen, _ = envs.reset(seed=2)
     plain.reset(seed=2)
     last = 0
@@ -148,9 +152,11 @@ def test_without_autoreset_worlds_begin_anew_where_a_mask_says():
 
 
 def test_gymnasium_makes_both_and_its_wrappers_work():
-    envs = RecordEpisodeStatistics(gymnasium.make_vec(ID, num_envs=2, overrides=ALONE, scenes=scenes()))
-    assert isinstance(envs.unwrapped, DriveVector) and envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    made = gymnasium.make_vec(ID, num_envs=2, overrides=ALONE, scenes=scenes(), render_mode="rgb_array")
+    assert isinstance(made.unwrapped, DriveVector) and made.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    envs = NormalizeObservation(RecordEpisodeStatistics(made))  # which knows NEXT_STEP alone
     envs.reset(seed=0)
+    assert [frame.shape for frame in envs.render()] == [(400, 400, 3)] * 2
     total, lengths = np.zeros(2), []
     for _ in range(61):
         _, reward, terminated, truncated, info = envs.step(np.tile(np.float32([0, 0, 1]), (2, 1)))
@@ -170,11 +176,44 @@ def test_what_cannot_be_stepped_is_refused_in_a_line():
     for env, shape in ((Drive(None, ALONE, scenes()), (3,)), (many(), (WORLDS, 3))):
         with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
             env.step(np.zeros(shape))
+        assert env.render() is None
+        env.render_mode = "rgb_array"
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+            env.render()
         env.reset(seed=0)
         for wrong in (shape[:-1], (*shape[:-1], 1), (*shape[:-1], 4)):
             with pytest.raises(ConfigError, match=r"action: shape .*; wanted is .*3"):
                 env.step(np.zeros(wrong))
     for make in (gymnasium.make, gymnasium.make_vec):
-        with warnings.catch_warnings(), pytest.raises(ConfigError, match="render_mode: 'human'; valid: None"):
+        with warnings.catch_warnings(), pytest.raises(ConfigError, match="render_mode: 'ansi'; valid: None, rgb_array"):
             warnings.simplefilter("ignore")
-            make(ID, overrides=ALONE, render_mode="human")
+            make(ID, overrides=ALONE, render_mode="ansi")
+    with pytest.raises(ConfigError, match=r"options\['scene'\]: \[0, 1\]; valid: 0 to 3, or -1 for any, or a list of 3 of these"):
+        many().reset(options={"scene": [0, 1]})
+
+
+def test_pictures_follow_the_car_on_its_road(single):
+    film, env = RenderCollection(single, pop_frames=False), single.unwrapped
+    film.reset(seed=1, options={"scene": 0})
+    ended = False
+    while not ended:
+        *_, ended, _, info = film.step(np.array([1.0, 0.6, -1.0]))
+    frames = np.array(film.render())
+    assert frames.shape[1:] == (400, 400, 3) and frames.dtype == np.uint8
+    centre = frames[:, 190:210, 190:210]
+    assert (centre == canvas.colour_of(0)).all(axis=-1).any(axis=(1, 2)).all()  # the car is in the middle of every picture
+    assert (frames[0] == canvas.ASPHALT).all(axis=-1).mean() > 0.02 and (frames[0] != frames[-2]).mean() > 0.05  # and its road moves by
+    mark = next(canvas.MARKS[name].colour for name, new in info["events"].items() if new)
+    assert (frames[-1] == mark).all(axis=-1).sum() > 20 > (frames[-2] == mark).all(axis=-1).sum()  # what ended it is marked where it stands
+    assert env.metadata["render_fps"] == env.pool.step_hz
+
+
+def test_gymnasium_records_a_video_of_an_episode(tmp_path):
+    pytest.importorskip("moviepy", reason="needs moviepy: pip install 'gymnasium[other]'")
+    env = RecordVideo(gymnasium.make(ID, overrides=ALONE, scenes=scenes(), render_mode="rgb_array"), str(tmp_path))
+    env.reset(seed=0)
+    for _ in range(60):
+        env.step(np.array([0.0, 0.0, 1.0], np.float32))
+    env.close()
+    [film] = tmp_path.glob("*.mp4")
+    assert film.stat().st_size > 5_000

@@ -13,7 +13,8 @@ Brax know one agent: the config must say `scenes.pack.agents=1`, and does by def
 
 What they share:
 
-- An observation is one vector of float32 (`flat`); `layout` says which columns are what. An action is throttle, steer, brake in [-1, 1].
+- An observation is one vector of float32 (`flat`); `layout` says which columns are what, and all are within finite bounds (`bounds`).
+  An action is throttle, steer, brake in [-1, 1].
 - A step is an action: with `controls.every=3` it is three control steps, and its reward what they paid together.
 - *Terminated* is a car that an event has ended (`config["ends"]`); it observes zeros from then on. *Truncated* is a car that was still
   driving when the time of its world was up (`timing.episode_s`); its last observation is a real one, to bootstrap from.

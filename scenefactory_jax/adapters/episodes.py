@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax import world
-from scenefactory_jax.adapters import flat
+from scenefactory_jax.adapters import bounds, flat
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.ends import EVENTS
 from scenefactory_jax.run import config as configs
@@ -29,10 +29,16 @@ class Pool(NamedTuple):
     scenes: Scene  # along the first axis, on the device
     names: tuple[str, ...]  # of the scenes
     agents: int  # slots
-    columns: int  # of an observation
+    low: np.ndarray  # of an observation's columns, and `high`
+    high: np.ndarray
     terms: tuple[str, ...]  # of the reward, sorted
     steps: int  # after which a world's time is up; a step is an action, with all control steps that it stands for
     step_hz: float
+
+    @property
+    def columns(self) -> int:
+        """Of an observation."""
+        return len(self.low)
 
     @property
     def cars(self) -> list[str]:
@@ -87,17 +93,21 @@ def pool(
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
     sources.use_compilation_cache()
-    env, found = world.make(config), sources.training(config["scenes"]) if scenes is None else scenes
+    parts = world.parts_of(config)
+    env = world.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
+    found = sources.training(config["scenes"]) if scenes is None else scenes
     held = jax.device_put(found.scene)
     slots = held.agents.present.shape[1]
     if alone and slots != 1:
         where = "the scenes given" if scenes is not None else f"scenes.capacity.agents={config['scenes']['capacity']['agents']}"
         raise ConfigError(f"{where}: {slots} slots a scene; this environment drives one car: set {ALONE} scenes.capacity.agents=null")
-    episode, seen = jax.eval_shape(functools.partial(begin, env), held, jax.random.key(0))
+    episode = jax.eval_shape(functools.partial(start, env), held, jax.random.key(0))
+    seen = jax.eval_shape(lambda scenes, at: env.observe(_one(scenes, at.scene), at.state), held, episode)
+    low, high = bounds.flat_bounds(parts.groups, seen)
     moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(moment.terms))
     steps, step_hz = world.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
-    return Pool(env, held, found.names, slots, seen.shape[1], terms, steps, step_hz)
+    return Pool(env, held, found.names, slots, low, high, terms, steps, step_hz)
 
 
 def begin(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
@@ -184,16 +194,18 @@ def seeded(seed: int) -> np.uint32:
     return np.uint32(seed % 2**32)
 
 
-def chosen(options: Mapping[str, Any] | None, count: int) -> int:
-    """The scene that `options["scene"]` of a `reset` names, or ANY.
+def chosen(options: Mapping[str, Any] | None, count: int, worlds: int | None = None) -> np.ndarray:
+    """The scene that `options["scene"]` of a `reset` names, or ANY; of several worlds, [worlds].
 
     Raises:
-        ConfigError: an index that is none.
+        ConfigError: an index that is none, or not one for each world.
     """
-    index = (options or {}).get("scene", ANY)
-    if index != ANY and not 0 <= index < count:
-        raise ConfigError(f"options['scene']: {index}; valid: 0 to {count - 1}, or {ANY} for any")
-    return int(index)
+    given = (options or {}).get("scene", ANY)
+    shape, index = () if worlds is None else (worlds,), np.asarray(given)
+    if not np.issubdtype(index.dtype, np.integer) or index.shape not in ((), shape) or index.min() < ANY or index.max() >= count:
+        each = "" if worlds is None else f", or a list of {worlds} of these"
+        raise ConfigError(f"options['scene']: {given!r}; valid: 0 to {count - 1}, or {ANY} for any{each}")
+    return np.broadcast_to(index, shape).astype(np.int32)
 
 
 def check_action(action: Any, shape: tuple[int, ...] | None, *, where: str = "action") -> None:
@@ -204,13 +216,3 @@ def check_action(action: Any, shape: tuple[int, ...] | None, *, where: str = "ac
     """
     if np.shape(action) != shape:
         raise ConfigError(f"{where}: shape {np.shape(action)}; wanted is {shape}, the last axis throttle, steer, brake")
-
-
-def check_render_mode(mode: Any) -> None:
-    """Refuse every way to draw.
-
-    Raises:
-        ConfigError: any but None.
-    """
-    if mode is not None:
-        raise ConfigError(f"render_mode: {mode!r}; valid: None; `replay` and `drive` draw")

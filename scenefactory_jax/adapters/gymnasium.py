@@ -2,9 +2,10 @@
 
     import gymnasium, scenefactory_jax.adapters.gymnasium
     env = gymnasium.make("scenefactory_jax/Drive-v0", overrides=["dynamics=bicycle"])
-    envs = gymnasium.make_vec("scenefactory_jax/Drive-v0", num_envs=64, autoreset_mode="SameStep", arrays="jax")
+    envs = gymnasium.make_vec("scenefactory_jax/Drive-v0", num_envs=64, overrides=["dynamics=bicycle"])
 
 Where only the name can be given, "scenefactory_jax.adapters.gymnasium:scenefactory_jax/Drive-v0" brings the import along.
+With `render_mode="rgb_array"`, `render()` gives a bird's-eye picture that follows the car (of a vector environment one for each world).
 World `i` of `make_vec(...).reset(seed=s)` runs as `make(...).reset(seed=s + i)` does. `reset(options={"scene": 3})` begins in that scene.
 `info` holds `scene`, an index into `names`, and of a step `terms` and `events`, as arrays with a mask `_terms` in a vector environment.
 """
@@ -16,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters import episodes, pictures
 from scenefactory_jax.adapters.episodes import Episode
 from scenefactory_jax.run import sources
 
@@ -30,6 +31,7 @@ except ImportError as error:
     raise ImportError("adapters.gymnasium needs Gymnasium; `pip install 'scenefactory_jax[gymnasium]'`") from error
 
 ID = "scenefactory_jax/Drive-v0"
+METADATA = {"render_modes": list(pictures.MODES), "render_fps": 30.0}  # of the class; an instance has the steps a second of its config
 
 
 class Drive(gymnasium.Env):
@@ -39,11 +41,13 @@ class Drive(gymnasium.Env):
         config: as `load("train", ...)` gives it, with `scenes.pack.agents=1`; None: that with its defaults.
         overrides: of the config, as on the command line.
         scenes: to draw episodes from; None: the config's.
-        render_mode: none but None.
+        render_mode: None, or rgb_array.
 
     Raises:
-        ConfigError: a render mode, scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
+        ConfigError: another render mode, scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
     """
+
+    metadata = METADATA
 
     def __init__(
         self,
@@ -52,14 +56,15 @@ class Drive(gymnasium.Env):
         scenes: sources.Scenes | None = None,
         render_mode: str | None = None,
     ):
-        episodes.check_render_mode(render_mode)
+        pictures.check_mode(render_mode)
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode = self.pool.names, render_mode
-        self.metadata = {"render_modes": [], "render_fps": self.pool.step_hz}
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32)
+        self.metadata = {**METADATA, "render_fps": self.pool.step_hz}
+        self.observation_space = spaces.Box(self.pool.low, self.pool.high, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
         self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
         self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
+        self._painter = pictures.Painter(self.pool)
         self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -76,7 +81,7 @@ class Drive(gymnasium.Env):
             key = jax.random.key(episodes.seeded(seed if seed is not None else int(self.np_random.integers(2**32))))
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
-        return np.asarray(observation)[0], {"scene": int(episode.scene)}
+        return np.array(observation)[0], {"scene": int(episode.scene)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One action.
@@ -89,8 +94,20 @@ class Drive(gymnasium.Env):
             raise ResetNeeded("step: no episode has begun; call reset first")
         episodes.check_action(action, self.action_space.shape)
         self._episode, rows = self._advance(self.pool.scenes, self._episode, np.asarray(action, np.float32)[None])
-        told = episodes.told(self.pool, np.asarray(rows)[0])
+        told = episodes.told(self.pool, np.array(rows)[0])
         return told.observation, told.reward, told.over and not told.truncated, told.truncated, told.info
+
+    def render(self) -> np.ndarray | None:
+        """The world from above around its car, [H, W, 3] from 0 to 255; None without a render mode.
+
+        Raises:
+            ResetNeeded: nothing has begun.
+        """
+        if self.render_mode is None:
+            return None
+        if self._episode is None:
+            raise ResetNeeded("render: no episode has begun; call reset first")
+        return self._painter.draw(jax.tree.map(lambda leaf: leaf[None], self._episode))[0]
 
 
 def register() -> None:

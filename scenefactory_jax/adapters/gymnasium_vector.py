@@ -11,9 +11,9 @@ from gymnasium import spaces  # an optional dependency: `adapters.gymnasium` say
 from gymnasium.error import ResetNeeded  # pyright: ignore[reportMissingImports]
 from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore[reportMissingImports]
 from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from scenefactory_jax.adapters import episodes
+from scenefactory_jax.adapters import episodes, pictures
 from scenefactory_jax.adapters.episodes import Episode
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import sources
@@ -24,16 +24,19 @@ from scenefactory_jax.types import Env, Scene
 class DriveVector(VectorEnv):
     """One car in each of many worlds; everything but the hand-over of arrays is one compiled program.
 
-    In mode SAME_STEP the observation after an episode's end is the first of the next one, and `info["final_obs"]` holds the last of the
-    one that ended, `info["final_info"]` its terms and events. In mode NEXT_STEP the step after an end begins the next episode, whatever
-    its action, with reward 0. In mode DISABLED an episode begins by `reset(options={"reset_mask": ended})`, which the others know, too.
+    In mode NEXT_STEP, which Gymnasium's own wrappers are written for, the step after an end begins the next episode, whatever its action,
+    with reward 0. In mode SAME_STEP the observation after an episode's end is the first of the next one, and `info["final_obs"]` holds the
+    last of the one that ended, `info["final_info"]` its terms and events. In mode DISABLED an episode begins by
+    `reset(options={"reset_mask": ended})`, which the others know, too. `reset(options={"scene": [0, 3, ...]})` names a scene for each
+    world, a single number one for all.
 
     Args:
         num_envs: worlds.
         config, overrides, scenes: as of `Drive`.
-        autoreset_mode: a mode or its value ("SameStep", "NextStep", "Disabled").
+        autoreset_mode: a mode or its value ("NextStep", "SameStep", "Disabled").
         arrays: numpy: as all of Gymnasium's own; jax: nothing leaves the device. Then `info` always holds `final_obs` [W, F] and
             `final_info`, and their masks say for which worlds they count.
+        render_mode: as of `Drive`.
 
     Raises:
         ConfigError: as of `Drive`, and other values of `arrays`.
@@ -45,23 +48,24 @@ class DriveVector(VectorEnv):
         config: Mapping[str, Any] | None = None,
         overrides: Sequence[str] = (),
         scenes: sources.Scenes | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         arrays: str = "numpy",
         render_mode: str | None = None,
     ):
         if arrays not in ("numpy", "jax"):
             raise ConfigError(f"arrays: {arrays!r}; valid: numpy, jax")
-        episodes.check_render_mode(render_mode)
+        pictures.check_mode(render_mode)
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode, self.num_envs, self.arrays = self.pool.names, render_mode, num_envs, arrays
         self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "render_fps": self.pool.step_hz, "autoreset_mode": self.mode}
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32)
+        self.metadata = {"render_modes": list(pictures.MODES), "render_fps": self.pool.step_hz, "autoreset_mode": self.mode}
+        self.single_observation_space = spaces.Box(self.pool.low, self.pool.high, dtype=np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._begin = jax.jit(functools.partial(_begin, self.pool.env))
         self._step = jax.jit(functools.partial(_step, self.pool.env, self.mode))
+        self._painter = pictures.Painter(self.pool)
         self._worlds: Episode | None = None
         self._ended: Any = (jnp if arrays == "jax" else np).zeros(num_envs, bool)
 
@@ -87,13 +91,22 @@ class DriveVector(VectorEnv):
         anew = np.array([one is not None for one in given])
         known = np.array([episodes.seeded(one or 0) for one in given], np.uint32)
         mask = everywhere if first else np.asarray((options or {}).get("reset_mask", everywhere), bool)
-        scene = episodes.chosen(options, len(self.names))
+        scene = episodes.chosen(options, len(self.names), self.num_envs)
         worlds, observation = self._begin(self.pool.scenes, self._worlds, known, anew, mask, scene)
         self._worlds, self._ended = worlds, self._ended & ~mask
         return self._out((observation, _paired({"scene": worlds.scene}, mask)))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One action of every world.
+
+        Raises:
+            See `advance`.
+        """
+        step = self.advance(actions)
+        return step.observation, step.reward, step.terminated, step.truncated, self._info(step)
+
+    def advance(self, actions: Any) -> "Stepped":
+        """`step` without Gymnasium's layout of `info`, for other interfaces.
 
         Raises:
             ResetNeeded: nothing has begun.
@@ -107,9 +120,20 @@ class DriveVector(VectorEnv):
             raise RuntimeError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset(options={{'reset_mask': ...}}) first")
         given = jnp.asarray(actions, jnp.float32)
         self._worlds, step = self._step(self.pool.scenes, self._worlds, self._ended, given)
-        step = self._out(step)
-        self._ended = step.ended
-        return step.observation, step.reward, step.terminated, step.truncated, self._info(step)
+        self._ended = step.ended if self.arrays == "jax" else np.asarray(step.ended)  # not what a caller may write to
+        return self._out(step)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Every world from above around its car, [H, W, 3] from 0 to 255 each; None without a render mode.
+
+        Raises:
+            ResetNeeded: nothing has begun.
+        """
+        if self.render_mode is None:
+            return None
+        if self._worlds is None:
+            raise ResetNeeded("render: no episode has begun; call reset first")
+        return tuple(self._painter.draw(self._worlds))
 
     def _info(self, step: "Stepped") -> dict[str, Any]:
         """Gymnasium's layout of what is known beside observation and reward."""
@@ -125,16 +149,23 @@ class DriveVector(VectorEnv):
         return info | {"final_obs": last, "_final_obs": step.ended, "final_info": final, "_final_info": step.ended}
 
     def _out(self, tree: Any) -> Any:
-        return jax.device_get(tree) if self.arrays == "numpy" else tree
+        """On the host as copies, which may be written to."""
+        return jax.tree.map(np.array, jax.device_get(tree)) if self.arrays == "numpy" else tree
 
 
 def _begin(
-    env: Env, scenes: Scene, worlds: Episode | None, seeds: UInt32[Any, " W"], anew: Bool[Any, " W"], mask: Bool[Any, " W"], scene: Any
+    env: Env,
+    scenes: Scene,
+    worlds: Episode | None,
+    seeds: UInt32[Any, " W"],
+    anew: Bool[Any, " W"],
+    mask: Bool[Any, " W"],
+    scene: Int[Any, " W"],
 ) -> tuple[Episode, Float[Array, "W F"]]:
     """Fresh episodes where `mask` says, of the seeds where `anew` says, else the next ones of their worlds."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     keys = keys if worlds is None else jnp.where(anew, keys, worlds.key)
-    fresh = jax.vmap(lambda key: episodes.start(env, scenes, key, scene))(keys)
+    fresh = jax.vmap(functools.partial(episodes.start, env, scenes))(keys, jnp.asarray(scene))
     worlds = fresh if worlds is None else choose(jnp.asarray(mask), fresh, worlds)
     return worlds, _observe(env, scenes, worlds)
 

@@ -59,7 +59,8 @@ class Drive(MultiAgentEnv):
         super().__init__(num_agents=self.pool.agents)
         self.agents = self.pool.cars
         self.scenes = self.pool.scenes
-        self.observation_spaces = {name: Box(-jnp.inf, jnp.inf, (self.pool.columns,)) for name in self.agents}
+        seen = Box(jnp.asarray(self.pool.low), jnp.asarray(self.pool.high), (self.pool.columns,))
+        self.observation_spaces = dict.fromkeys(self.agents, seen)
         self.action_spaces = {name: Box(-1.0, 1.0, (3,)) for name in self.agents}
 
     def holding(self, scenes: Scene) -> "Drive":

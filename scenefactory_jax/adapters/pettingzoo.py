@@ -50,7 +50,7 @@ class Drive(ParallelEnv):
         self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.step_hz, "is_parallelizable": True}
         self.possible_agents = self.pool.cars
         self.agents: list[str] = []
-        self.observation_spaces = {name: spaces.Box(-np.inf, np.inf, (self.pool.columns,), np.float32) for name in self.possible_agents}
+        self.observation_spaces = {name: spaces.Box(self.pool.low, self.pool.high, dtype=np.float32) for name in self.possible_agents}
         self.action_spaces = {name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in self.possible_agents}
         self._slot = {name: slot for slot, name in enumerate(self.possible_agents)}
         self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
@@ -78,7 +78,8 @@ class Drive(ParallelEnv):
             key = jax.random.key(episodes.seeded(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
-        active, seen, scene = jax.device_get((episode.state.active, observation, episode.scene))
+        active, scene = jax.device_get((episode.state.active, episode.scene))
+        seen = np.array(observation)
         self.agents = [name for name in self.possible_agents if active[self._slot[name]]]
         return {name: seen[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
 
@@ -99,7 +100,7 @@ class Drive(ParallelEnv):
             episodes.check_action(actions[name], (3,), where=f"actions: {name!r}")
             given[self._slot[name]] = actions[name]
         self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
-        rows = np.asarray(rows)
+        rows = np.array(rows)  # a copy: what a caller gets may be written to
         told = {name: episodes.told(self.pool, rows[self._slot[name]]) for name in self.agents}
         self.agents = [name for name, one in told.items() if not one.terminated and not one.truncated]
         names = ("observation", "reward", "terminated", "truncated", "info")

@@ -89,6 +89,19 @@ def frames(
     return _film(stages, fps=fps, stride=stride, columns=min(columns, len(stages)), panel=panel, trail_s=trail_s)
 
 
+def picture(trajectory: Trajectory, step: int, *, window: tuple[float, float, float], panel: int) -> UInt8[np.ndarray, "N N 3"]:
+    """One step of one world, without trails and frame.
+
+    Args:
+        window: left, bottom and side of the square that is shown, in metres.
+        panel: side of the picture in pixels.
+
+    Raises:
+        TrajectoryError: arrays that do not belong together.
+    """
+    return np.array(_draw_world(_prepare(trajectory, panel, window), step, trail_s=0.0))
+
+
 def shown_steps(length: int, stride: int) -> list[int]:
     """The control steps that become frames: every `stride`-th one, and the last."""
     steps = list(range(0, length, stride))
@@ -114,10 +127,10 @@ def _film(stages: list[_Stage], *, fps: float | int, stride: int, columns: int, 
         yield np.array(sheet)
 
 
-def _prepare(trajectory: Trajectory, panel: int) -> _Stage:
-    """Everything of a world that does not change from frame to frame."""
+def _prepare(trajectory: Trajectory, panel: int, window: tuple[float, float, float] | None = None) -> _Stage:
+    """Everything of a world that does not change from frame to frame; without a window its view holds all ways and goals."""
     trajectory = canvas.settle(trajectory)
-    view = View(*canvas.around(canvas.places(trajectory), margin=9.0, smallest=50.0), panel * _FINE)
+    view = View(*(window or canvas.around(canvas.places(trajectory), margin=9.0, smallest=50.0)), panel * _FINE)
     steps = np.arange(len(trajectory.active))[:, None]
     last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
     events = {name: happened & trajectory.present for name, happened in trajectory.events.items()}

@@ -1,0 +1,88 @@
+"""`render()` of the adapters for one car: a bird's-eye picture that follows the car."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, UInt8
+
+from scenefactory_jax.adapters.episodes import Episode, Pool
+from scenefactory_jax.build import ConfigError
+from scenefactory_jax.report import canvas, video
+from scenefactory_jax.struct import replace
+from scenefactory_jax.types import Agents, Boxes, Env, Events, Motion, Scene, Weather
+
+MODES = ("rgb_array",)
+_PIXELS, _SIDE_M = 400, 80.0  # side of a picture, and of the square around the car that it shows
+
+
+class Shown(NamedTuple):
+    """What is drawn of one world at one moment, beside its road."""
+
+    scene: Array  # index into the pool
+    motion: Motion
+    active: Array  # [A]
+    happened: Events
+    agents: Agents
+    weather: Weather
+    boxes: Boxes
+
+
+class Painter:
+    """Draws worlds of a pool; the roads of the scenes are fetched from the device once."""
+
+    def __init__(self, pool: Pool):
+        self._pool = pool
+        self._shown = jax.jit(jax.vmap(functools.partial(_shown, pool.env), in_axes=(None, 0)))
+        self._scenes: dict[int, Scene] = {}
+
+    def draw(self, worlds: Episode) -> list[UInt8[np.ndarray, "H W 3"]]:
+        """A picture of each world, [W, ...] along the first axis, as RGB from 0 to 255."""
+        shown = jax.device_get(self._shown(self._pool.scenes, worlds))
+        return [self._picture(jax.tree.map(lambda leaf, world=world: leaf[world], shown)) for world in range(len(shown.scene))]
+
+    def _picture(self, shown: Any) -> UInt8[np.ndarray, "H W 3"]:  # one world of `Shown`, in numpy arrays
+        place = shown.motion.position[:, :2]
+        trajectory = canvas.Trajectory(
+            scene=replace(self._scene(int(shown.scene)), weather=shown.weather),
+            position=place[None],
+            yaw=shown.motion.yaw[None],
+            speed=np.linalg.norm(shown.motion.velocity[:, :2], axis=-1)[None],
+            active=shown.agents.present[None],  # a car that has ended still stands there
+            events={name: (happened & ~shown.active)[None] for name, happened in vars(shown.happened).items()},
+            size=shown.agents.size,
+            goal=shown.agents.goal,
+            present=shown.agents.present,
+            control_hz=self._pool.step_hz,
+            title="",
+            weather="",
+            others=canvas.Others(*(np.asarray(column)[None] for column in _columns(shown.boxes))),
+        )
+        left, bottom = place[0] - _SIDE_M / 2
+        return video.picture(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
+
+    def _scene(self, index: int) -> Scene:
+        if index not in self._scenes:
+            self._scenes[index] = jax.device_get(jax.tree.map(lambda leaf: leaf[index], self._pool.scenes))
+        return self._scenes[index]
+
+
+def check_mode(mode: Any) -> None:
+    """Refuse a way to draw that there is not.
+
+    Raises:
+        ConfigError: any but None and those of `MODES`.
+    """
+    if mode is not None and mode not in MODES:
+        raise ConfigError(f"render_mode: {mode!r}; valid: None, {', '.join(MODES)}")
+
+
+def _shown(env: Env, scenes: Scene, world: Episode) -> Shown:
+    state = world.state
+    now = env.now(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
+    return Shown(world.scene, state.motion, state.active, state.happened, state.agents, state.weather, now.boxes)
+
+
+def _columns(boxes: Boxes) -> list[np.ndarray]:
+    return [getattr(boxes, name) for name in canvas.Others._fields]
