@@ -11,6 +11,7 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config, driving
 from scenefactory_jax.run import drive as window
 from scenefactory_jax.run.driving import Feel, Wheel
+from scenefactory_jax.struct import replace
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -67,7 +68,7 @@ def built():
     settings = config.load("drive", "dynamics=bicycle", "others=ignore", "observe=small")
     scene = scene_of([[-20.0, 0.0], [-50.0, -3.0]], [[60.0, 0.0], [-44.0, -3.0]], speeds=[5.0, 5.0])
     act = lambda parameters, observation, key: jnp.full((2, 3), 0.0)  # noqa: E731
-    return driving.world(world.make(settings), scene, act, None, car=1, dt=DT)
+    return driving.world(world.make(settings), scene, act, None, car=1, dt=DT, off_map_m=30.0)
 
 
 def driven(built, script, drive=None):
@@ -119,6 +120,15 @@ def test_a_broken_car_starts_again(built):
     assert driven(built, [(1, NONE, ())], broken).resets == 1
 
 
+def test_a_car_off_the_map_starts_again(built):
+    """Beside the road it drives on; 30 m from its last line, across or beyond its end, it is back at the start."""
+    begun = driving.start(built, seed=0)
+    for place, resets in (([0.0, 35.0], 0), ([0.0, 37.0], 1), ([88.0, 0.0], 0), ([91.0, 0.0], 1)):
+        motion = replace(begun.state.motion, position=begun.state.motion.position.at[1, :2].set(jnp.array(place)))
+        there = driven(built, [(2, NONE, ())], begun._replace(state=replace(begun.state, motion=motion)))
+        assert (there.resets, there.steps) == (resets, 0 if resets else 2), place
+
+
 def test_the_camera_key_frees_the_camera(built):
     assert not driven(built, [(2, NONE, ("camera",))]).chasing
 
@@ -152,6 +162,7 @@ def test_the_viewers_keys_become_commands(monkeypatch):
         ("keys.left=f13", "keys.left: 'f13'; valid: a letter, up, down"),
         ("keys.left=right", "keys.right: 'right' is the key of left, too"),
         ("feel.rise_s=0", "feel.rise_s: 0; wanted is at least 0.01"),
+        ("off_map_m=0", "off_map_m: 0; wanted is at least 1"),
         ("car=-1", "car: -1; wanted is at least 0"),
         ("overrides=[weather=wet]", "overrides: ['weather=wet'] without a run"),
     ],
