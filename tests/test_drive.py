@@ -11,7 +11,6 @@ from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import config, driving
 from scenefactory_jax.run import drive as window
 from scenefactory_jax.run.driving import Feel, Wheel
-from scenefactory_jax.struct import replace
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -121,12 +120,17 @@ def test_a_broken_car_starts_again(built):
 
 
 def test_a_car_off_the_map_starts_again(built):
-    """Beside the road it drives on; 30 m from its last line, across or beyond its end, it is back at the start."""
-    begun = driving.start(built, seed=0)
-    for place, resets in (([0.0, 35.0], 0), ([0.0, 37.0], 1), ([88.0, 0.0], 0), ([91.0, 0.0], 1)):
-        motion = replace(begun.state.motion, position=begun.state.motion.position.at[1, :2].set(jnp.array(place)))
-        there = driven(built, [(2, NONE, ())], begun._replace(state=replace(begun.state, motion=motion)))
-        assert (there.resets, there.steps) == (resets, 0 if resets else 2), place
+    """Beside the road it drives on; farther from its last line than `off_map_m` it is back at the start."""
+    near, drive, farthest = built._replace(off_map_m=5.0), driving.start(built, seed=0), 0.0
+    for step in range(200):
+        drive = driven(near, [(1, {"throttle"} | ({"left"} if step < 25 else set()), ())], drive)
+        if drive.resets:
+            break
+        y = float(drive.shot.position[1, 1])
+        assert drive.away_m == pytest.approx(min(abs(y), abs(abs(y) - 6.0)), abs=1e-3)
+        farthest = max(farthest, y)
+    assert (drive.resets, drive.steps, drive.away_m) == (1, 0, 0.0) and 11.0 < farthest < 12.0
+    assert float(drive.state.motion.position[1, 1]) == -3.0
 
 
 def test_the_camera_key_frees_the_camera(built):
