@@ -4,6 +4,7 @@ It needs `pip install -e '.[browser]'` and a Chromium or Chrome: on the path, wh
 """
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -45,13 +46,14 @@ def opened(browser, file):
     """Opens the page; nothing may be logged, thrown or asked for but the file itself."""
     troubles, contexts = [], []
 
-    def open(**options):
+    def open(address="", before="", **options):
         contexts.append(browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **options}))
         page = contexts[-1].new_page()
+        page.add_init_script(before)
         page.on("console", lambda message: troubles.append(message.text))
         page.on("pageerror", lambda error: troubles.append(str(error)))
         page.on("request", lambda request: troubles.append(request.url) if not request.url.startswith("file:") else None)
-        page.goto(file.as_uri())
+        page.goto(file.as_uri() + address)
         page.wait_for_selector("#cars button")
         return page
 
@@ -210,6 +212,59 @@ def test_charts_and_events_move_the_time(opened):
     text = row.inner_text()
     row.click()
     assert f"{float(page.text_content('#time').split(' ')[0]):.2f} s" in text and f"car {selected(page)}" in text
+
+
+def test_the_address_keeps_time_car_and_world(opened):
+    page = opened("#t=1.2&car=2&world=2")
+    assert page.input_value("#world") == "1" and selected(page) == "2" and step_of(page) == 35
+    page.keyboard.press("1")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("() => location.hash === '#t=1.23&car=1&world=2'")
+    page.keyboard.press("Escape")
+    page.wait_for_function("() => location.hash.includes('car=none')")
+    page.evaluate("() => { location.hash = '#t=0.5&car=0&world=1' }")  # typed by hand
+    page.wait_for_function("() => document.getElementById('time').dataset.step === '14'")
+    assert page.input_value("#world") == "0" and selected(page) == "0"
+    for nonsense in ("#t=soon&car=99&world=-3", "#car=&t=", "#", "#t=1e9&world=1.5"):
+        page = opened(nonsense)
+        assert page.input_value("#world") == "0" and selected(page) == "0" and 0 <= step_of(page) < STEPS
+
+
+def test_the_address_does_not_flood_the_history(opened):
+    counting = "window.told = 0; const put = history.replaceState.bind(history); history.replaceState = (...all) => (told++, put(...all))"
+    page = opened(before=counting)
+    before = page.evaluate("() => history.length")
+    page.keyboard.press(" ")
+    page.wait_for_timeout(1200)
+    assert page.evaluate("() => history.length") == before and 1 <= page.evaluate("() => told") <= 4
+
+
+def test_axes_are_labelled_in_plain_numbers(opened):
+    spy = """window.texts = new Set(); const put = CanvasRenderingContext2D.prototype.fillText;
+    CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+      if (this.canvas.closest(".plot")) texts.add(text);
+      put.call(this, text, ...rest);
+    }"""
+    page = opened(before=spy)
+    for car in "012":
+        page.keyboard.press(car)
+        settle(page)
+    texts = page.evaluate("() => [...texts]")
+    ticks = [text for text in texts if not re.match("[a-z]", text)]  # events are named in the chart, too
+    assert len(ticks) > 12 and all(re.fullmatch(r"−?\d{1,4}(\.\d{1,3})?( s)?", text) for text in ticks), ticks
+    assert "2.0 s" in ticks and not {"−0", "−0.0", "−0.00"} & set(ticks)
+
+
+def test_terms_and_things_on_the_map_have_legends(opened, recording):
+    page = opened()
+    pictures = page.eval_on_selector_all(".terms .swatch", "all => all.map((one) => one.toDataURL())")
+    assert len(set(pictures)) == len(recording.shots.terms) + 1  # and the sum
+    assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == [
+        "stop sign", "traffic light", "other road user"
+    ]  # fmt: skip
+    page.keyboard.press("w")
+    page.wait_for_function("() => document.getElementById('world').value === '1'")
+    assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == ["other road user"]
 
 
 def test_a_phone_has_room(opened):

@@ -16,6 +16,7 @@ from scene_documents import written
 from scenefactory_jax.report import replay_data, replay_html
 from scenefactory_jax.report.replay_bytes import Packer
 from scenefactory_jax.report.replay_html import ReplayError
+from scenefactory_jax.report.term_looks import TermLook, term_looks
 from scenefactory_jax.run import config
 from scenefactory_jax.run.replay import replay
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Light, Polyline, RawScene
@@ -102,6 +103,12 @@ def test_cars_events_and_others(page, recording):
     users = [(user["spans"], user["parked"]) for user in first["others"]]
     assert users == [([[STEPS // 2, STEPS - 1]], False), ([[0, STEPS - 1]], True)]
     assert first["lights"][0]["shown"] == [[0.0, "stop"], [1.0, "go"]] and first["signs"] == [[12.0, 5.0]] and not second["lights"]
+
+
+def test_every_reward_term_has_a_look_of_its_own(page, recording):
+    terms = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))["terms"]
+    shown = {name: TermLook(tuple(look["colour"]), look["pattern"], look["spike"]) for name, look in terms.items()}
+    assert shown == term_looks(recording.shots.terms)
 
 
 def test_roads_keep_their_shape_with_fewer_points(page):

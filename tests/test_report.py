@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import road_of
+from conftest import road_of, scene_of
 from PIL import Image
 
 from scenefactory_jax import layouts
@@ -483,3 +483,12 @@ def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
     assert not {"water", "ice"} & {text.get_text() for text in pictures.scene_figure(none).legends[0].get_texts()}
     box, width = figure.legends[0].get_window_extent(), figure.bbox.width
     assert box.x0 >= 0 and box.x1 <= width, "the legend fits the figure"
+
+
+def test_the_legend_names_what_the_road_shows():
+    plain = scene_of([[0.0, 0.0]], [[20.0, 0.0]])
+    across = np.stack([np.linspace(-5, 5, 11), np.full(11, 3.0)], -1)
+    kinds = {3: "bike lane", 17: "stop sign", 18: "crosswalk", 19: "speed bump", 20: "driveway"}
+    for scene, extra in ((plain, set()), (replace(plain, road=road_of([(kind, across) for kind in kinds])), set(kinds.values()))):
+        named = {text.get_text() for text in pictures.scene_figure(scene).legends[0].get_texts()}
+        assert extra == named & set(kinds.values())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from scenefactory_jax.types import DRIVABLE, LANE_BIKE, Road, Scene
+from scenefactory_jax.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road, Scene
 
 Colour = tuple[int, int, int]
 
@@ -17,6 +17,11 @@ QUIET: Colour = (112, 118, 126)
 WHITE: Colour = (255, 255, 255)
 YELLOW: Colour = (226, 170, 0)
 EDGE: Colour = (92, 97, 104)
+BIKE_LANE: Colour = (214, 224, 212)
+DRIVEWAY_LINE: Colour = (206, 208, 211)
+CROSSWALK_LINE: Colour = (178, 190, 206)
+BUMP: Colour = (190, 160, 120)
+STOP: Colour = (208, 28, 40)
 GOAL_RADIUS = 3.0  # m, of the goal's circle: the reference task's goal radius
 
 # One colour an agent, repeated after 16: Okabe and Ito's and Tol's colour-blind safe sets without their palest and without pure red,
@@ -202,17 +207,17 @@ class Stroke(NamedTuple):
 # kind (WOMD map.proto) -> colour, width in metres, thinnest width in pixels, dashed; in the order of drawing
 _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
     (DRIVABLE, ASPHALT, 3.9, 3.0, False),
-    ((LANE_BIKE,), (214, 224, 212), 1.8, 2.0, False),
-    ((20,), (206, 208, 211), 0.3, 1.0, False),  # driveway
+    ((LANE_BIKE,), BIKE_LANE, 1.8, 2.0, False),
+    ((DRIVEWAY,), DRIVEWAY_LINE, 0.3, 1.0, False),
     (DRIVABLE, (203, 205, 209), 0.12, 0.8, True),  # the lane's centre
-    ((18,), (178, 190, 206), 0.4, 1.2, False),  # crosswalk
-    ((19,), (190, 160, 120), 0.4, 1.2, False),  # speed bump
+    ((CROSSWALK,), CROSSWALK_LINE, 0.4, 1.2, False),
+    ((SPEED_BUMP,), BUMP, 0.4, 1.2, False),
     ((6,), WHITE, 0.2, 1.0, True),
     ((7, 8), WHITE, 0.25, 1.2, False),
     ((9, 10, 13), YELLOW, 0.2, 1.0, True),
     ((11, 12), YELLOW, 0.25, 1.2, False),
     ((15, 16), EDGE, 0.35, 1.4, False),
-    ((17,), (208, 28, 40), 0.8, 3.0, False),  # stop sign
+    ((STOP_SIGN,), STOP, 0.8, 3.0, False),
 )
 _DASH, _PERIOD = 3.0, 9.0  # m; dashes and their repetition on US roads are 10 and 40 feet, too sparse for a picture
 

@@ -16,6 +16,11 @@ from scenefactory_jax.report.plots import STYLE
 from scenefactory_jax.types import Scene
 
 _INCHES, _SHARE = 6.4, 0.84  # side of the figure, and the axes' share of it
+_ROAD = (  # of the legend: label, colour, width
+    ("lane", ASPHALT, 6.0), ("bike lane", canvas.BIKE_LANE, 6.0), ("road edge", canvas.EDGE, 1.5), ("yellow line", canvas.YELLOW, 1.5),
+    ("crosswalk", canvas.CROSSWALK_LINE, 1.5), ("speed bump", canvas.BUMP, 1.5), ("driveway", canvas.DRIVEWAY_LINE, 1.5),
+    ("stop sign", canvas.STOP, 3.0),
+)  # fmt: skip
 
 
 def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figure:
@@ -142,8 +147,7 @@ def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: 
     ]
     if road:
         drawn = {stroke.colour for stroke in canvas.strokes(scene.road)}
-        looks = (("lane", ASPHALT, 6), ("road edge", canvas.EDGE, 1.5), ("yellow line", canvas.YELLOW, 1.5))
-        handles += [Line2D([], [], color=_rgb(colour), linewidth=width, label=label) for label, colour, width in looks if colour in drawn]
+        handles += [Line2D([], [], color=_rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
     for area in {area.label: area for area in areas.areas(scene.weather)}.values():
         look = {"color": _rgb(area.colour), "markeredgecolor": _rgb(area.edge), "markeredgewidth": 0.6}
         handles.append(Line2D([], [], marker="s", linestyle="none", markersize=8, label=area.label, **look))

@@ -8,12 +8,14 @@ import matplotlib
 import numpy as np
 from matplotlib import rcsetup
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from scenefactory_jax.report import tables
 from scenefactory_jax.report.canvas import MARKS
 from scenefactory_jax.report.tables import METRICS, SHARE, Estimate, Records
+from scenefactory_jax.report.term_looks import DASHES, HATCHES, TermLook, term_looks
 
 # Okabe and Ito, "Color Universal Design" (2008), without yellow: it vanishes on white
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#882255", "#999933")
@@ -21,7 +23,7 @@ STYLE: dict[Any, Any] = {
     "font.size": 9, "axes.titlesize": 10, "axes.titleweight": "bold", "axes.titlelocation": "left", "axes.spines.top": False,
     "axes.spines.right": False, "axes.grid": True, "grid.color": "#e6e6e6", "grid.linewidth": 0.7, "axes.axisbelow": True,
     "axes.edgecolor": "#555555", "legend.frameon": False, "legend.fontsize": 8, "lines.linewidth": 1.6,
-    "axes.prop_cycle": rcsetup.cycler(color=COLOURS),
+    "axes.prop_cycle": rcsetup.cycler(color=COLOURS), "axes.formatter.useoffset": False, "axes.formatter.limits": (-7, 7),
 }  # fmt: skip
 RATES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "fault_rate", "unfinished_rate")
 
@@ -239,6 +241,12 @@ def safety_figure(table: Mapping[str, Records]) -> Figure:
     return figure
 
 
+def write_digits(axis: Axis) -> None:
+    """Label a logarithmic axis with numbers (1024, 0.0005) instead of powers."""
+    axis.set_major_formatter(FuncFormatter(lambda value, place: np.format_float_positional(value, precision=3, fractional=False, trim="-")))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def _keys(panel: Panel, table: Mapping[str, Any]) -> list[str]:
     """The columns of a table that a panel shows, in the panel's order."""
 
@@ -256,15 +264,17 @@ def _transpose(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 def _draw_panel(axes: Axes, panel: Panel, keys: list[str], table: Mapping[str, Any], steps: str) -> None:
     """One panel of the learning curves."""
-    looks = [_EVENTS.get(key, (_label(key), COLOURS[index % len(COLOURS)])) for index, key in enumerate(keys)]
-    for key, (name, colour) in zip(keys, looks, strict=True):
-        x, y = _series(table, steps, key)
-        if panel.kind != "stack":
-            axes.plot(x, y, color=colour, alpha=0.3, linewidth=0.8)
-            axes.plot(x, _running_mean(y), color=colour, label=name)
+    terms = _terms([key for key in keys if panel.kind == "stack" or key.startswith(("reward/", "terms/"))])
     if panel.kind == "stack":
         x = _series(table, steps, keys[0])[0]
-        _stack(axes, x, {_label(key): _running_mean(np.interp(x, *_series(table, steps, key))) for key in keys})
+        _stack(axes, x, {key: _running_mean(np.interp(x, *_series(table, steps, key))) for key in keys}, terms)
+    else:
+        for index, key in enumerate(keys):
+            name, colour = _EVENTS.get(key, (_label(key), _colour(terms[key]) if key in terms else COLOURS[index % len(COLOURS)]))
+            dash = DASHES[terms[key].pattern] if key in terms else "-"
+            x, y = _series(table, steps, key)
+            axes.plot(x, y, color=colour, alpha=0.3, linewidth=0.8)
+            axes.plot(x, _running_mean(y), color=colour, linestyle=dash, label=name)
     axes.set(title=panel.title, ylabel=panel.label, xlabel="agent steps")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if panel.kind == "shares":
@@ -272,6 +282,8 @@ def _draw_panel(axes: Axes, panel: Panel, keys: list[str], table: Mapping[str, A
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     elif panel.kind == "log":
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        write_digits(axes.yaxis)
     elif panel.label.startswith("controlled"):
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_ylim(bottom=0)
@@ -283,15 +295,25 @@ def _label(key: str) -> str:
     return METRICS[key].label if key in METRICS else key.rsplit("/", 1)[-1].replace("_", " ")
 
 
-def _stack(axes: Axes, x: np.ndarray, curves: Mapping[str, np.ndarray]) -> None:
-    """What adds up on top of each other, what takes away below, the largest first; what is always zero is left out."""
-    largest = sorted((name for name in curves if np.any(curves[name])), key=lambda name: -np.abs(curves[name]).mean())
+def _terms(keys: Sequence[str]) -> dict[str, TermLook]:
+    """The look of the reward term of each column."""
+    names = {key: key.rpartition("/")[2] for key in keys}
+    looks = term_looks(names.values())
+    return {key: looks[name] for key, name in names.items()}
+
+
+def _colour(look: TermLook) -> tuple[float, ...]:
+    return tuple(part / 255 for part in look.colour)
+
+
+def _stack(axes: Axes, x: np.ndarray, curves: Mapping[str, np.ndarray], looks: Mapping[str, TermLook]) -> None:
+    """Columns that add on top of each other, those that subtract below, the largest first; a column that is always zero is left out."""
+    largest = sorted((key for key in curves if np.any(curves[key])), key=lambda key: -np.abs(curves[key]).mean())
     up, down = np.zeros(len(x)), np.zeros(len(x))
-    for place, name in enumerate(largest):
-        again, colour = divmod(place, len(COLOURS))
-        look = {"facecolor": COLOURS[colour], "alpha": 0.75, "linewidth": 0, "hatch": "////" * again, "edgecolor": "white"}
-        new_up, new_down = up + np.maximum(curves[name], 0), down + np.minimum(curves[name], 0)
-        axes.fill_between(x, up, new_up, label=name, **look)
+    for key in largest:
+        look = {"facecolor": _colour(looks[key]), "alpha": 0.85, "linewidth": 0, "hatch": HATCHES[looks[key].pattern], "edgecolor": "white"}
+        new_up, new_down = up + np.maximum(curves[key], 0), down + np.minimum(curves[key], 0)
+        axes.fill_between(x, up, new_up, label=_label(key), **look)
         axes.fill_between(x, down, new_down, **look)
         up, down = new_up, new_down
     axes.plot(x, up + down, color="#222222", label="sum")

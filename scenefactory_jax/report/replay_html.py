@@ -17,11 +17,13 @@ from scenefactory_jax.recording import Recording
 from scenefactory_jax.report import replay_data
 from scenefactory_jax.report.canvas import AGENTS, GOAL_RADIUS, MARKS
 from scenefactory_jax.report.replay_data import Posts
+from scenefactory_jax.report.term_looks import term_looks
 
 if TYPE_CHECKING:
     from IPython.display import HTML
 
-SCRIPTS = ("data.js", "state.js", "view.js", "map.js", "marks.js", "charts.js", "page.js")
+SCRIPTS = ("data.js", "state.js", "view.js", "map.js", "marks.js", "plots.js", "rewards.js", "charts.js", "legend.js", "address.js")
+SCRIPTS += ("page.js",)  # it starts the page
 
 
 class ReplayError(ValueError):
@@ -93,6 +95,7 @@ def document(
         "goal_radius": goal_radius_m,
         "colours": [list(colour) for colour in AGENTS],
         "marks": {name: {"label": mark.label, "colour": list(mark.colour)} for name, mark in MARKS.items()},
+        "terms": {name: look._asdict() for name, look in term_looks(recording.shots.terms).items()},
         "ttc_most": replay_data.TTC_MOST_S,
         "worlds": [one for one, _ in worlds],
     }

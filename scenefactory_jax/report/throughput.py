@@ -162,6 +162,8 @@ def figure(rows: list[Row]) -> Figure:
                 [line] = axes.loglog(worlds, values, "o-", base=2, markersize=4, label=f"{slots} {'car' if slots == 1 else 'cars'} a world")
                 axes.loglog(worlds, [values[-1] / worlds[-1] * count for count in worlds], ":", base=2, color=line.get_color(), linewidth=1)
             axes.set(title=title, xlabel="worlds")
+            for axis in (axes.xaxis, axes.yaxis):
+                plots.write_digits(axis)
         panels[0].legend()
     return whole
 

@@ -64,6 +64,7 @@ FILM |= {"fps": Key(float, 0.1), "stride": COUNT, "at_s": Key(float, 0), "trail_
 HANDING_ON = {"run": Key(str), "trust": FLAG, "out": Key(str)}
 CARD = {"about": PLACE, "judged": Key(dict[str, str] | None), "bootstrap": COUNT, "seed": SEED}
 DRIVE = {"run": PLACE, "trust": FLAG, "overrides": Key(list[str]), "skip": SEED, "car": Key(int | None, 0), "seed": SEED}
+DRIVE |= {"off_map_m": Key(float, 1.0)}
 DRIVE_KEYS = {name: Key(str) for name in ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")}
 FEEL = {name: Key(float, 0.01) for name in ("rise_s", "fall_s", "turn_s", "centre_s", "calm_mps", "tap_s")}
 SCENES = {"op": Key(str), "out": PLACE, "copy": FLAG, "limit": SEED, "seed": SEED, "progress": FLAG, "filter": PLACE}

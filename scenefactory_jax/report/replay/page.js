@@ -61,19 +61,6 @@ function eventRow(event) {
   return row;
 }
 
-function showLegend() {
-  const labels = new Map(app.world.patches.map(({ label, colour }) => [label, colour]));
-  $("legend").replaceChildren(
-    ...[...labels].map(([text, colour]) => {
-      const item = element("li");
-      const swatch = element("i");
-      swatch.style.background = rgb(colour);
-      item.append(swatch, text);
-      return item;
-    }),
-  );
-}
-
 function showTime() {
   const { world } = app;
   const text = `${number(seconds(world, now()), 2)} s`;
@@ -330,6 +317,7 @@ function listen() {
     if (app.world) showWorld();
     redraw();
   });
+  window.addEventListener("hashchange", openAddress);
   new ResizeObserver(redraw).observe($("stage"));
   new ResizeObserver(redraw).observe($("panel"));
 }
@@ -348,7 +336,7 @@ async function start() {
   listen();
   resize();
   try {
-    await chooseWorld(0);
+    await openAddress();
   } catch (error) {
     document
       .querySelector("main")

@@ -19,19 +19,14 @@ const lighten = (colour, share) => colour.map((part) => Math.round(part + share 
 /** The step whose numbers count now. */
 const now = () => Math.min(Math.floor(app.time + 1e-6), app.world.end);
 
-/** A car's colour; in the dark the deep ones need light. */
-function colourOf(slot) {
-  const colour = replay.colours[slot % replay.colours.length];
-  const [red, green, blue] = colour;
-  const light = (0.3 * red + 0.6 * green + 0.1 * blue) / 255;
-  return dark.matches ? lighten(colour, 0.28 + 0.5 * Math.max(0, 0.45 - light)) : colour;
+/** A colour as the scheme needs it: in the dark the deep ones need light. */
+function inScheme(colour) {
+  if (!dark.matches) return colour;
+  const light = (0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2]) / 255;
+  return lighten(colour, light < 0.02 ? 0.92 : 0.28 + 0.5 * Math.max(0, 0.45 - light));
 }
-
-/** An event's colour. */
-function colourOfMark(name) {
-  const colour = replay.marks[name]?.colour ?? [120, 120, 120];
-  return dark.matches ? lighten(colour, name === "crashed" ? 0.92 : 0.3) : colour;
-}
+const colourOf = (slot) => inScheme(replay.colours[slot % replay.colours.length]);
+const colourOfMark = (name) => inScheme(replay.marks[name]?.colour ?? [120, 120, 120]);
 
 function seek(time) {
   app.time = clamp(time, 0, app.world.end);
@@ -117,6 +112,7 @@ function tick(stamp) {
     stale = false;
     draw();
   }
+  if (app.world) keepAddress(stamp);
   requestAnimationFrame(tick);
 }
 
