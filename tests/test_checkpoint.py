@@ -174,6 +174,7 @@ def test_what_was_handed_on_has_a_digest(saved, tmp_path):
             checkpoint.restore_parameters(tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # orbax leaves its other writes unawaited
 def test_a_full_disk_leaves_the_checkpoints_before_it(saved, tmp_path):
     resource = pytest.importorskip("resource")  # a limit on files stands for a full disk: the same path, with another reason
     folder, third, fourth = saved

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import sys
 import traceback
 from pathlib import Path
@@ -30,12 +31,15 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder as a user has one: a short run, a bank of another version, a reward of one's own, a run with it."""
+    """A folder as a user has one: a short run, a bank of another version, a reward of one's own, runs with it and with damage."""
     folder = tmp_path_factory.mktemp("here")
     train(smoke(folder / "runs" / "mine", "evaluation.enable=false", "iterations=1"))
     (folder / "old.bank").mkdir()
     (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
     (folder / "my_reward.py").write_text(OWN_REWARD)
+    shutil.copytree(folder / "runs" / "mine", folder / "runs" / "damaged")
+    shutil.copytree(folder / "runs" / "mine" / "checkpoints" / "1", folder / "runs" / "damaged" / "checkpoints" / "2")
+    (folder / "runs" / "damaged" / "checkpoints" / "2" / "parameters" / "_METADATA").write_text("{")
     config.write(folder / "runs" / "theirs", smoke(None, "+reward.haste={_target_: my_reward.haste, weight: 1.0}"))
     return folder
 
@@ -94,7 +98,7 @@ def normal(text: str, folder: Path) -> str:
 
 def test_the_page_shows_every_likely_mistake():
     headings = re.findall(r"^## \d+\. (.+)$", PAGE, re.MULTILINE)
-    assert len(headings) == 11 and len(SHOWN) >= 11 and PAGE.count("```console") == len(SHOWN)
+    assert len(headings) == 12 and len(SHOWN) >= 12 and PAGE.count("```console") == len(SHOWN)
     assert all("Traceback" not in text for _, text in SHOWN)
 
 

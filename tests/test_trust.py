@@ -97,12 +97,13 @@ def test_yaml_that_names_itself_is_read_once(tmp_path):
     assert "a.1._target_: 'os.system'" in str(caught.value) and "\x1b" not in str(caught.value)
 
 
-def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path):
+def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path, capsys):
     mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
     before = config.load("train", mine, f"out={tmp_path}")
     config.write(tmp_path, before)
     with train_folder.opened(before | {"resume": True}) as (folder, resume):  # what is built is the command's config, never the folder's
         assert folder == tmp_path and not resume
+    assert capsys.readouterr().out == f"{tmp_path} has no checkpoint to go on from: the run begins anew\n"
     other = config.load("train", f"out={tmp_path}", "resume=true")
     with pytest.raises(ConfigError, match=r"reward\.mine=None"), train_folder.opened(other):
         pass

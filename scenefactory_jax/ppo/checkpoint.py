@@ -9,6 +9,7 @@ wrote has none, and is read unchecked.
 import contextlib
 import errno
 import hashlib
+import logging
 import os
 import shutil
 import zipfile
@@ -161,8 +162,14 @@ def _manager(folder: Path, *, keep: int | None = None) -> Iterator[ocp.Checkpoin
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=keep is not None, enable_async_checkpointing=False)
     handlers: dict[str, Any] = {name: ocp.StandardCheckpointHandler() for name in (LEARNT, AVERAGED, REST)}
     handlers[HOST] = ocp.JsonCheckpointHandler()
-    with ocp.CheckpointManager(folder.absolute(), options=options, item_handlers=handlers) as manager:
-        yield manager
+    log = logging.getLogger("absl")  # orbax logs what it raises, with its traceback
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with ocp.CheckpointManager(folder.absolute(), options=options, item_handlers=handlers) as manager:
+            yield manager
+    finally:
+        log.setLevel(before)
 
 
 @contextlib.contextmanager
