@@ -40,7 +40,7 @@ def attempt(read, path):
         verdict = "read"
     except (Companion, OtherFormat, SceneError) as error:
         assert str(path) in str(error), f"no file in: {error}"
-        verdict = type(error).__name__
+        verdict = OtherFormat.__name__ if isinstance(error, OtherFormat) else type(error).__name__
     return verdict
 
 

@@ -315,7 +315,7 @@ def test_counts_of_a_binary_map_are_held_against_its_size(tmp_path, readers):
     raw = one(written(tmp_path, content), readers)
     assert [track.kind for track in raw.tracks] == ["vehicle", "pedestrian"] and raw.metadata["experts"] == [1]
     assert raw.tracks[0].size == pytest.approx((4.5, 1.9, 1.5)) and [len(line.xyz) for line in raw.roads] == [41, 41, 1]
-    claims = {0: "no PufferDrive map", 4: "no PufferDrive map", 12: r"objects\[0\]: type 1 with 2147483647 entries"}
+    claims = {0: "it begins with b", 4: "it begins with b", 12: r"objects\[0\]: type 1 with 2147483647 entries"}
     for place, message in claims.items():
         with pytest.raises(SceneError, match=message):
             one(written(tmp_path, content[:place] + struct.pack("<i", 2**31 - 1) + content[place + 4 :]), readers)

@@ -29,7 +29,7 @@ class OtherFormat(SceneError):
 
 
 class OtherContent(OtherFormat):
-    """The file is of this reader's container (JSON, pickle, parquet, TFRecord), but what it holds is of another format."""
+    """The file is of this reader's container (JSON, pickle, parquet, TFRecord, counts that fit), but what it holds is of another format."""
 
 
 class Companion(SceneError):

@@ -10,17 +10,24 @@ import importlib
 import multiprocessing
 import pickle
 import signal
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from scenefactory_jax.build import ConfigError, check_number
 from scenefactory_jax.scenes.raw import SceneError
 
 HERE = "spread=local scenes.workers=1 spread.timeout_s=null does without other processes"
+SERVE = (  # what a process runs, given a pipe and the path on which modules are found
+    "import sys; from multiprocessing.connection import Connection; sys.path[:] = sys.argv[2:];"
+    " from scenefactory_jax.scenes import spread; spread.serve(Connection(int(sys.argv[1])))"
+)
 Work = Callable[[Any], Any]
+Task = tuple[int, Any]  # an item, and its place among the items
+Busy = dict[Connection, tuple[subprocess.Popen[bytes], Task | None]]  # processes and what they work on; None while one starts
 Spread = Callable[[Work, Sequence[Any]], Iterable[Any]]
 
 
@@ -57,9 +64,9 @@ def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | 
         return
     packed = _packed(work, pickle.dumps)
     waiting, done = deque(enumerate(items)), {}
-    busy: dict[Connection, tuple[BaseProcess, int | None]] = {}  # and the item that the process has; None while it starts
+    busy: Busy = {}
     try:
-        busy.update(_start(packed, timeout_s) for _ in range(min(workers, len(items))))
+        busy.update(_start() for _ in range(min(workers, len(items))))
         for number in range(len(items)):
             while number not in done:
                 for connection in wait(list(busy)):
@@ -69,6 +76,7 @@ def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | 
         for connection, (process, _) in busy.items():
             connection.close()
             process.terminate()
+            process.wait()
 
 
 def _packed(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
@@ -81,54 +89,53 @@ def _packed(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
 
 
 def _answer(
-    connection: Connection,
-    busy: dict[Connection, tuple[BaseProcess, int | None]],
-    waiting: deque[tuple[int, Any]],
-    done: dict[int, Any],
-    packed: bytes,
-    timeout_s: float | None,
+    connection: Connection, busy: Busy, waiting: deque[Task], done: dict[int, Any], packed: bytes, timeout_s: float | None
 ) -> None:
     """Take a result, or the news of a death, and give the process or its successor the next item."""
-    process, place = busy.pop(connection)
+    process, given = busy.pop(connection)
     try:
         answer = connection.recv()
     except (EOFError, OSError):
-        process.join()
-        if place is None:
-            guard = 'a script needs `if __name__ == "__main__":`'
-            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {guard}; {HERE}") from None
-        done[place] = Lost(_death(process, timeout_s))
+        process.wait()
+        if given is None:
+            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {HERE}") from None
+        done[given[0]] = Lost(_death(process, timeout_s))
         if waiting:
-            busy.update([_start(packed, timeout_s)])
+            busy.update([_start()])
         return
-    if place is not None:
-        done[place] = answer
+    if given is not None:
+        done[given[0]] = answer
     if not waiting:
         connection.close()  # the process ends
+        process.wait()
         return
-    following, item = waiting.popleft()
+    following = waiting.popleft()
     try:
-        connection.send(item)
+        if given is None:
+            connection.send((packed, timeout_s))
+        connection.send(following[1])
         busy[connection] = process, following
     except OSError:  # it died without work: the item is not to blame
-        waiting.appendleft((following, item))
-        busy.update([_start(packed, timeout_s)])
+        process.wait()
+        waiting.appendleft(following)
+        busy.update([_start()])
 
 
-def _start(packed: bytes, timeout_s: float | None) -> tuple[Connection, tuple[BaseProcess, None]]:
-    context = multiprocessing.get_context("spawn")
-    ours, its = context.Pipe()
-    process = context.Process(target=_serve, args=(its, packed, timeout_s), daemon=True)
-    process.start()
+def _start() -> tuple[Connection, tuple[subprocess.Popen[bytes], None]]:
+    """A process that finds the modules of this one, and does not run this one's script again, as those of multiprocessing do."""
+    ours, its = multiprocessing.Pipe()
+    command = [sys.executable, "-P", "-c", SERVE, str(its.fileno()), *map(str, sys.path)]
+    process = subprocess.Popen(command, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL)
     its.close()  # only the process has it now: the pipe breaks when the process dies
     return ours, (process, None)
 
 
-def _serve(connection: Connection, packed: bytes, timeout_s: float | None) -> None:
+def serve(connection: Connection) -> None:
     """A process's life: it says that it is there, then answers until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the one that started this one ends it
     try:
         connection.send(None)
+        packed, timeout_s = connection.recv()
         while True:
             connection.send(_timed(packed, timeout_s, connection.recv()))
     except (EOFError, OSError):
@@ -140,11 +147,12 @@ def _timed(packed: bytes, timeout_s: float | None, item: Any) -> Any:
 
     Past its time the kernel's alarm ends the process, whatever code it hangs in.
     """
+    if isinstance(work := _loaded(packed), Unloadable):
+        return work
     if timeout_s is not None:
         signal.setitimer(signal.ITIMER_REAL, timeout_s)
     try:
-        work = _loaded(packed)
-        return work if isinstance(work, Unloadable) else work(item)
+        return work(item)
     except ConfigError as error:
         return error
     except Exception as error:
@@ -172,8 +180,8 @@ def _passed(result: Any) -> Any:
     return result
 
 
-def _death(process: BaseProcess, timeout_s: float | None) -> str:
-    code = process.exitcode or 0
+def _death(process: subprocess.Popen[bytes], timeout_s: float | None) -> str:
+    code = process.returncode
     if code == -signal.SIGALRM:
         return f"no result after {timeout_s:g} s (timeout_s)"
     if code < 0:

@@ -17,7 +17,7 @@ import numpy as np
 
 from scenefactory_jax.scenes.formats import documents, lines
 from scenefactory_jax.scenes.logs import FULL_TURN, wrapped
-from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.scenes.raw import OtherContent, OtherFormat, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, LANE_STREET, LINES, SPEED_BUMP, STOP_SIGN, RoadUser
 
 OBJECTS: dict[int, RoadUser] = {1: "vehicle", 2: "pedestrian", 3: "cyclist"}
@@ -95,7 +95,7 @@ def _layout(words: np.ndarray, size: int, path: Path) -> tuple[list[_Entity], li
         kind, count = (int(word) for word in words[place : place + HEAD]) if place + HEAD <= len(words) else (0, 0)
         end = place + HEAD + columns * count + TAIL
         if kind not in kinds or count < 1 or end > len(words):
-            error = OtherFormat if index == 0 else SceneError
+            error = OtherContent if index == 0 else SceneError
             raise error(f"{path}: {name}: type {kind} with {count} entries at byte {WORD * place} of {size}; damaged or cut short")
         entities.append(_Entity(kind, count, place + HEAD))
         place = end
