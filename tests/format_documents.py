@@ -51,6 +51,33 @@ def scenarionet_document():
     }  # fmt: skip
 
 
+def metadrive_document():
+    """MetaDrive's own map, as `export_scenarios` of 0.4.3 writes it: two roads of two lanes side by side, a ramp's lane, no road edge.
+
+    Lines are called by the lane beside them and its side; the road's sides are solid white lines, as is the one that closes the ramp off.
+    """
+    rim = lambda y, half=1.75: np.concatenate([street(y - half, 21)[:, :2], street(y + half, 21)[::-1, :2]])  # noqa: E731
+    features = {}
+    for towards, places in (("('>', '>>', ", (-1.75, -5.25, -8.75)), ("('->>', '->', ", (1.75, 5.25))):
+        for index, y in enumerate(places):
+            turn = 1 if towards[2] == ">" else -1
+            lane = {"type": "LANE_SURFACE_STREET", "polyline": street(y, 41)[::turn, :2], "polygon": rim(y), "speed_limit_kmh": 1000}
+            features[f"{towards}{index})"] = lane | {"left_neighbor": [], "right_neighbor": [], "entry_lanes": [], "exit_lanes": []}
+    features["('>', '>>', 1)"]["speed_limit_kmh"] = 40
+    drawn = {
+        "('>', '>>', 0)_0": ("ROAD_LINE_SOLID_SINGLE_YELLOW", 0.0), "('>', '>>', 1)_0": ("ROAD_LINE_BROKEN_SINGLE_WHITE", -3.5),
+        "('>', '>>', 1)_1": ("ROAD_LINE_SOLID_SINGLE_WHITE", -7.0), "('>', '>>', 2)_1": ("ROAD_LINE_SOLID_SINGLE_WHITE", -10.5),
+        "('->>', '->', 0)_0": ("ROAD_LINE_SOLID_SINGLE_YELLOW", 0.0), "('->>', '->', 1)_0": ("ROAD_LINE_BROKEN_SINGLE_WHITE", 3.5),
+        "('->>', '->', 1)_1": ("UNKNOWN_LINE", 7.0),  # a guardrail
+    }  # fmt: skip
+    for key, (kind, y) in drawn.items():
+        features[key] = {"type": kind, "polyline": street(y, 41)[:, :2], "speed_limit_kmh": 1000}
+    features["sidewalk"] = {"type": "ROAD_EDGE_SIDEWALK", "polygon": rim(-11.5, 1.0)}  # beside the road, and no lane
+    document = scenarionet_document()
+    metadata = {"ts": 0.1 * np.arange(STEPS), "dataset": "metadrive", "sdc_id": "7", "coordinate": "metadrive", "scenario_id": "PGMap-3"}
+    return document | {"id": "PGMap-3", "metadata": metadata, "map_features": features, "dynamic_map_states": {}}
+
+
 def in_spring_2023(document):
     """The layout of April 2023: lights as arrays, sizes in columns of their own."""
     lane, stop = np.full(STEPS, 1), np.tile([5.0, 0.0, 0.0], (STEPS, 1))

@@ -18,14 +18,17 @@ from format_documents import (
     encoded,
     in_march_2023,
     in_spring_2023,
+    metadrive_document,
     pufferdrive_map,
     scenarionet_document,
+    street,
 )
 from scene_documents import FORMATS, document, prepared
 
 from scenefactory_jax.scenes import source
 from scenefactory_jax.scenes.formats import lines, pickles
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, OtherFormat, SceneError
+from scenefactory_jax.types import EDGES
 
 LIMITS = {key: FORMATS["scenarionet"][key] for key in ("file_limit_mb", "opcode_limit")}
 METRES = 0.01  # positions agree to this
@@ -158,6 +161,26 @@ def test_every_layout_gives_the_same_scene(tmp_path, readers, layout):
     assert json.loads(json.dumps(raw.metadata)) == raw.metadata
     _, report = prepared(raw, require_agents=False)
     assert report.segments_kept
+
+
+def test_the_rim_of_a_metadrive_map_is_its_road_edge(tmp_path, readers):
+    whole = metadrive_document()
+    raw = one(written(tmp_path, dumped(whole)), readers)
+    names = {number: text for text, number in raw.metadata["tokens"]["features"].items()}
+    edges = [names[line.id] for line in raw.roads if line.kind in EDGES]
+    assert edges == ["('>', '>>', 2)_1", "('->>', '->', 1)_1"]
+    assert Counter(line.kind for line in raw.roads) == {2: 5, 6: 2, 7: 1, 11: 2, 15: 2}  # the ramp is closed off by a line
+    limits = [line.speed_limit for line in raw.roads if line.kind == 2]
+    assert limits == [None, pytest.approx(40 / 3.6), None, None, None]  # 1,000 km/h is none
+    scene, report = prepared(raw, centre="mean", require_agents=False)
+    assert len(scene.edges.kind) == 2 * 40 and report.metadata["edges_from_lines"] == 2
+    changes = [{"metadata": whole["metadata"] | {"dataset": "waymo"}}]
+    changes += [{"map_features": whole["map_features"] | {"edge": {"type": "ROAD_EDGE_MEDIAN", "polyline": street(20.0)}}}]
+    for change in changes:
+        same = one(written(tmp_path, dumped(whole | change)), readers)
+        assert not any(line.kind == 15 for line in same.roads) and "edges_from_lines" not in same.metadata
+    plain = source.make(FORMATS | {"scenarionet": FORMATS["scenarionet"] | {"outlines_are_edges": False}})
+    assert not any(line.kind in EDGES for line in one(written(tmp_path, dumped(whole)), plain).roads)
 
 
 class Hostile:

@@ -14,6 +14,7 @@ from format_documents import (
     encoded,
     in_march_2023,
     in_spring_2023,
+    metadrive_document,
     pufferdrive_map,
     scenarionet_document,
 )
@@ -60,11 +61,12 @@ def test_damaged_bytes(files, readers, name):
     assert set(verdicts) <= {"read", "OtherFormat", "SceneError"}
 
 
-@pytest.mark.parametrize("layout", [lambda whole: whole, in_spring_2023, in_march_2023], ids=["today", "April 2023", "March 2023"])
-def test_a_wrong_value_anywhere_in_a_scenario(tmp_path, readers, layout):
+@pytest.mark.parametrize("whole", [scenarionet_document(), in_spring_2023(scenarionet_document()), in_march_2023(scenarionet_document()),
+                                   metadrive_document()], ids=["today", "April 2023", "March 2023", "MetaDrive's"])  # fmt: skip
+def test_a_wrong_value_anywhere_in_a_scenario(tmp_path, readers, whole):
     path = tmp_path / "a.pkl"
     verdicts = set()
-    for what, bad in fuzzing.mutated(layout(scenarionet_document()), count=70):
+    for what, bad in fuzzing.mutated(whole, count=70):
         path.write_bytes(dumped(bad))
         try:
             verdicts.add(fuzzing.attempt(readers["scenarionet"], path))

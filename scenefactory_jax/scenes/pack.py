@@ -89,16 +89,14 @@ def pack(
         box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
         centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (facts 4.3).
         gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (facts 4.4).
-        agents: slots. Cars are taken nearest to the centre first.
+        agents, require_agents: slots, for the cars nearest to the centre; whether a scene in which none is left is refused.
         min_travel_m: a car whose goal is not farther than that from its start is no agent.
         car_size_m: length and width of every car; null: as logged.
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
-        require_agents: refuse a scene in which no agent is left.
         others: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
         others_least_m: shortest and narrowest that they may be.
-        outline_m: longest segment of the outline of a crosswalk, speed bump or driveway, of which sources have the corners only; the
-            configs of older runs do not say it.
+        outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway); the configs of older runs do not say it.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -116,7 +114,6 @@ def pack(
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _log(chosen, logs, raw, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     beside, others_dropped = _others(raw, logs, chosen, leaves, half, first, others, others_least_m)
-    leaves |= beside
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -134,7 +131,12 @@ def pack(
         relief_m=relief,
         metadata=dict(raw.metadata),
     )
-    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+    return _scene(leaves | beside), report
+
+
+def _scene(leaves: dict[str, np.ndarray]) -> Scene:
+    """The struct of these columns, in their types."""
+    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
 
 
 def _check(box_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:

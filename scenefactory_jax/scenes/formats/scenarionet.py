@@ -4,11 +4,11 @@
 from WOMD, nuScenes, nuPlan, Argoverse 2 or MetaDrive's own maps; coordinates are right-handed, boxes are given by their centres. Layouts
 before today's are read too (`scenarionet_layouts`).
 
-Three things that the converters do and this reader undoes: nuScenes' lanes are poses, their third column a heading and no height; the
-recording car of nuScenes has its length and width exchanged; and the outline of the drivable area comes as white lines (`boundary_7`).
+Four things that the converters do and this reader undoes: nuScenes' lanes are poses, their third column a heading and no height; the
+recording car of nuScenes has its length and width exchanged; the outline of the drivable area comes as white lines (`boundary_7`);
+and MetaDrive's own maps have solid lines for road edges (`metadrive_map`).
 """
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.scenes.formats import documents, identities, lines, pickles, scenarionet_layouts
+from scenefactory_jax.scenes.formats import documents, identities, lines, metadrive_map, pickles, scenarionet_layouts
 from scenefactory_jax.scenes.logs import wrapped
 from scenefactory_jax.scenes.raw import LIGHT_STATES, Companion, Light, OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.types import (
@@ -26,6 +26,7 @@ from scenefactory_jax.types import (
     DRIVEWAY,
     EDGE_BOUNDARY,
     EDGE_MEDIAN,
+    EDGES,
     LANE_BIKE,
     LANE_FREEWAY,
     LANE_STREET,
@@ -54,6 +55,9 @@ SIGNALS = {f"LANE_STATE_{name.upper()}": index for index, name in enumerate(LIGH
 }
 DATASETS = {"waymo": "WOMD", "nuscenes": "nuScenes", "nuplan": "nuPlan", "av2": "argoverse2"}
 UNITS = {"speed_limit_mph": 1609.344 / 3600, "speed_limit_kmh": 1 / 3.6}  # in m/s
+SPEED_LIMIT_MOST = 160 / 3.6  # m/s, of any country's signs: that of the United Arab Emirates
+METADRIVE = "metadrive"  # `dataset` of its own maps
+SOLID = (LINE_UNKNOWN, 7, 8, 11, 12)  # lines that nobody crosses, and those of no known type
 KEPT = ("scenario_id", "source_file", "map", "date")  # of the file's metadata, where they are texts
 
 
@@ -65,7 +69,8 @@ def read(
     Args:
         path: a pickle, read by `pickles.load`.
         current: the step at which the simulation takes over, where the file names none (all but WOMD's).
-        outlines_are_edges: whether lines named `boundary_N`, the drivable area's outline in nuScenes and nuPlan, become road edges.
+        outlines_are_edges: whether lines named `boundary_N`, the drivable area's outline in nuScenes and nuPlan, become road edges, and
+            the rim of MetaDrive's own maps, of which `metadata["edges_from_lines"]` counts the lines.
         point_spacing_m: between the points of a line, at most; WOMD's are dense as they are, the others may have corners only.
         file_limit_mb: larger files are refused.
         opcode_limit: longer pickles are refused.
@@ -102,6 +107,8 @@ def read(
         for (key, record), kind in zip(features.items(), kinds.values(), strict=True)
         if kind is not None
     ]
+    rims = _find_rims(roads, features, f"{where}map_features") if outlines_are_edges and dataset == METADRIVE else []
+    roads = [replace(line, kind=EDGE_BOUNDARY) if place in rims else line for place, line in enumerate(roads)]
     if dataset != "waymo":
         sparse = [len(line.xyz) > 0 and line.kind not in POLYGONS for line in roads]
         roads = [replace(line, xyz=lines.densify(line.xyz, point_spacing_m)) if s else line for line, s in zip(roads, sparse, strict=True)]
@@ -116,8 +123,23 @@ def read(
         current=current,
         sdc=sdc,
         lights=tuple(light for light in lights if light is not None),
-        metadata=_metadata(document, ids, where) | {"dataset": DATASETS.get(dataset, dataset), "left_out": dict(left_out)},
+        metadata=_metadata(document, ids, where)
+        | {"dataset": DATASETS.get(dataset, dataset), "left_out": dict(left_out)}
+        | ({"edges_from_lines": len(rims)} if rims else {}),
     )
+
+
+def _find_rims(roads: list[Polyline], features: Mapping[Any, Any], where: str) -> list[int]:
+    """Places in `roads` of the solid or unknown lines that are the rim of a MetaDrive map; none if it has edges."""
+    if any(line.kind in EDGES for line in roads):
+        return []
+    shaped = {key: record["polygon"] for key, record in features.items() if "polygon" in record and str(record["type"]).startswith("LANE_")}
+    lanes = [_points(polygon, f"{where}[{key!r}].polygon") for key, polygon in shaped.items()]
+    for lane in lanes:
+        documents.require_finite(lane, f"{where}: polygon")
+    solid = [place for place, line in enumerate(roads) if line.kind in SOLID and len(line.xyz) > 1]
+    rims = metadrive_map.find_rims([roads[place].xyz for place in solid], [lane[:, :2] for lane in lanes])
+    return [place for place, rim in zip(solid, rims, strict=True) if rim]
 
 
 def _times(metadata: Mapping[str, Any], where: str) -> Float[np.ndarray, " L"]:
@@ -234,11 +256,11 @@ def _lanes(entries: Any, ids: Mapping[str, int], where: str) -> tuple[int, ...]:
 
 
 def _speed_limit(feature: Mapping[str, Any], where: str) -> float | None:
-    """In m/s; WOMD's converter writes 0 where there is none."""
+    """In m/s; where there is none, WOMD's converter writes 0 and MetaDrive 1,000 km/h."""
     for key, unit in UNITS.items():
         if feature.get(key) is not None:
             limit = documents.expect(feature[key], float, f"{where}.{key}") * unit
-            return limit if 0 < limit < math.inf else None
+            return limit if 0 < limit <= SPEED_LIMIT_MOST else None
     return None
 
 
