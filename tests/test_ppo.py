@@ -117,6 +117,15 @@ def test_samples_without_weight_change_nothing(batch):
     assert not loss.normalise(garbage.returns, jnp.zeros(24)).any()
 
 
+def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
+    rng, none = np.random.default_rng(0), jnp.zeros((T, W, A))
+    active, truncated = (jnp.asarray(rng.random((T, W, A)) < share) for share in (0.7, 0.3))
+    observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
+    samples = rollout.Sample(observation, pair, pair, none, none, none, active, jnp.zeros((T, W, A), bool), truncated)
+    batch = train._batch(samples, none[0], gamma=0.9, gae_lambda=0.8, normalise_advantage=True, groups=1, axis=None)
+    np.testing.assert_array_equal(batch.weight, np.ravel(active & ~truncated))
+
+
 def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
     whole = update.split(jax.random.key(5), weight, minibatches=4, size=24)

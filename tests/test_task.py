@@ -278,6 +278,18 @@ def test_a_step_is_an_action_with_all_its_control_steps(config):
     jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
 
 
+def test_a_life_that_begins_within_an_action_has_no_part_in_it(config):
+    """The action takes the car to its goal in the first of two control steps, 10.5 / 30 m on. In the second a new life goes on at 10 m/s
+    with free pedals, and what that earns is no part of what the action is paid."""
+    env = build_env(config, hold=2, respawn=10.0)
+    scene = scene_of([[0.0, 0.0]], [[3.345, 0.0]], speeds=[10.0])
+    state, _ = env.reset(jax.random.key(0), scene)
+    after, outcome = jax.jit(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
+    assert outcome.done.tolist() == outcome.events.reached.tolist() == after.active.tolist() == [True] and after.age.tolist() == [1]
+    assert float(outcome.terms["goal"][0]) == 45.0 and float(outcome.terms["progress"][0]) == pytest.approx(2 * 10.5 / 30, abs=1e-5)
+    assert not after.previous_action.any() and float(after.motion.velocity[0, 0]) == 10.0
+
+
 def test_a_car_knows_how_it_turns(env):
     scene = scene_of([[0.0, 0], [0, 9]], [[50.0, 0]] * 2)
     state, _ = env.reset(jax.random.key(0), scene)
@@ -349,6 +361,7 @@ def test_goal_ends_a_car_once_and_pays_once(env, two_cars):
     assert not state.active[0] and state.active[1]
     assert all(h.reward[0] == 0 for h in history[when + 1 :]), "a finished car earns nothing"
     assert not history[-1].observation["neighbours"].mask[1].any(), "a finished car is not seen"
+    assert not any(leaf[0].any() for leaf in jax.tree.leaves(history[-1].observation)), "and sees nothing"
     assert all(float(jnp.abs(h.reward - sum(h.terms.values())).max()) < 1e-5 for h in history)
 
 

@@ -1,0 +1,217 @@
+"""Mutations of the package, each of which the tests must catch: `python experiments/mutations/run.py > experiments/mutations/mutations.md`.
+
+A mutation is one exact replacement of text in one file. Each is applied to a copy of the checkout in a temporary folder, where the tests
+named with it run until the first failure; a mutation that no test fails on has survived. Before the first one the same tests must pass
+without any. Files that move, or texts that change, are edited in `MUTATIONS`: a text that is not found exactly once ends the script.
+
+Options: `--whole` runs all fast tests for each mutation instead of the named ones (tens of minutes each), `--only WORD` those whose name or
+subject contains the word, `--jobs N` so many at a time. Progress goes to standard error. Exit status 1: a mutation survived.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One replacement of text, and what should fail because of it."""
+
+    subject: str
+    name: str  # what is wrong then
+    file: str  # of the package
+    find: str  # exactly once in the file
+    put: str
+    tests: str  # file, or file::test, below tests/; several are separated by spaces
+
+
+MUTATIONS = (
+    Mutation("reward", "progress has the wrong sign", "rewards.py",
+             "return jnp.clip(step.facts.progress", "return -jnp.clip(step.facts.progress", "test_rewards.py"),
+    Mutation("reward", "a collision that is less than half a second away costs nothing", "rewards.py",
+             "time < floor_s, limit,", "time < floor_s, 0.0,", "test_rewards.py"),
+    Mutation("events", "several events of one step are new", "ends.py", "& active & ~taken", "& active", "test_rewards.py"),
+    Mutation("events", "collisions count during the grace steps", "facts.py",
+             "& (after.age >= collision_grace_steps)", "", "test_rewards.py"),
+    Mutation("GAE", "advantages flow through slots without an agent", "ppo/gae.py", "cut = done | ~active", "cut = done", "test_ppo.py"),
+    Mutation("GAE", "a world that runs out of time counts as a failure", "ppo/gae.py",
+             "(truncated & ~cut)", "(truncated & cut)", "test_ppo.py"),
+    Mutation("PPO", "the clipped value loss takes the smaller error", "ppo/loss.py",
+             "errors = jnp.maximum(errors,", "errors = jnp.minimum(errors,", "test_ppo.py"),
+    Mutation("normaliser", "advantages are scaled but not centred", "ppo/loss.py",
+             "x - weighted_mean(x, weight, axis=axis)", "x", "test_ppo.py"),
+    Mutation("masks", "truncated samples are learnt from", "ppo/train.py",
+             "(samples.active & ~samples.truncated)", "samples.active", "test_ppo.py"),
+    Mutation("masks", "a car is among its own neighbours", "observations.py",
+             "everyone.present[None] & ~jnp.eye", "everyone.present[None] | jnp.eye",
+             "test_task.py::test_reset_is_pure_and_shapes_are_the_published_ones"),
+    Mutation("masks", "finished agents go on observing", "observations.py",
+             "mask = state.active.reshape", "mask = state.agents.present.reshape",
+             "test_task.py::test_goal_ends_a_car_once_and_pays_once"),
+    Mutation("curriculum", "scenes that succeed come more often", "run/samplers.py",
+             "(table.episodes[driven] - table.successes[driven] + 1.0)", "(table.successes[driven] + 1.0)",
+             "test_streams.py::test_failing_scenes_come_more_often_in_proportion_to_failure"),
+    Mutation("action repeat", "a life that begins within an action has part in it", "world.py",
+             "taking & ~outcome.done)", "taking)", "test_task.py::test_a_life_that_begins_within_an_action_has_no_part_in_it"),
+    Mutation("action repeat", "actions are read by the agent's age, not the world's clock", "world.py",
+             "state.step % parts.hold", "state.age[:, None] % parts.hold",
+             "test_task.py::test_a_life_that_begins_within_an_action_has_no_part_in_it"),
+    Mutation("inputs", "an agent with a NaN goal drives", "spawn.py",
+             "numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route",
+             "numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.route", "test_inputs.py"),
+    Mutation("physics", "the engine pushes a wheel against its own brake", "dynamics/forces.py",
+             "jnp.minimum(engine, friction)", "jnp.maximum(engine, friction)", "test_forces.py"),
+    Mutation("physics", "cars start with standing wheels", "dynamics/mjx_car.py",
+             "(agents.speed / radius)", "(0.0 * agents.speed / radius)",
+             "test_dynamics.py::test_cars_start_at_rest_height_with_turning_wheels"),
+    Mutation("physics", "tyres bounce: no damping along the road's normal", "dynamics/tyres.py",
+             "2.0 / (impedance * constant) * rate[0]", "0.0 * rate[0]", "test_solve.py"),
+    Mutation("contact", "a car's torque goes to the other of the pair", "dynamics/contact.py",
+             "[share * torque_one, share * torque_other]", "[share * torque_other, share * torque_one]",
+             "test_contact.py::test_momentum_is_kept"),
+    Mutation("contact", "every contact of a heap has its whole strength", "dynamics/contact.py",
+             "jnp.minimum(1.0, 2.0 / jnp.maximum(touched, 1.0))", "1.0 + 0.0 * touched",
+             "test_contact.py::test_a_heap_flies_apart_and_does_not_blow_up"),
+    Mutation("friction", "the surface's ratio is left out", "weather.py",
+             "jnp.maximum(theta * spacing(", "jnp.maximum(spacing(", "test_weather.py"),
+    Mutation("friction", "wheels read the road of the other side", "dynamics/mjx_car.py",
+             "beside = LEFT *", "beside = -LEFT *", "test_fields_driving.py::test_wheels_on_the_two_sides_have_the_friction_of_their_side"),
+    Mutation("readers", "headings of the old layout stay degrees", "scenes/formats/gpudrive.py",
+             "np.deg2rad(heading) if degrees", "heading if degrees", "test_scenes.py"),
+    Mutation("readers", "speed limits of WOMD are km/h", "scenes/formats/womd_scenario.py",
+             "MPH = 0.44704", "MPH = 1 / 3.6", "test_womd.py"),
+    Mutation("packing", "segments are twice as long", "scenes/pack.py", '"half_length": own / 2', '"half_length": own', "test_scenes.py"),
+    Mutation("banks", "a track's steps begin one row late", "scenes/arrow.py",
+             "list(map(slice, bounds[:-1], bounds[1:]))", "list(map(slice, [b + 1 for b in bounds[:-1]], bounds[1:]))", "test_banks.py"),
+    Mutation("checkpoints", "the oldest is restored", "ppo/checkpoint.py", "held[-1] if iteration is None", "held[0] if iteration is None",
+             "test_checkpoint.py"),
+    Mutation("checkpoints", "what is judged is the last step, not the running mean", "ppo/checkpoint.py",
+             "AVERAGED if AVERAGED in held else LEARNT", "LEARNT", "test_checkpoint.py"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What became of a mutation."""
+
+    mutation: Mutation
+    test: str | None  # the first that failed; None: it survived
+    seconds: float
+
+
+def mutated(mutation: Mutation) -> str:
+    """The text of its file with the mutation in it.
+
+    Raises:
+        SystemExit: the text to replace is not found exactly once.
+    """
+    path = ROOT / "scenefactory_jax" / mutation.file
+    text = path.read_text() if path.is_file() else ""
+    if (count := text.count(mutation.find)) != 1:
+        raise SystemExit(f"error: {mutation.name}: scenefactory_jax/{mutation.file}: expected once, found {count} times: {mutation.find!r}")
+    return text.replace(mutation.find, mutation.put)
+
+
+def copy(folder: Path) -> Path:
+    """The checkout's files as they are now, without what git ignores, beside a link to the shared data if there are any."""
+    checkout = folder / "checkout"
+    listed = subprocess.run(["git", "ls-files", "-coz", "--exclude-standard"], cwd=ROOT, check=True, capture_output=True, text=True)
+    for name in filter(None, listed.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, checkout / name)
+    if (shared := ROOT.parent / "shared").is_dir():
+        (folder / "shared").symlink_to(shared.resolve())
+    return checkout
+
+
+def first_failure(checkout: Path, tests: Sequence[str], compiled: Path) -> str | None:
+    """The first test that fails, of the named ones or of all fast ones; None if all pass.
+
+    Raises:
+        SystemExit: the tests do not run.
+    """
+    call = [sys.executable, "-m", "pytest", "-x", "-n0", "-p", "no:cacheprovider", *(f"tests/{name}" for name in tests)]
+    own = {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1", "JAX_COMPILATION_CACHE_DIR": str(compiled)}
+    done = subprocess.run(call, cwd=checkout, env=os.environ | own, capture_output=True, text=True)
+    found = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.MULTILINE)
+    if done.returncode not in (0, 1) or (done.returncode == 1) != bool(found):
+        raise SystemExit(f"error: {' '.join(call[2:])} ended with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr[-2000:]}")
+    return found.group(1) if found else None
+
+
+def try_one(mutation: Mutation, compiled: Path, *, whole: bool) -> Finding:
+    """Copy, mutate, test."""
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+        checkout = copy(Path(folder))
+        (checkout / "scenefactory_jax" / mutation.file).write_text(mutated(mutation))
+        test = first_failure(checkout, () if whole else mutation.tests.split(), compiled)
+    finding = Finding(mutation, test, time.monotonic() - begin)
+    print(f"{finding.seconds:6.0f} s  {mutation.name}: {test or 'SURVIVED'}", file=sys.stderr)
+    return finding
+
+
+def require_passing(mutations: Sequence[Mutation], compiled: Path, *, whole: bool) -> None:
+    """The tests must pass without a mutation: else nothing is caught by them.
+
+    Raises:
+        SystemExit: naming the test that fails, or the copy that Python does not import.
+    """
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+        checkout = copy(Path(folder))
+        call, own = [sys.executable, "-c", "import scenefactory_jax; print(scenefactory_jax.__file__)"], {"PYTHONPATH": str(checkout)}
+        said = subprocess.run(call, cwd=checkout, env=os.environ | own, check=True, capture_output=True, text=True).stdout.strip()
+        if not Path(said).is_relative_to(checkout):
+            raise SystemExit(f"error: tests would import {said}, not the copy in {checkout}")
+        tests = () if whole else sorted({test for mutation in mutations for test in mutation.tests.split()})
+        if failed := first_failure(checkout, tests, compiled):
+            raise SystemExit(f"error: {failed} fails without a mutation")
+
+
+def describe(findings: Sequence[Finding]) -> str:
+    """The table and the score."""
+    caught = sum(finding.test is not None for finding in findings)
+    rows = ["| Subject | Mutation | File | Caught by | s |", "| --- | --- | --- | --- | ---: |"]
+    for finding in findings:
+        mutation = finding.mutation
+        caught_by = f"`{finding.test}`" if finding.test else "**survived**"
+        rows.append(f"| {mutation.subject} | {mutation.name} | `{mutation.file}` | {caught_by} | {finding.seconds:.0f} |")
+    head = ["# Mutations", "", "Made by `python experiments/mutations/run.py`.", f"Score: {caught} of {len(findings)} caught.", ""]
+    return "\n".join(head + rows)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Try the mutations and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--whole", action="store_true", help="all fast tests for each mutation")
+    parser.add_argument("--only", default="", metavar="WORD", help="in the name or the subject")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="mutations at a time")
+    given = parser.parse_args(words)
+    chosen = [mutation for mutation in MUTATIONS if given.only in f"{mutation.subject} {mutation.name}"]
+    if not chosen:
+        raise SystemExit(f"error: --only {given.only}: in no mutation; subjects: {', '.join(sorted({m.subject for m in MUTATIONS}))}")
+    for mutation in chosen:  # all texts before the first test runs
+        mutated(mutation)
+    with tempfile.TemporaryDirectory(prefix="mutations-compiled-") as folder:
+        compiled = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR", folder))
+        require_passing(chosen, compiled, whole=given.whole)
+        with ThreadPoolExecutor(given.jobs) as pool:
+            findings = list(pool.map(lambda mutation: try_one(mutation, compiled, whole=given.whole), chosen))
+    print(describe(findings))
+    return int(any(finding.test is None for finding in findings))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
