@@ -29,6 +29,7 @@ def export(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"out: {out} holds something already; give a new folder")
     folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
+    episodes = {named(what, folder): results.judged(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policies.load_policy(config["run"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
@@ -39,9 +40,9 @@ def export(config: Mapping[str, Any]) -> Path:
     configs.write(out, own)
     shutil.copy(trained.folder / "versions.yaml", out)
     versions = yaml.safe_load((out / "versions.yaml").read_text())
-    text = card.markdown(
-        out.name, config["card"]["about"], config=own, versions=versions, training=log.read(trained.folder), judged=judged
-    )
+    training = log.read(trained.folder)
+    about = config["card"]["about"]
+    text = card.markdown(out.name, about, config=own, versions=versions, training=training, judged=judged, episodes=episodes)
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out
