@@ -313,6 +313,7 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     scored = [strict["success_rate"].count, *(tables.text(strict[name]) for name in ("success_rate", "clean_success_rate"))]
     assert card.startswith("# handy\n\nFor tests.\n") and f"| agent steps | {last['steps/total']:,.0f} |" in card
     assert "| unseen roads | strict | {} | {} | {} |".format(*scored) in card
+    assert "- **unseen roads**: starts: as recorded, at the recorded speed; weather: AC 0 mm; background traffic: none; dynamics: `" in card
     assert (kept / "versions.yaml").read_text() == (whole.folder / "versions.yaml").read_text()
     assert config.read(kept)["scenes"]["heldout"]["path"] is None and str(tmp_path.parent) not in (kept / "config.yaml").read_text()
     monkeypatch.setattr(policies, "SHIPPED", tmp_path / "pretrained")

@@ -16,7 +16,8 @@ def markdown(
     versions: Mapping[str, str],
     training: Sequence[Mapping[str, float]],
     judged: Mapping[str, Mapping[str, Mapping[str, tables.Estimate]]],
-    outside: Sequence[str] = (),
+    episodes: Mapping[str, Mapping[str, str]],
+    outside: Sequence[str],
 ) -> str:
     """The card as Markdown.
 
@@ -27,11 +28,12 @@ def markdown(
         versions: of packages and device, and the commit, of the training.
         training: rows of its metrics, first to last; none: the training left no record.
         judged: what was driven -> protocol -> `tables.summarise` of its records.
+        episodes: what was driven -> what decided its episodes, "Starts" -> "as recorded, from rest".
         outside: functions that the config names and the package does not have.
     """
     parts = [f"# {name}", about or "", "## Training", tables.grid(["", ""], _training(config, versions, training))]
     if judged:
-        parts += ["## Scores", *_scores(judged)]
+        parts += ["## Scores", *_scores(judged), _episodes(episodes)]
     learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
     parts += ["## Files", f"`config.yaml` has every setting of the training, {learnt}. {_code(outside)}"]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -59,6 +61,12 @@ def _training(config: Mapping[str, Any], versions: Mapping[str, str], training: 
         rows.append(["agent steps", f"{last['steps/total']:,.0f}"])
         rows.append(["minutes, compilation included", f"{last['minutes']:.1f}"])
     return rows + [[name, str(version)] for name, version in versions.items()]
+
+
+def _episodes(episodes: Mapping[str, Mapping[str, str]]) -> str:
+    """Starts, weather and the rest of each that was driven."""
+    told = {what: "; ".join(f"{label.lower()}: {words}" for label, words in found.items()) for what, found in episodes.items() if found}
+    return "\n".join(f"- **{what}**: {words}." for what, words in told.items())
 
 
 def _scores(judged: Mapping[str, Mapping[str, Mapping[str, tables.Estimate]]]) -> list[str]:

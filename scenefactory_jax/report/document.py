@@ -45,7 +45,6 @@ def write(
     videos: Mapping[str, Path] | None = None,
     files: Mapping[str, Path] | None = None,
     commands: Sequence[str] = (),
-    key_numbers: Sequence[str] = KEY_NUMBERS,
     failed: Mapping[str, Mapping[str, Path]] | None = None,
     kinds: Mapping[str, float] | None = None,
     episodes: Mapping[str, str] | None = None,
@@ -66,7 +65,6 @@ def write(
         videos: caption -> .gif (shown) or .mp4 (linked).
         files: what it is -> file, linked at the end (per-agent CSV, metrics).
         commands: how to get these numbers again.
-        key_numbers: dotted config keys shown in a table of their own.
         failed: name of records with kinds of failures -> kind -> picture of the worst; "film" -> their video.
         kinds: the numbers that the definitions of `failures.KINDS` name.
         episodes: what decided the episodes, "Starts" -> "as recorded, from rest".
@@ -91,7 +89,7 @@ def write(
         _section("Where it fails", *(_failures(folder, n, records[n], (failed or {}).get(n, {}), kinds or {}) for n in measured)),
         _section("Figures", *(_show(folder, caption, path) for caption, path in (figures or {}).items())),
         _section("What the numbers mean", _definitions(summary, measured)),
-        _section("Set-up", _setup(config, versions, key_numbers), _commands(commands), _links(folder, files or {}), _whole(config)),
+        _section("Set-up", _setup(config, versions), _commands(commands), _links(folder, files or {}), _whole(config)),
     ]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.md"
@@ -267,10 +265,10 @@ def _definitions(table: Mapping[str, Summary], measured: Sequence[str]) -> str:
     return "\n\n".join(part for part in ("\n".join(lines), note, protocols) if part)
 
 
-def _setup(config: Mapping[str, Any], versions: Mapping[str, str], key_numbers: Sequence[str]) -> str:
+def _setup(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     """Machine, versions, and the config's key numbers."""
     flat = flatten(config)
-    rows = [[f"`{k}`", _shown(v)] for key in key_numbers for k, v in flat.items() if k == key or k.startswith(key + ".")]
+    rows = [[f"`{k}`", _shown(v)] for key in KEY_NUMBERS for k, v in flat.items() if k == key or k.startswith(key + ".")]
     parts = [
         tables.grid(["Machine and software", ""], [[name, value] for name, value in versions.items()]) if versions else "",
         tables.grid(["Setting", "Value"], rows) if rows else "",

@@ -3,10 +3,10 @@
 import io
 import lzma
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 
-def opened(path: Path, mode: Literal["r", "w"]) -> IO[str]:
+def opened(path: Path, mode: Literal["r", "w"]) -> io.TextIOWrapper:
     """A UTF-8 file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
     if path.suffix == ".xz":
         return io.TextIOWrapper(lzma.LZMAFile(path, mode), newline="", encoding="utf-8")

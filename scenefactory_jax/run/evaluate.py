@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scenefactory_jax.ppo import checkpoint
-from scenefactory_jax.report import tables
+from scenefactory_jax.report import circumstances, tables
 from scenefactory_jax.report.canvas import Trajectory
 from scenefactory_jax.run import config as configs
 from scenefactory_jax.run import keys, log, playing, policies, results, sources, targets
@@ -112,7 +112,8 @@ def judge(
             label = protocol if name == "trained" else f"{protocol}, {name}"
             records[label], recording = play(values)
             if len(records) == 1:  # it can be judged: what was there before goes
-                results.begin(out, {**asked, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
+                noted = {**asked, "episodes": circumstances.describe(config)}
+                results.begin(out, {**noted, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
             tables.write_csv(out / f"agents-{label.replace(', ', '-')}.csv", records[label])
             if recording is None or name != "trained":
                 continue

@@ -30,6 +30,7 @@ def export(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"out: {out} holds something already; give a new folder")
     folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
+    episodes = {named(what, folder): results.judged(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policies.load_policy(config["run"], trust=config["trust"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
@@ -42,7 +43,7 @@ def export(config: Mapping[str, Any]) -> Path:
     versions = yaml.safe_load((out / "versions.yaml").read_text())
     text = card.markdown(
         out.name, config["card"]["about"], config=own, versions=versions, training=log.read(trained.folder), judged=judged,
-        outside=sorted(set(targets.outside(own).values())),
+        episodes=episodes, outside=sorted(set(targets.outside(own).values())),
     )  # fmt: skip
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
