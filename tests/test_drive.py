@@ -67,7 +67,7 @@ def built():
     settings = config.load("drive", "dynamics=bicycle", "others=ignore", "observe=small")
     scene = scene_of([[-20.0, 0.0], [-50.0, -3.0]], [[60.0, 0.0], [-44.0, -3.0]], speeds=[5.0, 5.0])
     act = lambda parameters, observation, key: jnp.full((2, 3), 0.0)  # noqa: E731
-    return driving.world(world.make(settings), scene, act, None, car=1, dt=DT)
+    return driving.world(world.make(settings), scene, act, None, car=1, dt=DT, off_map_m=30.0)
 
 
 def driven(built, script, drive=None):
@@ -119,6 +119,20 @@ def test_a_broken_car_starts_again(built):
     assert driven(built, [(1, NONE, ())], broken).resets == 1
 
 
+def test_a_car_off_the_map_starts_again(built):
+    """Beside the road it drives on; farther from its last line than `off_map_m` it is back at the start."""
+    near, drive, farthest = built._replace(off_map_m=5.0), driving.start(built, seed=0), 0.0
+    for step in range(200):
+        drive = driven(near, [(1, {"throttle"} | ({"left"} if step < 25 else set()), ())], drive)
+        if drive.resets:
+            break
+        y = float(drive.shot.position[1, 1])
+        assert drive.away_m == pytest.approx(min(abs(y), abs(abs(y) - 6.0)), abs=1e-3)
+        farthest = max(farthest, y)
+    assert (drive.resets, drive.steps, drive.away_m) == (1, 0, 0.0) and 11.0 < farthest < 12.0
+    assert float(drive.state.motion.position[1, 1]) == -3.0
+
+
 def test_the_camera_key_frees_the_camera(built):
     assert not driven(built, [(2, NONE, ("camera",))]).chasing
 
@@ -152,6 +166,7 @@ def test_the_viewers_keys_become_commands(monkeypatch):
         ("keys.left=f13", "keys.left: 'f13'; valid: a letter, up, down"),
         ("keys.left=right", "keys.right: 'right' is the key of left, too"),
         ("feel.rise_s=0", "feel.rise_s: 0; wanted is at least 0.01"),
+        ("off_map_m=0", "off_map_m: 0; wanted is at least 1"),
         ("car=-1", "car: -1; wanted is at least 0"),
         ("overrides=[weather=wet]", "overrides: ['weather=wet'] without a run"),
     ],

@@ -57,7 +57,8 @@ def drive(config: Mapping[str, Any]) -> Drive:
     car = int(slots[0]) if config["car"] is None else config["car"]
     env = worlds.make(settings)
     act, parameters = replays.driver({**config, "act": "policy"}, settings, slots=scene.agents.yaw.shape[0])
-    built = driving.world(env, scene, act, parameters, car=car, dt=1.0 / settings["timing"]["control_hz"])
+    dt = 1.0 / settings["timing"]["control_hz"]
+    built = driving.world(env, scene, act, parameters, car=car, dt=dt, off_map_m=config["off_map_m"])
     print(f"{shown.names[0]}: you drive car {car} of {len(slots)}; compiling", flush=True)
     begun = driving.advance(built, driving.start(built, seed=config["seed"]), set(), set(), feel=feel)
     print("; ".join(f"{command}: {key}" for command, key in config["keys"].items()), flush=True)

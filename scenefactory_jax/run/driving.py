@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from scenefactory_jax import roadside
 from scenefactory_jax.recording import Act, Shot, shot
 from scenefactory_jax.struct import replace
 from scenefactory_jax.types import Env, Observation, Scene, State
@@ -68,12 +69,13 @@ def _towards(now: float, aim: float, full_s: float, dt: float) -> float:
 
 
 class World(NamedTuple):
-    """What a drive needs of its world: two compiled functions."""
+    """What a drive needs of its world: two compiled functions, and how far from the road the map ends, in metres."""
 
     begin: Callable[[PRNGKeyArray], tuple[State, Observation]]
-    step: Callable[[State, Observation, PRNGKeyArray, Float[Array, "3"]], tuple[State, Observation, Shot]]
+    step: Callable[[State, Observation, PRNGKeyArray, Float[Array, "3"]], tuple[State, Observation, Shot, Float[Array, ""]]]
     dt: float
     car: int
+    off_map_m: float
 
 
 class Drive(NamedTuple):
@@ -82,6 +84,7 @@ class Drive(NamedTuple):
     state: State
     observation: Observation
     shot: Shot | None  # of the last step
+    away_m: float  # from the car to the nearest lane, line or edge
     first: PRNGKeyArray  # of the start: a reset draws the same weather, whose patches are on the picture
     key: PRNGKeyArray
     wheel: Wheel
@@ -91,7 +94,7 @@ class Drive(NamedTuple):
     steps: int  # since the last start
 
 
-def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: float) -> World:
+def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: float, off_map_m: float) -> World:
     """One world in which the car in slot `car` does what it is told and the others what `act` says."""
 
     def begin(scene: Scene, key: PRNGKeyArray) -> tuple[State, Observation]:
@@ -102,33 +105,35 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
 
     def step(
         scene: Scene, parameters: Any, state: State, observation: Observation, key: PRNGKeyArray, action: Float[Array, "3"]
-    ) -> tuple[State, Observation, Shot]:
+    ) -> tuple[State, Observation, Shot, Float[Array, ""]]:
         actions = act(parameters, observation, key).at[car].set(action)
         after, outcome = env.transition(scene, state, actions)
-        return after, env.observe(scene, after), shot(env, scene, state, after, outcome)
+        squared = roadside.segment_squared(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
+        away = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
+        return after, env.observe(scene, after), shot(env, scene, state, after, outcome), away
 
     scene = jax.tree.map(jnp.asarray, scene)
-    return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car)
+    return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car, off_map_m)
 
 
 def start(world: World, *, seed: int) -> Drive:
     """At the first start, with the pedals up."""
     first, key = jax.random.split(jax.random.key(seed))
     state, observation = world.begin(first)
-    return Drive(state, observation, None, first, key, Wheel(), paused=False, chasing=True, resets=0, steps=0)
+    return Drive(state, observation, None, 0.0, first, key, Wheel(), paused=False, chasing=True, resets=0, steps=0)
 
 
 def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, feel: Feel) -> Drive:
-    """One control step, if the drive does not pause; a reset goes back to the start at once, and so does a broken car.
+    """One control step, if the drive does not pause. A reset goes back to the start at once; so does a car that is broken or off the map.
 
     Args:
         pressed: commands (`COMMANDS`) of the keys that went down since the last call.
         held: commands of the keys that are down.
     """
     drive = drive._replace(paused=drive.paused ^ ("pause" in pressed), chasing=drive.chasing ^ ("camera" in pressed))
-    if "reset" in pressed or not bool(drive.state.active[world.car]):
+    if "reset" in pressed or drive.away_m > world.off_map_m or not bool(drive.state.active[world.car]):
         state, observation = world.begin(drive.first)
-        again = drive._replace(state=state, observation=observation, shot=None, wheel=Wheel())
+        again = drive._replace(state=state, observation=observation, shot=None, away_m=0.0, wheel=Wheel())
         return again._replace(paused=False, resets=drive.resets + 1, steps=0)
     if drive.paused:
         return drive
@@ -136,6 +141,6 @@ def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, fe
     wheel = turned(drive.wheel, pressed, held, speed=speed, feel=feel, dt=world.dt)
     action = jnp.array([wheel.throttle, wheel.steer, wheel.brake], jnp.float32)
     key, draw = jax.random.split(drive.key)
-    state, observation, seen = world.step(drive.state, drive.observation, draw, action)
+    state, observation, seen, away = world.step(drive.state, drive.observation, draw, action)
     seen = jax.tree.map(np.asarray, jax.device_get(seen))
-    return drive._replace(state=state, observation=observation, shot=seen, key=key, wheel=wheel, steps=drive.steps + 1)
+    return drive._replace(state=state, observation=observation, shot=seen, away_m=float(away), key=key, wheel=wheel, steps=drive.steps + 1)
