@@ -84,8 +84,8 @@ def pack(
     Args:
         raw: a checked scene.
         box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
-        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (facts 4.3).
-        gap_m: longer steps between two points of a polyline are gaps, not segments (facts 4.4).
+        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
+        gap_m: longer steps between two points of a polyline are gaps, not segments (SceneFactory).
         agents: slots. Cars are taken nearest to the centre first.
         min_travel_m: a car whose goal is not farther than that from its start is no agent.
         car_size_m: length and width of every car; null: as logged.
