@@ -5,7 +5,7 @@
 """
 
 import importlib
-import json
+import os
 import re
 import signal
 import sys
@@ -45,35 +45,51 @@ def main() -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         raise SystemExit(0 if arguments else 2)
-    command, overrides = arguments[0], arguments[1:]
     try:
-        if command not in configs.COMMANDS:
-            raise ConfigError(f"unknown command {command!r}; valid: {', '.join(configs.COMMANDS)}")
-        if any(flag in overrides for flag in ("--help", "-h")):
-            overrides = [*overrides, *_help(command, overrides)]
-        else:
-            _check(command, overrides)
-        sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, overrides)]
-        hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=command)(_job(command))()
+        _run(arguments[0], arguments[1:])
     except KeyboardInterrupt as stopped:  # a training that another signal ended says which
         raise SystemExit(128 + (stopped.args[0] if stopped.args else signal.SIGINT)) from None  # as a shell counts it
+    except BrokenPipeError:  # `--help | head`: the reader has what it wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python's last flush finds a file
+        raise SystemExit(141) from None
     except (ConfigError, OSError) as error:
         _end(error)
 
 
-def _help(command: str, overrides: Sequence[str]) -> list[str]:
-    """Hydra's own help shows the config, given these: what the command is for comes first, and nothing may be missing."""
-    purpose, keys = re.findall(rf"^  {command} +(.*?) +(\S+=.*)$", USAGE, re.MULTILINE)[0]
-    chosen = ["study=navigation"] if command == "study" and not any(word.startswith("study=") for word in overrides) else []
-    return [f"hydra.help.header={json.dumps(f'{command}: {purpose}; {keys}')}", *chosen]
-
-
-def _check(command: str, overrides: Sequence[str]) -> None:
-    """A wrong key is explained here, with the valid ones; and no two jobs of a sweep may judge into one folder."""
-    settings = configs.as_overrides(overrides)
-    if not any(flag in overrides for flag in ("-m", "--multirun")):
-        configs.load(command, *settings)
+def _run(command: str, arguments: Sequence[str]) -> None:
+    if command not in configs.COMMANDS:
+        raise ConfigError(f"unknown command {command!r}; valid: {', '.join(configs.COMMANDS)}")
+    flags = configs.parse_flags(arguments)
+    if flags.help:
+        print(_help(command, configs.as_overrides(flags)), flush=True)
         return
+    if flags.resolve and not flags.cfg:
+        raise ConfigError("--resolve: goes with --cfg job")
+    varied: set[str] = set()
+    if flags.cfg:
+        configs.load_with_choices(command, *configs.as_overrides(flags))
+    elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
+        varied = _check(command, configs.as_overrides(flags), sweeps=flags.multirun)
+    sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, arguments)]
+    name = flags.config_name or command
+    hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=name)(_job(command, varied))()
+
+
+def _help(command: str, settings: Sequence[str]) -> str:
+    """What a command is for, and its config with the comments of its files."""
+    from scenefactory_jax.run import annotated
+
+    purpose, keys = re.findall(rf"^  {command} +(.*?) +(\S+=.*)$", USAGE, re.MULTILINE)[0]
+    chosen = ["study=navigation"] if command == "study" and not any(word.startswith("study=") for word in settings) else []
+    last = "KEY=VALUE on the command line sets any of these; --cfg job shows what a command line gives, --hydra-help Hydra's own flags."
+    return f"{command}: {purpose}; {keys}\n\n{annotated.write(command, *chosen, *settings)}\n\n{last}"
+
+
+def _check(command: str, settings: Sequence[str], *, sweeps: bool) -> set[str]:
+    """The keys that vary in a sweep. A wrong key is explained here, with the valid ones; and no two jobs may judge into one folder."""
+    if not sweeps:
+        configs.load(command, *settings)
+        return set()
     first, varied = configs.sweep(settings)
     out = next((word for word in settings if word.startswith("out=")), "")
     apart = "${" in out or "out" in varied or (not out and varied <= {"run"})
@@ -81,6 +97,7 @@ def _check(command: str, overrides: Sequence[str]) -> None:
         raise ConfigError("out: the jobs of this sweep would write to one folder; give each its own: 'out=${run}/judged-${hydra:job.num}'")
     if not any("${hydra:" in word for word in settings):  # it is known within a job alone
         configs.load(command, *first)
+    return varied
 
 
 def _end(error: Exception | str) -> NoReturn:
@@ -90,13 +107,18 @@ def _end(error: Exception | str) -> NoReturn:
     raise SystemExit(2) from None
 
 
-def _job(command: str):
-    """What hydra calls with each job's config."""
+def _job(command: str, varied: set[str]):
+    """What hydra calls with each job's config; `varied`: the keys in which the jobs of a sweep differ."""
 
     def job(config) -> None:
         module = importlib.import_module(f"scenefactory_jax.run.{command}")
         try:
-            getattr(module, command)(configs.plain(config))
+            settings = configs.plain(config)
+            if command == "train" and varied and settings["out"] is None:
+                settings["out"] = str(module.train_folder.fresh(settings["name"], configs.changes(varied)))
+            getattr(module, command)(settings)
+        except BrokenPipeError:
+            raise
         except (ValueError, OSError) as error:  # ConfigError and SceneError among them; a bug's own ValueError keeps its traceback
             if type(error) is ValueError:
                 raise

@@ -39,7 +39,7 @@ def measure(
 ) -> Facts:
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
-    Definitions follow the published task (facts sheet 6.2, 6.3, 8): planar goal distance; nearest lane midpoint of the whole world, its
+    Definitions follow the published task (arXiv:2605.08528, section 4): planar goal distance; nearest lane midpoint of the whole world, its
     tangent turned towards the goal; TTC and DRAC with active cars and with boxes; edges touched by the bounding circles.
 
     Args:

@@ -25,19 +25,19 @@ def event(step: Step, *, name: str) -> Float[Array, " A"]:
 
 
 def progress(step: Step, *, limit_m: float) -> Float[Array, " A"]:
-    """Metres along the nearest lane towards the goal, clamped to one step's plausible way (facts 6.2, route progress)."""
+    """Metres along the nearest lane towards the goal, clamped to one step's plausible way (arXiv:2605.08528, Table 7, route progress)."""
     return jnp.clip(step.facts.progress, -limit_m, limit_m)
 
 
 def lane_keeping(step: Step, *, sigma_m: float, heading_share: float) -> Float[Array, " A"]:
-    """exp(-(offset/sigma)^2) [(1 - share) + share max(0, cos heading error)] (facts 6.2); 0 where there is no lane."""
+    """exp(-(offset/sigma)^2) [(1 - share) + share max(0, cos heading error)] (arXiv:2605.08528, Table 7); 0 where there is no lane."""
     near = jnp.exp(-((step.facts.lane_offset / sigma_m) ** 2))
     aligned = (1 - heading_share) + heading_share * jnp.maximum(step.facts.lane_alignment, 0.0)
     return jnp.where(step.facts.has_lane, near * aligned, 0.0)
 
 
 def off_lane(step: Step) -> Float[Array, " A"]:
-    """1 while the car is off its lane (facts 6.2, off-road)."""
+    """1 while the car is off its lane (arXiv:2605.08528, Table 7, off-road)."""
     return step.facts.off_lane.astype(jnp.float32)
 
 
@@ -47,7 +47,7 @@ def idle(step: Step) -> Float[Array, " A"]:
 
 
 def ttc(step: Step, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
-    """Closeness to a collision with another car: min(alpha / TTC, limit), and the limit below the floor (facts 6.2)."""
+    """Closeness to a collision with another car: min(alpha / TTC, limit), and the limit below the floor (arXiv:2605.08528, Table 7)."""
     return _urgency(step.facts.ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 

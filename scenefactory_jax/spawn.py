@@ -151,7 +151,7 @@ def random_pairs(
     candidates: int,
     car_size_m: list[float],
 ) -> Agents:
-    """Random start-goal pairs on the lanes, every slot filled where there is room (facts 4.7).
+    """Random start-goal pairs on the lanes, every slot filled where there is room (SceneFactory's published code).
 
     Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to length;
     starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot none of

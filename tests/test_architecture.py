@@ -1,6 +1,7 @@
 """The shape of the code: who may import whom, and how long a file and a function may be."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,9 @@ def test_imports_point_downwards(path):
 def test_only_run_prints(path):
     calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "print"]
     assert not calls
+
+
+def test_sources_are_ones_that_a_user_has():
+    """Numbers cite the paper or its code, not notes that are not published."""
+    pages = [*FILES, *(PACKAGE.parent / "conf").rglob("*.yaml"), *(PACKAGE.parent / "docs").rglob("*.md")]
+    assert not [path for path in pages if re.search(r"facts? sheet|\bfacts \d", path.read_text(), re.IGNORECASE)]

@@ -194,7 +194,8 @@ def test_a_backend_may_be_an_option_of_the_group(mine):
     (mine / "conf" / "dynamics" / "points.yaml").write_text("{_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}")
     place = f"hydra.searchpath=[{mine / 'conf'}]"
     assert config.load("task", "dynamics=points", place)["dynamics"] == config.load("task", *DYNAMICS)["dynamics"]
-    assert config.as_overrides(["dynamics=points", place, "hydra.verbose=true", "-m", "--cfg", "job"]) == ["dynamics=points", place]
+    flags = config.parse_flags(["-m", "--cfg", "job", "dynamics=points", place, "hydra.verbose=true"])
+    assert config.as_overrides(flags) == ["dynamics=points", place]
 
 
 def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):

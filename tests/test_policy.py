@@ -134,7 +134,7 @@ def test_published_network_has_the_published_size():
     policy = build(configs.load("train")["policy"], builtins=late_fusion, where="policy")()
     observation = {**observe(jax.random.key(0)), "neighbours": Rows(jnp.ones((W, A, 2, 7)), jnp.ones((W, A, 2), bool))}
     parameters = jax.eval_shape(policy.init, jax.random.key(1), observation)
-    assert sum(leaf.size for leaf in jax.tree.leaves(parameters)) == 132_359  # facts sheet 7.1: the paper's, without LayerNorm
+    assert sum(leaf.size for leaf in jax.tree.leaves(parameters)) == 132_359  # the paper's, without LayerNorm
 
 
 def test_bfloat16_is_near_and_stays_inside(tiny):

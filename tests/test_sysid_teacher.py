@@ -17,7 +17,7 @@ from scenefactory_jax.sysid.teacher import load, record, road_of, save
 from omegaconf import OmegaConf  # isort: skip
 from conftest import ROOT  # isort: skip
 
-# facts sheet section 3.2: manoeuvres and frames of each family
+# SceneFactory's published suite: manoeuvres and frames of each family
 TABLE = {
     "straight_accel": (10, 540), "straight_brake": (5, 510), "ramp_throttle": (2, 660), "step_steer": (40, 570), "const_steer": (24, 450),
     "trail_brake": (18, 541), "sine_steer": (36, 510), "chirp_steer": (3, 751), "surface_transition": (1, 600),

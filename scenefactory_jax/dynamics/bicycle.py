@@ -52,7 +52,9 @@ def make(
     grip: Callable[..., Any],
     control_dt: float,
 ) -> Dynamics:
-    """Kinematic bicycles, facts sheet 6.6, integrated once a control step as the paper says (the published code does it four times).
+    """Kinematic bicycles, SceneFactory's (arXiv:2605.08528, section 4.4), integrated once a control step.
+
+    The published code integrates four times.
 
     Args:
         mass: kg; it decides the contact force and nothing else.

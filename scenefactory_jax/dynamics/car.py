@@ -31,7 +31,7 @@ FADES = 0.1  # of the spin limit, over which the engine's torque ends
 @pytree
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CarParameters:
-    """Every number of the car. Sources: SceneFactory's vehicle (URDF and system identification), facts sheet section 2.
+    """Every number of the car. Sources: SceneFactory's vehicle (URDF and system identification), arXiv:2605.08528, Table 6.
 
     Plain numbers describe one car; `fleet` makes trees of the same shape with an agent axis, for cars that differ.
     """

@@ -22,6 +22,7 @@ from scenefactory_jax.report.mp4 import VideoError
 
 SUFFIXES = (".gif", ".mp4", ".png")
 SAMPLES = 6  # frames that a GIF's colours are taken from
+FINE = 2  # pixels drawn for one that is shown, in each direction: multisampling smooths outlines, but not the edges of shadows
 FOVY = 45.0  # MuJoCo's, of cameras that no model names
 
 
@@ -89,7 +90,7 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
     heading = smooth(np.unwrap(whole.yaw[:, followed]), lag=look.lag_s * whole.hz)
     views = ("chase", "bird") if look.view == "both" else (look.view,)
     above = _above(whole, aspect=look.width / look.height)
-    with opengl.painter(built.model, data, width=look.width, height=look.height) as paint:
+    with opengl.painter(built.model, data, width=FINE * look.width, height=FINE * look.height) as paint:
         for step in steps:
             stage.put(built, data, whole.joints[step], whole.opacity[step])
             behind = chase(whole.joints[step, followed, :3], float(heading[step]), distance_m=look.distance_m, pitch_deg=look.pitch_deg)
@@ -102,7 +103,8 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
             shown = []
             for camera in (behind if view == "chase" else above for view in views):
                 stage.light(data, camera.lookat)
-                shown.append(paint(camera, decorate))
+                fine = paint(camera, decorate).reshape(look.height, FINE, look.width, FINE, 3)
+                shown.append(fine.mean(axis=(1, 3)).round().astype(np.uint8))
             yield np.concatenate(shown, axis=1)
 
 

@@ -20,7 +20,7 @@ from scenefactory_jax.types import Scene
 
 GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
 SUN = (0.45, 0.3, -1.0)  # way of its light
-SHADOWS_M, SHADOW_PIXELS = 150.0, 4096  # how far from what is looked at shadows fall; just beyond, MuJoCo speckles the ground
+SHADOWS_M, SHADOW_PIXELS = 150.0, 8192  # how far from what is looked at shadows fall; just beyond, MuJoCo speckles the ground
 JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the front wheels; suspension and spin of the rear ones
 STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
 

@@ -11,7 +11,7 @@ from scenefactory_jax.report import sysid_figures as figures
 from scenefactory_jax.report.verdicts import Verdict, table
 
 Result = Mapping[str, Any]
-PUBLISHED = {  # facts sheet 3.4 (the paper's Table 8): candidates and best loss of each stage
+PUBLISHED = {  # SceneFactory, arXiv:2605.08528, Table 8: candidates and best loss of each stage
     "longitudinal": (97, 5.2937),
     "steering": (65, 170.588),
     "surface": (49, 55.3496),

@@ -1,24 +1,28 @@
 """Hydra configs -> plain dicts. Hydra decides nothing but configuration; past this door there are only mappings."""
 
+import argparse
 import copy
 import functools
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra._internal.utils import get_args_parser  # as `hydra.main` reads its arguments
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import OverrideType
 from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from scenefactory_jax.build import ConfigError
 from scenefactory_jax.run import targets, whole
@@ -61,6 +65,18 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     return plain(_open(name, overrides))
 
 
+def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """`load`, and which option of each group was chosen; a value that must be given shows as `???`.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    opened = _open(name, overrides, whole=True)
+    choices = {group: chosen for group, chosen in opened.hydra.runtime.choices.items() if not group.startswith("hydra/")}
+    del opened.hydra
+    return OmegaConf.to_container(opened, resolve=True), choices  # pyright: ignore[reportReturnType]
+
+
 def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> list[dict[str, Any]]:
     """`load` for each value of one key, at the cost of one.
 
@@ -75,8 +91,8 @@ def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> li
     return found
 
 
-def _open(name: str, overrides: Sequence[str]) -> Any:
-    """A composed config whose references are not followed yet, but can be.
+def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
+    """A composed config whose references are not followed yet, but can be; `whole`: with Hydra's own part, and values may be missing.
 
     Raises:
         ConfigError: see `load`.
@@ -85,19 +101,36 @@ def _open(name: str, overrides: Sequence[str]) -> Any:
     if name not in known:
         raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
     try:
-        opened = _compose(name, overrides)
-        plain(opened)
-        return opened
+        opened = _compose(name, overrides, whole=whole)
+        if not whole:
+            plain(opened)
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key}: missing; give {error.full_key}=..., as `{name} --help` describes it") from None
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(name, error)) from None
     except ValueError as error:  # what Hydra says of `timing=null`
         raise ConfigError(f"{' '.join(overrides)}: {error}") from None
+    _check_emptied(opened, overrides)
+    return opened
 
 
-def _compose(name: str, overrides: Sequence[str]) -> Any:
+def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
+    """Refuse `reward={}`: mappings are merged, so an empty one changes nothing.
+
+    Raises:
+        ConfigError: with what empties a mapping, and what drops one of its entries.
+    """
+    for one in OverridesParser.create().parse_overrides([quoted(override) for override in overrides]):
+        if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
+            key, entry = one.key_or_group, next(iter(held))
+            way = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
+            raise ConfigError(f"{key}={{}}: changes nothing, for mappings are merged; {way}")
+
+
+def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(folder()), version_base="1.3"):
-        return hydra_compose(name, overrides=[quoted(override) for override in overrides])
+        return hydra_compose(name, overrides=[quoted(override) for override in overrides], return_hydra_config=whole)
 
 
 def plain(config: Any) -> dict[str, Any]:
@@ -253,11 +286,33 @@ def quoted(override: str) -> str:
     return f"{match.group(1)}=[{','.join(repr(entry.strip()) for entry in match.group(2).split(','))}]"
 
 
-def as_overrides(arguments: Sequence[str]) -> list[str]:
-    """Command-line arguments that are overrides, without Hydra's own flags and their values (`--cfg job`); `hydra.searchpath` says where
-    options of one's own lie."""
-    settings = [a for a in arguments if a.startswith("~") or ("=" in a and not a.startswith("-"))]
-    return [a for a in settings if not a.startswith("hydra") or a.startswith("hydra.searchpath=")]
+def parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
+    """Command-line arguments as Hydra reads them: its flags with their values, and `overrides`.
+
+    Raises:
+        ConfigError: a flag that Hydra does not have, or a value that the flag does not take.
+    """
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(f"{message}; --hydra-help describes the flags")
+
+    parser.error = refuse  # argparse's own prints the usage and ends the process
+    return parser.parse_args(arguments)
+
+
+def as_overrides(flags: argparse.Namespace) -> list[str]:
+    """The settings among the arguments, without those of Hydra's own part; `hydra.searchpath` and `--config-dir` say where options of one's
+    own lie.
+
+    Raises:
+        ConfigError: an argument that is no setting.
+    """
+    for word in flags.overrides:
+        if "=" not in word and not word.startswith("~"):
+            raise ConfigError(f"{word}: no setting; write {word}=VALUE, or ~{word} to remove it")
+    own = [word for word in flags.overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath=")]
+    return own if flags.config_dir is None else [*own, f"hydra.searchpath=['file://{Path(flags.config_dir).resolve()}']"]
 
 
 def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
@@ -273,3 +328,8 @@ def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
     fixed = [one.input_line for one in parsed if not one.is_sweep_override() and one.input_line]
     first = [f"{one.get_key_element()}={next(one.sweep_string_iterator())}" for one in parsed if one.is_discrete_sweep()]
     return [*fixed, *first], {one.key_or_group for one in parsed if one.is_sweep_override()}
+
+
+def changes(varied: Set[str]) -> list[str]:
+    """The overrides of the present job of a sweep whose keys vary, but its name, which its folder has anyway."""
+    return [word for word in HydraConfig.get().overrides.task if word.partition("=")[0].lstrip("+~") in varied - {"name"}]

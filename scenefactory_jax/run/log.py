@@ -5,7 +5,9 @@ import csv
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from scenefactory_jax.run import whole
 
@@ -45,18 +47,20 @@ def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
     return [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(lines)]
 
 
+class _Bar(Progress):
+    """A bar with a line of text below it: side by side they do not fit into 80 columns."""
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield self.make_tasks_table(self.tasks)
+        for task in self.tasks:
+            yield Text(task.fields["text"], no_wrap=True, overflow="ellipsis")
+
+
 @contextlib.contextmanager
-def progress(total: int, *, enable: bool, start: int = 0) -> Iterator:
+def progress(total: int, *, enable: bool, start: int = 0, console: Console | None = None) -> Iterator:
     """A bar `show(iteration, text)` with the time left, or one that does nothing."""
-    columns = [
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[text]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    ]
-    with Progress(*columns, disable=not enable, refresh_per_second=2) as bar:
+    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+    columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
+    with _Bar(*columns, disable=not enable, refresh_per_second=2, console=console) as bar:
         task = bar.add_task("train", total=total, completed=start, text="compiling")
         yield lambda iteration, text: bar.update(task, completed=iteration, text=text)

@@ -181,7 +181,7 @@ def readers(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def assign(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
-    """One scene for each world: the whole list shuffled, again and again (facts 4.5, random fill); on the device, or shared out on several.
+    """One scene for each world: the whole list shuffled, again and again (SceneFactory's); on the device, or shared out on several.
 
     Returns:
         Scenes along the first axis, and a line that says how often each is used.

@@ -3,7 +3,9 @@
 import contextlib
 import datetime
 import itertools
-from collections.abc import Iterator, Mapping
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from scenefactory_jax.build import ConfigError, differing
 from scenefactory_jax.ppo import checkpoint
 from scenefactory_jax.run import config as configs
 
+MOST = 80  # letters of a sweep's changes in the name of a folder
 # What may be another when a run goes on, and all below it: nothing that was learnt rests on it
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
 FREE += ("loggers", "evaluation", "scenes.heldout")
@@ -31,11 +34,25 @@ def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
         yield folder, _goes_on(folder, config)
 
 
+def fresh(name: str, changes: Sequence[str] = ()) -> Path:
+    """The folder of a run that begins now: `runs/NAME-TIME`, or in a sweep `runs/NAME-weather_wet-seed_1-TIME`.
+
+    Args:
+        changes: overrides in which the run differs from the others. Each is written as the last part of its key and its value, in letters
+            that neither a shell nor Hydra reads as anything else; what is longer than MOST letters ends in a checksum instead.
+    """
+    told = [f"{key.rpartition('.')[2]}={value}" for key, _, value in (change.partition("=") for change in changes)]
+    text = "-".join(re.sub(r"[^A-Za-z0-9.-]+", "_", one).strip("_") for one in told)
+    if len(text) > MOST:
+        text = f"{text[: MOST - 9]}-{zlib.crc32(text.encode()):08x}"
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    return Path("runs", "-".join(part for part in (name, text, stamp) if part))
+
+
 @contextlib.contextmanager
 def _made(config: Mapping[str, Any]) -> Iterator[Path]:
     """The folder; what had to be made for it and is still empty when an error ends the run was no run's: it goes."""
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    named, base = config["out"] is not None, Path(config["out"] or f"runs/{config['name']}-{stamp}")
+    named, base = config["out"] is not None, Path(config["out"] or fresh(config["name"]))
     for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
         new = folders.missing(folder)
         try:

@@ -87,8 +87,8 @@ def pack(
     Args:
         raw: a checked scene.
         box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
-        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (facts 4.3).
-        gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (facts 4.4).
+        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
+        gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (SceneFactory).
         agents, require_agents: slots, for the cars nearest to the centre; whether a scene in which none is left is refused.
         min_travel_m: a car whose goal is not farther than that from its start is no agent.
         car_size_m: length and width of every car; null: as logged.

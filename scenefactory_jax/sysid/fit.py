@@ -1,8 +1,8 @@
 """The fit: the published loss in consistent units, its five stages by the cross-entropy method, and a least-squares refinement.
 
-Source: SceneFactory's system identification (facts sheet 3.3 and 3.4). What differs: populations of hundreds on the device where 16 ran one
-after the other, every error in SI units and radians, and a Gauss-Newton refinement at the end, whose Jacobian also says how well each
-parameter is known.
+Source: SceneFactory's system identification (arXiv:2605.08528, section 3.2, appendix H, and its published code). What differs: populations
+of hundreds on the device where 16 ran one after the other, every error in SI units and radians, and a Gauss-Newton refinement at the end,
+whose Jacobian also says how well each parameter is known.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The scene JSON that SceneFactory publishes (facts 4.1): polylines, and a start and an end pose for each agent."""
+"""The scene JSON that SceneFactory publishes: polylines, and a start and an end pose for each agent."""
 
 from collections.abc import Iterator
 from pathlib import Path
