@@ -45,5 +45,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """For tab completion: also what is not imported yet."""
-    return sorted({*globals(), *__all__})
+    """For tab completion: the public names, also those that are not imported yet."""
+    return sorted(__all__)

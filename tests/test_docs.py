@@ -143,6 +143,14 @@ def test_the_task_page_has_the_numbers_of_the_configs(quickly):
     assert f"| flat | with the masks | {' | '.join(map(str, widths))} |" in page
 
 
+def test_the_reference_lists_what_the_package_holds():
+    """Every public name and no other; the same names are what tab completion shows, and a type checker reads their types."""
+    listed = re.findall(r"^::: scenefactory_jax\.(\w+)$", (ROOT / "docs" / "reference" / "index.md").read_text(), re.MULTILINE)
+    assert sorted([*listed, "__version__"]) == sorted(sf.__all__) == dir(sf)
+    assert all(getattr(sf, name) is not None for name in sf.__all__)
+    assert (ROOT / "scenefactory_jax" / "py.typed").exists()
+
+
 def test_the_version_is_the_same_everywhere():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == __version__ and citation["cff-version"] == "1.2.0" and citation["license"] == "Apache-2.0"
@@ -160,6 +168,7 @@ def test_the_site_builds_without_network(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     site = tmp_path / "site"
     reference = (site / "reference" / "index.html").read_text()
-    assert "scenefactory_jax.run.train.train" in reference and "A key that does not fit".lower() in reference.lower()
+    assert all(f'id="scenefactory_jax.{name}"' in reference for name in sf.__all__ if name != "__version__")
+    assert "A key that does not fit".lower() in reference.lower()
     fetched = r"<(?:script|img|link)\b[^>]*\b(?:src|href)=\"?https?://[^\">]*"
     assert not [found for page in site.rglob("*.html") for found in re.findall(fetched, page.read_text())]

@@ -1,15 +1,17 @@
-"""The environment as Gymnasium, PettingZoo, JaxMARL and Brax know one. Each is a thin file over `episodes`, and an extra of the package.
+"""The environment as Gymnasium, Stable-Baselines3, PettingZoo, JaxMARL and Brax know one.
+
+Each is a thin file over `episodes`, and an extra of the package.
 
     import gymnasium, scenefactory_jax.adapters.gymnasium                      # pip install 'scenefactory_jax[gymnasium]'
     env = gymnasium.make("scenefactory_jax/Drive-v0", overrides=["dynamics=bicycle"])
     envs = gymnasium.make_vec("scenefactory_jax/Drive-v0", num_envs=64, overrides=["dynamics=bicycle"])
 
-    from scenefactory_jax.adapters.pettingzoo import Drive                     # ParallelEnv; also .jaxmarl and .brax
+    from scenefactory_jax.adapters.pettingzoo import Drive                     # ParallelEnv; also .sb3, .jaxmarl and .brax
     env = Drive(overrides=["experiment=demo"])
 
 All take `config` (what `scenefactory_jax.load("train", ...)` gives; by default that), `overrides` of it as on the command line, and
-`scenes` (what `load_scenes` gives; by default the config's). Every episode begins in a scene drawn at random from these. Gymnasium and
-Brax know one agent: the config must say `scenes.pack.agents=1`, and does by default.
+`scenes` (what `load_scenes` gives; by default the config's). Every episode begins in a scene drawn at random from these. Gymnasium, SB3
+and Brax know one agent: the config must say `scenes.pack.agents=1`, and does by default.
 
 What they share:
 
