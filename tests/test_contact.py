@@ -159,6 +159,13 @@ def test_pushes_apart_brakes_sliding_and_never_pulls():
     assert torque[0] > 1e3 and torque[1] > 1e3  # pushed back on the left, and forward on the right: both turn left
 
 
+def test_friction_turns_each_car_about_its_own_centre():
+    """Cars of 4 and 8 m nose to tail, 1 cm into each other, one sliding along the other's face: arms of 2 and 4 m less half the depth."""
+    force, torque, _ = forces(boxes([[0.0, 0.0], [5.99, 0.0]], velocity=[[0.0, 2.0], [0.0, 0.0]], size=[[4.0, 2.0], [8.0, 2.0]]))
+    assert force[0, 1] < -100.0
+    np.testing.assert_allclose(torque, [1.995 * force[0, 1], -3.995 * force[1, 1]], rtol=1e-3)
+
+
 def test_what_does_not_touch_feels_nothing():
     for state in (two(0.01, closing=20.0), two(-1.0, z=1.01), two(-1.0, present=[True, False])):
         assert all(not np.asarray(x).any() for x in (*forces(state), *both(*split(state))))

@@ -79,7 +79,7 @@ MUTATIONS = (
              "2.0 / (impedance * constant) * rate[0]", "0.0 * rate[0]", "test_solve.py"),
     Mutation("contact", "a car's torque goes to the other of the pair", "dynamics/contact.py",
              "[share * torque_one, share * torque_other]", "[share * torque_other, share * torque_one]",
-             "test_contact.py::test_momentum_is_kept"),
+             "test_contact.py::test_friction_turns_each_car_about_its_own_centre"),
     Mutation("contact", "every contact of a heap has its whole strength", "dynamics/contact.py",
              "jnp.minimum(1.0, 2.0 / jnp.maximum(touched, 1.0))", "1.0 + 0.0 * touched",
              "test_contact.py::test_a_heap_flies_apart_and_does_not_blow_up"),
@@ -145,7 +145,7 @@ def first_failure(checkout: Path, tests: Sequence[str], compiled: Path) -> str |
     call = [sys.executable, "-m", "pytest", "-x", "-n0", "-p", "no:cacheprovider", *(f"tests/{name}" for name in tests)]
     own = {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1", "JAX_COMPILATION_CACHE_DIR": str(compiled)}
     done = subprocess.run(call, cwd=checkout, env=os.environ | own, capture_output=True, text=True)
-    found = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.MULTILINE)
+    found = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - |$)", done.stdout, re.MULTILINE)
     if done.returncode not in (0, 1) or (done.returncode == 1) != bool(found):
         raise SystemExit(f"error: {' '.join(call[2:])} ended with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr[-2000:]}")
     return found.group(1) if found else None
