@@ -14,6 +14,7 @@ from scenefactory_jax.build import ConfigError, build
 from scenefactory_jax.policy import late_fusion
 from scenefactory_jax.ppo import gae, loss, rollout, train, update
 from scenefactory_jax.run import config as configs
+from scenefactory_jax.struct import unchecked
 from scenefactory_jax.types import Env
 
 T, W, A = 12, 2, 3
@@ -121,7 +122,10 @@ def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
     rng, none = np.random.default_rng(0), jnp.zeros((T, W, A))
     active, truncated = (jnp.asarray(rng.random((T, W, A)) < share) for share in (0.7, 0.3))
     observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
-    samples = rollout.Sample(observation, pair, pair, none, none, none, active, jnp.zeros((T, W, A), bool), truncated)
+    samples = unchecked(  # with the axis of time before that of worlds
+        rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
+        done=jnp.zeros((T, W, A), bool), truncated=truncated,
+    )  # fmt: skip
     batch = train._batch(samples, none[0], gamma=0.9, gae_lambda=0.8, normalise_advantage=True, groups=1, axis=None)
     np.testing.assert_array_equal(batch.weight, np.ravel(active & ~truncated))
 

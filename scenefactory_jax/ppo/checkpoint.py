@@ -12,6 +12,7 @@ import hashlib
 import logging
 import os
 import shutil
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,6 +32,7 @@ PREFIX = {LEARNT: LEARNT, AVERAGED: AVERAGED, REST: ""}  # of the names of their
 FILE = "policy.npz"  # in place of checkpoints: what a policy learnt, alone
 HOST = "host"  # what the loop around the train state carries
 SUMS = "SHA256SUMS"
+ATTEMPTS = 100  # 5 s
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, one's share of it, or a file is full
 
 
@@ -237,11 +239,20 @@ def _fitting(place: Path) -> Iterator[None]:
         code = next((code for code in FULL if os.strerror(code) in str(error)), None)
         if code is None:
             raise
-        for half in place.parent.glob(f"{place.name}.orbax-checkpoint-tmp*"):
-            shutil.rmtree(half, ignore_errors=True)
+        _remove_unfinished(place)
         held = latest(place.parent)
         kept = "no checkpoint is whole" if held is None else f"checkpoint {held} is whole: with resume=true training goes on from it"
         raise OSError(code, f"{os.strerror(code)}; {kept}", str(place)) from None
+
+
+def _remove_unfinished(place: Path) -> None:
+    """Remove what was written of a checkpoint. Orbax leaves writes of other arrays running that may add files meanwhile: try until they end."""
+    for _ in range(ATTEMPTS):
+        if not (halves := list(place.parent.glob(f"{place.name}.orbax-checkpoint-tmp*"))):
+            return
+        for half in halves:
+            shutil.rmtree(half, ignore_errors=True)
+        time.sleep(0.05)
 
 
 def _steps(folder: Path) -> list[int]:
