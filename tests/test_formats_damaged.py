@@ -119,6 +119,16 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_on_the_way(tmp_path, com
     assert fuzzing.peak_of(lambda path: source.read(path, readers), path) < 16_000_000  # xz itself asks for 8 MB
 
 
+def test_a_parquet_file_that_unpacks_to_more_than_the_limit_is_refused_unread(tmp_path):
+    content = argoverse2_files(scenario="x" * 2_000_000)[0]  # one text, which every row repeats
+    assert len(content) < 1_000_000
+    path = tmp_path / "scenario.parquet"
+    path.write_bytes(content)
+    readers = source.make({"argoverse2": FORMATS["argoverse2"] | {"file_limit_mb": 1}})
+    with pytest.raises(SceneError, match=r"\d MB unpacked; formats\.argoverse2\.file_limit_mb is 1"):
+        list(source.read(path, readers))
+
+
 @pytest.mark.parametrize("document", [scenefactory_document(), {"a": 1}], ids=["the second reader's", "none's"])
 def test_a_file_is_unpacked_once_however_many_readers_try_it(tmp_path, monkeypatch, readers, document):
     path, read, counts = tmp_path / "a.xz", documents._read, []

@@ -110,6 +110,9 @@ def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int, fil
             raise OtherContent(f"{path}: a parquet file, but no Argoverse 2 scenario: no column {missing[0]!r}")
         if file.metadata.num_rows > row_limit:
             raise SceneError(f"{path}: {file.metadata.num_rows} rows; formats.argoverse2.row_limit is {row_limit}")
+        unpacked = sum(file.metadata.row_group(group).total_byte_size for group in range(file.metadata.num_row_groups))
+        if unpacked > file_limit_mb * 10**6:
+            raise SceneError(f"{path}: {unpacked / 1e6:.0f} MB unpacked; formats.argoverse2.file_limit_mb is {file_limit_mb}")
         table = file.read(columns=list(COLUMNS), use_threads=False).select(list(COLUMNS)).cast(pa.schema(list(COLUMNS.items())))
         if not table.num_rows or any(column.null_count for column in table.columns):
             raise SceneError(f"{path}: {table.num_rows} rows, or some without a value; every row must have all of {', '.join(COLUMNS)}")
