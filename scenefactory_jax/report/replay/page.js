@@ -160,13 +160,7 @@ function say(text) {
 
 /** The timeline: a bar of the world's time, seconds, and every event; those of the selected car are larger. */
 function drawTimeline() {
-  const picture = $("marks");
-  const ratio = devicePixelRatio || 1;
-  const { width, height } = picture.parentElement.getBoundingClientRect();
-  picture.width = Math.max(1, Math.round(width * ratio));
-  picture.height = Math.max(1, Math.round(height * ratio));
-  const brush = picture.getContext("2d");
-  brush.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const { brush, width, height } = fitCanvas($("marks"));
   const across = (step) => 7 + (step / Math.max(app.world.end, 1)) * (width - 14);
   const middle = 29;
   brush.fillStyle = css("line");

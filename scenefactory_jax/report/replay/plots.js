@@ -4,12 +4,7 @@ const ROOM = { left: 34, right: 6, top: 4, bottom: 16 };
 
 /** A clean plot with its scales; `bounds` are the values at the bottom and the top. */
 function begin(picture, car, bounds) {
-  const ratio = devicePixelRatio || 1;
-  const { width, height } = picture.parentElement.getBoundingClientRect();
-  picture.width = Math.max(1, Math.round(width * ratio));
-  picture.height = Math.max(1, Math.round(height * ratio));
-  const brush = picture.getContext("2d");
-  brush.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const { brush, width, height } = fitCanvas(picture);
   const [first, end] = lifeOf(car);
   const inner = [width - ROOM.left - ROOM.right, height - ROOM.top - ROOM.bottom];
   const right = (step) => ROOM.left + ((step - first) / (end - first)) * inner[0];

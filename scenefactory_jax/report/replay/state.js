@@ -120,3 +120,14 @@ let stale = false;
 const refresh = () => {
   stale = true;
 };
+
+/** A canvas as large as the element around it, empty, with a brush that counts in CSS pixels. */
+function fitCanvas(picture) {
+  const ratio = devicePixelRatio || 1;
+  const { width, height } = picture.parentElement.getBoundingClientRect();
+  picture.width = Math.max(1, Math.round(width * ratio));
+  picture.height = Math.max(1, Math.round(height * ratio));
+  const brush = picture.getContext("2d");
+  brush.setTransform(ratio, 0, 0, ratio, 0, 0);
+  return { brush, width, height };
+}
