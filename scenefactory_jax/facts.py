@@ -47,7 +47,7 @@ def measure(
     """
     motion, active, cars, fault = after.motion, before.active, len(before.active), _are_broken(after)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    everyone = conflict.bodies(motion, after.agents.size, active & ~fault, scene.boxes)  # nobody meets a broken car
+    everyone = conflict.bodies(motion, after.agents.size, active & ~fault, scene.boxes)  # a faulty car collides with nothing
     centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     pairs = conflict.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
     speed, to_goal = norm(velocity), after.agents.goal - position

@@ -59,7 +59,7 @@ def remove_empty(places: Sequence[Path]) -> None:
 
 
 def _locked(path: Path) -> int:
-    """The open descriptor of a lock that nobody else holds.
+    """The open descriptor of a lock that no other process holds.
 
     Raises:
         BlockingIOError: a process holds it.

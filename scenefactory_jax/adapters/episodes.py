@@ -198,7 +198,7 @@ def chosen(options: Mapping[str, Any] | None, count: int, worlds: int | None = N
     """The scene that `options["scene"]` of a `reset` names, or ANY; of several worlds, [worlds].
 
     Raises:
-        ConfigError: an index that is none, or not one for each world.
+        ConfigError: an index of no scene, or another number of them than worlds.
     """
     given = (options or {}).get("scene", ANY)
     shape, index = () if worlds is None else (worlds,), np.asarray(given)

@@ -62,7 +62,7 @@ class Drive(VecEnv):
         """Fresh episodes everywhere, [W, F]: of the seeds that `seed` set, or the next ones of those before.
 
         Raises:
-            ConfigError: a scene in `set_options` that is none.
+            ConfigError: `set_options` names a scene that does not exist.
         """
         scene = [options.get("scene", episodes.ANY) for options in self._options]
         observation, info = self.worlds.reset(seed=self._seeds, options={"scene": scene})

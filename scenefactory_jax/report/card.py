@@ -40,7 +40,7 @@ def markdown(
 
 
 def _code(outside: Sequence[str]) -> str:
-    """What whoever loads the policy lets run."""
+    """Which code runs when the policy is loaded."""
     if not outside:
         return "The config names functions of scenefactory_jax alone: loading the policy runs no other code."
     named = ", ".join(f"`{target}`" for target in outside)
