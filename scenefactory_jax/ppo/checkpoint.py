@@ -246,7 +246,7 @@ def _fitting(place: Path) -> Iterator[None]:
 
 
 def _remove_unfinished(place: Path) -> None:
-    """Remove what was written of a checkpoint. Orbax leaves writes of other arrays running that may add files meanwhile: try until they end."""
+    """Remove what was written of a checkpoint; orbax leaves writes of other arrays running that may still add files: try until they end."""
     for _ in range(ATTEMPTS):
         if not (halves := list(place.parent.glob(f"{place.name}.orbax-checkpoint-tmp*"))):
             return
