@@ -79,9 +79,9 @@ class Drive(VecEnv):
         """Observations, rewards, whether the episodes ended, and infos.
 
         Raises:
-            as `DriveVector.advance`.
+            See `DriveVector.advance`.
         """
-        step = self.worlds.advance(self._actions)
+        step: Any = self.worlds.advance(self._actions)  # of numpy arrays, with all that mode SAME_STEP gives
         columns = {place: {name: column.tolist() for name, column in step.told[place].items()} for place in ("terms", "events")}
         scenes, before, late = (column.tolist() for column in (step.scene, step.scene_before, step.truncated))
         infos = []
