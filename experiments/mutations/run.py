@@ -1,16 +1,21 @@
-"""Mutations of the package, each of which the tests must catch: `python experiments/mutations/run.py > experiments/mutations/mutations.md`.
+"""Mutations of the package, each of which the tests must catch.
+
+`python experiments/mutations/run.py --out experiments/mutations/mutations.md` makes the committed table.
 
 A mutation is one exact replacement of text in one file. Each is applied to a copy of the checkout in a temporary folder, where the tests
 named with it run until the first failure; a mutation that no test fails on has survived. Before the first one the same tests must pass
 without any. Files that move, or texts that change, are edited in `MUTATIONS`: a text that is not found exactly once ends the script.
 
 Options: `--whole` runs all fast tests for each mutation instead of the named ones (tens of minutes each), `--only WORD` those whose name or
-subject contains the word, `--jobs N` so many at a time. Progress goes to standard error. Exit status 1: a mutation survived.
+subject contains the word, `--jobs N` so many at a time, `--out FILE` writes the table there instead of to standard output. Progress goes to
+standard error. Exit status 1: a mutation survived.
 """
 
 import argparse
 import os
+import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,9 +24,11 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = "jax", "jaxlib", "mujoco", "pytest"  # whose versions the table names
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,8 @@ MUTATIONS = (
              "(agents.speed / radius)", "(0.0 * agents.speed / radius)",
              "test_dynamics.py::test_cars_start_at_rest_height_with_turning_wheels"),
     Mutation("physics", "tyres bounce: no damping along the road's normal", "dynamics/tyres.py",
-             "2.0 / (impedance * constant) * rate[0]", "0.0 * rate[0]", "test_solve.py"),
+             "2.0 / (impedance * constant) * rate[0]", "0.0 * rate[0]",
+             "test_tree.py::test_the_problem_is_that_of_mjx_for_cars_that_differ"),
     Mutation("contact", "a car's torque goes to the other of the pair", "dynamics/contact.py",
              "[share * torque_one, share * torque_other]", "[share * torque_other, share * torque_one]",
              "test_contact.py::test_friction_turns_each_car_about_its_own_centre"),
@@ -86,7 +94,8 @@ MUTATIONS = (
     Mutation("friction", "the surface's ratio is left out", "weather.py",
              "jnp.maximum(theta * spacing(", "jnp.maximum(spacing(", "test_weather.py"),
     Mutation("friction", "wheels read the road of the other side", "dynamics/mjx_car.py",
-             "beside = LEFT *", "beside = -LEFT *", "test_fields_driving.py::test_wheels_on_the_two_sides_have_the_friction_of_their_side"),
+             "beside = LEFT *", "beside = -LEFT *",
+             "test_fields_driving.py::test_split_friction_turns_a_braking_car_to_the_side_that_grips"),
     Mutation("readers", "headings of the old layout stay degrees", "scenes/formats/gpudrive.py",
              "np.deg2rad(heading) if degrees", "heading if degrees", "test_scenes.py"),
     Mutation("readers", "speed limits of WOMD are km/h", "scenes/formats/womd_scenario.py",
@@ -180,38 +189,58 @@ def require_passing(mutations: Sequence[Mutation], compiled: Path, *, whole: boo
             raise SystemExit(f"error: {failed} fails without a mutation")
 
 
-def describe(findings: Sequence[Finding]) -> str:
-    """The table and the score."""
+def versions() -> str:
+    """The checkout's commit, Python and `PACKAGES`."""
+    asked = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+    commit = subprocess.run(asked, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    packages = (f"{name} {metadata.version(name)}" for name in PACKAGES)
+    return ", ".join([f"commit {commit}", f"Python {platform.python_version()}", *packages])
+
+
+def describe(findings: Sequence[Finding], command: str, ran: str) -> str:
+    """The table and the score.
+
+    Args:
+        command: that was called.
+        ran: `versions` before the first test.
+    """
     caught = sum(finding.test is not None for finding in findings)
     rows = ["| Subject | Mutation | File | Caught by | s |", "| --- | --- | --- | --- | ---: |"]
     for finding in findings:
         mutation = finding.mutation
         caught_by = f"`{finding.test}`" if finding.test else "**survived**"
         rows.append(f"| {mutation.subject} | {mutation.name} | `{mutation.file}` | {caught_by} | {finding.seconds:.0f} |")
-    head = ["# Mutations", "", "Made by `python experiments/mutations/run.py`.", f"Score: {caught} of {len(findings)} caught.", ""]
-    return "\n".join(head + rows)
+    what = "A mutation is a fault put into the package; a test that fails because of it catches it."
+    head = ["# Mutations", "", f"`{command}` on {ran}.", "", f"Score: {caught} of {len(findings)} caught. {what}", ""]
+    return "\n".join([*head, *rows])
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Try the mutations and print the table."""
+def main(words: Sequence[str]) -> int:
+    """Try the mutations, and print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--whole", action="store_true", help="all fast tests for each mutation")
     parser.add_argument("--only", default="", metavar="WORD", help="in the name or the subject")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="mutations at a time")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="of the table; standard output without it")
     given = parser.parse_args(words)
     chosen = [mutation for mutation in MUTATIONS if given.only in f"{mutation.subject} {mutation.name}"]
     if not chosen:
         raise SystemExit(f"error: --only {given.only}: in no mutation; subjects: {', '.join(sorted({m.subject for m in MUTATIONS}))}")
     for mutation in chosen:  # all texts before the first test runs
         mutated(mutation)
+    ran = versions()
     with tempfile.TemporaryDirectory(prefix="mutations-compiled-") as folder:
         compiled = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR", folder))
         require_passing(chosen, compiled, whole=given.whole)
         with ThreadPoolExecutor(given.jobs) as pool:
             findings = list(pool.map(lambda mutation: try_one(mutation, compiled, whole=given.whole), chosen))
-    print(describe(findings))
+    table = describe(findings, shlex.join(["python", "experiments/mutations/run.py", *words]), ran)
+    if given.out:
+        given.out.write_text(f"{table}\n")
+    else:
+        print(table)
     return int(any(finding.test is None for finding in findings))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))
