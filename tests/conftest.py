@@ -34,8 +34,8 @@ BY_DEFAULT |= {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.e
 SHARED = ROOT.parent / "shared" / "data"
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
     "test_study", "test_tree", "test_run", "test_validate", "test_notebook", "test_solve", "test_fleet", "test_others", "test_fields",
-    "test_sharding", "test_faults", "test_bench", "test_validation", "test_digests", "test_task", "test_sysid_fit", "test_ppo", "test_baseline",
-    "test_extremes", "test_set_kernel", "test_dynamics", "test_contact", "test_adapters_gymnasium", "test_adapters_brax",
+    "test_sharding", "test_faults", "test_bench", "test_validation", "test_digests", "test_task", "test_sysid_fit", "test_ppo",
+    "test_baseline", "test_extremes", "test_set_kernel", "test_dynamics", "test_contact", "test_adapters_gymnasium", "test_adapters_brax",
 )  # fmt: skip
 
 
