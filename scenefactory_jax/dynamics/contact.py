@@ -114,8 +114,8 @@ def forces(
     2 c dt / m stays below 4: 0.58 and 2.1 with 3e4 N s/m.
 
     Args:
-        cars: bodies that are not present, have no size, or whose state is not finite, touch nobody. Two that differ by more than `height`
-            in elevation do not meet.
+        cars: bodies that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
+            more than `height` do not meet.
         near: what each car may touch, leaves `[A, K, ...]`: see `neighbours`. It is on its way and feels nothing. One of finite mass cannot
             yield as it would, so its push ends where it would have taken on the car's speed within `yield_s`.
         stiffness: of a contact along a whole face of two cars, N/m.

@@ -1,8 +1,8 @@
 """Which functions the config in a folder may name.
 
-A config entry names a function by `_target_`, which is imported and called. In a config that comes with a run or a policy, that may be code
-of whoever made the folder. Such a config may therefore name parts of the package, and other functions only where the user allows them. What
-is typed on the command line, and the package's own `conf/`, is not checked.
+A config entry names a function by `_target_`, which is imported and called. In the config of a run or a policy, that may be code of the
+person who made the folder. Such a config may name parts of the package; it may name other functions only with `trust`. What is typed on the
+command line, and the package's own `conf/`, is not checked.
 """
 
 from collections.abc import Mapping

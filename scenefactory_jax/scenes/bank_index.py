@@ -107,10 +107,14 @@ def _entries(path: Path) -> dict[str, Any] | None:
         raise SceneError(f"{file}: damaged: no JSON: {error}; {REMEDY}") from error
     if not isinstance(found, dict):
         return {}
-    wanted, body = found.get(DIGEST), content.rpartition(f'"{DIGEST}"'.encode())[0]
-    missing = wanted is None and found.get("schema") == SCHEMA
-    if missing or (wanted is not None and hashlib.sha256(body).hexdigest() != wanted):
-        raise SceneError(f"{file}: damaged: {'no checksum' if missing else 'its checksum is another'}; {REMEDY}")
+    recorded = found.get(DIGEST)
+    if recorded is None:
+        if found.get("schema") == SCHEMA:
+            raise SceneError(f"{file}: damaged: no checksum; {REMEDY}")
+        return found  # of a schema without one
+    body = content.rpartition(f'"{DIGEST}"'.encode())[0]
+    if hashlib.sha256(body).hexdigest() != recorded:
+        raise SceneError(f"{file}: damaged: its checksum is another; {REMEDY}")
     return found
 
 

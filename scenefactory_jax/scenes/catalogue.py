@@ -19,7 +19,7 @@ COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(("lanes", "edges", "lines", "crosswalks", "stop_signs", "lights"), pa.int64()),
     **dict.fromkeys(("vehicles", "pedestrians", "cyclists"), pa.int64()),
     "findings": pa.int64(),  # of the rules of quality; null where nobody judged
-    "packing": pa.string(),  # PACKED, or why packing refused it at conversion (`pack.REFUSALS`); null where nobody tried
+    "packing": pa.string(),  # PACKED, or why packing refused it at conversion (`pack.REFUSALS`); null: not tried
     "sdc": pa.int64(),  # id of the car that recorded the log; null without one
     **dict.fromkeys(("min_x", "min_y", "max_x", "max_y"), pa.float64()),  # of the map, in the source's coordinates
 }

@@ -41,7 +41,7 @@ EVERY_BANK: dict[str, str] = {  # the columns that a bank has by itself (catalog
     "pedestrians": "Pedestrians.",
     "cyclists": "Cyclists.",
     "findings": "Findings of the rules of quality; none where nobody judged.",
-    "packing": "What packing made of it at conversion: packed, or why not; it stays in the bank. None where nobody tried.",
+    "packing": "Result of packing at conversion: packed, or the reason for its refusal; the scene stays in the bank. None: not tried.",
     "sdc": "Id of the car that recorded the log; none without one.",
     "min_x": "West end of the map in the source's coordinates, m.",
     "min_y": "South end, m.",

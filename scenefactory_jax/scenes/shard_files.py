@@ -129,7 +129,7 @@ def _mapped(path: Path) -> pa.Buffer:
 
 
 def _require_same(shard: Shard) -> None:
-    """Refuse a file that is not what was written; it is read once in a process, as long as nobody writes to it."""
+    """Refuse a file that is not what was written; a process reads it once, and again after it was changed."""
     path = Path(shard.file)
     bank_index.require_whole(path, shard)
     state = path.stat()

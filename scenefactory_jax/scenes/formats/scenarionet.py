@@ -57,7 +57,7 @@ DATASETS = {"waymo": "WOMD", "nuscenes": "nuScenes", "nuplan": "nuPlan", "av2": 
 UNITS = {"speed_limit_mph": 1609.344 / 3600, "speed_limit_kmh": 1 / 3.6}  # in m/s
 SPEED_LIMIT_MOST = 160 / 3.6  # m/s, of any country's signs: that of the United Arab Emirates
 METADRIVE = "metadrive"  # `dataset` of its own maps
-SOLID = (LINE_UNKNOWN, 7, 8, 11, 12)  # lines that nobody crosses, and those of no known type
+SOLID = (LINE_UNKNOWN, 7, 8, 11, 12)  # lines that may not be crossed, and those of no known type
 KEPT = ("scenario_id", "source_file", "map", "date")  # of the file's metadata, where they are texts
 
 
