@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING, Any
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
     from mujoco import mjx as _mjx  # noqa: F401
 
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run.config import load
-from scenefactory_jax.run.raws import read
-from scenefactory_jax.run.sources import training as load_scenes
-from scenefactory_jax.world import Parts, assemble, make
+from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.data.loading.raw_scenes import read
+from scenefactory_jax.data.loading.scene_source import training as load_scenes
+from scenefactory_jax.env.environment import Parts, assemble, make
 
 if TYPE_CHECKING:
-    from scenefactory_jax.run.evaluate import evaluate
-    from scenefactory_jax.run.policies import load_policy
-    from scenefactory_jax.run.replay import replay
-    from scenefactory_jax.run.train import train
+    from scenefactory_jax.cli.view import replay
+    from scenefactory_jax.evaluation.protocols import evaluate
+    from scenefactory_jax.learning.policy_io import load_policy
+    from scenefactory_jax.learning.training_loop import train
 
 __version__ = "0.1.0"
 __all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_policy", "load_scenes", "make", "read", "replay"]
@@ -38,10 +38,15 @@ __all__ += ["train"]
 
 def __getattr__(name: str) -> Any:
     """What loads checkpoints and reports is imported when it is first used: that takes a second."""
-    places = {"train": "train", "evaluate": "evaluate", "replay": "replay", "load_policy": "policies"}
+    places = {
+        "train": "learning.training_loop",
+        "evaluate": "evaluation.protocols",
+        "replay": "cli.view",
+        "load_policy": "learning.policy_io",
+    }
     if name not in places:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"scenefactory_jax.run.{places[name]}"), name)
+    return getattr(importlib.import_module(f"scenefactory_jax.{places[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -14,9 +14,9 @@ from typing import NoReturn
 
 import hydra
 
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import config as configs
-from scenefactory_jax.scenes.names import for_terminal
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.safe_names import for_terminal
 
 USAGE = f"""usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--help] [--cfg job]
 
@@ -37,6 +37,16 @@ commands: {", ".join(configs.COMMANDS)}
   sysid     fit the car to a teacher  sysid=reduced|full resume=true workers=N out=FOLDER
 
 `COMMAND --help` shows the config of a command, `COMMAND --cfg job` the one that your overrides give."""
+
+
+MODULES = {
+    "train": "scenefactory_jax.learning.training_loop",
+    "evaluate": "scenefactory_jax.evaluation.protocols",
+    "replay": "scenefactory_jax.cli.view",
+    "bench": "scenefactory_jax.cli.benchmark",
+    "weather": "scenefactory_jax.cli.physics",
+    "validate": "experiments.validation.run",
+}
 
 
 def main() -> None:
@@ -77,12 +87,12 @@ def _run(command: str, arguments: Sequence[str]) -> None:
 
 def _help(command: str, settings: Sequence[str]) -> str:
     """What a command is for, and its config with the comments of its files."""
-    from scenefactory_jax.run import annotated
+    from scenefactory_jax.cli import annotated_config
 
     purpose, keys = re.findall(rf"^  {command} +(.*?) +(\S+=.*)$", USAGE, re.MULTILINE)[0]
     chosen = ["study=navigation"] if command == "study" and not any(word.startswith("study=") for word in settings) else []
     last = "KEY=VALUE on the command line sets any of these; --cfg job shows what a command line gives, --hydra-help Hydra's own flags."
-    return f"{command}: {purpose}; {keys}\n\n{annotated.write(command, *chosen, *settings)}\n\n{last}"
+    return f"{command}: {purpose}; {keys}\n\n{annotated_config.write(command, *chosen, *settings)}\n\n{last}"
 
 
 def _check(command: str, settings: Sequence[str], *, sweeps: bool) -> set[str]:
@@ -111,7 +121,7 @@ def _job(command: str, varied: set[str]):
     """What hydra calls with each job's config; `varied`: the keys in which the jobs of a sweep differ."""
 
     def job(config) -> None:
-        module = importlib.import_module(f"scenefactory_jax.run.{command}")
+        module = importlib.import_module(MODULES.get(command, f"scenefactory_jax.cli.{command}"))
         try:
             settings = configs.plain(config)
             if command == "train" and varied and settings["out"] is None:
@@ -133,9 +143,9 @@ def _job(command: str, varied: set[str]):
 
 def _trouble(error: Exception, config) -> str | None:
     """What the machine or a library lacks, in one line; imported when there is trouble."""
-    from scenefactory_jax.run import trouble
+    from scenefactory_jax.cli import error_messages
 
-    return trouble.explain(error, configs.plain(config))
+    return error_messages.explain(error, configs.plain(config))
 
 
 if __name__ == "__main__":

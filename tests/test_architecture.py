@@ -1,77 +1,104 @@
-"""The shape of the code: who may import whom, and how long a file and a function may be."""
+"""The shape of the code: which package imports which, no circles, and how long a file and a function may be."""
 
 import ast
 import re
+from collections import defaultdict
+from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
+from support.running import ROOT
 
-PACKAGE = Path(__file__).resolve().parent.parent / "scenefactory_jax"
+PACKAGE = ROOT / "scenefactory_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
-HOST_ONLY = {"hydra", "omegaconf", "os", "pathlib", "time", "logging", "matplotlib", "shutil", "datetime"}
-HOST_PARTS = ("run", "report", "scenes", "folders")
-# every package may import from the ranks below its own
-RANK = {
-    "struct": 0, "build": 0, "types": 1, "geometry": 2, "patches": 2, "rain": 2, "weather": 2, "layouts": 3, "conditions": 3, "conflict": 3,
-    "tracks": 3, "cells": 2, "kernels": 0, "road_kernel": 4, "roadside": 4, "clues": 6, "folders": 1,
-    "ends": 4, "spawn": 4, "others": 4, "facts": 5, "rewards": 5, "observations": 5, "dynamics": 5,
-    "controls": 5, "world": 6, "policy": 7, "ppo": 7, "evaluation": 7, "recording": 7, "validation": 7, "sysid": 7, "report": 8, "run": 9,
-    "adapters": 9, "__init__": 9, "__main__": 10,
-}  # fmt: skip
+LAYERS = (  # a package imports from itself and from layers before its own; packages of one layer do not import each other
+    {"core"}, {"roadgraph", "weather", "loggers"}, {"dynamics", "data"}, {"env"}, {"learning"}, {"evaluation"},
+    {"visualization", "sysid", "adapters"}, {"cli"},
+)  # fmt: skip
+AT_THE_ROOT = {"__init__.py", "__main__.py"}
+ON_DEVICE = ("roadgraph/queries.py", "roadgraph/spatial_grid.py", "roadgraph/road_kernels.py", "weather", "dynamics", "env", "learning/ppo")
+HOST_ONLY = {"os", "pathlib", "time", "logging", "matplotlib", "shutil", "datetime"}
 
 
-def part_of(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
-def imports(path: Path, *, top_level: bool = False) -> set[str]:
-    tree = ast.parse(path.read_text())
+def imported_modules(path: Path) -> set[str]:
+    """Modules of the package that a file imports, at its top or in a function, as dotted names without the package's own."""
     found = set()
-    for node in tree.body if top_level else ast.walk(tree):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] == PACKAGE.name:
+            base = node.module.partition(".")[2]
+            names = {f"{base}.{alias.name}".lstrip(".") for alias in node.names}
+            found |= {name if is_module(name) else base for name in names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[2] for alias in node.names if alias.name.startswith(f"{PACKAGE.name}.")}
+    return found - {""}
+
+
+def is_module(name: str) -> bool:
+    place = PACKAGE / name.replace(".", "/")
+    return place.with_suffix(".py").is_file() or (place / "__init__.py").is_file()
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
+
+
+def libraries(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names |= {alias.name.partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+            names.add(node.module.partition(".")[0])
+    return names
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_files_and_functions_stay_short(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= 400
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            assert node.end_lineno - node.lineno < 66, f"{path.name}:{node.lineno} {node.name} is too long"
+def test_the_root_holds_packages_alone():
+    assert {path.name for path in PACKAGE.glob("*.py")} == AT_THE_ROOT
+    folders = {path.name for path in PACKAGE.iterdir() if any(path.glob("*.py"))}
+    assert folders == set().union(*LAYERS), "every package has its layer"
 
 
-@pytest.mark.parametrize("path", [f for f in FILES if part_of(f) not in (*HOST_PARTS, "__init__", "__main__")], ids=lambda p: p.name)
-def test_core_modules_stay_off_the_host(path):
-    if path.name == "checkpoint.py":
-        return
-    used = {name.split(".")[0] for name in imports(path)}
-    assert not used & HOST_ONLY
+def test_packages_import_from_the_layers_below_their_own():
+    below = {package: set().union(*LAYERS[:depth]) for depth, layer in enumerate(LAYERS) for package in layer}
+    wrong = [
+        f"{path.relative_to(PACKAGE)} imports {name}"
+        for path in FILES
+        if path.name not in AT_THE_ROOT or path.parent != PACKAGE
+        for name in sorted(imported_modules(path))
+        if name.partition(".")[0] not in below[path.relative_to(PACKAGE).parts[0]] | {path.relative_to(PACKAGE).parts[0]}
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_downwards(path):
-    own = part_of(path)
-    for name in imports(path):
-        if not name.startswith("scenefactory_jax."):
+def test_imports_form_no_circle():
+    graph = defaultdict(set) | {module_of(path): imported_modules(path) for path in FILES}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_only_commands_use_hydra_and_print():
+    for path in FILES:
+        if path.relative_to(PACKAGE).parts[0] in ("cli", "__main__.py"):
             continue
-        other = name.split(".")[1]
-        if own == "scenes":
-            assert other in ("scenes", "types", "geometry", "struct", "build", "folders"), f"scenes imports {name}"
-        elif other in RANK and other != own:
-            assert RANK[other] <= RANK[own], f"{path.name} imports {name}"
+        assert not libraries(path) & {"hydra", "omegaconf"}, path
+        calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "print"]
+        assert not calls, f"{path} prints"
 
 
-@pytest.mark.parametrize("path", [f for f in FILES if part_of(f) != "run" and f.name != "__main__.py"], ids=lambda p: p.name)
-def test_only_run_prints(path):
-    calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "print"]
-    assert not calls
+def test_what_runs_on_the_device_stays_off_the_host():
+    for path in FILES:
+        if str(path.relative_to(PACKAGE)).startswith(ON_DEVICE):
+            assert not libraries(path) & HOST_ONLY, path
+
+
+def test_files_and_functions_stay_short():
+    for path in FILES:
+        text = path.read_text()
+        assert len(text.splitlines()) <= 400, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                assert node.end_lineno - node.lineno < 66, f"{path}:{node.lineno} {node.name} is too long"
 
 
 def test_sources_are_ones_that_a_user_has():
     """Numbers cite the paper or its code, not notes that are not published."""
-    pages = [*FILES, *(PACKAGE.parent / "conf").rglob("*.yaml"), *(PACKAGE.parent / "docs").rglob("*.md")]
+    pages = [*FILES, *(ROOT / "conf").rglob("*.yaml"), *(ROOT / "docs").rglob("*.md")]
     assert not [path for path in pages if re.search(r"facts? sheet|\bfacts \d", path.read_text(), re.IGNORECASE)]

@@ -1,7 +1,7 @@
-"""What moves and renames must not change: digests of steps, training, scenes and an evaluation (tests/digests.json)."""
+"""What moves and renames must not change: digests of steps, training, scenes and an evaluation (tests/support/digests.json)."""
 
-import digests
 import pytest
+from support import digests
 
 SLOW = ("environment others", "environment weather", "environment by mjx.step", "training quick")  # a program each
 
@@ -11,7 +11,9 @@ SLOW = ("environment others", "environment weather", "environment by mjx.step", 
 )  # fmt: skip
 def test_numbers_are_those_of_the_record(name):
     found = digests.digest(digests.CASES[name]())
-    assert digests.is_same(name, found), f"{name}: {found}; recorded {digests.record()[name]}. Meant? python tests/digests.py --record"
+    assert digests.is_same(name, found), (
+        f"{name}: {found}; recorded {digests.record()[name]}. Meant? python tests/support/digests.py --record"
+    )
 
 
 def test_a_digest_sees_numbers_and_no_names():

@@ -29,7 +29,7 @@ Code in the style of purejaxrl, with one `jit` around everything, needs no adapt
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.types import Observation, Rows
+from scenefactory_jax.core.types import Observation, Rows
 
 
 def flat(observation: Observation) -> Float[Array, "..."]:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from scenefactory_jax.observations import ANY, Group
-from scenefactory_jax.struct import replace
-from scenefactory_jax.types import Observation, Rows
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import Observation, Rows
+from scenefactory_jax.env.observations import ANY, Group
 
 LIMIT = 10.0  # of its scale, at which a column without a bound of its own is clipped
 

@@ -30,10 +30,10 @@ from jaxtyping import Array
 
 from scenefactory_jax.adapters import episodes
 from scenefactory_jax.adapters.episodes import Episode
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.ends import EVENTS
-from scenefactory_jax.run import sources
-from scenefactory_jax.struct import choose
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import choose
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.env.termination import EVENTS
 
 
 class Drive(Env):
@@ -49,7 +49,7 @@ class Drive(Env):
     """
 
     def __init__(
-        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=True)
 

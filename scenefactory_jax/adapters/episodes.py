@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax import world
 from scenefactory_jax.adapters import bounds, flat
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.ends import EVENTS
-from scenefactory_jax.run import config as configs
-from scenefactory_jax.run import sources
-from scenefactory_jax.struct import struct
-from scenefactory_jax.types import Env, Scene, State
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import struct
+from scenefactory_jax.core.types import Env, Scene, State
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.env import environment
+from scenefactory_jax.env.termination import EVENTS
 
 ALONE = "scenes.pack.agents=1"
 ANY = -1  # in place of a scene's index: draw one
@@ -70,7 +70,7 @@ class Moment:
 
 
 def pool(
-    config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: sources.Scenes | None, *, alone: bool, lives: bool = False
+    config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: scene_source.Scenes | None, *, alone: bool, lives: bool = False
 ) -> Pool:
     """The pool of a config.
 
@@ -92,10 +92,10 @@ def pool(
         raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; here a car that ended stays so: set it to null")
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
-    sources.use_compilation_cache()
-    parts = world.parts_of(config)
-    env = world.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
-    found = sources.training(config["scenes"]) if scenes is None else scenes
+    scene_source.use_compilation_cache()
+    parts = environment.parts_of(config)
+    env = environment.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
+    found = scene_source.training(config["scenes"]) if scenes is None else scenes
     held = jax.device_put(found.scene)
     slots = held.agents.present.shape[1]
     if alone and slots != 1:
@@ -106,7 +106,7 @@ def pool(
     low, high = bounds.flat_bounds(parts.groups, seen)
     moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(moment.terms))
-    steps, step_hz = world.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
+    steps, step_hz = environment.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
     return Pool(env, held, found.names, slots, low, high, terms, steps, step_hz)
 
 
@@ -139,14 +139,14 @@ def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
     control = lambda state: env.transition(scene, state, action)  # noqa: E731
-    state, _, outcome, _ = world.act(control, episode.state, hold=env.hold)
+    state, _, outcome, _ = environment.act(control, episode.state, hold=env.hold)
     moment = Moment(
         observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
         events=vars(outcome.events),
         terminated=outcome.done,
-        truncated=world.out_of_time(outcome, episode.state.active),
+        truncated=environment.out_of_time(outcome, episode.state.active),
         active=state.active,
         over=outcome.over,
     )

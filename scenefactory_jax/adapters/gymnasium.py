@@ -19,7 +19,7 @@ import numpy as np
 
 from scenefactory_jax.adapters import episodes, pictures
 from scenefactory_jax.adapters.episodes import Episode
-from scenefactory_jax.run import sources
+from scenefactory_jax.data.loading import scene_source
 
 try:
     import gymnasium  # an optional dependency  # pyright: ignore[reportMissingImports]
@@ -53,7 +53,7 @@ class Drive(gymnasium.Env):
         self,
         config: Mapping[str, Any] | None = None,
         overrides: Sequence[str] = (),
-        scenes: sources.Scenes | None = None,
+        scenes: scene_source.Scenes | None = None,
         render_mode: str | None = None,
     ):
         pictures.check_mode(render_mode)

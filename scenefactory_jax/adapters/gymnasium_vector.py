@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from scenefactory_jax.adapters import episodes, pictures
 from scenefactory_jax.adapters.episodes import Episode
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import sources
-from scenefactory_jax.struct import choose
-from scenefactory_jax.types import Env, Scene
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import choose
+from scenefactory_jax.core.types import Env, Scene
+from scenefactory_jax.data.loading import scene_source
 
 
 class DriveVector(VectorEnv):
@@ -47,7 +47,7 @@ class DriveVector(VectorEnv):
         num_envs: int = 1,
         config: Mapping[str, Any] | None = None,
         overrides: Sequence[str] = (),
-        scenes: sources.Scenes | None = None,
+        scenes: scene_source.Scenes | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         arrays: str = "numpy",
         render_mode: str | None = None,

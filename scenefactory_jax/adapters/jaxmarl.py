@@ -26,8 +26,8 @@ from jaxtyping import Array
 
 from scenefactory_jax.adapters import episodes
 from scenefactory_jax.adapters.episodes import Episode, Moment
-from scenefactory_jax.run import sources
-from scenefactory_jax.types import Scene
+from scenefactory_jax.core.types import Scene
+from scenefactory_jax.data.loading import scene_source
 
 try:
     # its import leaves the process with other output streams than it had; the end of a redirection puts them back
@@ -53,7 +53,7 @@ class Drive(MultiAgentEnv):
     """
 
     def __init__(
-        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=False, lives=True)
         super().__init__(num_agents=self.pool.agents)

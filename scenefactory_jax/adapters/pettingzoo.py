@@ -19,8 +19,8 @@ import numpy as np
 
 from scenefactory_jax.adapters import episodes
 from scenefactory_jax.adapters.episodes import Episode
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import sources
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.data.loading import scene_source
 
 try:
     from gymnasium import spaces  # optional dependencies  # pyright: ignore[reportMissingImports]
@@ -43,7 +43,7 @@ class Drive(ParallelEnv):
     """
 
     def __init__(
-        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: sources.Scenes | None = None
+        self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
         self.pool = episodes.pool(config, overrides, scenes, alone=False)
         self.names, self.render_mode = self.pool.names, None

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.adapters import episodes
-from scenefactory_jax.build import ConfigError
-from scenefactory_jax.run import sources
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.data.loading import scene_source
 
 try:
     from gymnasium.vector import AutoresetMode  # optional dependencies  # pyright: ignore[reportMissingImports]
@@ -49,7 +49,7 @@ class Drive(VecEnv):
         num_envs: int = 1,
         config: Mapping[str, Any] | None = None,
         overrides: Sequence[str] = (),
-        scenes: sources.Scenes | None = None,
+        scenes: scene_source.Scenes | None = None,
         render_mode: str | None = None,
     ):
         self.worlds = DriveVector(num_envs, config, overrides, scenes, AutoresetMode.SAME_STEP, render_mode=render_mode)

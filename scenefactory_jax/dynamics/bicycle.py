@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.build import build, check_number, check_numbers
-from scenefactory_jax.dynamics.car import GRAVITY
-from scenefactory_jax.dynamics.contact import Contact, boxes_of, later
-from scenefactory_jax.geometry import heading, norm, wrap_angle
-from scenefactory_jax.struct import choose, replace, struct
-from scenefactory_jax.types import Dynamics, Motion, Scene
+from scenefactory_jax.core.geometry import heading, norm, wrap_angle
+from scenefactory_jax.core.instantiate import build, check_number, check_numbers
+from scenefactory_jax.core.pytree import choose, replace, struct
+from scenefactory_jax.core.types import Dynamics, Motion, Scene
+from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
+from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
 
 
 @struct
@@ -79,7 +79,7 @@ def make(
     pushes = {"acceleration": acceleration, "deceleration": deceleration, "rolling": rolling, "drag": drag, "air_drag": air_drag}
     check_numbers({"rear_length": rear_length, "centre_height": centre_height, **pushes}, where="dynamics", least=0.0)
     entry = {**contact, "_target_": "make"}
-    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.contact", where="dynamics.contact", height=math.inf)()
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from scenefactory_jax.build import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, build
 
 SURFACES = ("dry", "wet", "gravel")  # index = surface id
 TRAINING = (

@@ -1,0 +1,338 @@
+"""The same task without vectorising: cars in MuJoCo's C engine, loops over worlds and agents in Python.
+
+What a careful researcher would write for one machine without an accelerator, as the yardstick of a speed-up: one world after the other,
+each with all its cars in one C model (`oracle.meeting`, with the solver settings of the config), and for every agent in turn the
+observation, facts, reward, ends and both towers of the policy in numpy (`baseline_agent`). Work that a loop has no need for is left out:
+padding, absent slots, facts that no reward reads, and friction where the weather does not change.
+
+It acts, as a rollout does, with actions drawn as PPO draws them. Learning is not in it: a learner that goes through the agents one by one
+would only make the ratio larger.
+
+Differences from the environment on the device:
+- The engine has double precision and stops its solver by tolerance, with the config's iterations as the limit.
+- Contacts between cars are MuJoCo's box-box contacts with the spring's law (`oracle.meeting`). Several at once on one car do not share
+  their strength, as `contact.forces` lets them.
+- A car that rolls over sinks through the road, since only tyres touch it; the event `crashed` comes all the same.
+- A number that is not finite breaks its whole world, not one car: all its agents end with `fault`.
+- Finished cars hang in the air off stage, where nothing touches them.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from experiments.unvectorised_baseline import baseline_agent as one
+from experiments.unvectorised_baseline.baseline_agent import Agent, Crowd, Observation, Place
+from experiments.validation import engines
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.types import Scene
+from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.env import environment as device
+
+PHASES = ("policy", "physics", "facts + rewards + ends", "restart", "observation")
+
+
+class Engine(NamedTuple):
+    """Cars of the C engine."""
+
+    rig: Callable[[int], mujoco_c.Rig]  # of so many cars; compiled once for each number
+    still: Float[np.ndarray, "17"]  # qpos at rest
+    substeps: int
+    apart_m: float  # between cars off stage, and of them from the road: the side of a world's square
+
+
+class Task(NamedTuple):
+    """The parts of a config bound to their numbers."""
+
+    engine: Engine
+    draw: Callable[[PRNGKeyArray, Scene], tuple[Any, Any, Any]]  # -> starts, weather, friction; compiled
+    groups: Mapping[str, Callable[..., np.ndarray]]
+    measure: Callable[..., one.Facts]
+    judge: Callable[[Agent, one.Facts], str | None]
+    terms: Sequence[tuple[float, Callable[..., float]]]
+    circles: Mapping[str, float]
+    episode_steps: int
+
+
+@dataclasses.dataclass
+class World:
+    """One world in the middle of an episode."""
+
+    scene: Scene  # numpy leaves
+    place: Place
+    rig: mujoco_c.Rig
+    agents: list[Agent]  # of the slots that are present, as the rig's cars
+    mu: float  # friction under every wheel
+    step: int = 0
+
+
+def measure(
+    config: Mapping[str, Any], scenes: Sequence[Scene], parameters: Any, *, steps: int, repeats: int, seed: int
+) -> dict[str, Any]:  # fmt: skip
+    """Time the loop on a few worlds; one repeat goes unmeasured before the others.
+
+    Args:
+        config: as `bench` has it (`load("bench", ...)`).
+        scenes: one world each, not stacked.
+        parameters: of the policy, as `Policy.init` makes them.
+        steps: control steps of every world in a repeat.
+        repeats: timed ones.
+
+    Returns:
+        Control steps of spawned agents a second (median, least and most), the share of them that were active, milliseconds of each phase
+        and of the whole in a control step of one world (medians), cars a world (mean), and worlds, steps and repeats.
+
+    Raises:
+        ConfigError: a part that exists for the vectorised environment only, by name.
+    """
+    if not config["policy"]["_target_"].endswith("late_fusion.make"):
+        raise ConfigError(f"policy._target_: {config['policy']['_target_']}; the baseline has late_fusion")
+    task = make(config)
+    normal = functools.partial(np.random.default_rng(seed).standard_normal, dtype=np.float32)
+    act = actor(config["policy"]["activation"], parameters, normal)
+    keys = (jax.random.fold_in(jax.random.key(seed), count) for count in itertools.count())
+    with jax.default_device(jax.devices("cpu")[0]):
+        worlds = [start(task, scene, next(keys)) for scene in scenes]
+        rows = [_repeat(task, worlds, act, keys, steps) for _ in range(repeats + 1)][1:]
+    per_s = [row["spawned"] / row["seconds"] for row in rows]
+    control_steps = steps * len(worlds)
+    names = (*PHASES, "seconds")
+    phases = {name: 1e3 * statistics.median(row[name] for row in rows) / control_steps for name in names}
+    return {
+        "agent_steps_per_s": statistics.median(per_s),
+        "agent_steps_per_s_range": [min(per_s), max(per_s)],
+        "active_share": sum(row["active"] for row in rows) / sum(row["spawned"] for row in rows),
+        "phase_ms_a_control_step": {("whole" if name == "seconds" else name): value for name, value in phases.items()},
+        "cars": statistics.mean(row["spawned"] for row in rows) / control_steps,
+        "worlds": len(worlds),
+        "steps": steps,
+        "repeats": repeats,
+    }
+
+
+def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGKeyArray], steps: int) -> dict[str, float]:
+    """Drive every world on; seconds of each phase and of the whole, and steps of agents that were spawned and active."""
+    row: dict[str, float] = {name: 0.0 for name in (*PHASES, "spawned", "active")}
+
+    @contextlib.contextmanager
+    def timed(name: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        row[name] += time.perf_counter() - begun
+
+    begun = time.perf_counter()
+    seen = [observe(task, world) for world in worlds]
+    row["observation"] = time.perf_counter() - begun
+    for _, index in itertools.product(range(steps), range(len(worlds))):
+        world = worlds[index]
+        row["spawned"] += len(world.agents)
+        row["active"] += sum(agent.active for agent in world.agents)
+        with timed("policy"):
+            actions = [None if observation is None else act(observation)[0] for observation in seen[index]]
+        before = [agent.position for agent in world.agents]
+        with timed("physics"):
+            drive(task.engine, world, actions)
+        with timed("facts + rewards + ends"):
+            _, over = settle(task, world, before)
+        with timed("restart"):
+            if over:
+                worlds[index] = start(task, world.scene, next(keys))
+        with timed("observation"):
+            seen[index] = observe(task, worlds[index])
+    return {**row, "seconds": time.perf_counter() - begun}
+
+
+def make(config: Mapping[str, Any]) -> Task:
+    """The parts of a config that has timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
+
+    Raises:
+        ConfigError: a part that exists for the vectorised environment only, by name.
+    """
+    _refuse(config)
+    bound = functools.partial(build, builtins=one)
+    entries = {name: entry for name, entry in config["observe"].items() if entry is not None}
+    groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
+    terms = []
+    for name, entry in config["reward"].items():
+        if entry is not None:
+            numbers = {key: value for key, value in entry.items() if key != "weight"}
+            terms.append((entry["weight"], bound(numbers, where=f"reward.{name}")))
+    parts = device.parts_of(config)
+    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
+
+    def draw(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Any, Any]:
+        agents_key, weather_key, _ = jax.random.split(key, 3)  # the draws of `world.make`
+        weather = parts.draw_weather(weather_key, scene)
+        return parts.draw_agents(agents_key, scene), weather, grip(weather, jnp.zeros((1, 2)), jnp.zeros(1))[0]
+
+    return Task(
+        engine=_engine(config),
+        draw=jax.jit(draw),
+        groups=groups,
+        measure=bound({"_target_": "measure", **_without_kernels(config["facts"])}, where="facts"),
+        judge=bound({"_target_": "judge", **config["ends"]}, where="ends"),
+        terms=terms,
+        circles=config["facts"]["circles"],
+        episode_steps=parts.episode_steps,
+    )
+
+
+def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of the vectorised environment for its twin here, which has nothing to choose."""
+    return {key: value for key, value in entry.items() if key != "kernels"}
+
+
+def _refuse(config: Mapping[str, Any]) -> None:
+    """Name what only the vectorised environment has."""
+    dynamics, weather = config["dynamics"], config["weather"]
+    if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
+        raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
+    if config["controls"] != {"command": {"_target_": "pedals"}, "every": 1}:
+        raise ConfigError(f"controls: {config['controls']}; the baseline has pedals, read at every control step")
+    if config["others"]["_target_"] != "ignore":
+        raise ConfigError(f"others._target_: {config['others']['_target_']}; the baseline has ignore")
+    if config["spawn"]["respawn_clear_m"] is not None:
+        raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; the baseline has null")
+    if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":
+        raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
+    for group in ("observe", "reward"):
+        for name, entry in config[group].items():
+            if entry is not None and "." in entry["_target_"]:
+                raise ConfigError(f"{group}.{name}._target_: {entry['_target_']}; the baseline has built-in ones")
+
+
+def _engine(config: Mapping[str, Any]) -> Engine:
+    """The articulated car with Newton's method; `solve.newton` is the same for one car on the device."""
+    car, solver = cars.numbers(config["dynamics"])
+    newton = dataclasses.replace(solver, algorithm="Newton")
+    timing = config["timing"]
+    limits = {"physics_dt": 1.0 / timing["physics_hz"], "iterations": solver.iterations, "line_search": solver.line_search}
+    # the spring law of two cars in MuJoCo's terms, with the impedance that validation has found to be it
+    impedance = configs.load("validate")["validation"]["encounters"]["impedances"]["spring"]
+    touch = engines.touch(config["dynamics"], impedance=impedance)
+    alone = mujoco_c.single(car, newton, **limits)
+    return Engine(
+        rig=functools.cache(lambda count: mujoco_c.meeting(car, newton, touch, count=count, **limits)),
+        still=cars.rest(alone.model, car),
+        substeps=round(timing["physics_hz"] / timing["control_hz"]),
+        apart_m=config["facts"]["box_m"],
+    )
+
+
+def start(task: Task, scene: Scene, key: PRNGKeyArray) -> World:
+    """A fresh episode; the starts and the weather are those that `Env.start` draws from the same key."""
+    scene = jax.tree.map(np.asarray, scene)
+    drawn, weather, mu = jax.tree.map(np.asarray, task.draw(key, scene))
+    present = np.flatnonzero(drawn.present)
+    place = one.place_of(scene, float(weather.film_mm), int(weather.surface))
+    rig = task.engine.rig(len(present))
+    agents = [
+        Agent(
+            start=drawn.position[slot],
+            goal=drawn.goal[slot],
+            size=drawn.size[slot],
+            route=float(drawn.route[slot]),
+            position=drawn.position[slot],
+            elevation=float(task.engine.still[2]),
+            velocity=np.zeros(2, np.float32),
+            yaw=float(drawn.yaw[slot]),
+            upright=1.0,
+        )
+        for slot in present
+    ]
+    fresh = World(scene, place, rig, agents, float(mu))
+    _place(task.engine, fresh, drawn.speed[present])
+    return fresh
+
+
+def _place(engine: Engine, world: World, speed: Float[np.ndarray, " N"]) -> None:
+    position, yaw = np.array([agent.position for agent in world.agents]), np.array([agent.yaw for agent in world.agents])
+    mujoco_c.place(world.rig, engine.still, position.reshape(-1, 2), yaw, speed)
+    for row, agent in enumerate(world.agents):
+        _read(world.rig, row, agent, 0.0)
+
+
+def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"] | None]) -> None:
+    """One control step of all cars: throttle, steer and brake in [-1, 1] of each, None for those off stage."""
+    rig = world.rig
+    control = np.zeros((len(actions), 3))
+    for row, action in enumerate(actions):
+        if action is not None:
+            control[row] = np.clip(action, -1.0, 1.0)
+        if not world.agents[row].active:
+            rig.qpos[row], rig.qvel[row] = engine.still, 0.0
+            rig.qpos[row, :3] = engine.apart_m * (row + 1), 0.0, engine.apart_m
+    force = mujoco_c.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
+    if mujoco_c.broken(rig):
+        rig.qpos[:] = np.nan
+    world.step += 1
+    for row, agent in enumerate(world.agents):
+        if agent.active:
+            _read(rig, row, agent, force[row])
+            agent.age += 1
+
+
+def _read(rig: mujoco_c.Rig, row: int, agent: Agent, contact_force: float) -> None:
+    """What the rest of the world may know of a car of the rig."""
+    x, y, z, qw, qx, qy, qz = (float(value) for value in rig.qpos[row, :7])
+    agent.position, agent.elevation = np.array([x, y], np.float32), z
+    agent.velocity = rig.qvel[row, :2].astype(np.float32)
+    agent.yaw = float(np.arctan2(2 * (qx * qy + qw * qz), 1 - 2 * (qy * qy + qz * qz)))
+    agent.upright = 1 - 2 * (qx * qx + qy * qy)
+    agent.contact_force = float(contact_force)
+
+
+def observe(task: Task, world: World) -> list[Observation | None]:
+    """What each agent sees; None for those off stage."""
+    crowd = one.gather(world.agents, circles=task.circles)
+    return [look(task, world.place, agent, crowd) if agent.active else None for agent in world.agents]
+
+
+def look(task: Task, place: Place, agent: Agent, crowd: Crowd) -> Observation:
+    """All groups of one agent."""
+    return {name: group(place, agent, crowd) for name, group in task.groups.items()}
+
+
+def settle(task: Task, world: World, before: Sequence[Float[np.ndarray, "2"]]) -> tuple[list[float], bool]:
+    """Rewards of the step from the positions `before`, who has left the stage, and whether the world is over."""
+    crowd = one.gather(world.agents, circles=task.circles)
+    rewards = []
+    for agent, position in zip(world.agents, before, strict=True):
+        if not agent.active:
+            rewards.append(0.0)
+            continue
+        facts = task.measure(world.place, agent, crowd, position)
+        new = task.judge(agent, facts)
+        rewards.append(sum(weight * term(facts, new) for weight, term in task.terms))
+    return rewards, world.step >= task.episode_steps or not any(agent.active for agent in world.agents)
+
+
+def actor(
+    activation: str, parameters: Any, normal: Callable[[int], np.ndarray]
+) -> Callable[[Observation], tuple[np.ndarray, float]]:  # fmt: skip
+    """(one agent's observation) -> its action, drawn as PPO draws it, and the critic's value; float32 whatever the config's dtype.
+
+    Args:
+        normal: draws so many standard normal numbers.
+    """
+    towers = jax.tree.map(np.asarray, parameters)["params"]
+    spread = np.exp(towers["log_std"])
+
+    def act(observation: Observation) -> tuple[np.ndarray, float]:
+        mean = one.forward(towers["actor"], observation, activation=activation)
+        value = one.forward(towers["critic"], observation, activation=activation)
+        return mean + spread * normal(len(mean)), float(value[0])
+
+    return act

@@ -1,0 +1,102 @@
+"""`validate`: the physics against the C engine and against laws of motion, and a report of it.
+
+Every part writes its numbers to `out/results/PART.json` as soon as they are there; `validation.md` and its figures are made of these files
+alone, so a part can be measured again, or elsewhere, without the others.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from experiments.validation import measurements, target_check, task_experiments
+from experiments.validation import validation_report as report
+from experiments.validation.measurements import Spread
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.cli import schema
+from scenefactory_jax.core import result_file
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.parallel.process_pool import spreading
+from scenefactory_jax.data.loading import scene_source
+
+DIGITS = 5  # more than anybody reads
+
+
+class Part(NamedTuple):
+    """One part of the command: what computes it, and the keys of the config that it reads, dotted."""
+
+    run: Callable[[Mapping[str, Any], Spread], dict[str, Any]]
+    reads: tuple[str, ...]
+
+
+SHARED = ("validation.seed", "validation.reference", "validation.road", "validation.bound", "validation.worst", "timing", "dynamics")
+PARTS = {
+    "drives": Part(measurements.drives, (*SHARED, "validation.drives")),
+    "settings": Part(measurements.trials, (*SHARED, "validation.drives", "validation.settings")),
+    "encounters": Part(measurements.encounters, (*SHARED, "validation.encounters")),
+    "laws": Part(measurements.laws_of_motion, ("validation.laws", "validation.reference", "timing", "dynamics", "backends", "weather")),
+    "extremes": Part(measurements.whole_episodes, ("validation.extremes", "timing", "dynamics")),
+    "faults": Part(task_experiments.faults, ("validation.seed", "validation.faults")),
+    "costs": Part(task_experiments.costs, ("validation.seed", "validation.costs")),
+}
+
+
+def validate(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Run the parts of a config (`load("validate", "validation=full", "parts=[laws]")`) and write the report of all results in `out`.
+
+    Returns:
+        The results by part, as they were written.
+
+    Raises:
+        ConfigError: an unknown part, or a number that does not fit, by name.
+    """
+    schema.check(config, schema.VALIDATE)
+    if unknown := [name for name in config["parts"] if name not in PARTS]:
+        raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
+    scene_source.use_compilation_cache()
+    out = Path(config["out"])
+    (out / "results").mkdir(parents=True, exist_ok=True)
+    with spreading(config["workers"]) as spread:
+        for name in (name for name in PARTS if name in config["parts"]):
+            _measure(name, config, out, spread)
+    found, targets = read(out), config["validation"]["targets"]
+    if found:
+        print(f"{report.write(out, found, targets)}\n{target_check.text(target_check.of(found, targets))}", flush=True)
+    return found
+
+
+def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) -> None:
+    """One part, unless its result is there already."""
+    path, part = out / "results" / f"{name}.json", PARTS[name]
+    read = subset(config, part.reads)
+    made = {"settings": result_file.digest(read), "versions": configs.versions()}
+    if config["resume"] and path.is_file():
+        before = result_file.read(path)
+        if all(before[key] == value for key, value in made.items()):
+            print(f"{name}: kept", flush=True)
+            return
+    begun = time.perf_counter()
+    print(f"{name} ...", flush=True)
+    result = part.run(read, spread)
+    seconds = time.perf_counter() - begun
+    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": configs.command("validate"), "result": result}
+    result_file.write(path, whole, digits=DIGITS)
+    print(f"{name}: {seconds:.0f} s", flush=True)
+
+
+def read(out: Path) -> dict[str, Any]:
+    """The results in a folder by part, in the order of `PARTS`; others that lie there follow."""
+    files = {path.stem: path for path in sorted((out / "results").glob("*.json"))}
+    return {name: result_file.read(files[name]) for name in (*PARTS, *sorted(set(files) - set(PARTS))) if name in files}
+
+
+def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
+    """The parts of a config that these dotted keys name, and nothing else."""
+    found: dict[str, Any] = {}
+    for place in places:
+        *parents, last = place.split(".")
+        source, target = config, found
+        for name in parents:
+            source, target = source[name], target.setdefault(name, {})
+        target[last] = source[last]
+    return found

@@ -1,0 +1,108 @@
+"""A command's config as YAML with the comments of the files that it is composed of, for `COMMAND --help`."""
+
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scenefactory_jax.cli import hydra_config as configs
+
+WIDTH = 140  # a comment that would reach farther stands above its line
+
+Place = tuple[str, ...]  # of a key, from the top level down
+
+
+def write(command: str, *overrides: str) -> str:
+    """The composed config as text, each key with its comment, each group with the options that it has.
+
+    Raises:
+        ConfigError: see `config.load`.
+    """
+    composed, choices = configs.load_with_choices(command, *overrides)
+    comments: dict[Place, str] = {}
+    for file, place in _files(command, choices):
+        comments |= _comments(file.read_text(), place)
+    options = {_place(group): (group.partition("@")[0], chosen) for group, chosen in choices.items()}
+    return "\n".join(_lines(composed, (), comments, options))
+
+
+def _place(group: str) -> Place:
+    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/fleet`."""
+    name, _, package = group.partition("@")
+    return tuple((package or name.replace("/", ".")).split("."))
+
+
+def _files(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[Path, Place]]:
+    """The files that a config is composed of and where their keys lie, those that others build on first."""
+    root = configs.folder()
+    yield from _with_bases(root / f"{command}.yaml", ())
+    for group, chosen in choices.items():
+        for option in chosen if isinstance(chosen, list) else [chosen]:
+            yield from _with_bases(root / group.partition("@")[0] / f"{option}.yaml", _place(group))
+
+
+def _with_bases(file: Path, place: Place) -> Iterator[tuple[Path, Place]]:
+    """A file after those of its own folder that it builds on (`base`, `failures@evaluation.failures`)."""
+    if not file.is_file():  # of a folder of the user's own, or none chosen
+        return
+    text = file.read_text()
+    for name in (yaml.safe_load(text) or {}).get("defaults", []):
+        base, _, package = name.partition("@") if isinstance(name, str) else ("_self_", "", "")
+        if base != "_self_":
+            yield from _with_bases(file.parent / f"{base}.yaml", (*place, *package.split(".")) if package else place)
+    yield file, () if "@package _global_" in text else place
+
+
+def _comments(text: str, place: Place) -> dict[Place, str]:
+    """Key -> the comment behind it; the comment at the head of the file belongs to the group."""
+    lines, found = text.splitlines(), dict[Place, str]()
+    head = [line.lstrip("# ") for line in lines[: next((i for i, line in enumerate(lines) if not line.startswith("#")), 0)]]
+    if place and (told := " ".join(line for line in head if not line.startswith("@package"))):
+        found[place] = told
+
+    def visit(node: yaml.Node | None, place: Place) -> None:
+        if not isinstance(node, yaml.MappingNode):
+            return
+        for key, value in node.value:
+            last = key if isinstance(value, yaml.MappingNode) and not value.flow_style else value
+            behind = lines[last.end_mark.line][last.end_mark.column :] if last.end_mark.line < len(lines) else ""
+            if told := re.search(r"#\s*(.*)", behind):
+                found[(*place, key.value)] = told.group(1)
+            if last is key:  # what stands in braces shares one comment
+                visit(value, (*place, key.value))
+
+    visit(yaml.compose(text), place)
+    return found
+
+
+def _lines(node: Mapping[str, Any], place: Place, comments: Mapping[Place, str], options: Mapping[Place, tuple[str, Any]]) -> Iterator[str]:
+    """One line for each value; a mapping's keys stand below its own."""
+    indent = "  " * len(place)
+    for key, value in node.items():
+        here = (*place, str(key))
+        told = [comments[here]] if here in comments else []
+        if here in options:
+            told.insert(0, _options(*options[here]))
+        nested = isinstance(value, Mapping) and bool(value)
+        line = f"{indent}{key}:" if nested else f"{indent}{key}: {_plain(value)}"
+        comment = f"# {' '.join(told)}" if told else ""
+        if len(line) + len(comment) < WIDTH:
+            yield f"{line} {comment}".rstrip()
+        else:
+            yield from textwrap.wrap(comment, WIDTH, initial_indent=indent, subsequent_indent=f"{indent}# ", break_on_hyphens=False)
+            yield line
+        if nested:
+            yield from _lines(value, here, comments, options)
+
+
+def _options(group: str, chosen: Any) -> str:
+    """What a group is set to, and what else there is."""
+    others = [file.stem for file in sorted((configs.folder() / group).glob("*.yaml")) if file.stem != chosen]
+    return f"{group}={chosen or 'null'}{'; or ' if others else ''}{', '.join(others)}."
+
+
+def _plain(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000).strip().removesuffix("\n...")

@@ -1,0 +1,70 @@
+"""Which functions the config in a folder may name.
+
+A config entry names a function by `_target_`, which is imported and called. In the config of a run or a policy, that may be code of the
+person who made the folder. Such a config may name parts of the package; it may name other functions only with `trust`. What is typed on the
+command line, and the package's own `conf/`, is not checked.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from scenefactory_jax.core.instantiate import ConfigError
+
+PACKAGE = "scenefactory_jax"
+# Modules and packages that hold parts of a run. None of them runs programs, imports by a name that is given to it, or writes files
+PARTS = ("dynamics", "weather", "loggers", "env", "learning.networks", "learning.ppo", "evaluation.planners")
+PARTS += ("data.formats", "data.packing", "data.generators", "data.loading.samplers")
+SHOWN = 3  # targets in a message
+
+
+def check(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
+    """Refuse a config of a folder that names code outside of the package; with `trust`, print what it names instead.
+
+    Raises:
+        ConfigError: naming the file, the key and the target.
+    """
+    if not (found := outside(config)):
+        return
+    if trust:
+        print(f"{file}: trusted, and runs {', '.join(f'{target} ({place})' for place, target in found.items())}", flush=True)
+        return
+    told = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
+    more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    raise ConfigError(
+        f"{file}: {told}{more}: outside of {PACKAGE}, so loading it would run other code;"
+        " read that code first, then allow it: trust=true (in Python trust=True)"
+    )
+
+
+def outside(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Key -> target, for each `_target_` at any depth that is no part of the package.
+
+    A name without a dot is one: `build.find` looks it up in a module of the package.
+    """
+    found: dict[str, Any] = {}
+    todo: list[tuple[str, Any]] = [("", config)]
+    met: set[int] = set()  # YAML may name one mapping in several places, or within itself
+    for place, node in todo:
+        pairs = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, (list, tuple)) else ()
+        if id(node) in met:
+            continue
+        met.add(id(node))
+        for key, value in pairs:
+            where = f"{place}.{_shown(key)}" if place else _shown(key)
+            if key == "_target_" and not _is_part(value):
+                found[where] = value
+            todo.append((where, value))
+    return found
+
+
+def _is_part(target: Any) -> bool:
+    if not isinstance(target, str):
+        return False
+    module = target.rpartition(".")[0]
+    return not module or any(f"{module}.".startswith(f"{PACKAGE}.{part}.") for part in PARTS)
+
+
+def _shown(key: Any) -> str:
+    """A key that cannot steer the terminal."""
+    return str(key) if str(key).isprintable() else repr(key)

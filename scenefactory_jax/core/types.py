@@ -1,0 +1,310 @@
+"""Every type that crosses a module border.
+
+Axes: `A` agent slots, `O` others on the road, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written
+for one world and `jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from
+world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args
+
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+
+from scenefactory_jax.core.pytree import static, struct
+
+SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
+
+RoadUser = Literal["vehicle", "pedestrian", "cyclist", "other"]
+ROAD_USERS: tuple[RoadUser, ...] = get_args(RoadUser)  # the order of `Tracks.kind`
+
+# WOMD map element ids: the `kind` of a road segment (Waymo Open Motion Dataset, map.proto and GPUDrive's MapElementIds)
+LANE_FREEWAY, LANE_STREET, LANE_BIKE = 1, 2, 3
+LINES = tuple(range(6, 14))
+EDGE_BOUNDARY, EDGE_MEDIAN = 15, 16
+STOP_SIGN, CROSSWALK, SPEED_BUMP, DRIVEWAY = 17, 18, 19, 20
+DRIVABLE = (LANE_FREEWAY, LANE_STREET)
+POLYGONS = (CROSSWALK, SPEED_BUMP, DRIVEWAY)
+EDGES = (EDGE_BOUNDARY, EDGE_MEDIAN)
+
+
+@struct
+class Road:
+    """Road segments in storage order: kind ascending, then polyline order, then along the polyline."""
+
+    midpoint: Float[Array, "P 2"]
+    direction: Float[Array, "P 2"]  # unit, from the first to the second point
+    half_length: Float[Array, " P"]
+    kind: Int[Array, " P"]
+    polyline: Int[Array, " P"]  # index into RawScene.roads
+    arc: Float[Array, " P"]  # arc length along the polyline at the midpoint
+    valid: Bool[Array, " P"]
+
+
+@struct
+class Agents:
+    """Where the cars of one episode start and what they must reach."""
+
+    position: Float[Array, "A 2"]
+    yaw: Float[Array, " A"]
+    speed: Float[Array, " A"]
+    size: Float[Array, "A 2"]  # length, width
+    goal: Float[Array, "A 2"]
+    route: Float[Array, " A"]  # length of the way from start to goal
+    present: Bool[Array, " A"]
+
+
+@struct
+class Log:
+    """What the cars did in the recording, resampled to nothing: the source's own time step."""
+
+    position: Float[Array, "A L 2"]
+    yaw: Float[Array, "A L"]
+    velocity: Float[Array, "A L 2"]
+    valid: Bool[Array, "A L"]
+    dt: Float[Array, ""]
+
+
+@struct
+class Tracks:
+    """What everybody else on the road did in the recording: who was there and is no agent, at the steps of `Log`."""
+
+    position: Float[Array, "O L 2"]
+    yaw: Float[Array, "O L"]
+    velocity: Float[Array, "O L 2"]
+    valid: Bool[Array, "O L"]
+    size: Float[Array, "O 2"]  # length, width
+    kind: Int[Array, " O"]  # index into ROAD_USERS
+
+
+@struct
+class Patches:
+    """Places of the road with a condition of their own; where they overlap the last one counts.
+
+    One shape stands for all: the points within `radius` of a line of vertices and, if it is `closed`, the points inside it. A circle is one
+    vertex repeated, a strip an open line with half its width, a polygon a closed line with radius 0.
+    """
+
+    vertices: Float[Array, "N V 2"]
+    closed: Bool[Array, " N"]
+    radius: Float[Array, " N"]
+    surface: Int[Array, " N"]  # index into SURFACES
+    film_mm: Float[Array, " N"]
+    follows: Float[Array, " N"]  # share of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
+    present: Bool[Array, " N"]
+
+
+@struct
+class Rain:
+    """Water film of the open road over an episode: linear between knots, constant beyond them; it stays as it is without any."""
+
+    now_s: Float[Array, ""]  # since the episode began
+    time_s: Float[Array, " K"]  # of the knots, ascending
+    film_mm: Float[Array, " K"]
+
+
+@struct
+class Weather:
+    """Road condition of one world, over the plane and over time; `surface` indexes SURFACES."""
+
+    film_mm: Float[Array, ""]  # on the open road, now
+    surface: Int[Array, ""]  # of the open road
+    patches: Patches
+    rain: Rain
+
+
+@struct
+class Boxes:
+    """Oriented boxes on the road at one moment: cars, and what else they can hit."""
+
+    position: Float[Array, "B 2"]
+    elevation: Float[Array, " B"]  # of the boxes' centres
+    yaw: Float[Array, " B"]
+    velocity: Float[Array, "B 2"]
+    yaw_rate: Float[Array, " B"]
+    size: Float[Array, "B 2"]  # length, width
+    mass: Float[Array, " B"]  # inf: whatever hits it, it stays on its way
+    present: Bool[Array, " B"]
+
+
+@struct
+class Cells:
+    """A square grid over the road: for each cell, row after row, the segments within a radius of any of its points, in storage order.
+
+    The cells at the edge list nothing and stand for everything beyond them, too.
+    """
+
+    origin: Float[Array, "2"]  # corner of the first cell
+    first: Int[Array, " N"]  # where each cell's list begins in `rows`, and where the last one ends
+    rows: Int[Array, " M"]  # of the road
+    side: int = static()  # cells
+    size_m: float = static()
+    radius_m: float = static()
+    most: int = static()  # rows of the longest list
+
+
+@struct
+class Scene:
+    """One world as the graph sees it: constant in an episode, except for agents and weather, which a reset may redraw, and the boxes.
+
+    `lanes` (kinds DRIVABLE) and `edges` (kinds EDGES) repeat rows of `road`, so that looking for the nearest lane or edge does not walk
+    over everything else. Coordinates are metres around the scene's centre.
+    """
+
+    road: Road
+    lanes: Road
+    edges: Road
+    agents: Agents
+    log: Log
+    weather: Weather
+    others: Tracks
+    boxes: Boxes  # where the others are now; nobody is there until an environment says so
+    cells: Cells | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
+
+
+@struct
+class Motion:
+    """What the rest of the system may know of a car's body, read from any dynamics backend."""
+
+    position: Float[Array, "A 3"]  # centre of the chassis box
+    velocity: Float[Array, "A 3"]  # world frame
+    yaw: Float[Array, " A"]
+    yaw_rate: Float[Array, " A"]
+    upright: Float[Array, " A"]  # cosine between the car's and the world's up
+    steer: Float[Array, " A"]  # mean angle of the front wheels
+    contact_force: Float[Array, " A"]  # largest force of another car or box in the last control step, N
+    grip: Float[Array, " A"]  # friction coefficient, mean over the wheels
+    grip_use: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
+    slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
+
+
+@struct
+class Events:
+    """What can happen to an agent. At most one is true in one step: the order of the fields is the order of precedence."""
+
+    fault: Bool[Array, " A"]
+    reached: Bool[Array, " A"]
+    collided: Bool[Array, " A"]
+    crashed: Bool[Array, " A"]
+    touched_edge: Bool[Array, " A"]
+
+
+@struct
+class Facts:
+    """Everything true of one step, measured once. Rewards, ends, metrics and reports only read it."""
+
+    speed: Float[Array, " A"]
+    goal_distance: Float[Array, " A"]
+    progress: Float[Array, " A"]  # metres along the nearest lane, towards the goal
+    lane_offset: Float[Array, " A"]  # lateral distance from the nearest lane segment's line
+    lane_distance: Float[Array, " A"]  # distance from its midpoint
+    lane_alignment: Float[Array, " A"]  # cosine between the car and the lane, towards the goal
+    lane_heading: Float[Array, " A"]  # cosine between the car and the lane's own direction: negative against the traffic
+    has_lane: Bool[Array, " A"]
+    ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
+    gap: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
+    stopping_margin: Float[Array, " A"]  # way free straight ahead less the way to stop on the road's friction; inf with nobody ahead
+    edge_ttc: Float[Array, " A"]
+    edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
+    drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2
+    strayed: Float[Array, " A"]  # distance from the start
+    contact_force: Float[Array, " A"]
+    grip: Float[Array, " A"]
+    grip_use: Float[Array, " A"]
+    slip: Float[Array, " A"]
+    off_lane: Bool[Array, " A"]
+    idle: Bool[Array, " A"]
+    events: Events  # raw: several may be true at once
+
+
+@struct
+class State:
+    """What changes while a world runs."""
+
+    body: Any  # the dynamics backend's own pytree
+    motion: Motion
+    agents: Agents  # this episode's starts and goals
+    weather: Weather  # this episode's road condition
+    active: Bool[Array, " A"]  # on stage and not finished
+    happened: Events  # events so far, in this agent's life
+    age: Int[Array, " A"]  # control steps since the agent's own start
+    previous_action: Float[Array, "A 3"]
+    step: Int[Array, ""]
+    key: PRNGKeyArray
+
+
+@struct
+class Step:
+    """All that a reward term may see."""
+
+    scene: Scene
+    before: State
+    action: Float[Array, "A 3"]
+    after: State
+    facts: Facts
+    events: Events  # new in this step and exclusive
+
+
+@struct
+class Rows:
+    """A padded set of feature rows, one set per agent: road segments, neighbours."""
+
+    features: Float[Array, "*agents K F"]
+    mask: Bool[Array, "*agents K"]
+
+
+Observation = dict[str, Any]
+"""Group name -> Float[Array, "A F"] or Rows. Finished and absent agents read zeros and false masks."""
+
+
+@struct
+class Outcome:
+    """What one step gave, of an action or of a control step. `observation` is None where it was not asked for."""
+
+    observation: Observation | None
+    reward: Float[Array, " A"]
+    terms: dict[str, Float[Array, " A"]]  # weighted reward terms; they sum to `reward`
+    events: Events
+    done: Bool[Array, " A"]  # an event ended the agent in this step
+    truncated: Bool[Array, ""]  # the world's time is up
+    over: Bool[Array, ""]  # truncated, or no agent is left
+    facts: Facts
+
+
+class Dynamics(NamedTuple):
+    """A backend: cars of one world. `advance` covers one control step; bodies of inactive cars are held and touch nobody."""
+
+    init: Callable[[PRNGKeyArray, Scene], Any]
+    advance: Callable[[Scene, Any, Float[Array, "A 3"], Bool[Array, " A"]], Any]  # (scene, body, action, active) -> body
+    read: Callable[[Any], Motion]
+
+
+class Env(NamedTuple):
+    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all `hold` control steps that it
+    stands for, their rewards added up.
+
+    The others are their parts: `start` and `observe` divide a reset, so that a training loop can restart finished worlds before it pays
+    for the observation; `transition` is a single control step, for whoever looks closer than the agent acts. It reads every `hold`-th
+    action of an episode, the first one first, which stands until the next. `now` gives the scene as it is at a state's moment.
+
+    All of them take arrays of numpy or JAX, also closed over, and raise ValueError when they are traced with an argument of another shape
+    or kind of number than is annotated here. Values are not refused: an agent that starts with a number that is not finite, or with a size
+    that is not above 0, is absent; one that comes to have such a number later is a fault.
+    """
+
+    reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
+    step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
+    start: Callable[..., State]  # (key, scene, control step at which it begins = 0)
+    transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
+    observe: Callable[[Scene, State], Observation]
+    now: Callable[[Scene, State], Scene]
+    hold: int = 1
+
+
+class Policy(NamedTuple):
+    """`apply(parameters, observation) -> (mean [..., 3], log_std [3], value [...])` for any leading axes."""
+
+    init: Callable[[PRNGKeyArray, Observation], Any]
+    apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
+
+
+Pytree = Shaped[Array, "..."] | Any

@@ -1,0 +1,182 @@
+"""`bank.json`: which files a bank consists of and how the bank came to be. It is replaced as a whole, never changed in place.
+
+Its last line is the SHA-256 of what stands before it.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.core.instantiate import differing
+from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.data.formats.reader_selection import BANK_INDEX as INDEX
+
+FORMAT = "scenefactory_jax bank"
+SCHEMA = 4  # 4: checksums of `bank.json` and of each scene
+READABLE = (3, 4)
+REMEDY = "copy or convert the bank again"
+DIGEST = "sha256"  # key of the checksum
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One file of a bank, as it was when it was finished."""
+
+    file: str  # relative to the bank's folder; those of a view lie in other folders
+    scenes: int
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Index:
+    """What `bank.json` says."""
+
+    settings: dict[str, Any]  # what the scenes were read, checked and chosen with
+    shards: tuple[Shard, ...] = ()  # of scenes
+    metadata: tuple[Shard, ...] = ()  # of the catalogue: a row a scene, and where the scene lies
+    files: tuple[str, ...] = ()  # source files that are done, relative to the source
+    rejects: tuple[dict[str, Any], ...] = ()  # source, scene (null: the file itself) and reason
+    companions: tuple[dict[str, Any], ...] = ()  # source and reason of files that belong to scenes beside them
+    account: dict[str, Any] = field(default_factory=dict)  # counts of what the trial packing kept and dropped
+    complete: bool = False  # false: the conversion was stopped; it goes on where it stopped
+
+
+def is_bank(path: Path | str) -> bool:
+    """Whether a folder says of itself that it is a bank, of any schema; one whose index is damaged may be."""
+    try:
+        return _format(_entries(Path(path))) == FORMAT
+    except SceneError:
+        return True
+
+
+def require_replaceable(path: Path) -> None:
+    """Refuse a folder that is not surely a bank.
+
+    Raises:
+        SceneError: it is none, or its index is damaged.
+    """
+    if _format(_entries(path)) != FORMAT:
+        raise SceneError(f"{path}: exists and is no bank; give another path, or remove it")
+
+
+def read(path: Path) -> Index:
+    """The index of a bank.
+
+    Raises:
+        SceneError: no bank, a bank of another schema, or an index that is damaged.
+    """
+    found = _entries(path)
+    if found is None or _format(found) != FORMAT:
+        what = "no such folder" if not path.exists() else f"no bank: it has no {INDEX} of this format"
+        raise SceneError(f"{path}: {what}; make one with `convert source=FILES out={path}`")
+    if found.get("schema") not in READABLE:
+        what = "a bank of packed scenes, schema 2" if found.get("schema") == 2 else f"a bank of schema {found.get('schema')!r}"
+        ours = f"this version reads {' and '.join(map(str, READABLE))}, whole scenes"
+        raise SceneError(f"{path}: {what}; {ours}: convert its source again, to another folder")
+    try:
+        shards = {name: tuple(map(_shard, found[name])) for name in ("shards", "metadata")}
+        lists = {name: tuple(found[name]) for name in ("files", "rejects", "companions")}
+        return Index(found["settings"], account=found["account"], complete=found["complete"], **shards, **lists)
+    except (KeyError, TypeError) as error:
+        wanted = ", ".join(entry.name for entry in fields(Index))
+        raise SceneError(f"{path / INDEX}: damaged: {error}; it must hold {wanted}") from error
+
+
+def _entries(path: Path) -> dict[str, Any] | None:
+    """What the index of a folder holds, in whatever format; None where there is none.
+
+    Raises:
+        SceneError: it cannot be read, or is not what was written.
+    """
+    file = path / INDEX
+    try:
+        content = file.read_bytes()
+        found = json.loads(content)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file}: damaged: no JSON: {error}; {REMEDY}") from error
+    if not isinstance(found, dict):
+        return {}
+    recorded = found.get(DIGEST)
+    if recorded is None:
+        if found.get("schema") == SCHEMA:
+            raise SceneError(f"{file}: damaged: no checksum; {REMEDY}")
+        return found  # of a schema without one
+    body = content.rpartition(f'"{DIGEST}"'.encode())[0]
+    if hashlib.sha256(body).hexdigest() != recorded:
+        raise SceneError(f"{file}: damaged: its checksum is another; {REMEDY}")
+    return found
+
+
+def _format(entries: Mapping[str, Any] | None) -> Any:
+    return None if entries is None else entries.get("format")
+
+
+def _shard(entry: Any) -> Shard:
+    """One file's entry.
+
+    Raises:
+        TypeError: other keys or values than such an entry has.
+    """
+    if not isinstance(entry, dict) or {name: type(value) for name, value in entry.items()} != Shard.__annotations__:
+        raise TypeError(f"{repr(entry)[:80]} in place of {', '.join(Shard.__annotations__)}")
+    return Shard(**entry)
+
+
+def write(folder: Path, index: Index) -> None:
+    """Replace the index, so that a reader finds the one of before or this one, whole."""
+    entries = {"format": FORMAT, "schema": SCHEMA} | {entry.name: getattr(index, entry.name) for entry in fields(Index)}
+    entries |= {name: [asdict(shard) for shard in entries[name]] for name in ("shards", "metadata")}
+    lines = [f'"{name}": {json.dumps(value, default=_plain)}' for name, value in entries.items()]  # a line each: json's indent is slow
+    fresh = folder / f".{INDEX}"
+    with fresh.open("w") as file:
+        body = "{\n" + ",\n".join(lines) + ",\n"
+        file.write(f'{body}"{DIGEST}": "{hashlib.sha256(body.encode()).hexdigest()}"\n}}\n')
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(fresh, folder / INDEX)
+
+
+def describe(folder: Path, file: str, scenes: int) -> Shard:
+    """A finished file's size and checksum."""
+    return Shard(file, scenes, (folder / file).stat().st_size, digest(folder / file))
+
+
+def digest(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def require_whole(path: Path, shard: Shard) -> None:
+    """Refuse a shard that is missing or of another size than it was, by name."""
+    size = path.stat().st_size if path.is_file() else None
+    if size is None:
+        raise SceneError(f"{path}: missing; a bank needs all of its files, a view also the banks that it refers to: copy them together")
+    if size != shard.bytes:
+        raise SceneError(f"{path}: {size} bytes, cut short or changed: there were {shard.bytes}; {REMEDY}")
+
+
+def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
+    """Keys in which two settings differ, with both values."""
+    return [f"{name}: {theirs!r} there, {ours!r} here" for name, (theirs, ours) in differing(there, here).items()]
+
+
+def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as JSON gives them back, to be compared with those of a bank."""
+    return json.loads(json.dumps(settings, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has no word for, in its words."""
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)

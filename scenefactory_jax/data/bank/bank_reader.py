@@ -1,0 +1,319 @@
+"""Banks: whole scenes on disk, nothing cut and nothing chosen; they are checked and packed into worlds when they are loaded.
+
+A bank is a folder with `bank.json` (`bank_index`), shards of scenes (`arrow`: Arrow IPC files, a record batch a scene) and their catalogue
+(`catalogue`: a row a scene). It can be moved. A view is a bank whose shards lie in other banks, by relative path: choosing scenes copies
+none. Shards are mapped when they are first read, and hold no file open; a scene that is not what was written is refused (`shard_files`).
+"""
+
+import functools
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Int
+
+from scenefactory_jax.core.parallel import task_map
+from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
+from scenefactory_jax.core.types import Scene
+from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_writer, catalogue, shard_files
+from scenefactory_jax.data.bank.bank_index import Index, Shard
+from scenefactory_jax.data.bank.catalogue import Features
+from scenefactory_jax.data.packing import columns
+from scenefactory_jax.data.packing.pack import Packed, prepare
+from scenefactory_jax.data.packing.stack import CutReport, stack
+
+INDEX = bank_index.INDEX
+is_bank = bank_index.is_bank
+PIECE = 16  # scenes that a process packs at a time
+SHARD = 256  # scenes of a shard, where a bank is written at once
+Readers = dict[int, shard_files.Reader]
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """An open bank, or a choice of the scenes of some: `open`, `view`, `join`. Scenes stay on disk until they are asked for."""
+
+    path: Path  # the folder that was opened; of a view that was never saved: of its first bank
+    index: Index
+    shards: tuple[Shard, ...]  # by absolute path
+    places: Int[np.ndarray, "N 5"]  # of each scene: shard, and where in it, with a checksum (`shard_files.PLACE`)
+    metadata: pa.Table  # the catalogue: a row a scene
+    readers: Readers = field(default_factory=dict, repr=False)  # of the shards that were mapped so far; views share them
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Another process maps shards of its own."""
+        return vars(self) | {"readers": {}}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.metadata["name"].to_pylist())
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return self.index.settings
+
+    @property
+    def rejects(self) -> tuple[dict[str, Any], ...]:
+        return self.index.rejects
+
+    @property
+    def unfinished(self) -> str:
+        """What to say after the bank's name where scenes may be missing; else nothing."""
+        return "" if self.index.complete else ", whose conversion was stopped: the same `convert` goes on with it"
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+def open(path: Path | str) -> Bank:
+    """Open a bank. Its catalogue is read and held against its checksum, its scenes are not touched.
+
+    Raises:
+        SceneError: no bank, a bank of another schema, or a file that is missing, cut short or damaged, by name.
+    """
+    path = Path(path).resolve()
+    index = bank_index.read(path)
+    shards = tuple(replace(shard, file=os.path.normpath(path / shard.file)) for shard in index.shards)
+    for shard in shards:
+        bank_index.require_whole(Path(shard.file), shard)
+    if not shards or not index.metadata:
+        raise SceneError(f"{path / INDEX}: damaged: it names no shards; {bank_index.REMEDY}")
+    table = _concatenated([shard_files.table(path / part.file, part) for part in index.metadata], str(path))
+    places = shard_files.places(table)
+    limits = np.array([shard.scenes for shard in shards])
+    if (places[:, :2] < 0).any() or (places[:, 0] >= len(shards)).any() or (places[:, 1] >= limits[places[:, 0]]).any():
+        raise SceneError(f"{path}: its catalogue names scenes that its shards do not have; {bank_index.REMEDY}")
+    return Bank(path, index, shards, places, table.select([name for name in table.column_names if name not in shard_files.PLACE]))
+
+
+def verify(path: Path | str) -> None:
+    """Read every byte of a bank, and of those that a view refers to, against the checksums.
+
+    Raises:
+        SceneError: as `open`, or the files that have changed, by name.
+    """
+    path = Path(path).resolve()
+    index = bank_index.read(path)
+    shards = (*index.shards, *index.metadata)
+    whole = lambda shard: (path / shard.file).is_file() and bank_index.describe(path, shard.file, shard.scenes) == shard  # noqa: E731
+    if damaged := [shard.file for shard in shards if not whole(shard)]:
+        raise SceneError(f"{path}: damaged: {', '.join(damaged)}: not what was written; {bank_index.REMEDY}")
+    open(path)
+
+
+def raw(bank: Bank, index: int) -> RawScene:
+    """One scene as its reader gave it. Its arrays are views of the file, read-only.
+
+    Raises:
+        SceneError: no such scene, or its shard has changed or vanished.
+    """
+    return next(raws(bank, [index]))
+
+
+def raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawScene]:
+    """Scenes one after another.
+
+    Raises:
+        SceneError: as `raw`.
+    """
+    yield from _scenes(bank.shards, bank.places[_rows(bank, indices)], bank.readers)
+
+
+def view(bank: Bank, indices: Sequence[int] | np.ndarray) -> Bank:
+    """A bank of these scenes in this order, without copying; an index may occur many times.
+
+    Raises:
+        SceneError: no such scene, or no indices.
+    """
+    rows = _rows(bank, indices)
+    if not len(rows):
+        raise SceneError(f"{bank.path}: a view of no scene; valid indices: 0 to {len(bank) - 1}")
+    return replace(bank, index=_chosen(bank.index.settings, [bank]), places=bank.places[rows], metadata=bank.metadata.take(rows))
+
+
+def join(banks: Sequence[Bank]) -> Bank:
+    """The scenes of several banks, one bank after another, without copying.
+
+    Raises:
+        SceneError: no banks, or columns of their catalogues that do not go together.
+    """
+    if not banks:
+        raise SceneError("no banks to join; give at least one")
+    shards = {shard.file: shard for bank in banks for shard in bank.shards}
+    number = {file: place for place, file in enumerate(shards)}
+    places = []
+    for bank in banks:
+        own = np.array([number[shard.file] for shard in bank.shards])
+        places.append(np.column_stack([own[bank.places[:, 0]], bank.places[:, 1:]]))
+    table = _concatenated([bank.metadata for bank in banks], ", ".join(str(bank.path) for bank in banks))
+    settings = {"joined": [dict(bank.index.settings) for bank in banks]}
+    return Bank(banks[0].path, _chosen(settings, banks), tuple(shards.values()), np.concatenate(places), table)
+
+
+def save(bank: Bank, path: Path | str, *, copy: bool, settings: Mapping[str, Any]) -> Bank:
+    """Write a bank or a view and open it. A bank that is there is replaced once the new one is complete.
+
+    Args:
+        path: folder to make.
+        copy: write the scenes too, so that the folder needs no other; else refer to those of the banks that they lie in.
+        settings: what the scenes were chosen with, kept for the record.
+
+    Raises:
+        SceneError: the path exists and is no bank, or is one that the view would refer to.
+    """
+    path = Path(path).resolve()
+    if not copy and any(Path(shard.file).parent == path for shard in bank.shards):
+        raise SceneError(f"{path}: a view cannot take the place of the bank that it refers to; give another path, or copy=true")
+    with bank_writer.replacing(path) as folder:
+        if copy:
+            parts = [slice(start, start + SHARD) for start in range(0, len(bank), SHARD)]
+            shards = ((_batches(bank.shards, bank.places[part], bank.readers), bank.metadata[part]) for part in parts)
+            bank_writer.fill(folder, shards, settings=settings, compression=None, complete=bank.index.complete)
+        else:
+            bank_writer.refer(folder, path, bank.shards, bank.places, bank.metadata, settings=settings, complete=bank.index.complete)
+    return open(path)
+
+
+def write(
+    path: Path | str,
+    scenes: Iterable[RawScene],
+    *,
+    settings: Mapping[str, Any],
+    features: Features | None = None,
+    compression: bank_writer.Compression = None,
+) -> Bank:
+    """Write scenes that somebody made, and open the bank. A bank that is there is replaced once the new one is complete.
+
+    Args:
+        path: folder to make.
+        scenes: taken one shard at a time.
+        settings: what they were made with, kept for the record.
+        features: more columns for the catalogue.
+        compression: of the shards; None can be mapped without copying.
+
+    Raises:
+        SceneError: the path exists and is no bank, there are no scenes, or one that no bank can hold.
+    """
+    path, scenes = Path(path).resolve(), iter(scenes)
+    with bank_writer.replacing(path) as folder:
+        parts = iter(lambda: list(itertools.islice(scenes, SHARD)), [])
+        shards = ((map(arrow_codec.encode, part), catalogue.table([catalogue.extended(raw, features) for raw in part])) for part in parts)
+        bank_writer.fill(folder, shards, settings=settings, compression=compression)
+    return open(path)
+
+
+def packed(
+    bank: Bank, indices: Sequence[int] | np.ndarray, *, check: Callable[..., Any], pack: Callable[..., Any], workers: int
+) -> list[Packed | Reject]:
+    """Scenes checked and packed, in the order of the indices; a scene that cannot be is a `Reject` in its place.
+
+    Args:
+        check: `checks.check` bound to its numbers.
+        pack: `pack.pack` bound to its numbers.
+        workers: processes; 1 works in this one.
+
+    Raises:
+        SceneError: no such scene, a shard that has changed, or a process that died.
+    """
+    places = bank.places[_rows(bank, indices)]
+    pieces = [places[start : start + PIECE] for start in range(0, len(places), PIECE)]
+    work = functools.partial(_packed, shards=bank.shards, check=check, pack=pack)
+    found: list[Packed | Reject] = []
+    for piece in task_map.local(work, pieces, workers=workers if len(pieces) > 1 else 1, timeout_s=None):
+        if isinstance(piece, task_map.Lost):
+            raise SceneError(f"{bank.path}: scenes could not be packed: {piece.reason}; try fewer workers")
+        if isinstance(piece, SceneError):
+            raise piece
+        found.extend(piece)
+    return found
+
+
+def load(
+    bank: Bank,
+    indices: Sequence[int] | np.ndarray,
+    *,
+    check: Callable[..., Any],
+    pack: Callable[..., Any],
+    capacity: Mapping[str, int | None],
+    workers: int,
+) -> tuple[Scene, CutReport]:
+    """Worlds of the given scenes, checked, packed, stacked and padded; an index may occur many times. See `packed` and `stack`.
+
+    Raises:
+        SceneError: a scene that does not exist or cannot be packed, no indices, or a capacity that is none.
+    """
+    rows = _rows(bank, indices)
+    distinct, world = np.unique(rows, return_inverse=True)
+    scenes = []
+    for row, one in zip(distinct, packed(bank, distinct, check=check, pack=pack, workers=workers), strict=True):
+        if isinstance(one, Reject):
+            raise SceneError(f"{bank.path}: scene {row}, {one.scene}: {one.reason}; leave it out, or change scenes.check or scenes.pack")
+        scenes.append(one.scene)
+    stacked, report = stack(scenes, capacity=capacity)
+    if np.array_equal(distinct, rows):
+        return stacked, report
+    leaves = {name: leaf[world] for name, leaf in columns.flatten(stacked).items()}
+    cuts = tuple(replace(cut, world=int(place)) for cut in report.cuts for place in np.flatnonzero(world == cut.world))
+    return columns.assemble(Scene, leaves), CutReport(len(rows), report.capacity, cuts)
+
+
+def _packed(
+    places: Int[np.ndarray, "N 5"], *, shards: Sequence[Shard], check: Callable[..., Any], pack: Callable[..., Any]
+) -> list[Packed | Reject] | SceneError:
+    """Some scenes of a bank; of a damaged file the error, which another process is to raise."""
+    found: list[Packed | Reject] = []
+    try:
+        for scene in _scenes(shards, places, {}):
+            found.append(_prepared(scene, check, pack))
+    except SceneError as error:
+        return error
+    return found
+
+
+def _prepared(scene: RawScene, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed | Reject:
+    try:
+        return prepare(scene, check=check, pack=pack)
+    except SceneError as error:
+        return Reject(scene.name, str(error).removeprefix(f"{scene.source}: "), error.kind)
+
+
+def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:
+    """Scenes one after another; a shard is mapped when the first of its scenes is asked for."""
+    return (_reader(shards, number, readers).scene(place) for number, *place in places.tolist())
+
+
+def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[pa.RecordBatch]:
+    """Scenes as they lie in their shards."""
+    return (_reader(shards, number, readers).batch(place) for number, *place in places.tolist())
+
+
+def _reader(shards: Sequence[Shard], number: int, readers: Readers) -> shard_files.Reader:
+    if number not in readers:
+        readers[number] = shard_files.Reader(shards[number])
+    return readers[number]
+
+
+def _concatenated(tables: Sequence[pa.Table], where: str) -> pa.Table:
+    """Catalogues one below the other; a column that one lacks is null there."""
+    try:
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise SceneError(f"{where}: catalogues that do not go together: {error}") from error
+
+
+def _rows(bank: Bank, indices: Sequence[int] | np.ndarray) -> Int[np.ndarray, " N"]:
+    """Indices as rows; those below zero count from the end."""
+    rows, count = np.asarray(indices, np.int64).reshape(-1), len(bank)
+    if (wrong := rows[(rows < -count) | (rows >= count)]).size:
+        raise SceneError(f"{bank.path}: no scene {wrong[0]}; valid: 0 to {count - 1}")
+    return rows % max(count, 1)
+
+
+def _chosen(settings: Mapping[str, Any], banks: Sequence[Bank]) -> Index:
+    """The index of what was chosen: as complete as the banks are, and without the account of a conversion."""
+    return Index(settings=dict(settings), complete=all(bank.index.complete for bank in banks))

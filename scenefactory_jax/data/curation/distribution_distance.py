@@ -1,0 +1,254 @@
+"""How alike two sets of scenes are: what is on their maps and how traffic moves, as distributions side by side."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+from scipy import stats
+from scipy.spatial import KDTree
+
+from scenefactory_jax.core.raw_scene import RawScene, Track
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LINES, STOP_SIGN
+from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.visualization.report import plots
+
+CURVE_M = 3.0  # step over which a lane's curvature is measured: logged points are rounded to centimetres
+ACCELERATION_STEPS = 5  # over which a speed's change is measured, for the same reason
+MOVING_M = 3.0  # a vehicle that goes farther within the log moves
+STANDING_MPS = 0.5  # slower vehicles have no heading to speak of and stand
+Samples = dict[str, Float[np.ndarray, " N"]]
+
+
+class Quantity(NamedTuple):
+    """What is compared: its axis label, and what one sample of it belongs to."""
+
+    label: str
+    each: str
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "lane_m": Quantity("lanes in the box, m", "scene"),
+    "edge_m": Quantity("road edges in the box, m", "scene"),
+    "line_m": Quantity("painted lines in the box, m", "scene"),
+    "points": Quantity("road points in the box", "scene"),
+    "segment_m": Quantity("segment of a road element, m", "segment"),
+    "lane_length_m": Quantity("length of a lane, m", "lane"),
+    "curvature_1_m": Quantity("curvature of lanes, 1/m", "3 m of lane"),
+    "crosswalks": Quantity("crosswalks", "scene"),
+    "stop_signs": Quantity("stop signs", "scene"),
+    "driveways": Quantity("driveways", "scene"),
+    "lights": Quantity("lanes with a light", "scene"),
+    "vehicles": Quantity("vehicles in the box", "scene"),
+    "moving": Quantity("moving vehicles in the box", "scene"),
+    "pedestrians": Quantity("pedestrians in the box", "scene"),
+    "cyclists": Quantity("cyclists in the box", "scene"),
+    "speed_mps": Quantity("speed of moving vehicles, m/s", "vehicle"),
+    "acceleration_mps2": Quantity("acceleration of moving vehicles, m/s²", "vehicle and half second"),
+    "yaw_rate": Quantity("yaw rate of moving vehicles, rad/s", "vehicle and half second"),
+    "travel_m": Quantity("way of moving vehicles in the log, m", "vehicle"),
+    "recorded": Quantity("share of the log in which a vehicle is seen", "vehicle"),
+    "nearest_m": Quantity("from a moving vehicle to the next vehicle, m", "vehicle"),
+}
+
+
+class Difference(NamedTuple):
+    """Two distributions of one quantity."""
+
+    ks: float  # Kolmogorov-Smirnov statistic: largest difference between the two distribution functions, 0 to 1
+    wasserstein: float  # earth mover's distance over the standard deviation of both together
+    medians: tuple[float, float]
+    counts: tuple[int, int]
+
+
+def measure(raw: RawScene, *, box_m: float) -> Samples:
+    """Samples of every quantity in one scene.
+
+    Args:
+        box_m: side of the square in which things count, around the recording car at the current step, or the mean of the road points.
+    """
+    centre = _centre(raw)
+    inside = lambda points: np.abs(points[:, :2] - centre).max(axis=1) <= box_m / 2  # noqa: E731
+    roads = [(road.kind, road.xyz[:, :2], inside(road.xyz)) for road in raw.roads]
+    long = [(kind, points, near) for kind, points, near in roads if len(points) >= 2 and near.any()]
+    count = lambda kind: np.array([sum(near.any() for own, _, near in roads if own == kind)], float)  # noqa: E731
+    lanes = [(points, near) for kind, points, near in long if kind in DRIVABLE]
+    samples: Samples = {
+        "lane_m": np.array([_metres(long, DRIVABLE)]),
+        "edge_m": np.array([_metres(long, EDGES)]),
+        "line_m": np.array([_metres(long, LINES)]),
+        "points": np.array([sum(near.sum() for _, _, near in long)], float),
+        "segment_m": _joined([_steps(points)[near[1:] & near[:-1]] for _, points, near in long]),
+        "lane_length_m": np.array([_steps(points).sum() for points, _ in lanes]),
+        "curvature_1_m": _joined([_curvature(points[near]) for points, near in lanes]),
+        "crosswalks": count(CROSSWALK),
+        "stop_signs": count(STOP_SIGN),
+        "driveways": count(DRIVEWAY),
+        "lights": np.array([len({light.lane for light in raw.lights})], float),
+    }
+    return samples | _measure_traffic(raw, centre, box_m / 2)
+
+
+def _measure_traffic(raw: RawScene, centre: Float[np.ndarray, "2"], half: float) -> Samples:
+    """Samples of who is in the box at the current step and how they move."""
+    now, dt = raw.current, float(np.median(np.diff(raw.times)))
+    here = [track for track in raw.tracks if track.valid[now] and np.abs(track.xyz[now, :2] - centre).max() <= half]
+    number = lambda kind: np.array([sum(track.kind == kind for track in here)], float)  # noqa: E731
+    vehicles = [track for track in here if track.kind == "vehicle"]
+    ways = [_way(track) for track in vehicles]
+    moving = [track for track, way in zip(vehicles, ways, strict=True) if way > MOVING_M]
+    places = np.array([track.xyz[now, :2] for track in vehicles]).reshape(-1, 2)
+    mine = np.array([track.xyz[now, :2] for track in moving]).reshape(-1, 2)
+    nearest = KDTree(places).query(mine, k=2)[0][:, 1] if len(places) > 1 and len(mine) else np.zeros(0)
+    changes = [_changes(track, dt) for track in moving]
+    return {
+        "vehicles": number("vehicle"),
+        "moving": np.array([len(moving)], float),
+        "pedestrians": number("pedestrian"),
+        "cyclists": number("cyclist"),
+        "speed_mps": np.array([float(np.hypot(*track.velocity[now])) for track in moving]),
+        "acceleration_mps2": _joined([change[0] for change in changes]),
+        "yaw_rate": _joined([change[1] for change in changes]),
+        "travel_m": np.array([way for way in ways if way > MOVING_M]),
+        "recorded": np.array([track.valid.mean() for track in vehicles]),
+        "nearest_m": nearest,
+    }
+
+
+def _centre(raw: RawScene) -> Float[np.ndarray, "2"]:
+    """The recording car at the current step, or else the mean of the road points."""
+    if raw.sdc is not None and raw.tracks[raw.sdc].valid[raw.current]:
+        return raw.tracks[raw.sdc].xyz[raw.current, :2]
+    return np.concatenate([road.xyz[:, :2] for road in raw.roads if len(road.xyz) >= 2]).mean(axis=0)
+
+
+def _steps(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " M"]:
+    return np.linalg.norm(np.diff(points, axis=0), axis=1)
+
+
+def _joined(parts: Sequence[np.ndarray]) -> Float[np.ndarray, " N"]:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _metres(roads: Sequence[tuple[int, np.ndarray, Bool[np.ndarray, "_"]]], kinds: Sequence[int]) -> float:
+    """Length of the roads of some kinds within the box."""
+    return float(sum(_steps(points)[near[1:] & near[:-1]].sum() for kind, points, near in roads if kind in kinds))
+
+
+def _curvature(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " M"]:
+    """Absolute curvature along a lane, a value every CURVE_M."""
+    place = np.concatenate([[0.0], np.cumsum(_steps(points))])
+    if place[-1] < 3 * CURVE_M:
+        return np.zeros(0)
+    at = np.arange(0.0, place[-1], CURVE_M)
+    coarse = np.stack([np.interp(at, place, points[:, axis]) for axis in (0, 1)], axis=-1)
+    ahead = np.diff(coarse, axis=0)
+    turn = np.diff(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    return np.abs(np.mod(turn + np.pi, 2 * np.pi) - np.pi) / CURVE_M
+
+
+def _way(track: Track) -> float:
+    """From the first to the last valid position, m."""
+    rows = np.flatnonzero(track.valid)
+    return float(np.linalg.norm(track.xyz[rows[-1], :2] - track.xyz[rows[0], :2]))
+
+
+def _changes(track: Track, dt: float) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " M"]]:
+    """Acceleration along the way and yaw rate, over half seconds in which the track is valid throughout."""
+    speed = np.hypot(*track.velocity.T)
+    first = np.arange(0, len(speed) - ACCELERATION_STEPS, ACCELERATION_STEPS)
+    last = first + ACCELERATION_STEPS
+    valid = np.array([track.valid[a : b + 1].all() for a, b in zip(first, last, strict=True)], bool)
+    turned = np.mod(track.yaw[last] - track.yaw[first] + np.pi, 2 * np.pi) - np.pi
+    driven = valid & (speed[first] > STANDING_MPS)
+    span = ACCELERATION_STEPS * dt
+    return ((speed[last] - speed[first]) / span)[valid], (turned / span)[driven]
+
+
+def collect(scenes: Iterable[RawScene], *, box_m: float) -> Samples:
+    """The samples of many scenes, pooled."""
+    found = [measure(raw, box_m=box_m) for raw in scenes]
+    return {name: _joined([one[name] for one in found]) for name in QUANTITIES}
+
+
+def compare(one: Samples, other: Samples) -> dict[str, Difference | None]:
+    """How far apart two sets are, quantity by quantity; None where one of them holds none at all, as lights in a format without."""
+    return {name: _difference(one[name], other[name], counted=name == "lights") for name in QUANTITIES}
+
+
+def _difference(one: Float[np.ndarray, " N"], other: Float[np.ndarray, " M"], *, counted: bool) -> Difference | None:
+    if not len(one) or not len(other) or (counted and not (one.any() and other.any())):
+        return None
+    spread = float(np.std(np.concatenate([one - one.mean(), other - other.mean()]))) or 1.0
+    result = stats.ks_2samp(one, other, method="asymp")
+    return Difference(
+        ks=float(result.statistic),  # pyright: ignore[reportAttributeAccessIssue]
+        wasserstein=float(stats.wasserstein_distance(one, other)) / spread,
+        medians=(float(np.median(one)), float(np.median(other))),
+        counts=(len(one), len(other)),
+    )
+
+
+def mean_distance(differences: Mapping[str, Difference | None]) -> float:
+    """Mean of the Kolmogorov-Smirnov statistics of the quantities that both sets have."""
+    return float(np.mean([one.ks for one in differences.values() if one is not None]))
+
+
+def table(reference: str, sets: Mapping[str, Samples]) -> str:
+    """A row a quantity: its median in every set, and each one's distance from the reference."""
+    others = [name for name in sets if name != reference]
+    found = {name: compare(sets[reference], sets[name]) for name in others}
+    header = ["quantity", *(f"median {name}" for name in sets), *(f"{kind} {name}" for name in others for kind in ("KS", "W"))]
+    rows = []
+    for name, quantity in QUANTITIES.items():
+        middle = [f"{np.median(samples[name]):.3g}" if len(samples[name]) else "none" for samples in sets.values()]
+        apart = [found[other][name] for other in others]
+        shown = [text for one in apart for text in ((f"{one.ks:.2f}", f"{one.wasserstein:.2f}") if one else ("", ""))]
+        rows.append([quantity.label, *middle, *shown])
+    means = [f"{mean_distance(found[other]):.2f}" if i == 0 else "" for other in others for i in range(2)]
+    return agent_metrics.grid(header, [*rows, ["mean", *("" for _ in sets), *means]])
+
+
+def figure(reference: str, sets: Mapping[str, Samples]) -> Figure:
+    """A histogram a quantity, all sets over one another, each with the same area."""
+    columns = 4
+    names = [name for name in QUANTITIES if all(len(samples[name]) for samples in sets.values())]
+    with matplotlib.rc_context(plots.STYLE):
+        whole = Figure(figsize=(3.6 * columns, 2.2 * -(-len(names) // columns) + 0.5), layout="constrained")
+        panels = whole.subplots(-(-len(names) // columns), columns, squeeze=False).ravel()
+        for axes, name in zip(panels, names, strict=False):
+            pooled = np.concatenate([samples[name] for samples in sets.values()])
+            low, high = np.quantile(pooled, [0.005, 0.995])
+            edges = np.linspace(low, high if high > low else low + 1.0, 31)
+            for colour, (label, samples) in zip(plots.COLOURS, sets.items(), strict=False):
+                weights = np.full(len(samples[name]), 1 / len(samples[name]))
+                kind, alpha = ("stepfilled", 0.4) if label == reference else ("step", 1.0)
+                shown = np.clip(samples[name], low, high)
+                axes.hist(shown, bins=list(edges), weights=weights, color=colour, label=label, linewidth=1.4, histtype=kind, alpha=alpha)
+            axes.set_title(QUANTITIES[name].label, fontsize=8)
+            axes.set_ylabel(f"share of {QUANTITIES[name].each}s", fontsize=7)
+        for axes in panels[len(names) :]:
+            axes.remove()
+        handles, labels = panels[0].get_legend_handles_labels()
+        whole.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    return whole
+
+
+def write(folder: Path, reference: str, sets: Mapping[str, Samples], *, box_m: float, command: str) -> Path:
+    """Write `folder`/realism.md and realism.png, and return the report's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = plots.save(figure(reference, sets), folder / "realism.png")
+    scenes = ", ".join(f"{name}: {len(samples['vehicles'])}" for name, samples in sets.items())
+    words = (
+        f"Scenes: {scenes}. Everything within {box_m:g} m by {box_m:g} m around the recording car. KS is the largest difference between "
+        "two distribution functions (0: the same, 1: nothing in common), W the earth mover's distance in standard deviations, both from "
+        f"{reference}; the mean is over the quantities that both sets have. In the figure all histograms have the same area and the "
+        "outermost bars hold what lies beyond."
+    )
+    lines = ["# Scenes compared", f"`{command}`", words, table(reference, sets), f"![Distributions]({picture.name})"]
+    path = folder / "realism.md"
+    path.write_text("\n\n".join(lines) + "\n", encoding="utf-8")
+    return path

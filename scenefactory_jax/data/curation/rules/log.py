@@ -1,0 +1,77 @@
+"""Rules on the log as a whole: its times, the car that recorded it, and who stands where at its start."""
+
+from collections import Counter
+
+import numpy as np
+import shapely
+
+from scenefactory_jax.core.raw_scene import RawScene, Track
+from scenefactory_jax.data.curation.quality_gate import Finding, point
+from scenefactory_jax.data.packing.pack import corners
+
+
+def times(raw: RawScene, *, share: float) -> list[Finding]:
+    """Steps whose length differs from the median step by more than a share of it."""
+    step = np.diff(raw.times)
+    if not len(step):
+        return []
+    usual = float(np.median(step))
+    off = np.abs(step - usual) / usual if usual > 0 else np.full(len(step), np.inf)
+    worst = int(np.argmax(off))
+    if off[worst] <= share:
+        return []
+    message = f"{int((off > share).sum())} steps of the log are not {usual:.3g} s long; step {worst} is {step[worst]:.3g} s"
+    return [Finding(message, float(off[worst]), share, step=worst)]
+
+
+def sdc(raw: RawScene, *, without: list[str]) -> list[Finding]:
+    """The car that recorded the log is not named, or not there at the current step.
+
+    Args:
+        without: datasets that have no such car.
+    """
+    if raw.metadata.get("dataset") in without:
+        return []
+    if raw.sdc is None:
+        return [Finding("no track is named as the car that recorded the log", 0.0, 1.0)]
+    track = raw.tracks[raw.sdc]
+    if track.valid[raw.current]:
+        return []
+    message = f"the car that recorded the log (id {track.id}) is absent at the current step {raw.current}"
+    return [Finding(message, 0.0, 1.0, step=raw.current, objects=(track.id,))]
+
+
+def track_ids(raw: RawScene) -> list[Finding]:
+    """Ids that several tracks have: what names an object by its id may mean the wrong one."""
+    counts = Counter(track.id for track in raw.tracks)
+    return [
+        Finding(f"{number} tracks have the id {identity}", float(number), 1.0, objects=(identity,))
+        for identity, number in counts.items()
+        if number > 1
+    ]
+
+
+def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
+    """Vehicles whose boxes lie in each other at the current step, by a share of the smaller box."""
+    tracks = [track for track in raw.tracks if track.kind == "vehicle" and track.valid[raw.current]]
+    now = raw.current
+    boxes = np.array([shapely.Polygon(corners(t.xyz[now, :2], float(t.yaw[now]), *t.size[:2])) for t in tracks], dtype=object)
+    if len(boxes) < 2:
+        return []
+    one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    one, other = one[one < other], other[one < other]
+    area = shapely.area(boxes)
+    common = shapely.area(shapely.intersection(boxes[one], boxes[other])) / np.minimum(area[one], area[other])
+    found = []
+    for first, second, part in zip(one, other, common, strict=True):
+        if part > share and _same_level(tracks[first], tracks[second], now):
+            ids = (tracks[first].id, tracks[second].id)
+            place = (tracks[first].xyz[now] + tracks[second].xyz[now]) / 2
+            message = f"vehicles {ids[0]} and {ids[1]} share {100 * part:.0f} % of the smaller box at the current step"
+            found.append(Finding(message, float(part), share, point(place), now, ids))
+    return found
+
+
+def _same_level(one: Track, other: Track, step: int) -> bool:
+    """Whether two boxes overlap in height, too."""
+    return bool(abs(one.xyz[step, 2] - other.xyz[step, 2]) < (one.size[2] + other.size[2]) / 2)

@@ -1,0 +1,143 @@
+"""Rules on the tracks of vehicles: errors of perception, which a simulation would replay. At most one finding a track and rule."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from scenefactory_jax.core.raw_scene import RawScene, Track
+from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.data.curation.quality_gate import Finding, point
+
+Excess = tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"]]  # steps, and what was measured there
+
+
+def speed(raw: RawScene, *, most_m_s: float) -> list[Finding]:
+    """Positions of neighbouring steps that imply a higher speed."""
+
+    def measure(track: Track) -> Excess:
+        steps = _neighbours(track)
+        way = np.linalg.norm(track.xyz[steps + 1, :2] - track.xyz[steps, :2], axis=1)
+        return steps + 1, way / np.diff(raw.times)[steps]
+
+    return _worst(raw, measure, most_m_s, "moves at {:.1f} m/s")
+
+
+def acceleration(raw: RawScene, *, most_m_s2: float, over_s: float) -> list[Finding]:
+    """Logged speeds that change faster than a car can, over a time long enough for the noise of single steps to fade."""
+    stride = max(1, round(over_s / _step_s(raw)))
+
+    def measure(track: Track) -> Excess:
+        there = np.flatnonzero(track.valid[stride:] & track.valid[:-stride])
+        value = np.linalg.norm(track.velocity, axis=1)
+        return there + stride, np.abs(value[there + stride] - value[there]) / (raw.times[there + stride] - raw.times[there])
+
+    return _worst(raw, measure, most_m_s2, "changes its speed by {:.1f} m/s²")
+
+
+def yaw_rate(raw: RawScene, *, most_rad_s: float) -> list[Finding]:
+    """Headings of neighbouring steps that imply a faster turn, such as a box that is turned round."""
+
+    def measure(track: Track) -> Excess:
+        steps = _neighbours(track)
+        turn = np.abs(wrapped(track.yaw[steps + 1] - track.yaw[steps]))
+        return steps + 1, turn / np.diff(raw.times)[steps]
+
+    return _worst(raw, measure, most_rad_s, "turns at {:.1f} rad/s")
+
+
+def jumps(raw: RawScene, *, off_m: float, drift_m_s: float) -> list[Finding]:
+    """Places that are not where the place before and the velocities lead, also across a gap.
+
+    Args:
+        off_m: allowed between two steps.
+        drift_m_s: allowed on top for every second of a gap.
+    """
+
+    def measure(track: Track) -> Excess:
+        seen = np.flatnonzero(track.valid)
+        before, after = seen[:-1], seen[1:]
+        time = raw.times[after] - raw.times[before]
+        led = (track.velocity[before] + track.velocity[after]) / 2 * time[:, None]
+        off = np.linalg.norm(track.xyz[after, :2] - track.xyz[before, :2] - led, axis=1)
+        gap = np.where(after - before > 1, time, 0.0)
+        return after, off - drift_m_s * gap
+
+    return _worst(raw, measure, off_m, "is {:.1f} m from where its velocity leads")
+
+
+def frozen(raw: RawScene, *, steps: int, speed_m_s: float) -> list[Finding]:
+    """A track that stays exactly in place although its velocity says that it moves.
+
+    Args:
+        steps: in a row that are allowed.
+        speed_m_s: least velocity that counts as moving.
+    """
+
+    def measure(track: Track) -> Excess:
+        pairs = _neighbours(track)
+        still = np.zeros(len(track.valid), bool)
+        moving = np.linalg.norm(track.velocity[pairs + 1], axis=1) > speed_m_s
+        still[pairs + 1] = moving & (track.xyz[pairs + 1] == track.xyz[pairs]).all(axis=1)
+        total = np.cumsum(still)
+        run = total - np.maximum.accumulate(np.where(still, 0, total))
+        return np.arange(len(run)), run.astype(float)
+
+    return _worst(raw, measure, float(steps), "stays in place for {:.0f} steps while its velocity moves on")
+
+
+def flicker(raw: RawScene, *, gaps: int) -> list[Finding]:
+    """A track that vanishes and comes back more often."""
+
+    def measure(track: Track) -> Excess:
+        seen = np.flatnonzero(track.valid)
+        back = seen[1:][np.diff(seen) > 1]
+        return back, np.arange(1.0, len(back) + 1)
+
+    return _worst(raw, measure, float(gaps), "vanishes and comes back {:.0f} times")
+
+
+def length(raw: RawScene, *, range_m: list[float]) -> list[Finding]:
+    """Vehicles longer or shorter than vehicles are."""
+    return _sizes(raw, 0, "long", range_m)
+
+
+def width(raw: RawScene, *, range_m: list[float]) -> list[Finding]:
+    """Vehicles wider or narrower than vehicles are."""
+    return _sizes(raw, 1, "wide", range_m)
+
+
+def _sizes(raw: RawScene, axis: int, word: str, range_m: list[float]) -> list[Finding]:
+    found = []
+    for track in _vehicles(raw):
+        value, step = track.size[axis], int(np.argmax(track.valid))
+        if not range_m[0] <= value <= range_m[1]:
+            limit = range_m[0] if value < range_m[0] else range_m[1]
+            found.append(Finding(f"vehicle {track.id} is {value:.2f} m {word}", value, limit, point(track.xyz[step]), step, (track.id,)))
+    return found
+
+
+def _worst(raw: RawScene, measure: Callable[[Track], Excess], limit: float, words: str) -> list[Finding]:
+    """The step of each vehicle at which the measure exceeds its limit by most."""
+    found = []
+    for track in _vehicles(raw):
+        steps, values = measure(track)
+        if len(values) and (value := float(values.max())) > limit:
+            step = int(steps[np.argmax(values)])
+            more = int((values > limit).sum())
+            message = f"vehicle {track.id} {words.format(value)} at step {step}" + (f" ({more} steps in all)" if more > 1 else "")
+            found.append(Finding(message, value, limit, point(track.xyz[step]), step, (track.id,)))
+    return found
+
+
+def _vehicles(raw: RawScene) -> Iterator[Track]:
+    return (track for track in raw.tracks if track.kind == "vehicle" and track.valid.any())
+
+
+def _neighbours(track: Track) -> Int[np.ndarray, " K"]:
+    """Steps that are valid and followed by one that is."""
+    return np.flatnonzero(track.valid[1:] & track.valid[:-1])
+
+
+def _step_s(raw: RawScene) -> float:
+    return float(np.median(np.diff(raw.times))) if len(raw.times) > 1 else np.inf

@@ -1,0 +1,39 @@
+"""MetaDrive's own maps: which of their lines are the rim of the road.
+
+MetaDrive has a type for the side of the road (`PGLineType.SIDE`) but writes it as a solid white line, and a guardrail as a line of no known
+type (`PGMap.get_line_type`), so a map has no road edges. Beside such a line there is a lane on one side only; beside the solid lines that
+separate lanes there is one on both.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from scenefactory_jax.data.formats.polylines import densify
+
+BESIDE_M = 0.5  # how far beside a line lanes are looked for: less than half a lane, more than the slits between lanes in curves
+SPACING_M = 1.0  # of the places along it
+
+
+def find_rims(lines: Sequence[Float[np.ndarray, "_ 3"]], lanes: Sequence[Float[np.ndarray, "_ 2"]]) -> list[bool]:
+    """Whether each line has a lane on one side at most, over more than half of its length.
+
+    Args:
+        lines: their points.
+        lanes: the outlines of all lanes.
+    """
+    area = shapely.union_all([shapely.make_valid(shapely.Polygon(lane)) for lane in lanes if len(lane) > 2])
+    shapely.prepare(area)
+    return [_is_rim(densify(line, SPACING_M)[:, :2], area) for line in lines]
+
+
+def _is_rim(points: Float[np.ndarray, "_ 2"], area: shapely.Geometry) -> bool:
+    """Whether less than half of a line's pieces have the area on both sides."""
+    along = np.diff(points, axis=0)
+    length = np.hypot(along[:, 0], along[:, 1])
+    along, middle = along[length > 0] / length[length > 0, None], ((points[1:] + points[:-1]) / 2)[length > 0]
+    aside = BESIDE_M * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    both = shapely.contains_xy(area, middle + aside) & shapely.contains_xy(area, middle - aside)
+    return bool(len(both)) and bool(both.mean() < 0.5)

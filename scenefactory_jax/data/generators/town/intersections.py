@@ -1,0 +1,357 @@
+"""Blocks where streets meet: intersections of three to five arms, and roundabouts."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.types import LANE_BIKE
+from scenefactory_jax.data.generators.curves import FINE_M, Points, connect, curvature, heading, wrap_angle
+from scenefactory_jax.data.generators.procedural.road_layout import Line, check_range, draw
+from scenefactory_jax.data.generators.town.road_network import SOLID_WHITE, Block, Crosswalk, Lane, Port, Stop, Street
+
+Control = Literal["signal", "all_way_stop", "two_way_stop", "yield"]
+STRAIGHT_ON = np.radians(40.0)  # a movement that turns by less goes straight on
+OPPOSITE = np.radians(150.0)  # arms this far apart have green together
+GROWTHS, GROW_M = 24, 1.5  # an intersection grows until its sharpest turn can be driven
+TURN_RANK = {"straight": 4, "right": 3, "left": 2}
+RING_RANK = 50
+PAVED_M = 0.3  # between a lane's side and the kerb within a junction
+RING_PAVED_M = 0.5  # the same in a roundabout, where long cars cut the curve
+POST_M = 1.5  # from the kerb to a stop sign
+
+
+class Arm(NamedTuple):
+    """A street that ends at a junction, as the junction sees it."""
+
+    yaw: float  # out of the junction
+    street: Street
+    leaving: int  # lanes out of the junction
+    entering: int
+    bay: str = ""  # "left" or "right": the side of a lane that only turns
+
+
+class Turn(NamedTuple):
+    """A way through a junction: from an entering slot of one arm to a leaving slot of another."""
+
+    source: tuple[int, int]  # arm, slot
+    target: tuple[int, int]
+    kind: str  # "straight", "left", "right"
+
+
+def intersection(
+    rng: np.random.Generator,
+    centre: Float[np.ndarray, " 2"],
+    arms: Sequence[Arm],
+    control: Control,
+    *,
+    corner_radius_m: list[float],
+    turn_radius_m: float,
+    crosswalk_m: list[float],
+    crosswalk_share: float,
+) -> Block:
+    """Arms around a centre, set back until no connecting lane turns sharper than `turn_radius_m`.
+
+    Args:
+        arms: counter-clockwise.
+        crosswalk_m: depth of a crosswalk.
+        crosswalk_share: how many arms have one; at lights all have.
+
+    Raises:
+        ConfigError: no set-back is large enough.
+    """
+    corner = draw(rng, corner_radius_m, "intersection.corner_radius_m")
+    depth = draw(rng, crosswalk_m, "intersection.crosswalk_m", low=1.0)
+    zebra = [control == "signal" or bool(rng.random() < crosswalk_share) for _ in arms]
+    mouths = _setbacks(arms, corner) + np.where(zebra, depth + 1.0, 0.0)
+    turns = find_turns(arms)
+    for _ in range(GROWTHS):
+        paths = [_path(centre, arms, mouths, turn) for turn in turns]
+        if max(np.abs(curvature(path)[2:-2]).max() for path in paths) <= 1 / turn_radius_m:
+            return _assemble(centre, arms, mouths, turns, paths, control, zebra, depth)
+        mouths = mouths + GROW_M
+    raise ConfigError(f"intersection.turn_radius_m: {turn_radius_m:g} m does not fit {len(arms)} arms; ask for less")
+
+
+def half_width(arm: Arm, side: Literal["left", "right"]) -> float:
+    """From the middle of an arm to its kerb, seen out of the junction: entering lanes lie on the left."""
+    slots = arm.entering if side == "left" else arm.leaving
+    return arm.street.median / 2 + slots * arm.street.width + arm.street.bike + PAVED_M
+
+
+def _setbacks(arms: Sequence[Arm], corner: float) -> Float[np.ndarray, " A"]:
+    """Distances from the centre at which no two arms overlap and a corner of the given radius fits between any two."""
+    mouths = np.full(len(arms), 6.0)
+    for i, arm in enumerate(arms):
+        j = (i + 1) % len(arms)
+        between = np.mod(arms[j].yaw - arm.yaw, 2 * np.pi)
+        own, other = half_width(arm, "left"), half_width(arms[j], "right")
+        if between < OPPOSITE:
+            rounding = corner / np.tan(between / 2)
+            mouths[i] = max(mouths[i], (other + own * np.cos(between)) / np.sin(between) + rounding)
+            mouths[j] = max(mouths[j], (own + other * np.cos(between)) / np.sin(between) + rounding)
+    return mouths
+
+
+def slot_place(centre: Float[np.ndarray, " 2"], arm: Arm, mouth: float, slot: int | float, *, entering: bool) -> Float[np.ndarray, " 2"]:
+    """Where a slot of an arm meets the junction; slots at half numbers are lines between lanes."""
+    beside = arm.street.median / 2 + (slot + 0.5) * arm.street.width
+    return centre + mouth * heading(arm.yaw) + (beside if entering else -beside) * heading(arm.yaw + np.pi / 2)
+
+
+def _path(centre: Float[np.ndarray, " 2"], arms: Sequence[Arm], mouths: Float[np.ndarray, " A"], turn: Turn) -> Points:
+    """Centre line of a connecting lane."""
+    source, target = arms[turn.source[0]], arms[turn.target[0]]
+    start = slot_place(centre, source, mouths[turn.source[0]], turn.source[1], entering=True)
+    end = slot_place(centre, target, mouths[turn.target[0]], turn.target[1], entering=False)
+    return connect(start, source.yaw + np.pi, end, target.yaw)
+
+
+def find_turns(arms: Sequence[Arm]) -> list[Turn]:
+    """Left turns from the innermost lane, right turns from the outermost, straight on lane by lane but from a bay.
+
+    A lane that would lead nowhere, or that nothing would lead into, is joined to the nearest slot of the straightest arm.
+    """
+    found: list[Turn] = []
+    for a, arm in enumerate(arms):
+        for b, other in enumerate(arms):
+            if a == b or not arm.entering or not other.leaving:
+                continue
+            angle = wrap_angle(other.yaw - arm.yaw - np.pi)
+            if abs(angle) < STRAIGHT_ON:
+                first, last = int(arm.bay == "left"), arm.entering - int(arm.bay == "right")
+                shift = first
+                pairs = [(slot, slot - shift) for slot in range(first, last) if slot - shift < other.leaving]
+                found += [Turn((a, i), (b, j), "straight") for i, j in pairs]
+            elif angle > 0:
+                found.append(Turn((a, 0), (b, 0), "left"))
+            else:
+                found.append(Turn((a, arm.entering - 1), (b, other.leaving - 1), "right"))
+    return found + _loose_ends(arms, found)
+
+
+def _loose_ends(arms: Sequence[Arm], found: Sequence[Turn]) -> list[Turn]:
+    """Turns for the lanes that lead nowhere or that nothing leads into."""
+    extra = []
+    angle = lambda a, b: wrap_angle(arms[b].yaw - arms[a].yaw - np.pi)  # noqa: E731
+    kind = lambda a, b: "straight" if abs(angle(a, b)) < STRAIGHT_ON else "left" if angle(a, b) > 0 else "right"  # noqa: E731
+    leads, led = {turn.source for turn in found}, {turn.target for turn in found}
+    for a, arm in enumerate(arms):
+        for i in range(arm.entering):
+            if (a, i) not in leads:
+                b = min((b for b in range(len(arms)) if b != a and arms[b].leaving), key=lambda b: abs(angle(a, b)))
+                extra.append(Turn((a, i), (b, min(i, arms[b].leaving - 1)), kind(a, b)))
+        for j in range(arm.leaving):
+            if (a, j) not in led:
+                b = min((b for b in range(len(arms)) if b != a and arms[b].entering), key=lambda b: abs(angle(b, a)))
+                extra.append(Turn((b, min(j, arms[b].entering - 1)), (a, j), kind(b, a)))
+    return extra
+
+
+def _assemble(
+    centre: Float[np.ndarray, " 2"],
+    arms: Sequence[Arm],
+    mouths: Float[np.ndarray, " A"],
+    turns: Sequence[Turn],
+    paths: Sequence[Points],
+    control: Control,
+    zebra: Sequence[bool],
+    depth: float,
+) -> Block:
+    """Lanes with right of way, stops, crosswalks and ports; lanes for bicycles straight on."""
+    phases = _phases(arms) if control == "signal" else []
+    stops = [stop for a, arm in enumerate(arms) for stop in _stops(centre, arm, a, mouths[a], control, phases, highest=_highest(arms))]
+    governed = {(stop.arm, stop.protected): index for index, stop in enumerate(stops)}
+    cycles = [(a, b) for a in range(len(arms)) for b in range(len(arms)) if _cycles_cross(arms, a, b)]
+    lanes = []
+    for turn, path in zip(turns, paths, strict=True):
+        street = arms[turn.source[0]].street
+        control_of = governed.get((turn.source[0], turn.kind == "left"), governed.get((turn.source[0], False)))
+        lanes.append(Lane(path, street.width, street.limit, _rank(street, turn.kind, control), street.kind, control_of))
+    for a, b in cycles:
+        path = _cycle_path(centre, arms, mouths, a, b)
+        street = arms[a].street
+        lanes.append(Lane(path, street.bike, street.limit, _rank(street, "right", control), LANE_BIKE, governed.get((a, False))))
+    strips = [paved(lane, PAVED_M) for lane in lanes[: len(turns)]]
+    waiting = {stop.arm for stop in stops}
+    return Block(
+        kind=f"{len(arms)}_arms",
+        lanes=lanes,
+        lines=[Line(SOLID_WHITE, _stop_line(centre, arm, mouths[a])) for a, arm in enumerate(arms) if a in waiting],
+        areas=[*strips, *_middle(centre, arms, mouths, depth + 1.0)],
+        stops=stops,
+        crosswalks=[_crosswalk(centre, arm, a, mouths[a], depth) for a, arm in enumerate(arms) if zebra[a]],
+        ports=[_port(centre, arm, a, turns, cycles, mouths[a], a in waiting) for a, arm in enumerate(arms)],
+        phases=phases,
+    )
+
+
+def paved(lane: Lane, beside: float) -> shapely.Polygon:
+    """The surface that a lane needs, with so much beside it."""
+    return shapely.LineString(lane.points).simplify(0.03).buffer(lane.width / 2 + beside, cap_style="flat")
+
+
+def _highest(arms: Sequence[Arm]) -> int:
+    return max(arm.street.rank for arm in arms)
+
+
+def _rank(street: Street, kind: str, control: Control) -> int:
+    """Right of way of a turn: by street, where no light and no stop for all makes them equal, then straight before right before left."""
+    return TURN_RANK[kind] + (0 if control in ("signal", "all_way_stop") else 5 * street.rank)
+
+
+def _phases(arms: Sequence[Arm]) -> list[frozenset[int]]:
+    """Arms that have green together: opposite ones in pairs, the others alone."""
+    left, phases = list(range(len(arms))), []
+    while left:
+        own = left.pop(0)
+        facing = [other for other in left if abs(wrap_angle(arms[other].yaw - arms[own].yaw)) > OPPOSITE]
+        if facing:
+            left.remove(facing[0])
+        phases.append(frozenset([own, *facing[:1]]))
+    return phases
+
+
+def _stops(
+    centre: Float[np.ndarray, " 2"], arm: Arm, index: int, mouth: float, control: Control, phases: Sequence[frozenset[int]], *, highest: int
+) -> list[Stop]:
+    """What an arm's traffic waits for: lights, with an arrow for a left turn that nobody meets, a sign, or nothing."""
+    if not arm.entering:
+        return []
+    post = slot_place(centre, arm, mouth, arm.entering - 0.5, entering=True)
+    post = post + (arm.street.bike + PAVED_M + POST_M) * heading(arm.yaw + np.pi / 2)
+    if control == "signal":
+        alone = any(phase == frozenset([index]) for phase in phases)
+        return [Stop("signal", index, post), *([Stop("signal", index, post, protected=True)] if alone else [])]
+    if control == "all_way_stop" or (control == "two_way_stop" and arm.street.rank < highest):
+        return [Stop("stop", index, post)]
+    return []
+
+
+def _cycles_cross(arms: Sequence[Arm], a: int, b: int) -> bool:
+    """Whether a bicycle lane leads straight on from an arm to another."""
+    straight = a != b and abs(wrap_angle(arms[b].yaw - arms[a].yaw - np.pi)) < STRAIGHT_ON
+    return bool(straight) and min(arms[a].street.bike, arms[b].street.bike, arms[a].entering, arms[b].leaving) > 0
+
+
+def _cycle_path(centre: Float[np.ndarray, " 2"], arms: Sequence[Arm], mouths: Float[np.ndarray, " A"], a: int, b: int) -> Points:
+    """Centre line of a bicycle lane straight on."""
+    ends = []
+    for arm, mouth, slots, entering in ((arms[a], mouths[a], arms[a].entering, True), (arms[b], mouths[b], arms[b].leaving, False)):
+        aside = arm.street.bike / 2 * heading(arm.yaw + np.pi / 2)
+        ends.append(slot_place(centre, arm, mouth, slots - 0.5, entering=entering) + (aside if entering else -aside))
+    return connect(ends[0], arms[a].yaw + np.pi, ends[1], arms[b].yaw)
+
+
+def _middle(
+    centre: Float[np.ndarray, " 2"], arms: Sequence[Arm], mouths: Float[np.ndarray, " A"], depth: float
+) -> list[shapely.Geometry]:
+    """What is paved between the arms: all between an arm and the one straight ahead, else from the centre to the arm's port."""
+    found: list[shapely.Geometry] = []
+    straight = np.zeros(len(arms), bool)
+    near = [_mouth(centre, arm, max(0.0, mouth - depth), mouth) for arm, mouth in zip(arms, mouths, strict=True)]
+    for a, arm in enumerate(arms):
+        for b in range(a):
+            if abs(wrap_angle(arm.yaw - arms[b].yaw - np.pi)) < STRAIGHT_ON:
+                found.append(shapely.convex_hull(shapely.union(near[a], near[b])))
+                straight[[a, b]] = True
+    return found + [_mouth(centre, arm, 0.0, mouths[a]) for a, arm in enumerate(arms) if not straight[a]]
+
+
+def _mouth(centre: Float[np.ndarray, " 2"], arm: Arm, near: float, far: float) -> shapely.Polygon:
+    """The arm's full width between two distances from the centre."""
+    along, across = heading(arm.yaw), heading(arm.yaw + np.pi / 2)
+    left, right = half_width(arm, "left"), half_width(arm, "right")
+    corners = ((near, -right), (far + 0.05, -right), (far + 0.05, left), (near, left))
+    return shapely.Polygon([centre + x * along + y * across for x, y in corners])
+
+
+def _stop_line(centre: Float[np.ndarray, " 2"], arm: Arm, mouth: float) -> Points:
+    """Across the lanes that enter."""
+    return np.stack([slot_place(centre, arm, mouth, slot, entering=True) for slot in (-0.5, arm.entering - 0.5)])
+
+
+def _crosswalk(centre: Float[np.ndarray, " 2"], arm: Arm, index: int, mouth: float, depth: float) -> Crosswalk:
+    """A zebra across an arm, just inside the stop line."""
+    along, across = heading(arm.yaw), heading(arm.yaw + np.pi / 2)
+    left, right = half_width(arm, "left"), half_width(arm, "right")
+    near, far = mouth - 0.8 - depth, mouth - 0.8
+    outline = np.stack([centre + x * along + y * across for x, y in ((near, -right), (far, -right), (far, left), (near, left))])
+    middle = centre + (near + far) / 2 * along
+    return Crosswalk(outline, np.stack([middle - right * across, middle + left * across]), index)
+
+
+def _port(
+    centre: Float[np.ndarray, " 2"],
+    arm: Arm,
+    index: int,
+    turns: Sequence[Turn],
+    cycles: Sequence[tuple[int, int]],
+    mouth: float,
+    waiting: bool,
+) -> Port:
+    """Where an arm's street begins; bicycle lanes are numbered behind the turns."""
+    leaving = tuple(tuple(t for t, turn in enumerate(turns) if turn.target == (index, slot)) for slot in range(arm.leaving))
+    entering = tuple(tuple(t for t, turn in enumerate(turns) if turn.source == (index, slot)) for slot in range(arm.entering))
+    out = tuple(len(turns) + c for c, (_, b) in enumerate(cycles) if b == index)
+    into = tuple(len(turns) + c for c, (a, _) in enumerate(cycles) if a == index)
+    side = arm.bay or "right"
+    return Port(centre + mouth * heading(arm.yaw), arm.yaw, arm.street, leaving, entering, out, into, side, waiting)
+
+
+def roundabout(
+    rng: np.random.Generator,
+    centre: Float[np.ndarray, " 2"],
+    arms: Sequence[Arm],
+    control: Control,
+    *,
+    ring_radius_m: list[float],
+    ring_width_m: list[float],
+    split_deg: float,
+    crosswalk_m: list[float],
+    crosswalk_share: float,
+) -> Block:
+    """A ring driven counter-clockwise, with one lane a direction at every arm; what is on the ring goes first.
+
+    Args:
+        arms: counter-clockwise, with one slot a direction.
+        ring_radius_m: of the ring's lane centre.
+        split_deg: angle between an arm and the points where its traffic leaves and joins the ring, less where arms are close.
+
+    Raises:
+        ConfigError: numbers out of range.
+    """
+    check_range(ring_radius_m, "roundabout.ring_radius_m", low=8.0)
+    radius, width = draw(rng, ring_radius_m, "roundabout.ring_radius_m"), draw(rng, ring_width_m, "roundabout.ring_width_m", low=3.0)
+    depth = draw(rng, crosswalk_m, "roundabout.crosswalk_m", low=1.0)
+    yaws = np.array([arm.yaw for arm in arms])
+    split = min(np.radians(split_deg), 0.42 * float(np.min(np.mod(np.roll(yaws, -1) - yaws, 2 * np.pi))))
+    beside = max(arm.street.median / 2 + arm.street.width / 2 for arm in arms)
+    # entry and exit are arcs where the mouth lies at this distance: the chord then makes half the turn's angle with the arm
+    mouth = radius * np.cos(split) + max(radius * np.sin(split) - beside, 1.0) / np.tan((np.pi / 2 - split) / 2) + 2.0
+    lanes: list[Lane] = []
+    follows, ports, walks = [], [], []
+    for index, arm in enumerate(arms):
+        base, following = 4 * index, 4 * ((index + 1) % len(arms))
+        leave, join = arm.yaw - split, arm.yaw + split
+        next_leave = join + np.mod(arms[(index + 1) % len(arms)].yaw - split - join, 2 * np.pi)
+        before, after = _ring(centre, radius, leave, join), _ring(centre, radius, join, next_leave)
+        start, end = (slot_place(centre, arm, mouth, 0, entering=side) for side in (True, False))
+        limit = min(arm.street.limit, 10.0)
+        entry = connect(start, arm.yaw + np.pi, after[0], join + np.pi / 2)
+        leaving = connect(before[0], leave + np.pi / 2, end, arm.yaw)
+        lanes += [Lane(entry, arm.street.width, limit, TURN_RANK["right"]), Lane(leaving, arm.street.width, limit, RING_RANK)]
+        lanes += [Lane(before, width, limit, RING_RANK), Lane(after, width, limit, RING_RANK)]
+        follows += [(base, base + 3), (base + 2, base + 3), (base + 3, following + 1), (base + 3, following + 2)]
+        zebra = bool(rng.random() < crosswalk_share)
+        walks += [_crosswalk(centre, arm, index, mouth + depth + 0.8, depth)] if zebra else []
+        ports.append(Port(centre + mouth * heading(arm.yaw), arm.yaw, arm.street, ((base + 1,),), ((base,),), controlled=True))
+    return Block("roundabout", lanes, follows, areas=[paved(lane, RING_PAVED_M) for lane in lanes], crosswalks=walks, ports=ports)
+
+
+def _ring(centre: Float[np.ndarray, " 2"], radius: float, start: float, end: float) -> Points:
+    """A piece of the ring, counter-clockwise."""
+    return centre + radius * heading(np.linspace(start, end, max(3, round(radius * (end - start) / FINE_M))))

@@ -1,0 +1,67 @@
+"""Which network of roads a town has: its streets, or a motorway."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.data.generators.procedural.road_layout import BROKEN_WHITE
+from scenefactory_jax.data.generators.town.build_network import realise
+from scenefactory_jax.data.generators.town.cross_sections import make_class
+from scenefactory_jax.data.generators.town.road_network import Network, Street
+
+PACKAGE = "scenefactory_jax.scenes.town"
+SITES = {"intersection": "junctions", "driveway": "junctions", "roundabout": "junctions", "parking_lot": "parking"}
+
+
+def draw_network(
+    rng: np.random.Generator,
+    reach: float,
+    *,
+    plans: Mapping[str, Any],
+    motorway: Mapping[str, Any],
+    motorway_share: float,
+    streets: Mapping[str, Mapping[str, Any]],
+    driveway: Mapping[str, float],
+    lots: Mapping[str, Any],
+    roads: Mapping[str, Any],
+    junctions: Mapping[str, Any],
+    blocks: Mapping[str, Mapping[str, Any]],
+) -> tuple[str, Network] | None:
+    """A kind of town and its network; None where the plan that was drawn cannot be built.
+
+    Args:
+        plans: entries for the towns' streets, `(rng, reach, classes) -> Plan` or None, each as likely as the others.
+        motorway: entry for `(rng, reach) -> Network`.
+        motorway_share: of scenes that are a motorway.
+        streets: name -> numbers of a class of streets (`streets.StreetClass`), the least important first.
+        driveway: lane width and speed limit.
+        lots: entry for parking lots beside the streets of a plan, `(rng, plan, reach, street) -> Plan`.
+        roads: entry for `links.Numbers`.
+        junctions: entry for `(blocks, roads) -> build.Choice`.
+        blocks: entries for intersection, driveway, roundabout and parking_lot.
+
+    Raises:
+        ConfigError: an unknown key or a number that makes no sense, by name.
+    """
+    where = "generate.network"
+    layouts = {name: entry for name, entry in plans.items() if entry is not None}
+    if not layouts:
+        raise ConfigError(f"{where}.plans: empty; give at least one entry")
+    if set(blocks) != set(SITES):
+        wrong = sorted(set(blocks) ^ set(SITES))[0]
+        raise ConfigError(f"{where}.blocks.{wrong}: missing or unknown; valid: {', '.join(SITES)}")
+    makers = {name: build(entry, builtins=f"{PACKAGE}.plans", where=f"{where}.plans.{name}") for name, entry in layouts.items()}
+    classes = [make_class(name, rank, numbers) for rank, (name, numbers) in enumerate(streets.items(), start=1)]
+    built = {name: build(blocks[name], builtins=f"{PACKAGE}.{module}", where=f"{where}.blocks.{name}") for name, module in SITES.items()}
+    add_lots = build(lots, builtins=f"{PACKAGE}.plans", where=f"{where}.lots")
+    numbers = build(roads, builtins=f"{PACKAGE}.links", where=f"{where}.roads")()
+    choice = build(junctions, builtins=f"{PACKAGE}.build", where=f"{where}.junctions")(built, numbers)
+    if rng.random() < motorway_share:
+        return "motorway", build(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
+    kind = str(rng.choice(list(makers)))
+    lane = Street(1, 1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_WHITE + 3)
+    plan = makers[kind](rng, reach, classes)
+    network = None if plan is None else realise(rng, add_lots(rng, plan, reach, lane), choice)
+    return None if network is None else (kind, network)

@@ -1,0 +1,249 @@
+"""Training on more scenes than memory holds: some worlds get other scenes before every iteration, loaded while the one before ran.
+
+    with stream.flowing(config, mesh=None, before=None) as flow:
+        scenes = flow.scenes()                                # for all worlds, on their devices
+        for iteration in range(iterations):
+            if iteration:
+                state, scenes = flow.exchange(trainer.swap, state, scenes)
+            state, metrics = trainer.iterate(state, scenes)
+            flow.draw()                                       # while the devices work
+            flow.note(*jax.device_get((state.record.episodes, state.record.successes)))
+
+What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
+state, it makes a resumed run the unbroken one, bit for bit.
+"""
+
+import contextlib
+import functools
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as Late
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_share
+from scenefactory_jax.core.parallel import process_pool
+from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.types import Scene
+from scenefactory_jax.data.loading import batches, samplers
+from scenefactory_jax.data.loading.batches import Batch
+
+SHOWN = 10  # scenes left out that are told by name
+
+
+class Numbers(NamedTuple):
+    """A `stream` entry of a config, checked; see conf/stream/base.yaml."""
+
+    sampler: samplers.Sampler
+    swapped: int  # worlds, before every iteration
+    ahead: int
+    processes: int
+    wait_s: float
+    memory: float
+    excess: batches.Excess
+    sample: int
+    headroom: float
+    memory_gib: float
+    capacity: Mapping[str, int | None]
+
+
+def numbers(
+    *,
+    sampler: dict,
+    share: float,
+    ahead: int,
+    workers: int,
+    wait_s: float,
+    memory: float,
+    excess: Literal["cut", "skip"],
+    sample: int,
+    headroom: float,
+    memory_gib: float,
+    capacity: dict,
+    seed: int,
+    worlds: int,
+    devices: int,
+) -> Numbers:
+    """Check a `stream` entry.
+
+    Raises:
+        ConfigError: a number out of range, or worlds that do not divide among the devices, by name.
+    """
+    least = {"ahead": (ahead, 1), "workers": (workers, 0), "sample": (sample, 1), "headroom": (headroom, 1)}
+    for name, (value, bound) in least.items():
+        if value < bound:
+            raise ConfigError(f"stream.{name}: {value}; wanted is at least {bound}")
+    for name, value in {"share": share, "memory": memory}.items():
+        check_share(value, where=f"stream.{name}")
+    for name, value in {"wait_s": wait_s, "memory_gib": memory_gib}.items():
+        check_number(value, where=f"stream.{name}", above=0)
+    if worlds % devices:
+        raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
+    swapped = min(worlds, int(np.ceil(share * worlds / devices)) * devices)  # every device takes an equal part of the rows
+    draw = build(sampler, builtins=samplers, where="stream.sampler", seed=seed)
+    return Numbers(draw, swapped, ahead, workers, wait_s, memory, excess, sample, headroom, memory_gib, capacity)
+
+
+class Placed(NamedTuple):
+    """A batch on its way to the devices."""
+
+    batch: Batch
+    scenes: Scene
+
+
+class Flow:
+    """Scenes on their way into worlds, and what is known of them. Made by `flowing`."""
+
+    def __init__(self, source: batches.Source, entry: Numbers, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
+        """`held` is what `state` told, or `_new`."""
+        self._source, self._entry, self._load = source, entry, load
+        self._table = samplers.Table(
+            np.asarray(held["draws"], int), np.asarray(held["episodes"], float), np.asarray(held["successes"], float), source.count is None
+        )
+        self._sizes, self._exchanges, self._counts = dict(held["sizes"]), held["exchanges"], dict(held["counts"])
+        self._placed = np.asarray(held["placed"], int)  # the scene of each world
+        self._record = np.asarray(held["record"], int)  # of each world since then: episodes, successes
+        self._waiting = deque((np.asarray(drawn, int), load(np.asarray(drawn, int))) for drawn in held["waiting"])
+        self._waited_s, self._told = 0.0, set()
+        self.swapped = entry.swapped  # worlds an exchange
+
+    def scenes(self) -> Scene:
+        """Those of all worlds, on their devices. At the start of a run they are drawn, and the next ones with them."""
+        if self._table.draws.any():  # they were accounted for when they were drawn
+            return self._load(self._placed).result().scenes
+        taken = self._take(self._load(self._drawn(len(self._placed))))
+        self._placed = taken.batch.indices
+        self.draw()
+        return taken.scenes
+
+    def exchange(self, swap: Callable[..., tuple[Any, Scene]], state: Any, scenes: Scene) -> tuple[Any, Scene]:
+        """Put the next scenes into the worlds whose own have been there longest, by a trainer's `swap`, which takes both donated.
+
+        Raises:
+            SceneError: not one of the next scenes can be used.
+            RuntimeError: what else went wrong in loading them, with a scene's name; or that they did not come in time.
+        """
+        if not self._entry.swapped:
+            return state, scenes
+        count, swapped = len(self._placed), self._entry.swapped
+        worlds = (self._exchanges * swapped + np.arange(swapped)) % count
+        _, future = self._waiting[0]
+        taken = self._take(future)
+        self._waiting.popleft()
+        self._table = samplers.learnt(self._table, self._placed[worlds], *self._record[:, worlds], memory=self._entry.memory)
+        self._placed[worlds], self._record[:, worlds] = taken.batch.indices, 0
+        self._exchanges += 1
+        return swap(state, scenes, worlds, taken.scenes)
+
+    def draw(self) -> None:
+        """Draw what is to be on its way, and begin to load it."""
+        while self._entry.swapped and len(self._waiting) < self._entry.ahead:
+            drawn = self._drawn(self._entry.swapped)
+            self._waiting.append((drawn, self._load(drawn)))
+
+    def note(self, episodes: np.ndarray, successes: np.ndarray) -> dict[str, float | int]:
+        """Take note of what became of the worlds' agents; the row of numbers is for the run's metrics."""
+        self._record = np.stack([episodes, successes]).astype(int)
+        waited, self._waited_s = self._waited_s, 0.0
+        counts = {f"stream/{name}": count for name, count in self._counts.items()}
+        return {"stream/scenes": int((self._table.draws > 0).sum()), **counts, "stream/wait_s": waited}
+
+    def state(self) -> dict[str, Any]:
+        """All that the next draws depend on, as JSON values."""
+        return {
+            "source": self._source.count,
+            "sizes": self._sizes,
+            "exchanges": self._exchanges,
+            "placed": self._placed.tolist(),
+            "record": self._record.tolist(),
+            "waiting": [drawn.tolist() for drawn, _ in self._waiting],
+            "counts": self._counts,
+            **{name: getattr(self._table, name).tolist() for name in ("draws", "episodes", "successes")},
+        }
+
+    def _drawn(self, count: int) -> np.ndarray:
+        """The sampler's next scenes; it sees the worlds that are running, too."""
+        table = samplers.learnt(self._table, self._placed, *self._record, memory=self._entry.memory)
+        indices = np.asarray(self._entry.sampler(table, count))
+        last = None if self._source.count is None else self._source.count - 1
+        wrong = indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any()
+        if wrong or (last is not None and (indices > last).any()):
+            raise ConfigError(f"stream.sampler: it drew {indices!r}; wanted are {count} whole numbers from 0 to {last or 'anywhere'}")
+        self._table = samplers.drawn(self._table, indices)
+        return indices
+
+    def _take(self, future: Future) -> Placed:
+        """What was loaded, and the account of it."""
+        begun = time.monotonic()
+        try:
+            taken: Placed = future.result(timeout=self._entry.wait_s)
+        except Late:
+            wait = f"stream.wait_s: no scenes after {self._entry.wait_s:g} s"
+            raise RuntimeError(f"{wait} from {self._source.line}; raise it, or stream.workers") from None
+        self._waited_s += time.monotonic() - begun
+        self._counts["cut"] += taken.batch.cut
+        self._counts["refused"] += len(taken.batch.refused)
+        for name, reason in taken.batch.refused.items():
+            if name not in self._told and len(self._told) < SHOWN:
+                self._told.add(name)
+                print(for_terminal(f"left out {name}: {reason}"), flush=True)
+        return taken
+
+
+def _new(source: batches.Source, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
+    """The state of a stream that has not begun."""
+    table = samplers.empty(source.count)
+    return {
+        "source": source.count,
+        "sizes": dict(sizes),
+        "exchanges": 0,
+        "placed": np.zeros(worlds, int),
+        "record": np.zeros((2, worlds), int),
+        "waiting": [],
+        "counts": {"cut": 0, "refused": 0},
+        **{name: getattr(table, name) for name in ("draws", "episodes", "successes")},
+    }
+
+
+@contextlib.contextmanager
+def flowing(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[Flow]:
+    """The stream of a config, from its beginning or from a `state` of before; its threads and processes end with the context.
+
+    Raises:
+        ConfigError: a key that does not fit, sizes that make no sense, or a state that belongs to other scenes.
+        SceneError: scenes that cannot be read, with reasons.
+    """
+    source = batches.open(config["scenes"])
+    devices = 1 if mesh is None else mesh.size
+    context = {"seed": config["seed"], "worlds": config["worlds"], "devices": devices}
+    entry: Numbers = build({"_target_": "numbers", **config["stream"]}, builtins=__name__, where="stream", **context)()
+    if before is not None and before["source"] != source.count:
+        raise ConfigError(f"resume=true: the run streamed {before['source']} scenes; there are {source.line} now")
+    grid = config["scenes"]["cells"]
+    with contextlib.ExitStack() as stack:
+        thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
+        stack.callback(thread.shutdown, wait=True, cancel_futures=True)
+        pool = stack.enter_context(process_pool.pool(entry.processes)) if entry.processes else None
+        if before is None:
+            asked = {"sample": entry.sample, "headroom": entry.headroom, "given": entry.capacity, "seed": config["seed"]}
+            sizes = batches.measure(source, pool, grid=grid, **asked)
+        else:
+            sizes = before["sizes"]
+        batches.require_memory(sizes, config["worlds"] + entry.ahead * entry.swapped, gib=entry.memory_gib)
+        read = functools.partial(batches.load, source, pool, fit=batches.Fit(sizes, grid, entry.excess))
+
+        def placed(indices: np.ndarray) -> Placed:
+            batch = read(indices)
+            return Placed(batch, jax.block_until_ready(sharding.place(batch.scene, mesh)))
+
+        held = _new(source, sizes, config["worlds"]) if before is None else before
+        flow = Flow(source, entry, lambda indices: thread.submit(placed, indices), held)
+        what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
+        print(f"stream of {source.line}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}", flush=True)
+        yield flow

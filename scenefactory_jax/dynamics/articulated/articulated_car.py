@@ -1,0 +1,251 @@
+"""Articulated cars: `arrow` moves one of them, or MJX does, `vmap` runs the cars of a world, `contact` lets them meet.
+
+Only what the next step needs is carried: positions, velocities and the solver's warm start, in MuJoCo's order.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from scenefactory_jax.core.geometry import heading, norm
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.pytree import choose, replace, struct
+from scenefactory_jax.core.types import Dynamics, Motion, Scene
+from scenefactory_jax.dynamics.articulated import closed_form_step, equations_of_motion, mjx_backend
+from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated import randomization as fleets
+from scenefactory_jax.dynamics.articulated import state as states
+from scenefactory_jax.dynamics.articulated.actuators import Command, Load, applied, held, pulling, slip_damping, wanted
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, Places, Solver
+from scenefactory_jax.dynamics.articulated.randomization import Fleet, enlist, standing
+from scenefactory_jax.dynamics.articulated.tyres import Tyres
+from scenefactory_jax.dynamics.articulated.vector import Vector, dot
+from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
+
+
+@struct
+class Body:
+    """Cars of one world; every leaf has the agent axis first."""
+
+    qpos: Float[Array, "A 17"]
+    qvel: Float[Array, "A 16"]
+    qacc_warmstart: Float[Array, "A 16"]
+    spin_sign: Float[Array, "A 4"]  # last direction of each wheel; only latched brakes read it
+    contact_force: Float[Array, " A"]
+    tyres: Tyres
+    fleet: Fleet | None  # cars that differ
+
+
+class Plant(NamedTuple):
+    """The compiled car and all that is constant about it."""
+
+    own: Fleet  # of one: the reference car
+    vary: Callable[..., CarParameters] | None  # (key, scene) -> the cars of an episode
+    stages: mjx_backend.Stages | None  # of MJX, where its solvers are asked for
+    places: Places
+    latched: bool
+    solver: Solver
+    still: np.ndarray  # qpos of the reference car at rest
+    physics_dt: float
+    substeps: int
+
+
+class Single(NamedTuple):
+    """What is carried of one car from step to step, in MuJoCo's order."""
+
+    qpos: Float[Array, "17"]
+    qvel: Float[Array, "16"]
+    qacc_warmstart: Float[Array, "16"]
+    spin_sign: Float[Array, "4"]
+
+
+def make(
+    *,
+    car: dict[str, Any],
+    solver: dict[str, Any],
+    contact: dict[str, Any],
+    brakes: Literal["friction", "latched"],
+    fleet: dict[str, Any] | None,
+    grip: Callable[..., Any],
+    physics_dt: float,
+    control_dt: float,
+) -> Dynamics:
+    """Cars with 10 joints each.
+
+    Args:
+        car: numbers of `car.CarParameters`.
+        solver: numbers of `car.Solver`.
+        contact: numbers of `contact.make`; its height is the car's.
+        brakes: `friction` lets the solver find locking and standstill by itself; `latched` applies the published torque against a
+            remembered spin direction, which flips every substep once a wheel locks.
+        fleet: null: all cars are the reference car. An entry whose target, such as `fleet.drawn`, gives a function (key, scene) ->
+            parameters with an agent axis, called at every start: nothing is compiled anew. It may declare `car` and `physics_dt`.
+        grip: (weather, position, speed) -> friction coefficient, asked for every wheel at the start of every control step.
+        physics_dt: s; `control_dt` must be a whole multiple of it.
+
+    Raises:
+        ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
+    """
+    parameters, settings = cars.numbers({"car": car, "solver": solver})
+    plant = compiled(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
+    entry, numbers = {**contact, "_target_": "make"}, {"height": parameters.height, "physics_dt": physics_dt}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", **numbers)()
+    context = {"car": parameters, "physics_dt": physics_dt}
+    vary = None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)()
+    return bind(plant._replace(vary=vary), meet, grip)
+
+
+def compiled(
+    car: CarParameters, solver: Solver, *, brakes: Literal["friction", "latched"], physics_dt: float, control_dt: float
+) -> Plant:  # fmt: skip
+    """The car with all that is derived of it; all cars are this one until `vary` says otherwise.
+
+    Raises:
+        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `arrow` has not, or rolling
+            resistance with latched brakes, which have no dry friction.
+    """
+    cars.stable_limits(car, physics_dt=physics_dt, where="dynamics.car")
+    if solver.algorithm == "arrow" and solver.integrator != "Euler":
+        raise ConfigError(f"dynamics.solver.integrator: {solver.integrator}; wanted is Euler, or dynamics.solver.algorithm: Newton or CG")
+    if brakes == "latched" and car.rolling_torque != 0.0:
+        torque = f"dynamics.car.rolling_torque: {car.rolling_torque:g} N m"
+        raise ConfigError(f"{torque}; it must be 0 with latched brakes, or dynamics.brakes must be friction")
+    substeps = round(control_dt / physics_dt)
+    if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
+        raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
+    model = cars.standalone(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
+    at = cars.places(model)
+    weights = (model.dof_invweight0[at.spin_v], model.body_invweight0[at.wheel, 0])
+    return Plant(
+        own=Fleet(car, *(jnp.asarray(weight, jnp.float32) for weight in weights)),
+        vary=None,
+        stages=None if solver.algorithm == "arrow" else mjx_backend.compiled(model),
+        places=at,
+        latched=brakes == "latched",
+        solver=solver,
+        still=cars.rest(model, car),
+        physics_dt=physics_dt,
+        substeps=substeps,
+    )
+
+
+def bind(plant: Plant, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
+    """The backend of a compiled car, on a road that `grip` tells."""
+
+    def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
+        with jax.default_matmul_precision("highest"):  # TF32 costs accuracy and buys 8 %
+            return _advance(plant, meet, grip, scene, body, action, active)
+
+    return Dynamics(init=functools.partial(start, plant), advance=advance, read=functools.partial(read, plant))
+
+
+def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
+    """Cars at their starts: at ride height, wheels turning as fast as the road passes under them."""
+    agents, at = scene.agents, plant.places
+    count = agents.yaw.shape[0]
+    half = agents.yaw / 2.0
+    zero = jnp.zeros_like(half)
+    qpos = jnp.tile(jnp.asarray(plant.still, jnp.float32), (count, 1))
+    fleet = None if plant.vary is None else jax.vmap(enlist)(plant.vary(key, scene))
+    if fleet is not None:
+        height, travel = jax.vmap(functools.partial(standing, physics_dt=plant.physics_dt))(fleet)
+        qpos = qpos.at[:, 2].set(height).at[:, at.suspension_q].set(travel)
+    qpos = qpos.at[:, :2].set(agents.position).at[:, 3:7].set(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1))
+    velocity = agents.speed[:, None] * heading(agents.yaw)
+    radius = jnp.broadcast_to(plant.own.car.wheel_radius if fleet is None else fleet.car.wheel_radius, (count,))
+    qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
+    return Body(
+        qpos=qpos,
+        qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),
+        qacc_warmstart=jnp.zeros((count, 16), jnp.float32),
+        spin_sign=jnp.ones((count, 4), jnp.float32),
+        contact_force=jnp.zeros((count,), jnp.float32),
+        tyres=Tyres(*(jnp.zeros((count, 4), jnp.float32) for _ in range(4))),  # an array each: none may be donated twice
+        fleet=fleet,
+    )
+
+
+def _advance(
+    plant: Plant,
+    meet: Contact,
+    grip: Callable[..., Any],
+    scene: Scene,
+    body: Body,
+    action: Float[Array, "A 3"],
+    active: Bool[Array, " A"],
+) -> Body:
+    """One control step of all cars."""
+    own = plant.own if body.fleet is None else body.fleet
+    car, fields = own.car, {}
+    if plant.stages and body.fleet is not None:
+        fields = jax.vmap(functools.partial(mjx_backend.fit, plant.stages.model, plant.places))(body.fleet)
+    before = read(plant, body)
+    speed = norm(before.velocity[:, :2])
+    wheels = wheel_positions(car, before.position[:, :2], before.yaw)
+    mu = grip(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
+    steer, drive, brake = wanted(car, action)
+    one = jax.vmap(functools.partial(move, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
+    mass = equations_of_motion.mass(car)
+    near = meet.neighbours(boxes_of(before, scene.agents.size, active, mass), scene.boxes)
+
+    def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
+        touching = boxes_of(read(plant, now), scene.agents.size, active, mass)
+        force, torque, strength = meet.forces(touching, later(near, time))
+        command = Command(steer, drive, brake, mu, force, torque)
+        moved, tyres = one(own, fields, Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
+        strongest = jnp.maximum(now.contact_force, strength)
+        return replace(now, **moved._asdict(), contact_force=strongest, tyres=tyres), None
+
+    zero = jnp.zeros_like(body.contact_force)
+    after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), plant.physics_dt * jnp.arange(plant.substeps))
+    return choose(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
+
+
+def move(plant: Plant, own: Fleet, fields: dict[str, Array], now: Single, command: Command) -> tuple[Single, Tyres]:
+    """One physics step of one car.
+
+    Args:
+        fields: of MJX's model, if that is used and the car differs from the reference.
+    """
+    car, state = own.car, states.seen(own.car, now.qpos, now.qvel)
+    sign = jnp.where(jnp.abs(state.spin) > 1e-4, jnp.sign(state.spin), now.spin_sign)
+    engine, friction = pulling(car, command.drive, state.spin), command.brake + car.rolling_torque
+    turn, friction = (engine - command.brake * sign, None) if plant.latched else held(engine, friction, state.spin)
+    load = Load(applied(car, state, command, turn), command.mu, friction, slip_damping(car, state))
+    body = own, state, load, now.qpos, now.qvel, now.qacc_warmstart
+    if plant.stages is None:
+        qpos, qvel, acceleration, tyres = closed_form_step.step(*body, solver=plant.solver, physics_dt=plant.physics_dt)
+    else:
+        qpos, qvel, acceleration, tyres = mjx_backend.step(plant.stages, fields, *body, solver=plant.solver)
+    return Single(qpos, qvel, acceleration, sign), tyres
+
+
+def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Float[Array, " A"]) -> Float[Array, "A 4 2"]:
+    """Where the wheels stand in the plane, in the order of `car.WHEELS`; the cars may differ."""
+    ahead = AHEAD * jnp.asarray(car.wheelbase / 2)[..., None]
+    beside = LEFT * jnp.asarray(car.track / 2)[..., None]
+    forward, left = heading(yaw)[:, None], heading(yaw + jnp.pi / 2)[:, None]
+    return position[:, None] + ahead[..., None] * forward + beside[..., None] * left
+
+
+def read(plant: Plant, body: Body) -> Motion:
+    """What the rest of the system may know of the cars."""
+    rotation = states.matrix(body.qpos[:, 3:7].T)
+    tyres, loaded = body.tyres, body.tyres.normal > 1.0  # N
+    return Motion(
+        position=body.qpos[:, :3],
+        velocity=body.qvel[:, :3],
+        yaw=jnp.arctan2(rotation[1][0], rotation[0][0]),
+        yaw_rate=dot(Vector(*rotation[2]), Vector(*body.qvel[:, 3:6].T)),
+        upright=rotation[2][2],
+        steer=body.qpos[:, plant.places.steer_q].mean(-1),
+        contact_force=body.contact_force,
+        grip=tyres.mu.mean(-1),
+        grip_use=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
+        slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
+    )

@@ -1,0 +1,95 @@
+"""Where a car is and how it moves, in its own axes: read from MuJoCo's arrays, written back, and moved on in time."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters
+from scenefactory_jax.dynamics.articulated.vector import Number, Vector, dot, length
+
+TINY = 1e-6  # rad/s
+
+
+class State(NamedTuple):
+    """A car's position and velocity, in its own axes."""
+
+    height: Array  # of the box's centre above the road, m
+    east: Vector  # the world's x, y and z axes
+    north: Vector
+    up: Vector
+    velocity: Vector  # of the box's centre, m/s
+    rate: Vector  # angular velocity, rad/s
+    travel: Float[Array, "4"]  # of each suspension, m
+    sinking: Float[Array, "4"]  # its rate, m/s
+    steer: Float[Array, "4"]  # rad; 0 for the rear wheels
+    steering: Float[Array, "4"]  # its rate, rad/s
+    spin: Float[Array, "4"]  # rate, rad/s
+    hub: Vector  # place of each wheel's centre, m
+    axle: Vector  # its axis of spin
+
+
+def seen(car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> State:
+    """MuJoCo's arrays as a state."""
+    east, north, up = (Vector(*row) for row in matrix(qpos[3:7]))
+    velocity = east * qvel[0] + north * qvel[1] + up * qvel[2]
+    travel, steer, _ = _apart(qpos[7:])
+    sinking, steering, spin = _apart(qvel[6:])
+    hub = Vector(AHEAD * (car.wheelbase / 2), LEFT * (car.track / 2), car.wheel_height + travel)
+    axle = Vector(-jnp.sin(steer), jnp.cos(steer), 0.0)
+    return State(qpos[2], east, north, up, velocity, Vector(*qvel[3:6]), travel, sinking, steer, steering, spin, hub, axle)
+
+
+def matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
+    """Rotation matrix of a unit quaternion (w, x, y, z): its columns are the body's axes in the world, its rows the world's in the body."""
+    w, x, y, z = quaternion
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def flat(base: list[Number], own: list[Number], state: State) -> Float[Array, "16"]:
+    """Velocities, accelerations or forces by joint, in MuJoCo's order and axes.
+
+    Args:
+        base: 3 linear and 3 angular ones of the chassis, in the car's axes.
+        own: of the wheels: suspension, spin, steering.
+    """
+    linear = Vector(*base[:3])
+    world = [dot(axis, linear) for axis in (state.east, state.north, state.up)]
+    suspension, spin, steer = own
+    joints = [number[wheel] for wheel in range(4) for number in ((suspension, steer, spin) if wheel < 2 else (suspension, spin))]
+    return jnp.stack([*world, *base[3:], *joints])
+
+
+def unflat(joints: Float[Array, "16"], state: State) -> tuple[list[Number], list[Number]]:
+    """The inverse of `flat`."""
+    linear = state.east * joints[0] + state.north * joints[1] + state.up * joints[2]
+    suspension, steer, spin = _apart(joints[6:])
+    return [*linear, *joints[3:6]], [suspension, spin, steer]
+
+
+def _apart(joints: Float[Array, "10"]) -> tuple[Float[Array, "4"], Float[Array, "4"], Float[Array, "4"]]:
+    """Suspension, steering and spin of each wheel: in MuJoCo's arrays wheel by wheel, the rear ones without steering."""
+    front, rear = joints[:6].reshape(2, 3), joints[6:].reshape(2, 2)
+    suspension, spin = jnp.concatenate([front[:, 0], rear[:, 0]]), jnp.concatenate([front[:, 2], rear[:, 1]])
+    return suspension, jnp.concatenate([front[:, 1], jnp.zeros(2)]), spin
+
+
+def integrate(
+    qpos: Float[Array, "17"], qvel: Float[Array, "16"], acceleration: Float[Array, "16"], *, physics_dt: float
+) -> tuple[Float[Array, "17"], Float[Array, "16"]]:
+    """Semi-implicit Euler: the new velocities move the car. The chassis turns about its angular velocity, which is in its own axes."""
+    qvel = qvel + physics_dt * acceleration
+    x, y, z = qvel[3:6]
+    rate = length(x, y, z)
+    turns, half = rate > TINY, 0.5 * physics_dt
+    share = jnp.where(turns, jnp.sin(half * rate) / jnp.where(turns, rate, 1.0), half)
+    a, b, c, d = jnp.cos(half * rate), share * x, share * y, share * z
+    w, i, j, k = qpos[3:7]
+    turned = [w * a - i * b - j * c - k * d, w * b + i * a + j * d - k * c, w * c - i * d + j * a + k * b, w * d + i * c - j * b + k * a]
+    unit = length(*turned)
+    joints = qpos[7:] + physics_dt * qvel[6:]
+    return jnp.concatenate([qpos[:3] + physics_dt * qvel[:3], jnp.stack([part / unit for part in turned]), joints]), qvel

@@ -1,0 +1,77 @@
+"""Cars that follow the recording. Actions are ignored; contact is reported with the other backends' model and moves nobody."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core.geometry import norm
+from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.pytree import choose, replace, struct
+from scenefactory_jax.core.track_interpolation import sample
+from scenefactory_jax.core.types import Dynamics, Log, Motion, Scene
+from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
+
+
+@struct
+class Body:
+    """Where each car is in its recording, and what that reads; every leaf has the agent axis first."""
+
+    steps: Int[Array, " A"]  # control steps since the start
+    motion: Motion
+
+
+def make(
+    *, start_row: int, centre_height: float, mass: float, contact: dict[str, Any], grip: Callable[..., Any], control_dt: float
+) -> Dynamics:
+    """Cars on the tracks of `scene.log`, linear in time between valid rows, at rest before the first and after the last.
+
+    Args:
+        start_row: row of the log at which episodes begin.
+        centre_height: of the boxes' centres above the ground, m.
+        mass: kg; it decides the contact force and nothing else.
+        contact: numbers of `contact.make`.
+        grip: (weather, position, speed) -> friction coefficient, for the report.
+
+    Raises:
+        ConfigError: an unknown or missing number of `contact`.
+    """
+    entry = {**contact, "_target_": "make"}
+    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
+
+    def at(scene: Scene, steps: Int[Array, " A"]) -> Motion:
+        row = start_row + steps.astype(jnp.float32) * (control_dt / scene.log.dt)
+        position, velocity, yaw, yaw_rate = jax.vmap(lambda r, *track: sample(r, *track, dt=scene.log.dt))(row, *_tracks(scene.log))
+        zero = jnp.zeros_like(yaw)
+        return Motion(
+            position=jnp.concatenate([position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
+            velocity=jnp.concatenate([velocity, zero[:, None]], axis=-1),
+            yaw=yaw,
+            yaw_rate=yaw_rate,
+            upright=jnp.ones_like(zero),
+            steer=zero,
+            contact_force=zero,
+            grip=grip(scene.weather, position, norm(velocity)),
+            grip_use=zero,
+            slip=zero,
+        )
+
+    def init(key: PRNGKeyArray, scene: Scene) -> Body:
+        steps = jnp.zeros(scene.agents.yaw.shape, jnp.int32)
+        return Body(steps=steps, motion=at(scene, steps))
+
+    def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
+        motion = at(scene, body.steps + 1)
+        cars = boxes_of(motion, scene.agents.size, active, mass)
+        _, _, force = meet.forces(cars, later(meet.neighbours(cars, scene.boxes), control_dt))
+        moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
+        return choose(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
+
+    return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
+
+
+def _tracks(log: Log) -> tuple[Array, Array, Array, Array]:
+    return log.position, log.yaw, log.velocity, log.valid

@@ -1,0 +1,329 @@
+"""Env for ONE world, made of dynamics, spawn, weather, others, facts, ends, rewards and observations.
+
+`make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both
+give pure functions to put under one's own `jit`, `vmap` and `scan`.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_type
+from scenefactory_jax.core.pytree import check, check_array, choose, is_finite, replace, strong, to_jax, unchecked
+from scenefactory_jax.core.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
+from scenefactory_jax.env import observations, rewards, spawning, termination
+from scenefactory_jax.weather import friction, rain, road_condition
+
+GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # of a config
+
+
+KEYS = {  # of the groups that no one function takes
+    "timing": ("physics_hz", "control_hz", "episode_s"),
+    "controls": ("command", "every"),
+    "spawn": ("draw", "respawn_clear_m"),
+    "weather": ("draw", "grip", "patches", "rain"),
+}
+
+
+def episode_steps(timing: Mapping[str, float | int]) -> int:
+    """Control steps in an episode."""
+    return round(timing["episode_s"] * timing["control_hz"])
+
+
+class Parts(NamedTuple):
+    """What an environment is made of, every part bound to its numbers."""
+
+    dynamics: Dynamics
+    command: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
+    hold: int  # control steps from one action to the next
+    draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
+    draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
+    others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
+    measure: Callable[[Scene, State, State], Facts]
+    judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
+    terms: Mapping[str, tuple[float, rewards.Term]]
+    groups: Mapping[str, observations.Group]
+    episode_steps: int  # control steps after which a world is truncated
+    control_dt: float  # s; the weather moves on by as much before every control step
+    # None parks finished agents until the world ends (the paper's rule); a number of metres starts them again at a fresh draw
+    # once no active car stands within that distance
+    respawn_clear_m: float | None
+
+
+def make(config: Mapping[str, Any]) -> Env:
+    """The environment of a config, joined from its `parts_of`.
+
+    Raises:
+        ConfigError: naming the entry and key that does not fit, with the valid ones.
+    """
+    return assemble(parts_of(config))
+
+
+def parts_of(config: Mapping[str, Any]) -> Parts:
+    """The parts of a config with the groups timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
+
+    Raises:
+        ConfigError: naming the entry and key that does not fit, with the valid ones.
+    """
+    _require(config)
+    timing, clear_m = config["timing"], config["spawn"]["respawn_clear_m"]
+    for key, value in timing.items():
+        check_type(value, float, where=f"timing.{key}")
+        check_number(value, where=f"timing.{key}", above=0.0)
+    if episode_steps(timing) < 1:
+        raise ConfigError(f"timing.episode_s: {timing['episode_s']}; wanted is a control step, {1 / timing['control_hz']:g} s, or more")
+    check_type(clear_m, float | None, where="spawn.respawn_clear_m")
+    if clear_m is not None:
+        check_number(clear_m, where="spawn.respawn_clear_m", least=0.0)
+    context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
+    grip = friction.make(config["weather"]["grip"])
+    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    bound = functools.partial(build, builtins="scenefactory_jax.env.step_metrics")
+    termination.check(config["ends"].get("ending", []), where="ends")
+    return Parts(
+        dynamics=dynamics,
+        command=build(config["controls"]["command"], builtins="scenefactory_jax.env.actions", where="controls.command"),
+        hold=_hold(config),
+        draw_agents=spawning.make(config["spawn"]["draw"]),
+        draw_weather=road_condition.make(config["weather"]),
+        others=build(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context),
+        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
+        judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.env.termination", where="ends"),
+        terms=rewards.make(config["reward"], **context),
+        groups=observations.make(config["observe"], **context),
+        episode_steps=episode_steps(timing),
+        control_dt=context["control_dt"],
+        respawn_clear_m=clear_m,
+    )
+
+
+def _hold(config: Mapping[str, Any]) -> int:
+    """Control steps from one action to the next; episodes hold a whole number of actions."""
+    hold, steps = config["controls"]["every"], episode_steps(config["timing"])
+    check_type(hold, int, where="controls.every")
+    if hold < 1 or steps % hold:
+        raise ConfigError(f"controls.every: {hold}; wanted is a divisor of the {steps} control steps of an episode")
+    return hold
+
+
+def assemble(parts: Parts) -> Env:
+    """Join bound parts into an environment, whose functions refuse arguments of other shapes than `types` says when they are traced."""
+
+    def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
+        (scene,) = _checked("env.reset", scene)
+        state = _start(parts, key, scene)
+        # copies: nothing in the state is anybody else's, so that a step may be given it to keep (`donate_argnums`)
+        return jax.tree.map(jnp.copy, state), _observe(parts, scene, state)
+
+    def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+        (scene,) = _checked("env.start", scene)
+        return _start(parts, key, scene, step)
+
+    def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        scene, state, action = _checked("env.step", scene, state, action)
+        control = functools.partial(_transition, parts, scene, action=action)
+        state, _, outcome, _ = act(control, state, hold=parts.hold)
+        return state, replace(outcome, observation=_observe(parts, scene, state))
+
+    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+        return _transition(parts, *_checked("env.transition", scene, state, action))
+
+    def observe(scene: Scene, state: State) -> Observation:
+        return _observe(parts, *_checked("env.observe", scene, state))
+
+    def now(scene: Scene, state: State) -> Scene:
+        return _now(parts, *_checked("env.now", scene, state))
+
+    return Env(reset, step, start, transition, observe, now, parts.hold)
+
+
+def _checked(where: str, scene: Scene, *others: Any) -> tuple[Any, ...]:
+    """A scene, or a scene and a state, or those and an action, as JAX arrays that fit each other.
+
+    Raises:
+        ValueError: another kind of thing, or an array of another shape or kind of number, by name.
+    """
+    sizes: dict[str, int | None] = dict.fromkeys("AO")  # L may differ between log and others: nothing compares their rows
+    check(scene, Scene, where=f"{where}: scene", sizes=sizes)
+    if others:
+        check(others[0], State, where=f"{where}: state", sizes=sizes)
+    if len(others) == 2:
+        action = jnp.asarray(others[1])
+        action = action.astype(jnp.promote_types(action.dtype, jnp.float32))  # whole numbers are numbers
+        check_array(action, Float[Array, "A 3"], where=f"{where}: action", sizes=sizes)
+        others = others[0], action.astype(jnp.float32)
+    return to_jax((scene, *others))
+
+
+def act(
+    control: Callable[[State], tuple[State, Outcome]],
+    state: State,
+    noted: Any = None,
+    *,
+    hold: int,
+    note: Callable[[Any, State, Outcome], tuple[Any, Any]] = lambda *_: (None, None),
+) -> tuple[State, Any, Outcome, Any]:
+    """All control steps that one action stands for, of one world or of many.
+
+    Args:
+        control: one control step with that action.
+        noted: what `note` carries from step to step: (noted, state before the step, its outcome) -> (noted, numbers to add up). By default
+            nothing is noted.
+
+    Returns:
+        The state, what was noted, the outcome of the whole action, and the sums of the numbers. In the outcome reward and terms are sums
+        and events those of any step, for the agents that took the action: who begins a new life meanwhile has no part in it. Facts are
+        those of the last step that an agent drove in, and whether a world is truncated or over is the last step's.
+    """
+
+    def body(carry: tuple[State, Any, Array], _: None) -> tuple[tuple[State, Any, Array], tuple]:
+        before, noted, taking = carry
+        after, outcome = control(before)
+        own = {
+            "reward": jnp.where(taking, outcome.reward, 0.0),
+            "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
+            "events": jax.tree.map(lambda new: new & taking, outcome.events),
+            "done": outcome.done & taking,
+        }
+        noted, numbers = note(noted, before, outcome)
+        clock = {"truncated": outcome.truncated, "over": outcome.over}
+        return (after, noted, taking & ~outcome.done), (own, taking, outcome.facts, clock, numbers)
+
+    # unrolled, a single step is no loop in the program
+    (state, noted, _), each = jax.lax.scan(body, (state, noted, state.active), None, length=hold, unroll=hold == 1)
+    own, took, facts, clock, numbers = each
+    own, numbers = jax.tree.map(lambda leaf: leaf.any(0) if leaf.dtype == bool else leaf.sum(0), (own, numbers))
+    drove = jnp.maximum(took.sum(0) - 1, 0)[None]
+    facts = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], facts)
+    clock = {name: leaf[-1] for name, leaf in clock.items()}
+    return state, noted, unchecked(Outcome, observation=None, facts=facts, **own, **clock), numbers
+
+
+def out_of_time(outcome: Outcome, active: Bool[Array, "*W A"]) -> Bool[Array, "*W A"]:
+    """Who drove before an action, of one world or of many, and was still driving when the time was up."""
+    return outcome.truncated[..., None] & active & ~outcome.done
+
+
+def _now(parts: Parts, scene: Scene, state: State) -> Scene:
+    """The scene as it is at a state's moment: this episode's agents and weather, and the others where they are."""
+    return replace(scene, agents=state.agents, weather=state.weather, boxes=parts.others(scene, state.step))
+
+
+def _start(parts: Parts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+    """A fresh episode, or one whose clock is already at a later control step: rain and the others are as they are then."""
+    step = jnp.asarray(step, jnp.int32)
+    agents_key, weather_key, key, body_key = jax.random.split(key, 4)
+    scene = replace(scene, boxes=parts.others(scene, step))
+    agents = spawning.admit(parts.draw_agents(agents_key, scene))
+    weather = rain.pass_time(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
+    body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
+    count, motion = agents.present.shape[0], parts.dynamics.read(body)
+    agents = replace(agents, present=agents.present & is_finite(motion))
+    state = State(
+        body=body,
+        motion=motion,
+        agents=agents,
+        weather=weather,
+        active=agents.present,
+        happened=termination.none(count),
+        age=jnp.zeros(count, jnp.int32),
+        previous_action=jnp.zeros((count, 3), jnp.float32),
+        step=step,
+        key=key,
+    )
+    return strong(state)
+
+
+def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+    """One control step, without the observation."""
+    scene = _now(parts, scene, replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt)))
+    action = jnp.where(state.active[:, None], _command(parts, state, action), 0.0)
+    after = _advance(parts.dynamics, scene, state, action)
+    scene = _now(parts, scene, after)
+    measured, after = _quarantine(parts.measure(scene, state, after), state, after)
+    events, done = parts.judge(measured, state.happened, state.active)
+    after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
+    reward, terms = rewards.weigh(Step(scene, state, after.previous_action, after, measured, events), parts.terms)
+    truncated = after.step >= parts.episode_steps
+    if parts.respawn_clear_m is None:
+        over = truncated | ~jnp.any(after.active)
+    else:
+        over = truncated
+        after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clear_m)
+    return strong(after), Outcome(None, reward, terms, events, done, truncated, over, measured)
+
+
+def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
+    return observations.observe(_now(parts, scene, state), state, parts.groups)
+
+
+def _command(parts: Parts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+    """Throttle, steer and brake in this step: what the action means, or what stands since the last one that was read."""
+    fresh = jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
+    return fresh if parts.hold == 1 else jnp.where(state.step % parts.hold == 0, fresh, state.previous_action)
+
+
+def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
+    body = dynamics.advance(scene, state.body, action, state.active)
+    return replace(
+        state,
+        body=body,
+        motion=dynamics.read(body),
+        weather=scene.weather,
+        age=state.age + state.active.astype(jnp.int32),
+        previous_action=action,
+        step=state.step + 1,
+    )
+
+
+def _quarantine(measured: Facts, before: State, after: State) -> tuple[Facts, State]:
+    """A car whose motion is no longer finite is put back where it last was, and its action forgotten: its NaN reaches neither rewards nor
+    observations nor anybody else."""
+    fault = measured.events.fault
+    clean = Facts(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
+    body, motion = choose(fault, (before.body, before.motion), (after.body, after.motion))
+    action = jnp.where(fault[:, None], 0.0, after.previous_action)  # it may be what was broken
+    return clean, replace(after, body=body, motion=motion, previous_action=action)
+
+
+def _finite(value: Array) -> Array:
+    """NaN becomes zero; infinities keep their meaning (no TTC)."""
+    return value if value.dtype == bool else jnp.where(jnp.isnan(value), 0.0, value)
+
+
+def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
+    """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
+    draw_key, key, body_key = jax.random.split(state.key, 3)
+    fresh = spawning.admit(draw_agents(draw_key, scene))
+    body = dynamics.init(body_key, replace(scene, agents=fresh))
+    waiting = ~state.active & fresh.present & is_finite(dynamics.read(body))
+    clear = spawning.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
+    begins = waiting & clear
+    agents, body = choose(begins, (fresh, body), (state.agents, state.body))
+    count = begins.shape[0]
+    return replace(
+        state,
+        body=body,
+        motion=dynamics.read(body),
+        agents=agents,
+        active=state.active | begins,
+        happened=choose(begins, termination.none(count), state.happened),
+        age=jnp.where(begins, 0, state.age),
+        previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
+        key=key,
+    )
+
+
+def _require(config: Mapping[str, Any]) -> None:
+    """Refuse a config without a group, and a group with other keys than its own."""
+    if missing := [name for name in GROUPS if name not in config]:
+        raise ConfigError(f"config: group {missing[0]!r} is missing; an environment needs {', '.join(GROUPS)}")
+    for group, names in KEYS.items():
+        if missing := [name for name in names if name not in config[group] and name not in ("patches", "rain")]:
+            raise ConfigError(f"{group}.{missing[0]}: missing; {group} needs {', '.join(names)}")
+        if unknown := [name for name in config[group] if name not in names]:
+            raise ConfigError(f"{group}.{unknown[0]}: unknown key; valid: {', '.join(names)}")

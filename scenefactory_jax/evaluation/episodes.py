@@ -1,0 +1,138 @@
+"""One deterministic episode a world, measured on device: what happened to every agent, and what a viewer needs to draw it.
+
+Events are counted from the facts, not from the exclusive events that rewards use: an agent that touches an edge and another car in one step
+has done both. Nothing is counted after an agent's end or the world's.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core.pytree import replace, struct
+from scenefactory_jax.core.types import Env, Events, Outcome, Scene, State
+from scenefactory_jax.env import termination
+from scenefactory_jax.evaluation import failure_signals
+from scenefactory_jax.evaluation.failure_signals import Clues
+
+Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
+
+
+@struct
+class Tally:
+    """Running record of one episode."""
+
+    happened: Events
+    ended: Bool[Array, " A"]
+    steps: Int[Array, " A"]
+    goal_distance: Float[Array, " A"]
+    drac_max: Float[Array, " A"]
+    ttc_min: Float[Array, " A"]
+    ttc_sum: Float[Array, " A"]
+    ttc_steps: Int[Array, " A"]
+    speed_sum: Float[Array, " A"]
+    swing_sum: Float[Array, " A"]  # |change of the yaw rate|, rad/s
+    grip_sum: Float[Array, " A"]
+    grip_use_sum: Float[Array, " A"]
+    margin_min: Float[Array, " A"]
+    force_max: Float[Array, " A"]
+    clues: Clues
+
+
+@struct
+class Frame:
+    """What one moment looks like from above; where the others are then follows from the scene and the step alone."""
+
+    position: Float[Array, "A 2"]
+    yaw: Float[Array, " A"]
+    speed: Float[Array, " A"]
+    active: Bool[Array, " A"]
+    goal: Float[Array, "A 2"]
+    events: Events
+
+
+@struct
+class Episode:
+    """Everything that a running episode carries."""
+
+    state: State
+    observation: Any
+    tally: Tally
+    over: Bool[Array, ""]
+
+
+def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
+    """An episode at its start."""
+    state, observation = env.reset(key, scene)
+    count = state.active.shape[0]
+    zero, none = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32)
+    distance = jnp.linalg.norm(state.agents.goal - state.motion.position[:, :2], axis=1)
+    tally = Tally(
+        happened=termination.none(count),
+        ended=jnp.zeros(count, bool),
+        steps=none,
+        goal_distance=distance,
+        drac_max=zero,
+        ttc_min=zero + jnp.inf,
+        ttc_sum=zero,
+        ttc_steps=none,
+        speed_sum=zero,
+        swing_sum=zero,
+        grip_sum=zero,
+        grip_use_sum=zero,
+        margin_min=zero + jnp.inf,
+        force_max=zero,
+        clues=failure_signals.begin(state, distance),
+    )
+    return Episode(state, observation, tally, ~jnp.any(state.active))
+
+
+def play(
+    env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float, notes: Mapping[str, float]
+) -> tuple[Episode, Frame]:
+    """Drive on for that many control steps; frames come back with a leading step axis.
+
+    Args:
+        ttc_limit_s: TTC above this counts as this in an agent's mean (the published evaluation uses 10 s).
+        notes: numbers of `clues.note`.
+    """
+
+    def body(episode: Episode, _: None) -> tuple[Episode, Frame]:
+        before = replace(episode.state, active=episode.state.active & ~episode.over)
+        action = act(parameters, episode.observation)
+        state, outcome = env.transition(scene, before, action)
+        seen, boxes = episode.tally, env.now(scene, state).boxes
+        found = failure_signals.note(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
+        tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
+        place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
+        frame = Frame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
+        return Episode(state, env.observe(scene, state), tally, episode.over | outcome.over), frame
+
+    return jax.lax.scan(body, episode, None, length=steps)
+
+
+def _note(tally: Tally, before: State, after: State, outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
+    facts = outcome.facts
+    active = before.active & ~facts.events.fault  # a broken car's facts are no measurements
+    seen = active & jnp.isfinite(facts.ttc)
+    happened = jax.tree.map(lambda old, new: old | (new & before.active), tally.happened, facts.events)
+    add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
+    return Tally(
+        happened=happened,
+        ended=tally.ended | (outcome.done & before.active),
+        steps=tally.steps + active.astype(jnp.int32),
+        goal_distance=jnp.where(active, facts.goal_distance, tally.goal_distance),
+        drac_max=jnp.maximum(tally.drac_max, jnp.where(active, facts.drac, 0.0)),
+        ttc_min=jnp.minimum(tally.ttc_min, jnp.where(active, facts.ttc, jnp.inf)),
+        ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(facts.ttc, ttc_limit_s), 0.0),
+        ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
+        speed_sum=add(tally.speed_sum, facts.speed),
+        swing_sum=add(tally.swing_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
+        grip_sum=add(tally.grip_sum, facts.grip),
+        grip_use_sum=add(tally.grip_use_sum, facts.grip_use),
+        margin_min=jnp.minimum(tally.margin_min, jnp.where(active, facts.stopping_margin, jnp.inf)),
+        force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
+        clues=found,
+    )

@@ -1,0 +1,222 @@
+"""Triton kernels, through Pallas, of `late_fusion.encode_set` for two layers: what lies between rows and pooled set stays on the chip.
+
+Plain JAX writes the hidden and output values of every row to memory and reads them back: 270 kB for a set of 350 rows, of 7 kB. Here one
+program walks over the rows of one set and keeps the largest value of every channel, with the row that it came from; it stops behind the
+last row that the mask shows, so that an empty set costs next to nothing. The gradient walks over the winners alone.
+
+Arithmetic is that of plain JAX on the same GPU: products of float32 numbers in TF32, of bfloat16 numbers as they are, sums in float32.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax.core import pallas
+
+Weights = list[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
+
+INPUTS = 16  # columns of a row on the chip: its features, a one that the bias takes, zeros; the least that the matrix units take
+CHANNELS = 32  # of an output tile; one width for all of them keeps one layout, so that hidden values are worked out once
+ROWS, FEW = 64, 32  # a program takes at a time; where a set has no more rows than that
+MOST = 128  # channels: more do not fit into the registers
+LOG2_E = 1.4426950408889634
+
+
+def fits(weights: Weights) -> bool:
+    """Whether the kernels are made for such layers: two, of 32, 64, 96 or 128 channels, behind fewer than 16 features."""
+    widths = [kernel.shape[1] for kernel, _ in weights]
+    return len(widths) == 2 and weights[0][0].shape[0] < INPUTS and all(0 < w <= MOST and w % CHANNELS == 0 for w in widths)
+
+
+def encode(
+    activation: str,
+    dtype: str,
+    weights: Weights,
+    x: Float[Array, "*batch K F"],
+    mask: Bool[Array, "*batch K"],
+    *,
+    warps: int = 4,
+    stages: int = 1,
+    interpret: bool = False,
+) -> tuple[Float[Array, "*batch G"], Int[Array, "*batch G"]]:
+    """Largest value of each channel over the rows that the mask shows, and the first row that has it; zeros for an empty set.
+
+    Args:
+        dtype: of what the second layer multiplies.
+        warps, stages: of a program, see Triton.
+        interpret: run on any device, slowly.
+    """
+    (first, first_bias), (second, second_bias) = weights
+    *batch, width, features = x.shape
+    out = second.shape[1]
+    if not mask.size:
+        return jnp.zeros((*batch, out), jnp.float32), jnp.zeros((*batch, out), jnp.int32)
+    x, mask = x.reshape(-1, width, features), mask.reshape(-1, width)
+    operands = (pallas.shown(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
+    rows = ROWS if width > FEW else FEW
+    pooled, winner = pl.pallas_call(
+        functools.partial(_encode, activate=_activations(interpret)[activation][0], rows=rows, width=width, features=features),
+        grid=(len(x),),
+        in_specs=[*map(pallas.row, operands[:3]), *map(pallas.whole, operands[3:])],
+        out_specs=[pl.BlockSpec((None, out), lambda i: (i, 0))] * 2,
+        out_shape=[jax.ShapeDtypeStruct((len(x), out), jnp.float32), jax.ShapeDtypeStruct((len(x), out), jnp.int32)],
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=stages),
+        interpret=interpret,
+        name="encode_set",
+    )(*operands)
+    return pooled.reshape(*batch, out), winner.reshape(*batch, out)
+
+
+def _encode(last, x, mask, first, second, second_bias, pooled, winner, *, activate, rows: int, width: int, features: int) -> None:
+    hidden, out = tiles(first.shape[1], 64), tiles(second.shape[1], CHANNELS)
+    count, lanes, columns = last[0], jnp.arange(rows), jnp.arange(INPUTS)
+    ones = _ones(rows, features)
+    split = (rows // 16, 2, 8)  # a thread of the matrix units holds rows r and r + 8 of 16: the larger of them needs no other thread
+
+    def block(index, best):
+        at = index * rows + lanes
+        seen = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
+        table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=seen[:, None] & (columns < features)[None, :], other=ones)
+        inner = [activate(_product(table, first[:, pl.ds(start, length)])).astype(second.dtype) for start, length in hidden]
+        found = []
+        for (start, length), (value, where) in zip(out, best, strict=True):
+            parts = [_product(part, second[pl.ds(k, w), pl.ds(start, length)]) for part, (k, w) in zip(inner, hidden, strict=True)]
+            here = jnp.where(seen[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
+            largest, half = jnp.max(here, axis=1), jnp.argmax(here, axis=1).astype(jnp.int32)
+            better = largest > value
+            found.append((jnp.where(better, largest, value), jnp.where(better, 2 * index + half, where)))
+        return found
+
+    shape = (rows // 16, 8)
+    begin = [(jnp.full((*shape, length), -jnp.inf, jnp.float32), jnp.zeros((*shape, length), jnp.int32)) for _, length in out]
+    best = jax.lax.fori_loop(0, pl.cdiv(count, rows), block, begin)
+    for (start, length), (value, where) in zip(out, best, strict=True):
+        largest = jnp.max(jnp.max(value, axis=1), axis=0)
+        place = 16 * jax.lax.broadcasted_iota(jnp.int32, value.shape, 0) + jax.lax.broadcasted_iota(jnp.int32, value.shape, 1)
+        row = jnp.where(value == largest[None, None], (where // 2) * rows + (where % 2) * 8 + place, width)
+        pooled[pl.ds(start, length)] = jnp.where(count > 0, largest + second_bias[pl.ds(start, length)], 0.0)
+        winner[pl.ds(start, length)] = jnp.where(count > 0, jnp.min(jnp.min(row, axis=1), axis=0), 0)
+
+
+def gradient(
+    activation: str,
+    dtype: str,
+    weights: Weights,
+    x: Float[Array, "*batch K F"],
+    winner: Int[Array, "*batch G"],
+    cotangent: Float[Array, "*batch G"],
+    *,
+    programs: int = 132,
+    warps: int = 4,
+    interpret: bool = False,
+) -> Weights:
+    """Gradient of the weights through the row that each channel took.
+
+    Args:
+        cotangent: of the pooled channels; zero for an empty set. Sets behind the last one that has any are not looked at.
+        programs: among which the sets are dealt out, for each tile of channels; their sums are added up afterwards.
+    """
+    (first, first_bias), (second, _) = weights
+    width, features = x.shape[-2:]
+    hidden, out = second.shape
+    if not x.size:
+        return jax.tree.map(jnp.zeros_like, weights)
+    cotangent = cotangent.reshape(-1, out)
+    programs = min(programs, len(cotangent))
+    last = pallas.shown((cotangent != 0.0).any(axis=1)[None])
+    activate, slope = _activations(interpret)[activation]
+    rounded = second.T.astype(dtype).astype(jnp.float32)
+    operands = (last, x.reshape(-1, width, features), winner.reshape(-1, out), cotangent, _with_bias(first, first_bias), rounded)
+    outer, inner = pl.pallas_call(
+        functools.partial(_gradient, activate=activate, slope=slope, dtype=jnp.dtype(dtype), features=features),
+        grid=(programs, out // CHANNELS),
+        in_specs=[*map(pallas.whole, operands)],
+        out_specs=[
+            pl.BlockSpec((None, CHANNELS, hidden), lambda i, j: (i, j, 0)),
+            pl.BlockSpec((None, None, INPUTS, hidden), lambda i, j: (i, j, 0, 0)),
+        ],
+        out_shape=[
+            jax.ShapeDtypeStruct((programs, out, hidden), jnp.float32),
+            jax.ShapeDtypeStruct((programs, out // CHANNELS, INPUTS, hidden), jnp.float32),
+        ],
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=1),
+        interpret=interpret,
+        name="encode_set_gradient",
+    )(*operands)
+    inner = jnp.sum(inner, axis=(0, 1))
+    return [(inner[:features], inner[features]), (jnp.sum(outer, axis=0).T, jnp.sum(cotangent, axis=0))]
+
+
+def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activate, slope, dtype, features: int) -> None:
+    parts, columns = tiles(first.shape[1], CHANNELS), jnp.arange(INPUTS)
+    program, programs, base = pl.program_id(0), pl.num_programs(0), pl.program_id(1) * CHANNELS
+    mine = base + jnp.arange(CHANNELS)
+    ones, known = _ones(CHANNELS, features), jnp.broadcast_to((columns < features)[None, :], (CHANNELS, INPUTS))
+
+    def one(index, sums):
+        at = program + index * programs  # the first sets may have rows where later ones are empty: everybody gets some of both
+        pull, row = cotangent[at, mine], winner[at, mine]
+        table = plgpu.load(x.at[at, row[:, None], columns[None, :]], mask=known, other=ones)
+        found = []
+        for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
+            before = _product(table, first[:, pl.ds(start, length)])
+            after = activate(before)
+            steep = pull[:, None] * second[pl.ds(base, CHANNELS), pl.ds(start, length)] * slope(before, after)
+            wide += pull[:, None] * after.astype(dtype).astype(jnp.float32)
+            found.append((wide, narrow + _product(table, steep, along=0)))
+        return found
+
+    begin = [(jnp.zeros((CHANNELS, length), jnp.float32), jnp.zeros((INPUTS, length), jnp.float32)) for _, length in parts]
+    sums = jax.lax.fori_loop(0, pl.cdiv(last[0] - program, programs), one, begin)
+    for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
+        outer[:, pl.ds(start, length)] = wide
+        inner[:, pl.ds(start, length)] = narrow
+
+
+def tiles(width: int, most: int) -> list[tuple[int, int]]:
+    """A width as starts and lengths, powers of two, the largest first: 96 -> (0, 64), (64, 32)."""
+    found, start = [], 0
+    while start < width:
+        length = min(most, 1 << ((width - start).bit_length() - 1))
+        found.append((start, length))
+        start += length
+    return found
+
+
+def _ones(rows: int, features: int) -> Array:
+    """What a row holds beside its features: a one that the bias takes."""
+    return jnp.broadcast_to(jnp.where(jnp.arange(INPUTS) == features, 1.0, 0.0)[None, :], (rows, INPUTS))
+
+
+def _product(a: Array, b: Array, *, along: int = 1) -> Array:
+    """Of two matrices on the matrix units, over an axis of the first and the rows of the second, summed up in float32."""
+    return jax.lax.dot_general(a, b, (((along,), (0,)), ((), ())), preferred_element_type=jnp.float32)
+
+
+def _with_bias(kernel: Array, bias: Array) -> Array:
+    """The first layer as one matrix for rows that hold a one behind their features."""
+    return jnp.concatenate([kernel, bias[None], jnp.zeros((INPUTS - 1 - len(kernel), kernel.shape[1]), kernel.dtype)])
+
+
+def _activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]]:
+    """Name -> the function, and its slope from what went in and what came out."""
+    exp2 = jnp.exp2 if interpret else _exp2
+    return {
+        "elu": (lambda x: jnp.where(x > 0.0, x, exp2(LOG2_E * x) - 1.0), lambda x, y: jnp.where(x > 0.0, 1.0, y + 1.0)),
+        "relu": (lambda x: jnp.maximum(x, 0.0), lambda x, y: jnp.where(x > 0.0, 1.0, 0.0)),
+        "tanh": (jnp.tanh, lambda x, y: 1.0 - y * y),
+    }
+
+
+def _exp2(x: Array) -> Array:
+    """The hardware's 2^x, to 2 ulp; `jnp.exp2` and `jnp.expm1` are library functions of 10 and 30 instructions."""
+    [result] = plgpu.elementwise_inline_asm(
+        "ex2.approx.ftz.f32 $0, $1;", args=[x], constraints="=f,f", pack=1, result_shape_dtypes=[jax.ShapeDtypeStruct(x.shape, x.dtype)]
+    )
+    return result

@@ -1,0 +1,108 @@
+"""A training iteration as nested programs, each with one part more than the one before.
+
+What a part costs is what the program without it saves: the parts add up to the iteration, with all that XLA fuses across them.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from scenefactory_jax.core.pytree import choose, replace
+from scenefactory_jax.core.types import Env, Scene, State
+from scenefactory_jax.env.environment import Parts
+from scenefactory_jax.weather import rain
+
+ACTING = ("physics", "facts, rewards, ends", "restarts", "observation")  # with random actions; then come policy and update
+Run = Callable[[State, Scene, PRNGKeyArray], tuple[State, Array]]
+
+
+class Timed(NamedTuple):
+    """One program, timed."""
+
+    seconds: list[float]  # of each repeat
+    compile_s: float
+    memory_gib: float  # arguments, results and temporaries of the compiled program
+    left: Any  # what the last call returned
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.seconds)
+
+
+def control_steps(config: Mapping[str, Any]) -> int:
+    """Of a rollout."""
+    return config["ppo"]["horizon"] * config["controls"]["every"]
+
+
+def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
+    """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
+
+    Returns:
+        A function of the worlds' state, their scenes and a key, for `jit`: the state afterwards, and a number that all went into.
+    """
+    depth = ACTING.index(level)
+
+    def moved(scene: Scene, state: State, action: Array) -> State:
+        state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
+        return replace(state, body=parts.dynamics.advance(env.now(scene, state), state.body, action, state.active), step=state.step + 1)
+
+    def step(scenes: Scene, worlds: State, key: PRNGKeyArray) -> tuple[State, Array]:
+        action_key, start_key = jax.random.split(key)
+        action = jax.random.uniform(action_key, (*worlds.active.shape, 3), jnp.float32, -1.0, 1.0)
+
+        def control(worlds: State, _: None) -> tuple[State, tuple[Array, Array]]:
+            if not depth:
+                return jax.vmap(moved)(scenes, worlds, action), (jnp.zeros(len(worlds.step), bool), jnp.float32(0.0))
+            after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
+            return after, (outcome.over, outcome.reward.sum())
+
+        after, (over, told) = jax.lax.scan(control, worlds, None, length=env.hold, unroll=env.hold == 1)
+        told = told.sum()
+        if depth > 1:
+            after = choose(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
+        if depth > 2:
+            seen = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # a learner would keep it: it is written out
+            told += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
+        return after, told
+
+    def run(worlds: State, scenes: Scene, key: PRNGKeyArray) -> tuple[State, Array]:
+        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps // env.hold))
+        return worlds, told.sum()
+
+    return run
+
+
+def timed(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmup: int, repeats: int) -> Timed:
+    """Compile `run(state, *arguments(i))` and call it again and again, each time with the state that it returned, donated."""
+    state = jax.tree.map(jnp.copy, state)  # its own buffers: `jit` may have handed a scene's straight through, and donating would delete it
+    begun = time.perf_counter()
+    compiled = jax.jit(run, donate_argnums=0).lower(state, *arguments(0)).compile()
+    compile_s, seconds, rest = time.perf_counter() - begun, [], None
+    for repeat in range(warmup + repeats):
+        given = arguments(repeat)
+        begun = time.perf_counter()
+        state, rest = jax.block_until_ready(compiled(state, *given))
+        seconds.append(time.perf_counter() - begun)
+    return Timed(seconds[warmup:], compile_s, memory_gib(compiled), (state, rest))
+
+
+def memory_gib(compiled: Any) -> float:
+    """What a compiled program holds at once; 0 where the platform does not say."""
+    sizes = compiled.memory_analysis()
+    if sizes is None:
+        return 0.0
+    held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
+    return held / 2**30
+
+
+def parts_of_the_whole(nested: Mapping[str, float]) -> dict[str, float]:
+    """Times of nested programs -> what each part adds."""
+    before, found = 0.0, {}
+    for name, value in nested.items():
+        found[name], before = value - before, value
+    return found

@@ -1,0 +1,78 @@
+"""Trained policies by where they are: a folder that `train` or `export` wrote, or the name of one that comes with the package."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.types import Policy, Scene
+from scenefactory_jax.env import environment
+from scenefactory_jax.learning import checkpoint, initial_parameters
+from scenefactory_jax.learning.training_loop import make_policy
+
+SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
+
+
+class Trained(NamedTuple):
+    """A policy with what it learnt, and the config that it was trained with."""
+
+    folder: Path
+    config: dict[str, Any]
+    policy: Policy
+    parameters: Any
+
+
+def load_policy(run: str | Path, *, trust: bool = False) -> Trained:
+    """A trained policy to act with, to judge or to train on.
+
+        trained = sf.load_policy("runs/demo-...")
+        env = sf.make(trained.config)
+        mean, log_std, value = trained.policy.apply(trained.parameters, observation)
+
+    Args:
+        run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package.
+        trust: whether its config may name functions outside of the package, which are then imported and called; they are printed.
+
+    Raises:
+        ConfigError: neither; or a config that names such functions without `trust`.
+        FileNotFoundError: a run without a checkpoint.
+    """
+    folder = find(run)
+    config = configs.read(folder, trust=trust)
+    return Trained(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
+
+
+def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
+    """What a run's policy was before training, drawn anew from its config and seed as training draws it.
+
+    Args:
+        scene: one world, for the shapes of what is observed.
+    """
+    key = jax.random.key(config["seed"])
+    seen = jax.eval_shape(environment.make(config).reset, key, scene)[1]
+    blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
+    return initial_parameters.draw_parameters(key, make_policy(config), blank)
+
+
+def find(run: str | Path) -> Path:
+    """The folder of a run, or of a policy that comes with the package, by its name.
+
+    Raises:
+        ConfigError: neither is there; the message names the policies that come with the package.
+    """
+    if (Path(run) / configs.FILE).is_file():
+        return Path(run)
+    shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
+    if str(run) in shipped:
+        return shipped[str(run)]
+    known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
+    raise ConfigError(f"{run} is no run: it has no {configs.FILE}; give the folder that `train` wrote{known}")
+
+
+def is_shipped(folder: Path) -> bool:
+    """Whether a policy comes with the package, whose folder is nobody's to write to."""
+    return folder.parent == SHIPPED

@@ -1,0 +1,93 @@
+"""The folder of a training: a new one or one to go on in, one command's at a time, and as it was before where nothing could begin."""
+
+import contextlib
+import datetime
+import itertools
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import folder_lock
+from scenefactory_jax.core.instantiate import ConfigError, differing
+from scenefactory_jax.learning import checkpoint
+
+MOST = 80  # letters of a sweep's changes in the name of a folder
+# What may be another when a run goes on, and all below it: nothing that was learnt rests on it
+FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
+FREE += ("loggers", "evaluation", "scenes.heldout")
+
+
+@contextlib.contextmanager
+def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
+    """The run's folder, and whether there is a checkpoint in it to go on from. Nobody else trains there meanwhile.
+
+    Raises:
+        ConfigError: a folder that holds a run already, or `resume` where there is none, or one of other settings.
+        folders.Busy: another command trains there.
+    """
+    if config["resume"] and config["out"] is None:
+        raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
+    with _made(config) as folder, folder_lock.alone(folder):
+        yield folder, _goes_on(folder, config)
+
+
+def fresh(name: str, changes: Sequence[str] = ()) -> Path:
+    """The folder of a run that begins now: `runs/NAME-TIME`, or in a sweep `runs/NAME-weather_wet-seed_1-TIME`.
+
+    Args:
+        changes: overrides in which the run differs from the others. Each is written as the last part of its key and its value, in letters
+            that neither a shell nor Hydra reads as anything else; what is longer than MOST letters ends in a checksum instead.
+    """
+    told = [f"{key.rpartition('.')[2]}={value}" for key, _, value in (change.partition("=") for change in changes)]
+    text = "-".join(re.sub(r"[^A-Za-z0-9.-]+", "_", one).strip("_") for one in told)
+    if len(text) > MOST:
+        text = f"{text[: MOST - 9]}-{zlib.crc32(text.encode()):08x}"
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    return Path("runs", "-".join(part for part in (name, text, stamp) if part))
+
+
+@contextlib.contextmanager
+def _made(config: Mapping[str, Any]) -> Iterator[Path]:
+    """The folder; what had to be made for it and is still empty when an error ends the run was no run's: it goes."""
+    named, base = config["out"] is not None, Path(config["out"] or fresh(config["name"]))
+    for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
+        new = folder_lock.missing(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=named)
+            break
+        except FileExistsError:  # the jobs of a parallel sweep start in one second: making it says whose it is
+            if named:
+                raise ConfigError(f"out={folder}: is a file; give a folder") from None
+    try:
+        yield folder
+    except BaseException:
+        folder_lock.remove_empty(new)
+        raise
+
+
+def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint is there to go on from; a run that was stopped before its first one begins anew."""
+    begun, last = (folder / configs.FILE).is_file(), checkpoint.latest(folder / "checkpoints")
+    if not config["resume"]:
+        if begun or last is not None:
+            raise ConfigError(f"out={folder}: holds a run already; add resume=true to go on with it, or choose another folder")
+        return False
+    if not begun:
+        raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
+    _check_same(folder, config)
+    if last is None:
+        print(f"{folder} has no checkpoint to go on from: the run begins anew", flush=True)
+    return last is not None
+
+
+def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
+    """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
+    shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
+    found = differing(configs.values(folder), config).items()
+    bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
+    if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
+        more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
+        raise ConfigError(f"resume=true: {'; '.join(told[:8])}{more}: {folder} goes on as it began; for other settings choose another out")

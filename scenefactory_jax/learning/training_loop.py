@@ -1,0 +1,233 @@
+"""`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh
+
+from scenefactory_jax import loggers
+from scenefactory_jax.cli import error_messages, schema
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.types import Env, Policy, Scene
+from scenefactory_jax.data.loading import scene_source, stream
+from scenefactory_jax.env import environment
+from scenefactory_jax.learning import checkpoint, interrupt, run_folder
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration as ppo
+from scenefactory_jax.loggers import metrics_csv
+
+OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
+
+
+class Prepared(NamedTuple):
+    """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
+
+    `scenes`: those to train on, before `scenes.take`; None: read anew. `examiners`: protocol -> `evaluate.make_examiner`, for evaluations
+    while training; None: the config's own.
+    """
+
+    env: Env
+    policy: Policy
+    mesh: Mesh | None
+    trainer: ppo.Trainer
+    scenes: scene_source.Scenes | None = None
+    examiners: Mapping[str, Callable] | None = None
+
+
+class Run(NamedTuple):
+    """What `train` hands back in Python."""
+
+    folder: Path
+    config: dict[str, Any]
+    env: Env
+    policy: Policy
+    state: ppo.TrainState
+    metrics: list[dict[str, float]]
+
+
+def prepare(config: Mapping[str, Any]) -> Prepared:
+    """Environment, policy and trainer of a config.
+
+    Raises:
+        ConfigError: a key that does not fit, by name.
+    """
+    env, policy, mesh = environment.make(config), make_policy(config), sharding.mesh(config["devices"])
+    return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
+
+
+def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
+    """Train as a config says (`load("train", ...)`).
+
+    Args:
+        on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
+            donated to the next iteration: copy what is to outlive the call.
+        prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
+
+    Raises:
+        ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
+        SceneError: scenes that cannot be read.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
+    """
+    schema.check_train(config)
+    if config["evaluation"]["enable"]:
+        scene_source.check_heldout(config["scenes"])
+    watching = loggers.make(config["loggers"])
+    scene_source.use_compilation_cache()
+    prepared = prepared or prepare(config)
+    with run_folder.opened(config) as (folder, resume):
+        state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
+        if config["evaluation"]["enable"]:
+            if scene_source.has_heldout(config["scenes"]):
+                from scenefactory_jax.evaluation.protocols import after_training
+
+                after_training(config, folder)
+            else:
+                print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
+    return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
+
+
+def _trained(
+    config: dict[str, Any],
+    folder: Path,
+    prepared: Prepared,
+    watching: Mapping[str, loggers.Logger],
+    on_iteration: OnIteration | None,
+    *,
+    resume: bool,
+) -> ppo.TrainState:
+    """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
+    trainer = prepared.trainer
+    with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
+        state = trainer.init(jax.random.key(config["seed"]), worlds)
+        if resume:
+            state = checkpoint.restore(folder / "checkpoints", state)
+            print(f"resumed at iteration {int(state.iteration)}", flush=True)
+        configs.write(folder, config)
+        watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
+        callbacks = [c for c in (watch, on_iteration) if c]
+        return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
+
+
+@contextlib.contextmanager
+def _scenes(
+    config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
+) -> Iterator[tuple[Scene, stream.Flow | None]]:
+    """The scenes of all worlds on their devices, and where others come from, if they do not stay."""
+    if config["stream"] is None:
+        given = prepared.scenes
+        loaded = scene_source.training(config["scenes"]) if given is None else scene_source.taken(given, config["scenes"])
+        worlds, chosen = scene_source.assign(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
+        print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
+        yield worlds, None
+        return
+    before = checkpoint.restore_host(folder / "checkpoints") if resume else None
+    with stream.flowing(config, mesh=prepared.mesh, before=before) as flow:
+        worlds = flow.scenes()
+        print(f"run {folder}", flush=True)
+        yield worlds, flow
+
+
+def make_policy(config: Mapping[str, Any]) -> Policy:
+    """The policy of a config's `policy` entry."""
+    return build(config["policy"], builtins=late_fusion, where="policy")()
+
+
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
+    """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
+    entry = {"_target_": "make", **config["ppo"]}
+    make = build(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
+    return make(env, policy, mesh=mesh)
+
+
+def _make_watch(
+    config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
+) -> OnIteration | None:
+    """Held-out evaluation every so many iterations or at those that are listed, if the config asks for it."""
+    every = config["evaluation"]["every"]
+    if not every or (examiners is None and not config["evaluation"]["enable"]):
+        return None
+    from scenefactory_jax.evaluation.protocols import make_watch
+
+    watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
+
+    def due(iteration: int | float) -> bool:
+        return iteration in every if isinstance(every, list) else iteration % every == 0
+
+    return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
+
+
+def _loop(
+    config,
+    folder: Path,
+    trainer: ppo.Trainer,
+    worlds,
+    state,
+    flow: stream.Flow | None,
+    watching: Mapping[str, loggers.Logger],
+    *,
+    resume: bool,
+    callbacks: list[OnIteration],
+):
+    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
+
+    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. A signal to stop ends it after
+    the iteration that it fell into, with a checkpoint.
+    """
+    first, total = int(state.iteration), config["iterations"]
+    file = metrics_csv.MetricsFile(folder, resume_at=first if resume else None)
+    spent = file.rows[-1]["minutes"] if file.rows else 0.0
+    with (
+        interrupt.deferred() as asked,
+        loggers.opened(watching, folder, config, after=first if resume else 0) as note,
+        metrics_csv.progress(total, enable=config["progress"], start=first) as show,
+    ):
+        for iteration in range(first + 1, total + 1):
+            before = time.monotonic()
+            state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
+            seconds = time.monotonic() - before
+            spent += seconds / 60
+            row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
+            row["casps"] = row["steps/spawned"] / seconds
+            file.add(row)
+            note(row)
+            show(iteration, describe(row))
+            error_messages.check_finite(row)
+            for callback in callbacks:
+                callback(state, row)
+            late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
+            if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
+                host = None if flow is None else flow.state()
+                checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
+            if stop:
+                interrupt.end(folder, iteration, stop)
+            if late:
+                break
+    return state
+
+
+def step(
+    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.Flow | None, *, first: bool
+) -> tuple[ppo.TrainState, Scene, dict[str, float | int]]:
+    """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
+    if flow is None:
+        state, metrics = trainer.iterate(state, worlds)
+        return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
+    if not first:
+        state, worlds = flow.exchange(trainer.swap, state, worlds)
+    state, metrics = trainer.iterate(state, worlds)
+    flow.draw()  # while the devices work
+    metrics, record = jax.device_get((metrics, state.record))
+    return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
+
+
+def describe(row: Mapping[str, float | int]) -> str:
+    """One line on how training stands."""
+    names = {"reached": "goal", "collided": "collision", "touched_edge": "edge", "crashed": "crash"}
+    rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
+    return f"{rates} | {row['casps']:,.0f} steps/s"

@@ -1,0 +1,27 @@
+"""TensorBoard: event files in `RUN/tensorboard`."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboardX import SummaryWriter
+
+from scenefactory_jax.loggers import Add, Logger, Row
+
+
+def make() -> Logger:
+    """A scalar for each column of a row. Of a resumed run TensorBoard forgets what came after the checkpoint."""
+
+    @contextlib.contextmanager
+    def log(folder: Path, config: Mapping[str, Any], after: int) -> Iterator[Add]:
+        own = {"purge_step": after + 1 if after else None, "filename_suffix": f".{after}"}  # files of one second would overwrite each other
+        with SummaryWriter(str(Path(folder) / "tensorboard"), **own) as writer:
+
+            def add(row: Row) -> None:
+                for name, value in row.items():
+                    writer.add_scalar(name, value, int(row["iteration"]))
+
+            yield add
+
+    return log

@@ -1,1 +1,0 @@
-"""Experiments that compare the batched cars with MuJoCo's C engine: the cases, both engines' runs, and what the two say."""

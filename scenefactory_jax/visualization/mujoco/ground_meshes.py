@@ -1,0 +1,117 @@
+"""A road's plan as solid surfaces to see in three dimensions: asphalt under the lanes, paint, kerbs, and the weather's patches."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int
+from shapely import ops
+
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, SPEED_BUMP, Road, Scene
+from scenefactory_jax.visualization.birds_eye import patch_overlay
+from scenefactory_jax.visualization.mujoco import world_mjcf
+
+STRAIGHT_M = 0.03
+LANE_M, CLOSING_M = 2.0, 1.5  # half a lane, and half the width of what is closed between two
+DASH_M, GAP_M = 3.0, 4.5  # of broken lines
+Colour = tuple[float, float, float, float]
+WHITE, YELLOW = world_mjcf.WHITE, world_mjcf.YELLOW
+
+
+class Surface(NamedTuple):
+    """Prisms of one colour that stand on the ground."""
+
+    name: str
+    vertices: Float[np.ndarray, "N 3"]
+    faces: Int[np.ndarray, "M 3"]
+    colour: Colour
+
+
+class Layer(NamedTuple):
+    """How lines of some kinds become a surface."""
+
+    kinds: tuple[int, ...]
+    half_m: float  # of the line's width
+    height_m: float
+    colour: Colour
+    broken: bool = False
+    area: bool = False  # closed lines are areas
+
+
+LAYERS: dict[str, Layer] = {
+    "driveway": Layer((DRIVEWAY,), 0.1, 0.012, (0.30, 0.30, 0.32, 1.0), area=True),
+    "bike": Layer((LANE_BIKE,), 0.9, 0.016, (0.24, 0.33, 0.27, 1.0)),
+    "crosswalk": Layer((CROSSWALK,), 0.1, 0.020, (0.62, 0.62, 0.60, 1.0), area=True),
+    "bump": Layer((SPEED_BUMP,), 0.2, 0.05, (0.80, 0.55, 0.20, 1.0), area=True),
+    "white": Layer((7, 8), 0.07, 0.03, WHITE),
+    "white-broken": Layer((6,), 0.07, 0.03, WHITE, broken=True),
+    "yellow": Layer((11, 12), 0.07, 0.03, YELLOW),
+    "yellow-broken": Layer((9, 10, 13), 0.07, 0.03, YELLOW, broken=True),
+    "kerb": Layer(EDGES, 0.10, 0.14, (0.66, 0.65, 0.62, 1.0)),
+}
+ASPHALT, ASPHALT_M, PATCH_M = (0.20, 0.21, 0.23, 1.0), 0.008, 0.014
+
+
+def surfaces(scene: Scene) -> list[Surface]:
+    """Everything flat of one world, on the host."""
+    lines = [(shapely.simplify(shapely.LineString(points), STRAIGHT_M), kind) for points, kind in world_mjcf.chains(scene.road, None)]
+    lanes = [line.buffer(LANE_M, quad_segs=4) for line, kind in lines if kind in (*DRIVABLE, LANE_BIKE)]
+    asphalt = shapely.union_all(lanes).buffer(CLOSING_M, quad_segs=3).buffer(-CLOSING_M, quad_segs=3) if lanes else None
+    found = [] if asphalt is None else [prism("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]
+    for name, layer in LAYERS.items():
+        shapes = [_shape(line, layer) for line, kind in lines if kind in layer.kinds]
+        if shapes:
+            found.append(prism(name, shapely.union_all(shapes), layer.height_m, layer.colour))
+    for number, area in enumerate(patch_overlay.areas(scene.weather)):
+        whole = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
+        colour = (*(channel / 255 for channel in area.colour), 0.75)
+        found.append(prism(f"patch{number}", whole, PATCH_M + 0.001 * number, colour))
+    return [surface for surface in found if len(surface.faces)]
+
+
+def _shape(line: shapely.LineString, layer: Layer) -> shapely.Geometry:
+    if layer.area and len(line.coords) > 3 and shapely.get_point(line, 0).distance(shapely.get_point(line, -1)) < 0.1:
+        return shapely.Polygon(line).buffer(0)
+    if not layer.broken:
+        return line.buffer(layer.half_m, cap_style="flat", join_style="mitre")
+    begins = np.arange(0.0, line.length, DASH_M + GAP_M)
+    dashes = [ops.substring(line, begin, begin + DASH_M) for begin in begins]
+    return shapely.union_all([dash.buffer(layer.half_m, cap_style="flat") for dash in dashes])
+
+
+def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[float]) -> Surface:
+    """A plan's polygons raised from the ground: tops that look up, walls that look outwards, no bottoms."""
+    vertices: list[Float[np.ndarray, "n 3"]] = [np.zeros((0, 3))]
+    faces: list[Int[np.ndarray, "n 3"]] = [np.zeros((0, 3), int)]
+    count = 0
+    for polygon in shapely.get_parts(shape):
+        if polygon.geom_type != "Polygon" or polygon.area < 1e-4:
+            continue
+        whole = shapely.orient_polygons(polygon)  # outside counter-clockwise, holes clockwise: walls look outwards
+        tops = [_upwards(np.asarray(triangle.exterior.coords)[:3]) for triangle in shapely.constrained_delaunay_triangles(whole).geoms]
+        corners = np.concatenate(tops)
+        vertices.append(np.c_[corners, np.full(len(corners), height_m)])
+        faces.append(count + np.arange(len(corners)).reshape(-1, 3))
+        count += len(corners)
+        for ring in (whole.exterior, *whole.interiors):
+            points = np.asarray(ring.coords)
+            here, there = points[:-1], points[1:]
+            low, high = np.zeros(len(here)), np.full(len(here), height_m)
+            vertices.append(np.concatenate([np.c_[here, low], np.c_[there, low], np.c_[there, high], np.c_[here, high]]))
+            corner = count + np.arange(len(here))[:, None] + len(here) * np.array([0, 1, 2, 0, 2, 3])
+            faces.append(corner.reshape(-1, 3))
+            count += 4 * len(here)
+    return Surface(name, np.concatenate(vertices), np.concatenate(faces), (colour[0], colour[1], colour[2], colour[3]))
+
+
+def _upwards(triangle: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "3 2"]:
+    (ax, ay), (bx, by) = triangle[1] - triangle[0], triangle[2] - triangle[0]
+    return triangle if ax * by > ay * bx else triangle[::-1]
+
+
+def extent(road: Road) -> tuple[Float[np.ndarray, "2"], float]:
+    """Middle of a road's box, and half its longer side."""
+    places = np.asarray(road.midpoint, float)[np.asarray(road.valid, bool)]
+    low, high = places.min(axis=0), places.max(axis=0)
+    return (low + high) / 2, float((high - low).max() / 2)

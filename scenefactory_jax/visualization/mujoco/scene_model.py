@@ -1,0 +1,134 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
+"""A world as a MuJoCo model that is only looked at: its road, and its cars where they are put. Nothing is stepped.
+
+`scenes.mjcf` builds the same world to be simulated, with lines as thin boxes; here surfaces are meshes, which draw fast.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from scenefactory_jax.core.types import Scene
+from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated.parameters import CarParameters
+from scenefactory_jax.visualization.birds_eye import drawing
+from scenefactory_jax.visualization.mujoco import ground_meshes
+from scenefactory_jax.visualization.mujoco.ground_meshes import Surface
+
+GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
+SUN = (0.45, 0.3, -1.0)  # way of its light
+SHADOWS_M, SHADOW_PIXELS = 150.0, 8192  # how far from what is looked at shadows fall; just beyond, MuJoCo speckles the ground
+JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the front wheels; suspension and spin of the rear ones
+STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
+
+
+class Stage(NamedTuple):
+    """The compiled model and where its cars stand in it."""
+
+    model: mujoco.MjModel
+    slots: Int[np.ndarray, " C"]  # of the cars that the world has
+    joints: Int[np.ndarray, "C 17"]  # of each in qpos
+    geoms: list[Int[np.ndarray, " n"]]  # of each
+    paint: Float[np.ndarray, "G 4"]  # every geom's own colour
+
+
+def build(scene: Scene, car: CarParameters) -> Stage:
+    """The world of an episode.
+
+    Args:
+        scene: one world on the host, with the weather that is to be seen.
+        car: how cars look; each is as long and as wide as its agent, its wheels in proportion.
+    """
+    model = _empty(scene)
+    for surface in ground_meshes.surfaces(scene):
+        _mesh(model, surface)
+    slots = np.flatnonzero(np.asarray(scene.agents.present))
+    for slot in slots:
+        length, width = (float(side) for side in np.asarray(scene.agents.size)[slot])
+        model.attach(_painted(sized(car, length, width), int(slot)), prefix=f"agent{slot}/", frame=model.worldbody.add_frame())
+    compiled = model.compile()
+    bodies = [compiled.body(f"agent{slot}/chassis").id for slot in slots]
+    first = [int(compiled.joint(f"agent{slot}/root").qposadr[0]) for slot in slots]
+    geoms = [np.flatnonzero(compiled.body_rootid[compiled.geom_bodyid] == body) for body in bodies]
+    joints = np.array(first, int)[:, None] + np.arange(JOINTS)
+    return Stage(compiled, slots, joints, geoms, compiled.geom_rgba.copy())
+
+
+def sized(car: CarParameters, length: float, width: float) -> CarParameters:
+    """The car drawn longer and wider, its wheels in proportion."""
+    along, across = length / car.length, width / car.width
+    return dataclasses.replace(car, length=length, width=width, wheelbase=car.wheelbase * along, track=car.track * across)
+
+
+def posture(
+    car: CarParameters,
+    position: Float[np.ndarray, "*n 2"],
+    yaw: Float[np.ndarray, "*n"],
+    steer: Float[np.ndarray, "*n"],
+    spin: Float[np.ndarray, "*n"],
+) -> Float[np.ndarray, "*n 17"]:
+    """Joints of level cars that stand on their wheels, for dynamics that have no joints.
+
+    Args:
+        steer: of the front wheels.
+        spin: angle by which the wheels have turned.
+    """
+    joints = np.zeros((*np.shape(yaw), JOINTS))
+    joints[..., :2], joints[..., 2] = position, car.wheel_radius - car.wheel_height
+    joints[..., 3], joints[..., 6] = np.cos(yaw / 2), np.sin(yaw / 2)
+    joints[..., STEER], joints[..., SPIN] = np.asarray(steer)[..., None], np.asarray(spin)[..., None]
+    return joints
+
+
+def put(stage: Stage, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
+    """Every car where its joints say, all slots given; what is wholly transparent is not drawn."""
+    for row, slot in enumerate(stage.slots):
+        data.qpos[stage.joints[row]] = joints[slot]
+        geoms = stage.geoms[row]
+        stage.model.geom_rgba[geoms, 3] = stage.paint[geoms, 3] * opacity[slot]
+    mujoco.mj_kinematics(stage.model, data)
+    mujoco.mj_camlight(stage.model, data)
+
+
+def light(data: mujoco.MjData, place: Float[np.ndarray, "3"]) -> None:
+    """Move the sun to where shadows are to be sharp."""
+    data.light_xpos[0] = place - 0.5 * SHADOWS_M * np.array(SUN)
+
+
+def _empty(scene: Scene) -> mujoco.MjSpec:
+    """Ground, sky and sun around the road."""
+    model = mujoco.MjSpec()
+    model.modelname = "world"
+    (x, y), half = ground_meshes.extent(scene.road)
+    model.stat.center, model.stat.extent = [x, y, 0.0], half
+    model.visual.map.znear, model.visual.map.zfar = 0.5 / half, 20.0  # in extents
+    model.visual.map.shadowclip, model.visual.quality.shadowsize = SHADOWS_M / half, SHADOW_PIXELS
+    model.visual.map.haze, model.visual.rgba.haze = 0.6, [*HORIZON, 1.0]
+    model.visual.headlight.ambient, model.visual.headlight.diffuse = [0.45] * 3, [0.15] * 3
+    model.visual.headlight.specular = [0.0] * 3
+    sky, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    model.add_texture(name="sky", type=sky, builtin=gradient, rgb1=list(SKY), rgb2=list(HORIZON), width=128, height=768)
+    sun = model.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[x, y, 0.0], dir=list(SUN))
+    sun.castshadow, sun.diffuse, sun.specular = True, [0.55] * 3, [0.1] * 3
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    model.worldbody.add_geom(name="ground", type=plane, size=[0, 0, 1], rgba=list(GROUND), contype=0, conaffinity=0)
+    return model
+
+
+def _mesh(model: mujoco.MjSpec, surface: Surface) -> None:
+    """A surface to see, that nothing touches."""
+    mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    model.worldbody.add_geom(name=surface.name, type=kind, meshname=surface.name, rgba=list(surface.colour), contype=0, conaffinity=0)
+
+
+def _painted(car: CarParameters, slot: int) -> mujoco.MjSpec:
+    """A car in its slot's colour."""
+    spec = cars.spec(car, visual=True, brake_rows=False)
+    spec.geom("hull").rgba = [*(channel / 255 for channel in drawing.colour_of(slot)), 1.0]
+    return spec

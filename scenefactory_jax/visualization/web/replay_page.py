@@ -1,0 +1,117 @@
+"""A recording as one HTML file that needs nothing else: no network, no server, no library. Browsers open it, notebooks show it.
+
+The page itself is `replay/`: its parts are put into one document beside the worlds' data, with a content policy under which a browser
+loads nothing from anywhere.
+"""
+
+import html
+import json
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+from scenefactory_jax.env.rollout import Recording
+from scenefactory_jax.visualization.birds_eye.drawing import AGENTS, GOAL_RADIUS, MARKS
+from scenefactory_jax.visualization.web import replay_data
+from scenefactory_jax.visualization.web.replay_data import Posts
+from scenefactory_jax.visualization.web.term_styles import term_looks
+
+if TYPE_CHECKING:
+    from IPython.display import HTML
+
+SCRIPTS = ("data.js", "state.js", "view.js", "map.js", "marks.js", "plots.js", "rewards.js", "charts.js", "legend.js", "address.js")
+SCRIPTS += ("page.js",)  # it starts the page
+
+
+class ReplayError(ValueError):
+    """A recording that cannot be shown; the message names the argument and what would be valid."""
+
+
+def write(
+    path: Path | str,
+    recording: Recording,
+    *,
+    names: Sequence[str] = (),
+    posts: Sequence[Posts] = (),
+    title: str = "replay",
+    goal_radius_m: float = GOAL_RADIUS,
+) -> Path:
+    """Write the page, about 0.1 to 1 MB a world.
+
+    Args:
+        recording: of one or several worlds, see `recording.record`.
+        names: of the worlds; none: numbers.
+        posts: lights and stop signs of the worlds (`replay_data.posts`); none: not shown.
+        title: of the page.
+        goal_radius_m: of the goals' circles.
+
+    Raises:
+        ReplayError: names or posts that are not as many as the worlds, or nothing recorded.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(document(recording, names=names, posts=posts, title=title, goal_radius_m=goal_radius_m), encoding="utf-8")
+    return path
+
+
+def show(recording: Recording, *, height: int = 720, **options: Any) -> "HTML":
+    """The page inline in a notebook, `height` pixels tall; the other options are those of `write`.
+
+    Raises:
+        ReplayError: see `write`.
+    """
+    from IPython.display import HTML
+
+    page = html.escape(document(recording, **options), quote=True)
+    style = f"width:100%;height:{height}px;border:0"
+    return HTML(f'<div><iframe title="replay" style="{style}" srcdoc="{page}"></iframe></div>')
+
+
+def document(
+    recording: Recording,
+    *,
+    names: Sequence[str] = (),
+    posts: Sequence[Posts] = (),
+    title: str = "replay",
+    goal_radius_m: float = GOAL_RADIUS,
+) -> str:
+    """The page as text; arguments and errors as `write`."""
+    recording = jax.device_get(recording)
+    count, steps = recording.shots.time_s.shape if recording.shots.time_s.ndim == 2 else (0, 0)
+    if not count or not steps:
+        raise ReplayError(f"recording: {count} worlds of {steps} steps; wanted is at least one of each, worlds along the first axis")
+    for what, given in (("names", names), ("posts", posts)):
+        if given and len(given) != count:
+            raise ReplayError(f"{what}: {len(given)} for {count} worlds; wanted is one for each, or none")
+    worlds = [
+        replay_data.world(recording, index, name=names[index] if names else f"world {index}", posts=posts[index] if posts else Posts())
+        for index in range(count)
+    ]
+    head = {
+        "title": title,
+        "goal_radius": goal_radius_m,
+        "colours": [list(colour) for colour in AGENTS],
+        "marks": {name: {"label": mark.label, "colour": list(mark.colour)} for name, mark in MARKS.items()},
+        "terms": {name: look._asdict() for name, look in term_looks(recording.shots.terms).items()},
+        "ttc_most": replay_data.TTC_MOST_S,
+        "worlds": [one for one, _ in worlds],
+    }
+    arrays = "\n".join(f'<script type="text/plain" class="arrays">{text}</script>' for _, text in worlds)
+    parts = {
+        "title": html.escape(title),
+        "style": _part("replay.css"),
+        "head": json.dumps(head, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "arrays": arrays,
+        "script": "\n".join(_part(name) for name in SCRIPTS),
+    }
+    page = _part("page.html")
+    for name, text in parts.items():
+        page = page.replace(f"<!--{name}-->", text, 1)
+    return page
+
+
+def _part(name: str) -> str:
+    return (resources.files("scenefactory_jax.visualization.web") / "page" / name).read_text(encoding="utf-8")

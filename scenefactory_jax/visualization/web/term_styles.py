@@ -1,0 +1,59 @@
+"""How reward terms look in every page and figure: one colour and one pattern for each, by the term's name."""
+
+import zlib
+from collections.abc import Iterable
+from typing import Literal, NamedTuple
+
+from scenefactory_jax.visualization.birds_eye.drawing import MARKS, Colour
+
+Pattern = Literal["plain", "striped", "dotted", "crossed"]
+HATCHES: dict[Pattern, str] = {"plain": "", "striped": "////", "dotted": "...", "crossed": "xxxx"}  # matplotlib's, of areas
+DASHES: dict[Pattern, str] = {"plain": "-", "striped": "--", "dotted": ":", "crossed": "-."}  # matplotlib's, of lines
+
+
+class TermLook(NamedTuple):
+    """Colour and pattern of a term; `spike`: paid at once for an event, so that an axis is not scaled by it."""
+
+    colour: Colour
+    pattern: Pattern = "plain"
+    spike: bool = False
+
+
+# Seven hues beside those of the events. Two different hues are at least 30 apart in CIELAB, and 10 for an eye without green receptors.
+BLUE, VIOLET, SKY, KHAKI, SLATE, PINK, WINE = HUES = (
+    (15, 79, 192), (176, 92, 236), (86, 197, 238), (181, 173, 60), (122, 130, 150), (240, 154, 181), (125, 27, 87),
+)  # fmt: skip
+# the terms of conf/reward and of `rewards`: related ones share their hue and differ in the pattern
+TERMS: dict[str, TermLook] = {
+    "goal": TermLook(MARKS["reached"].colour, spike=True),
+    "collision": TermLook(MARKS["collided"].colour, spike=True),
+    "crash": TermLook(MARKS["crashed"].colour, spike=True),
+    "road_edge": TermLook(MARKS["touched_edge"].colour, spike=True),
+    "progress": TermLook(BLUE),
+    "speed": TermLook(BLUE, "striped"),
+    "lane_keeping": TermLook(SKY),
+    "wrong_way": TermLook(SKY, "striped"),
+    "off_lane": TermLook(KHAKI),
+    "idle": TermLook(SLATE),
+    "stopping": TermLook(SLATE, "striped"),
+    "ttc": TermLook(PINK),
+    "clearance": TermLook(PINK, "striped"),
+    "edge_ttc": TermLook(WINE),
+    "edge_clearance": TermLook(WINE, "striped"),
+    "steer_rate": TermLook(VIOLET),
+    "action_rate": TermLook(VIOLET, "striped"),
+}
+OWN = tuple(TermLook(hue, pattern) for pattern in ("dotted", "crossed") for hue in HUES)  # of terms that are not above
+
+
+def term_looks(names: Iterable[str]) -> dict[str, TermLook]:
+    """The look of each term.
+
+    A term of one's own takes the look of `OWN` at the CRC-32 of its name, or the next one that is free: it looks the same wherever it is
+    shown, as long as no two names of one set meet.
+    """
+    names, own = list(names), dict[str, TermLook]()
+    for name in sorted(set(names) - TERMS.keys()):
+        first = zlib.crc32(name.encode()) % len(OWN)
+        own[name] = next((look for look in (*OWN[first:], *OWN[:first]) if look not in own.values()), OWN[first])
+    return {name: TERMS.get(name) or own[name] for name in names}

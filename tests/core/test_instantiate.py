@@ -1,0 +1,88 @@
+"""Config entries: bound by name, refused by name."""
+
+import sys
+import types
+
+import pytest
+
+from scenefactory_jax.core.instantiate import ConfigError, build, check_number
+from scenefactory_jax.env import rewards
+
+
+def _module():
+    module = types.ModuleType("parts")
+
+    def scale(x, *, factor: float, steps: int, names: list[str], dt: float = 0.1):
+        return factor * x * steps + dt
+
+    scale.__module__ = "parts"
+    module.scale = scale
+    sys.modules["parts"] = module
+    return module
+
+
+ENTRY = {"_target_": "scale", "factor": 2, "steps": 3, "names": ["a"]}
+
+
+def test_binds_numbers_and_context():
+    assert build(ENTRY, builtins=_module(), where="x", dt=0.5)(1.0) == 6.5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"_target_": "sclae"}, "valid: scale"),
+        ({"_target_": "no_such_module.f"}, "cannot import 'no_such_module'"),
+        ({"factr": 1.0}, "x.factr: unknown key"),
+        ({"factor": "fast"}, "x.factor: 'fast' is of type str, wanted float"),
+        ({"steps": 1.5}, "x.steps: 1.5"),
+        ({"steps": True}, "x.steps: True"),
+        ({"names": [1]}, "x.names"),
+    ],
+)
+def test_refuses_by_name(change, message):
+    with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
+        build({**ENTRY, **change}, builtins=_module(), where="x")
+
+
+IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env.rewards.Mapping", "event.func", ".event", ""]
+
+
+@pytest.mark.parametrize("target", IMPORTED)
+def test_a_part_is_what_a_module_defines_not_what_it_imports(target):
+    with pytest.raises(ConfigError, match=r"^x\._target_: "):
+        build({"_target_": target}, builtins=rewards, where="x")
+
+
+def test_missing_key_lists_what_is_needed():
+    with pytest.raises(ConfigError, match=r"x.factor: missing; scale needs dt, factor, names, steps"):
+        build({"_target_": "scale", "steps": 1, "names": []}, builtins=_module(), where="x")
+
+
+def test_a_context_value_is_no_key():
+    with pytest.raises(ConfigError, match=r"x.dt: unknown key"):
+        build({**ENTRY, "dt": 1.0}, builtins=_module(), where="x", dt=0.5)
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds", "message"),
+    [
+        (0, {"above": 0.0}, "x: 0; wanted is a number above 0"),
+        (1.0, {"above": 0.0, "below": 1.0}, "x: 1; wanted is a number above 0 and below 1"),
+        (-1, {"least": 0.0}, "x: -1; wanted is a number of at least 0"),
+        (float("nan"), {"least": 0.0}, "x: nan; wanted is a finite number of at least 0"),
+        (float("inf"), {}, "x: inf; wanted is a finite number$"),
+    ],
+)
+def test_a_number_beyond_its_bounds_is_refused(value, bounds, message):
+    with pytest.raises(ConfigError, match=message):
+        check_number(value, where="x", **bounds)
+    check_number(0.5, where="x", **bounds)
+
+
+def test_reward_entries_need_a_weight():
+    with pytest.raises(ConfigError, match=r"reward.idle.weight: missing"):
+        rewards.make({"idle": {"_target_": "idle"}})
+    with pytest.raises(ConfigError, match=r"reward.idle.weight: 'x'"):
+        rewards.make({"idle": {"_target_": "idle", "weight": "x"}})
+    assert set(rewards.make({"idle": {"_target_": "idle", "weight": -1}, "goal": None})) == {"idle"}

@@ -1,0 +1,125 @@
+"""A folder that holds a run or a policy runs no code of its own: its config may name parts of the package, and others only with `trust`."""
+
+import shutil
+
+import pytest
+import yaml
+
+import scenefactory_jax as sf
+from scenefactory_jax.cli import hydra_config, view
+from scenefactory_jax.cli.compare import _read
+from scenefactory_jax.cli.export import export
+from scenefactory_jax.cli.view import of_run
+from scenefactory_jax.core import trusted_targets
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.evaluation.protocols import evaluate
+from scenefactory_jax.learning import policy_io, run_folder
+from scenefactory_jax.visualization.report import policy_card
+
+PLANTED = (
+    "from pathlib import Path\nPath(__file__).with_name('ran').touch()\nfrom scenefactory_jax.learning.networks.late_fusion import make\n"
+)
+FOREIGN = [
+    "planted.make",
+    "os.system",
+    "runpy.run_path",
+    "scenefactory_jax.cli.hydra_config.subprocess.run",
+    "scenefactory_jax.core.instantiate.find",
+]
+FOREIGN += ["scenefactory_jax.learning.checkpoint.strip", "scenefactory_jax.core.atomic_file.replaced"]
+FOREIGN += ["scenefactory_jax_evil.rewards.event", ".planted.make", 7]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The package's policy in a folder with a module beside it, importable from where the command is called."""
+    shutil.copytree(policy_io.SHIPPED / "town", tmp_path / "theirs")
+    (tmp_path / "theirs" / "planted.py").write_text(PLANTED)
+    monkeypatch.chdir(tmp_path / "theirs")
+    monkeypatch.syspath_prepend(tmp_path / "theirs")
+    return tmp_path / "theirs"
+
+
+def change(folder, edit):
+    own = yaml.safe_load((folder / "config.yaml").read_text())
+    edit(own)
+    (folder / "config.yaml").write_text(yaml.safe_dump(own))
+
+
+@pytest.mark.parametrize("target", FOREIGN, ids=str)
+def test_a_run_names_parts_of_the_package_alone(folder, target):
+    change(folder, lambda own: own["reward"]["goal"].update(_target_=target))
+    with pytest.raises(ConfigError) as caught:
+        sf.load_policy(folder)
+    told = str(caught.value)
+    assert told.startswith(f"{folder / 'config.yaml'}: reward.goal._target_: {target!r}: outside of scenefactory_jax")
+    assert "trust=true" in told and "\n" not in told and not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "door",
+    [
+        lambda run, out: sf.load_policy(run),
+        lambda run, out: export(hydra_config.load("export", f"run={run}", f"out={out}")),
+        lambda run, out: evaluate(hydra_config.load("evaluate", f"run={run}", f"out={out}")),
+        lambda run, out: view.replay(hydra_config.load("replay", f"run={run}", f"out={out}.html")),
+        lambda run, out: of_run(hydra_config.load("drive", f"run={run}"), command="drive"),
+    ],
+    ids=["load_policy", "export", "evaluate", "replay", "drive"],
+)
+def test_every_door_is_the_same(folder, tmp_path, door):
+    change(folder, lambda own: own["scenes"]["formats"].update(mine={"_target_": "planted.make", "more": [{"_target_": "os.system"}]}))
+    named = r"scenes\.formats\.mine\._target_: 'planted\.make'; scenes\.formats\.mine\.more\.0\._target_: 'os\.system'"
+    with pytest.raises(ConfigError, match=named):
+        door(folder, tmp_path / "out")
+    assert not (folder / "ran").exists() and not (tmp_path / "out").exists()
+
+
+def test_what_is_trusted_is_named_and_runs(folder, tmp_path, capsys):
+    change(folder, lambda own: own["policy"].update(_target_="planted.make"))
+    trained = sf.load_policy(folder, trust=True)
+    assert (folder / "ran").exists() and trained.config["policy"]["_target_"] == "planted.make"
+    assert f"{folder / 'config.yaml'}: trusted, and runs planted.make (policy._target_)\n" == capsys.readouterr().out
+    kept = export(hydra_config.load("export", f"run={folder}", f"out={tmp_path / 'mine'}", "trust=true"))
+    assert "names functions outside of scenefactory_jax: `planted.make`." in (kept / "README.md").read_text()
+    with pytest.raises(ConfigError, match=r"policy\._target_: 'planted\.make'"):
+        sf.load_policy(kept)
+
+
+def test_a_policy_of_the_package_needs_no_trust(capsys):
+    assert trusted_targets.outside(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
+    assert policy_card._code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
+
+
+def test_whatever_a_training_can_choose_may_be_named():
+    whole = hydra_config.load("train")
+    groups = [group for group in whole if (hydra_config.folder() / group).is_dir()]
+    files = [file for group in groups for file in (hydra_config.folder() / group).rglob("*.yaml")]
+    assert {"dynamics", "reward", "observe", "scenes", "policy", "loggers", "weather"} <= set(groups) and len(files) > 40
+    for name in [*files, hydra_config.folder() / "formats.yaml"]:
+        assert trusted_targets.outside(yaml.safe_load(name.read_text()) or {}) == {}, name
+
+
+def test_yaml_that_names_itself_is_read_once(tmp_path):
+    (tmp_path / "config.yaml").write_text('a: &a [*a, {_target_: os.system}]\n"\\e[2J": {_target_: x.y}\n')
+    with pytest.raises(ConfigError) as caught:
+        hydra_config.read(tmp_path)
+    assert "a.1._target_: 'os.system'" in str(caught.value) and "\x1b" not in str(caught.value)
+
+
+def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path, capsys):
+    mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
+    before = hydra_config.load("train", mine, f"out={tmp_path}")
+    hydra_config.write(tmp_path, before)
+    with run_folder.opened(before | {"resume": True}) as (folder, resume):  # what is built is the command's config, never the folder's
+        assert folder == tmp_path and not resume
+    assert capsys.readouterr().out == f"{tmp_path} has no checkpoint to go on from: the run begins anew\n"
+    other = hydra_config.load("train", f"out={tmp_path}", "resume=true")
+    with pytest.raises(ConfigError, match=r"reward\.mine=None"), run_folder.opened(other):
+        pass
+
+
+def test_runs_are_compared_without_trust(tmp_path):
+    hydra_config.write(tmp_path, hydra_config.load("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
+    (tmp_path / "metrics.csv").write_text("iteration\n1\n")
+    assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"

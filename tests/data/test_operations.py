@@ -1,0 +1,416 @@
+"""Choosing, dividing and joining scenes of banks: laws, oracles, and real scenes."""
+
+import functools
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.scene_banks import FEATURES, PROCEDURAL, banked, generated, moved, rounded, window
+
+from scenefactory_jax import __main__ as command_line
+from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.cli.scenes import scenes
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.data.bank import bank_index
+from scenefactory_jax.data.bank import bank_reader as banks
+from scenefactory_jax.data.curation import duplicates, filter_expressions, geographic_split, operations
+from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading import batches
+
+SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
+TOWN = {"metadata": {"dataset": "town", "town": "one"}}  # scenes of one frame
+NUMBERS = {"tolerance_m": 0.2, "share": 0.95, "slack": 0.02}
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """Twelve scenes: six procedural ones, each alone, and six windows onto one street that overlap in two groups of three."""
+    street = generated(0)
+    points = np.concatenate([line.xyz for line in street.roads])
+    centre, towards = points.mean(axis=0), np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0))[2][0]
+    turn = np.array([[towards[0], towards[1], 0], [-towards[1], towards[0], 0], [0, 0, 1]])  # the street along x
+    straight = replace(street, roads=tuple(replace(line, xyz=(line.xyz - centre) @ turn.T) for line in street.roads), tracks=street.tracks)
+    onto = [window(straight, x, 30.0, name=f"window-{x:+d}", **TOWN) for x in (-40, -32, -24, 24, 32, 40)]
+    return banked(tmp_path_factory.mktemp("banks") / "town", [*(generated(index) for index in range(6)), *onto])
+
+
+# ---- conditions
+
+COLUMNS = {"vehicles": int, "lane_m": float, "dataset": str, "curved": bool, "sdc_distance_m": float}
+
+
+def condition(rng, depth=3):
+    """A random condition, and what Python makes of it."""
+    number = rng.choice(["vehicles", "lane_m", "sdc_distance_m", "3", "2.5", "vehicles * 2 - lane_m / 4", "-(lane_m - 3)"])
+    leaves = [
+        f"{number} {rng.choice(['<', '<=', '>', '>=', '==', '!='])} {rng.choice(['vehicles', '4', 'lane_m', '-1'])}",
+        f"1 < {number} <= 6", f"vehicles {rng.choice(['in', 'not in'])} [1, 2, 3]", f"dataset {rng.choice(['==', '!=', '<'])} 'b'",
+        "dataset in ('a', 'c')", "curved", "curved == True",
+    ]  # fmt: skip
+    if depth == 0:
+        return str(rng.choice(leaves))
+    one, other = condition(rng, depth - 1), condition(rng, depth - 1)
+    return str(rng.choice([*leaves, f"({one} and {other})", f"({one} or {other})", f"(not {one})"]))
+
+
+def test_conditions_mean_what_they_mean_in_python():
+    rng = np.random.default_rng(0)
+    rows = [
+        {"vehicles": int(v), "lane_m": float(x), "dataset": str(d), "curved": bool(c), "sdc_distance_m": float(s)}
+        for v, x, d, c, s in zip(*(rng.integers(0, 8, (5, 60)) / 1), strict=True)
+    ]
+    rows = [row | {"dataset": "abc"[int(row["lane_m"]) % 3]} for row in rows]
+    table = pa.Table.from_pylist(rows)
+    held = 0
+    for _ in range(100):
+        text = condition(rng)
+        wanted = [index for index, row in enumerate(rows) if eval(text, {}, dict(row))]
+        assert filter_expressions.rows(table, text, where="filter").tolist() == wanted, text
+        held += 0 < len(wanted) < len(rows)
+    assert held > 50
+
+
+def test_a_missing_value_meets_no_condition():
+    table = pa.table({"sdc_distance_m": [5.0, None, 20.0], "vehicles": [1, 2, 3]})
+    for text, wanted in {
+        "sdc_distance_m > 10": [2], "not sdc_distance_m > 10": [0], "sdc_distance_m > 10 or vehicles == 2": [1, 2],
+        "sdc_distance_m in [5]": [0], "vehicles / 0 > 1 and 100 + 100 > vehicles": [0, 1, 2],
+    }.items():  # fmt: skip
+        assert filter_expressions.rows(table, text, where="filter").tolist() == wanted, text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("vehicls > 3", "filter: unknown column 'vehicls'; did you mean vehicles\\? valid: dataset, vehicles"),
+        ("__import__('os').system('true')", "has no place in a condition; valid: columns, numbers"),
+        ("vehicles.real > 1", "'vehicles.real' has no place"),
+        ("[x for x in vehicles]", "has no place"),
+        ("vehicles ** 99999 > 1", "has no place"),
+        ("vehicles >", "is no condition"),
+        ("((((" * 2000, "is no condition"),
+        ("vehicles + 1", "is a value of type int64, no condition"),
+        ("dataset > 3", "values that cannot be compared"),
+        ("vehicles > 99999999999999999999", "is no condition"),
+        ("", "is no condition; write one such as"),
+    ],
+)
+def test_what_is_no_condition_is_refused(text, message):
+    with pytest.raises(ConfigError, match=message):
+        filter_expressions.rows(pa.table({"vehicles": [1, 2], "dataset": ["a", "b"]}), text, where="filter")
+
+
+# ---- streets
+
+
+def components(sets, least):
+    """Groups of overlapping sets, by looking at every pair until nothing changes."""
+    group = list(range(len(sets)))
+    for _ in sets:
+        for i, j in itertools.combinations(range(len(sets)), 2):
+            if len(sets[i] & sets[j]) >= least:
+                group[i] = group[j] = min(group[i], group[j])
+    return group
+
+
+@pytest.mark.parametrize("block", [3, 4096])
+def test_groups_are_connected_by_shared_streets(block, monkeypatch):
+    monkeypatch.setattr(geographic_split, "BLOCK", block)
+    rng = np.random.default_rng(1)
+    for least, reach in ((1, 40), (2, 60), (3, 60)):
+        sets = [set(rng.integers(0, reach * 4, rng.integers(0, 9)).tolist()) for _ in range(40)]
+        starts = np.cumsum([0, *map(len, sets)])
+        found = geographic_split.groups(np.array([key for one in sets for key in one], int), starts, least_shared=least)
+        wanted = np.unique(components(sets, least), return_inverse=True)[1]
+        pairs = {(a, b) for a, b in zip(found.tolist(), wanted.tolist(), strict=True)}
+        assert len(pairs) == len(set(found.tolist())) == len(set(wanted.tolist())) > 1
+
+
+def test_groups_are_dealt_whole_and_shares_are_met():
+    rng = np.random.default_rng(0)
+    group = np.unique(rng.integers(0, 300, 1000), return_inverse=True)[1]
+    parts = geographic_split.deal(group, SHARES, seed=0)
+    assert np.array_equal(np.sort(np.concatenate(list(parts.values()))), np.arange(1000))
+    assert not any(set(group[a]) & set(group[b]) for a, b in itertools.combinations(parts.values(), 2))
+    assert [len(rows) for rows in parts.values()] == [600, 200, 200] and not any(geographic_split.leaks(group, parts).values())
+    again, other = geographic_split.deal(group, SHARES, seed=0), geographic_split.deal(group, SHARES, seed=1)
+    assert all(np.array_equal(parts[name], again[name]) for name in parts) and any(set(parts[name]) != set(other[name]) for name in parts)
+    by_scene = geographic_split.deal(np.arange(1000), SHARES, seed=0)
+    apart = {name: sum(g in set().union(*(group[r] for n, r in by_scene.items() if n != name)) for g in group[rows])
+             for name, rows in by_scene.items()}  # fmt: skip
+    assert geographic_split.leaks(group, by_scene) == apart and apart["test"] > 100
+    with pytest.raises(ConfigError, match=r"split.shares.val: 0.2 of 9 scenes in 1 groups"):
+        geographic_split.deal(np.zeros(9, int), SHARES, seed=0)
+    for wrong, message in (({"train": 1.0}, "two parts or more"), ({"a": 1, "b": 0}, "split.shares.b: 0")):
+        with pytest.raises(ConfigError, match=message):
+            geographic_split.deal(group, wrong, seed=0)
+
+
+def test_a_split_never_divides_a_street(town):
+    table = operations.described(town, FEATURES)
+    groups = operations.streets(table, least_shared=2)
+    assert sorted(np.bincount(groups).tolist()) == [1] * 6 + [3, 3]
+    assert [set(groups[6:9]), set(groups[9:])] == [{groups[6]}, {groups[9]}]
+    for seed in range(6):
+        made = operations.split(town, table, shares={"train": 0.5, "test": 0.5}, by="streets", least_shared=2, seed=seed)
+        names = {part: set(bank.names) for part, bank in made.banks.items()}
+        assert not names["train"] & names["test"] and names["train"] | names["test"] == set(town.names)
+        assert made.account["leaks"] == {"train": 0, "test": 0} and made.account["groups_by_size"] == {"1": 6, "3": 2}
+        for part in names.values():
+            assert sum(name.startswith("window") for name in part) % 3 == 0
+    leaky = [operations.split(town, table, shares={"train": 0.5, "test": 0.5}, by="scene", least_shared=2, seed=s) for s in range(6)]
+    assert any(made.account["leaks"]["test"] for made in leaky)
+
+
+def womd(folder, part, names=None):
+    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    files = sorted((folder / "womd" / part).iterdir())
+    return [next(reader_selection.read(file, formats)) for file in files if names is None or file.name.split(".")[0] in names]
+
+
+def shown(raws):
+    found = [geographic_split.streets(raw, **hydra_config.load("scenes")["features"]["streets"]) for raw in raws]
+    return geographic_split.groups(np.concatenate(found), np.cumsum([0, *map(len, found)]), least_shared=3)
+
+
+def test_real_scenes_of_one_street_are_found(shared_data):
+    raws = womd(shared_data, "train", {"tfrecord-00138-of-01000_326", "tfrecord-00441-of-01000_20", "tfrecord-00000-of-01000_4"})
+    groups = shown(raws)
+    assert groups[1] == groups[2] != groups[0]  # two recordings of one crossing, of different days
+
+
+@pytest.mark.slow
+def test_the_shipped_test_scenes_share_no_street_with_the_training_scenes(shared_data):
+    train, test = womd(shared_data, "train"), womd(shared_data, "test")
+    groups = shown([*train, *test])
+    assert not set(groups[: len(train)]) & set(groups[len(train) :])
+    leaks = [
+        geographic_split.leaks(groups, geographic_split.deal(np.arange(len(groups)), {"train": 0.8, "test": 0.2}, seed=s))["test"]
+        for s in range(200)
+    ]
+    assert len(groups) - len(set(groups)) == 1 and 0.2 < np.mean(leaks) < 0.45  # one pair in 192: a random split divides it with 0.32
+
+
+# ---- duplicates
+
+
+def test_copies_are_found_and_different_scenes_kept(tmp_path):
+    raws = [generated(index) for index in (0, 2, 3, 4)]
+    crossing = raws[2]
+    copy = rounded(moved(crossing, (812.34, -55.5, 3.0)), name="a copy", source="elsewhere", metadata={"dataset": "other"}, sdc=None)
+    faster = replace(crossing, name="another run", tracks=tuple(replace(t, xyz=np.roll(t.xyz, 8, axis=0)) for t in crossing.tracks))
+    fewer = replace(crossing, name="one car fewer", tracks=crossing.tracks[1:])
+    bank = banked(tmp_path / "bank", [*raws, copy, faster, fewer])
+    made = duplicates.dedupe(bank, operations.described(bank, FEATURES), **NUMBERS)
+    assert made.account["groups"] == [[crossing.name, "a copy"]] and made.account["compared"] >= 1
+    assert list(made.bank.names) == [*(raw.name for raw in raws), "another run", "one car fewer"]
+    alike = functools.partial(duplicates.same, crossing, tolerance_m=0.2, share=0.95)
+    assert alike(copy) and not alike(faster) and not alike(fewer)
+    again = duplicates.dedupe(made.bank, operations.described(made.bank, FEATURES), **NUMBERS)
+    assert again.account["groups"] == [] and len(again.bank) == len(made.bank)
+
+
+# ---- samples, merges, statistics
+
+
+def test_samples_are_seeded_and_keep_strata(town):
+    table = operations.described(town, FEATURES)
+    draw = functools.partial(operations.sample, town, table)
+    one, same, other = (draw(count=5, share=None, stratify=None, seed=seed).bank.names for seed in (0, 0, 1))
+    assert one == same != other and len(set(one)) == 5 and [name for name in town.names if name in one] == list(one)
+    by = draw(count=None, share=0.5, stratify="dataset", seed=0).bank.metadata["dataset"].to_pylist()
+    assert sorted(by) == ["procedural"] * 3 + ["town"] * 3
+    assert operations._quotas(np.array([5, 3, 2]), 5).tolist() in ([3, 1, 1], [2, 2, 1])
+    for wrong, message in (
+        ({"count": 5, "share": 0.5}, "count 5 and share 0.5; give one"), ({"count": None, "share": None}, "give one of the two"),
+        ({"count": 13, "share": None}, "sample.count: 13 of 12 scenes; valid: 1 to 12"),
+        ({"count": None, "share": 1.5}, "sample.share: 1.5"),
+        ({"count": 2, "share": None, "stratify": "colour"}, "sample.stratify: no column 'colour'; valid: bike_lane_m"),
+        ({"count": 2, "share": None, "stratify": "streets"}, "holds lists"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            draw(**{"stratify": None, "seed": 0} | wrong)
+
+
+def test_a_merge_has_every_scene_once(town, tmp_path):
+    table = operations.described(town, FEATURES)
+    parts = operations.split(town, table, shares=SHARES, by="scene", least_shared=2, seed=0).banks
+    whole = operations.merge(list(parts.values()), duplicates="refuse")
+    assert sorted(whole.bank.names) == sorted(town.names) and whole.account["banks"] == [len(bank) for bank in parts.values()]
+    for index in (0, 5, 11):
+        assert banks.raw(whole.bank, index).name == whole.bank.names[index]
+    with pytest.raises(SceneError, match=r"merge: \d scenes have the name of another: procedural-.*duplicates=first"):
+        operations.merge([town, parts["test"]], duplicates="refuse")
+    assert operations.merge([town, parts["test"]], duplicates="first").bank.names == town.names
+    bare = banked(tmp_path / "bare", [generated(6)], described=False)
+    mixed = operations.described(operations.merge([town, bare], duplicates="refuse").bank, FEATURES)
+    assert mixed["lane_m"].to_pylist()[-1] == FEATURES(generated(6))["lane_m"] and mixed["streets"].null_count == 0
+    assert mixed.slice(0, 12).select(["lane_m", "streets"]).equals(table.select(["lane_m", "streets"]))
+
+
+def test_statistics_agree_with_numpy(town):
+    table = operations.described(town, FEATURES)
+    every, parts = operations.statistics(table, by=None)["all"], operations.statistics(table, by="dataset")
+    lane = table["lane_m"].to_numpy()
+    found = every["numbers"]["lane_m"]
+    assert [found[key] for key in ("min", "median", "mean", "max", "sum")] == pytest.approx(
+        [lane.min(), np.median(lane), lane.mean(), lane.max(), lane.sum()]
+    )
+    assert every["texts"]["dataset"] == {"procedural": 6, "town": 6} and every["numbers"]["sdc_distance_m"] == {"missing": 12}
+    assert {name: part["scenes"] for name, part in parts.items()} == {"procedural": 6, "town": 6}
+    assert sum(part["numbers"]["lane_m"]["sum"] for part in parts.values()) == pytest.approx(lane.sum())
+    json.dumps(every)
+    with pytest.raises(ConfigError, match=r"info\.by: no column 'colour'"):
+        operations.statistics(table, by="colour")
+
+
+# ---- the command
+
+
+def command(bank, *overrides):
+    return scenes(hydra_config.load("scenes", f"scenes.path={bank.path}", "progress=false", *overrides))
+
+
+def test_commands_write_views(town, tmp_path, capsys):
+    info = command(town, "op=info", "info.json=true")
+    assert json.loads(capsys.readouterr().out) == info and info["all"]["scenes"] == 12
+    command(town, "op=info", "info.by=dataset")
+    printed = capsys.readouterr().out
+    assert "dataset = town: 6 scenes" in printed and "| lane_m |" in printed and "Length of all driving lanes." in printed
+
+    kept = command(town, "op=filter", "filter=intersections >= 1 and dataset in [\"procedural\", 'x']", f"out={tmp_path / 'filtered'}")
+    assert len(kept) == 3 and banks.open(tmp_path / "filtered").names == kept.names and "filter: 3 of 12 scenes" in capsys.readouterr().out
+    assert kept.settings["made_by"]["op"] == "filter" and not list((tmp_path / "filtered").glob("scenes*"))
+    halves = ["split.shares={train: 0.5, test: 0.5}", "split.least_shared=2"]
+    parts = command(town, "op=split", *halves, f"out={tmp_path / 'parts'}", "copy=true")
+    assert set(parts) == {"train", "test"} and list((tmp_path / "parts" / "train").glob("scenes*"))
+    assert "12 scenes on 8 streets of their own" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"out: .* is a bank; give another folder"):
+        command(town, "op=split", *halves, f"out={town.path}")
+    merged = command(parts["train"], "op=merge", f"merge.banks=[{parts['test'].path}]", f"out={tmp_path / 'merged'}")
+    assert sorted(merged.names) == sorted(town.names)
+    assert len(command(town, "op=sample", "sample.share=0.25", "seed=4")) == 3 and len(command(town, "op=dedupe")) == 12
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["filtered", "merged", "parts"]  # without `out` nothing is written
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("gpudrive", "*.json"), ("scenarionet", "sd_*.pkl")])
+def test_what_is_exported_reads_back(town, tmp_path, name, pattern):
+    assert command(town, "op=export", f"export.format={name}", f"out={tmp_path}") == 12
+    files = sorted(tmp_path.glob(pattern))
+    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    found = {raw.name: raw for file in files for raw in reader_selection.read(file, formats)}
+    assert len(files) == 12 and len(found) == 12
+    for index in (0, 11):
+        raw = banks.raw(town, index)
+        back = next(one for key, one in found.items() if raw.name in key)
+        np.testing.assert_allclose(back.tracks[0].xyz[:, :2], raw.tracks[0].xyz[:, :2], atol=0.01)
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("gpudrive", "*.json"), ("scenarionet", "sd_*.pkl")])
+def test_an_export_goes_on_past_what_is_repaired_or_cannot_be_written(tmp_path, capsys, name, pattern):
+    sound = generated(0)
+    boxless = replace(sound.tracks[0], size=(float("nan"), -1.0, 0.0))
+    sizes = replace(sound, name="sizes", tracks=(boxless, *sound.tracks[1:]))
+    laneless = replace(sound, name="laneless", roads=())
+    later = replace(sound, name="later")
+    bank = banked(tmp_path / "bank", [sizes, laneless, later, later], described=False)
+    assert command(bank, "op=export", f"export.format={name}", f"out={tmp_path / 'out'}") == 2
+    told = capsys.readouterr().out
+    assert "not written: laneless: " in told and "no driving lane" in told and "two scenes need two names" in told
+    assert "in 1 scenes: sizes that are not positive replaced by (4.0, 2.0, 1.0)" in told and "2 of 4 scenes in the format" in told
+    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    found = [raw for file in (tmp_path / "out").glob(pattern) for raw in reader_selection.read(file, formats)]
+    back = next(raw for raw in found if "sizes" in raw.name)
+    assert len(found) == 2 and back.tracks[0].size == pytest.approx((4.0, 2.0, 1.0))
+
+
+def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
+    name, spelled = "a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec", r"a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec"
+    assert for_terminal(name) == spelled and for_terminal("straße 北 é") == "straße 北 é"
+    evil = replace(generated(0), name=name, metadata={"dataset": name, "format": "f"})
+    bank = banked(tmp_path / "bank", [evil, replace(evil, source="again")])
+    command(bank, "op=info")
+    command(bank, "op=check")
+    command(bank, "op=dedupe")
+    command(bank, "op=export", "export.format=gpudrive", f"out={tmp_path / 'out'}")
+    with pytest.raises(SystemExit) as ended:
+        command_line._end(SceneError(f"scenes.path: no scene\n{name}"))
+    told = capsys.readouterr()
+    assert ended.value.code == 2 and told.err == f"error: scenes.path: no scene\n{spelled.replace(chr(92) + 'n', chr(10), 1)}\n"
+    assert told.out.count(spelled) >= 5 and "\x1b" not in told.out + told.err and "\x9b" not in told.out + told.err
+
+
+def test_a_bank_is_held_against_its_checksums(tmp_path, capsys):
+    bank = banked(tmp_path / "bank", [generated(0)])
+    assert len(command(bank, "op=verify")) == 1
+    assert "1 scenes in 1 files, all as they were written" in capsys.readouterr().out
+    for name, damage in {"scenes-00000.arrow": lambda old: old[:-1] + b"!", "metadata-00000.arrow": lambda old: old[:-1]}.items():
+        (bank.path / name).write_bytes(damage((bank.path / name).read_bytes()))
+    with pytest.raises(SceneError, match=r"damaged: scenes-00000\.arrow, metadata-00000\.arrow: not what was written"):
+        command(bank, "op=verify")
+
+
+def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
+    bank = banked(tmp_path / "bank", [generated(0), generated(1)])
+    bank_index.write(bank.path, replace(bank.index, complete=False))
+    found = command(bank, "op=info", "info.json=true")
+    told = capsys.readouterr()
+    assert json.loads(told.out) == found and f"bank {bank.path}, whose conversion was stopped" in told.err
+    command(bank, "op=sample", "sample.count=1", f"out={tmp_path / 'sample'}")
+    assert "whose conversion was stopped" in capsys.readouterr().err
+    assert "whose conversion was stopped" in batches.open(hydra_config.load("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+
+
+def test_banks_are_judged_and_compared(town, tmp_path):
+    counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
+    assert counts.keys() == hydra_config.load("scenes")["quality"]["rules"].keys()
+    assert "12 scenes" in (tmp_path / "quality" / "quality.md").read_text()
+    others = ["compare.others=[procedural]", "compare.limit=2", f"out={tmp_path / 'compared'}"]
+    text = command(town, "op=compare", *others).read_text()
+    assert f"median {town.path.name}" in text and "median procedural" in text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["op=compare", "out=x"], "compare.others: none; give paths, or entries of `scenes`: procedural, town, womd"),
+        (["op=quality"], "out: null; give a folder for the report"),
+        (["op=export", "export.format=bvh", "out=x"], "export.format: 'bvh'; valid: gpudrive, scenarionet"),
+        (["op=export"], "out: null; give a folder for the files"),
+        (["op=polish"], "op: 'polish'; valid: check, sheet, quality, compare, simulate, info, filter"),
+        (["op=filter"], "filter: null; give a condition"),
+        (["op=filter", "filter='cars > 3'"], "filter: unknown column 'cars'"),
+        (["op=filter", "filter='vehicles > 300'"], "none of 12 scenes meets it"),
+        (["op=split"], "split.shares: null; give the parts' shares"),
+        (["op=split", "split.by=road"], "split.by: 'road'"),
+        (["op=split", "split.shares={a: 1, b: much}"], "split.shares: .* is of type dict, wanted dict"),
+        (["op=split", "split.shares={a: 1}"], "two parts or more"),
+        (["op=sample"], "give one of the two"),
+        (["op=sample", "+sample.size=3"], "sample.size: unknown key; valid: count, share, stratify"),
+        (["op=sheet"], "out: null; give a folder"),
+        (["op=info", "scenes.path=null"], "scenes.path: null; op=info needs a bank"),
+        (["op=verify", "scenes.path=null"], "scenes.path: null; op=verify needs a bank"),
+        (["scenes.pack.others=-1"], "scenes.pack.others: -1; wanted is a number of at least 0"),
+        (["scenes.pack.box_m=0.0"], "scenes.pack.box_m: 0; wanted is a number above 0"),
+        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: \[4.0\]; wanted are length and width"),
+        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: \[4.0, -2.0\]; wanted are length and width"),
+    ],
+)
+def test_what_cannot_be_done_is_named(town, overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        command(town, *overrides)
+
+
+def test_scenes_are_simulated(capsys):
+    small = ["scenes.count=3", "scenes.pack.agents=4", "simulate.worlds=2", "simulate.seconds=0.2", "op=simulate"]
+    found = scenes(hydra_config.load("scenes", *small))
+    assert all(list(row) == ["cars", "faults", "overlapping", "on_edge", "off_lane", "collided", "touched_edge"] for row in found.values())
+    clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
+    assert clean == [True] * 3
+    assert "3 scenes, 6 steps each; 3 without any of these" in capsys.readouterr().out
+    assert PROCEDURAL["count"] > 3

@@ -1,0 +1,382 @@
+"""Scenes that pass through the worlds: what a swap changes, what samplers draw, what is loaded, and that a resumed run is unbroken."""
+
+import contextlib
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.probes import NUMBERS, SMALL, probe, scenes
+from support.running import smoke
+from support.scene_documents import document, thing, written
+from support.streets import street
+
+from experiments.benchmarks import streaming
+from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.data.bank import bank_reader
+from scenefactory_jax.data.loading import batches, samplers, stream
+from scenefactory_jax.learning import checkpoint
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration
+from scenefactory_jax.learning.training_loop import train as run_train
+from scenefactory_jax.loggers import metrics_csv
+from scenefactory_jax.roadgraph import spatial_grid
+from scenefactory_jax.visualization.report import throughput_report
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+WORLDS = 8
+SHORT = ("stream.workers=0", "stream.sample=4", "stream.share=0.5")
+CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
+
+
+def bits(tree):
+    """Leaves as numpy arrays of their own, keys as their data."""
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x  # noqa: E731
+    return jax.tree.map(lambda x: np.array(plain(x)), tree)
+
+
+def same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, bits(one), bits(other))
+
+
+# ---- swap
+
+
+def trainer_of(**numbers):
+    return train_iteration.make(probe(life=3, episode_steps=50), late_fusion.make(**SMALL), **{**NUMBERS, "episode_steps": 50, **numbers})
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    return trainer_of(initial_phase=True)
+
+
+@pytest.fixture(scope="module")
+def swapped(trainer):
+    """States and scenes before and after other scenes came into worlds 6, 1 and 4, and what a restart in them alone gives."""
+    stage, fresh, worlds = scenes(WORLDS), scenes(3, task=2), np.array([6, 1, 4])
+    state, _ = trainer.iterate(trainer.init(jax.random.key(0), stage), stage)
+    alone = trainer_of(initial_phase=False).restart(jax.tree.map(jnp.copy, state), fresh)
+    before = bits((state, stage))
+    after, stage = trainer.swap(state, stage, worlds, fresh)
+    kept = bits((after, stage))
+    following = trainer.iterate(after, stage)[0]
+    return SimpleNamespace(before=before, after=kept, alone=bits(alone), fresh=bits(fresh), worlds=worlds, following=following, stage=stage)
+
+
+def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
+    state, stage = swapped.after
+    for name in ("worlds", "observation", "lives"):
+        same(jax.tree.map(lambda leaf: leaf[swapped.worlds], getattr(state, name)), getattr(swapped.alone, name))
+    same(jax.tree.map(lambda leaf: leaf[swapped.worlds], stage), swapped.fresh)
+    same(state.key, swapped.alone.key)
+    assert not np.asarray(state.worlds.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
+
+
+def test_a_swap_leaves_everybody_else_alone(swapped):
+    others = np.setdiff1d(np.arange(WORLDS), swapped.worlds)
+    rest = lambda tree: jax.tree.map(lambda leaf: leaf[others], tree)  # noqa: E731
+    (before, stage_before), (after, stage_after) = swapped.before, swapped.after
+    for name in ("worlds", "observation", "lives", "record"):
+        same(rest(getattr(before, name)), rest(getattr(after, name)))
+    same(rest(stage_before), rest(stage_after))
+    for name in ("parameters", "optimiser", "iteration", "steps"):
+        same(getattr(before, name), getattr(after, name))
+
+
+def test_records_count_from_the_swap_on(swapped):
+    """Lives of three steps: five end in sixteen, of the two agents of each world; what began before the swap does not count."""
+    assert (swapped.before[0].record.episodes == 10).all() and (swapped.before[0].record.successes == 10).all()
+    wanted = np.where(np.isin(np.arange(WORLDS), swapped.worlds), 0, 10)
+    np.testing.assert_array_equal(swapped.after[0].record.episodes, wanted)
+    episodes = np.asarray(swapped.following.record.episodes)
+    assert (episodes[swapped.worlds] >= 10).all() and (episodes[swapped.worlds] <= 14).all()  # at most one more by time
+    assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.record.successes) <= episodes).all()
+
+
+def test_nothing_compiles_twice(trainer, swapped):
+    state, stage = jax.tree.map(jnp.copy, (swapped.following, swapped.stage))
+    for world in range(3):
+        state, stage = trainer.swap(state, stage, np.array([world, 5, 7]), scenes(3, task=world + 1))
+        state, _ = trainer.iterate(state, stage)
+    assert trainer.swap._cache_size() == trainer.iterate._cache_size() == 1
+    np.testing.assert_array_equal(stage.weather.surface, [1, 2, 3, 5, 2, 3, 2, 3])
+
+
+# ---- samplers
+
+
+def table(draws, episodes=None, successes=None, *, endless=False):
+    zeros = np.zeros(len(draws))
+    return samplers.Table(np.asarray(draws), zeros if episodes is None else episodes, zeros if successes is None else successes, endless)
+
+
+def sequence(sampler, known, counts):
+    """What is drawn in parts of these sizes."""
+    drawn = []
+    for count in counts:
+        drawn.append(sampler(known, count))
+        known = samplers.drawn(known, drawn[-1])
+    return np.concatenate(drawn), known
+
+
+def test_shuffled_brings_every_scene_once_an_epoch():
+    draw = build({"_target_": "shuffled"}, builtins=samplers, where="stream.sampler", seed=4)
+    whole, known = sequence(draw, samplers.empty(11), [33])
+    parts, _ = sequence(draw, samplers.empty(11), [3, 7, 1, 2, 20])
+    np.testing.assert_array_equal(parts, whole)
+    epochs = whole.reshape(3, 11)
+    assert all(sorted(epoch) == list(range(11)) for epoch in epochs) and len({tuple(epoch) for epoch in epochs}) == 3
+    assert (known.draws == 3).all()
+    endless, known = sequence(draw, samplers.empty(None), [4, 5])
+    assert list(endless) == list(range(9)) and list(known.draws) == [1] * 9
+
+
+def test_failing_scenes_come_more_often_in_proportion_to_failure():
+    """Four kinds of scenes with 0, 1/4, 1/2 and all of 38 lives without success: draws beside those in turn are as 1 : 10.5 : 20 : 39."""
+    kind = np.arange(400) % 4
+    failures = np.array([0.0, 9.5, 19.0, 38.0])[kind]
+    known, counts = table(np.zeros(400, int), np.full(400, 38.0), 38.0 - failures), np.zeros(4)
+    for trial in range(3000):
+        drawn = samplers.failing(known, 2, seed=trial, floor=0.5)  # one in turn, one that fails
+        counts[kind[drawn[0]]] += 1
+    wanted = 3000 * np.array([1.0, 10.5, 20.0, 39.0]) / 70.5
+    assert ((counts - wanted) ** 2 / wanted).sum() < 16.3  # chi-square with three degrees of freedom: 0.1 %
+
+
+@pytest.mark.parametrize("floor", [0.25, 1.0])
+def test_failing_starves_nobody(floor):
+    """Whatever happens, every scene comes once in N / floor draws, again and again."""
+    scenes_, rounds = 60, 4
+    episodes = np.full(scenes_, 50.0)
+    known = table(np.zeros(scenes_, int), episodes, np.where(np.arange(scenes_) == 7, 0.0, episodes))  # one scene fails always
+    for turn in range(1, rounds + 1):
+        drawn, known = sequence(lambda known, count: samplers.failing(known, count, seed=1, floor=floor), known, [4] * int(15 / floor))
+        assert known.draws.min() >= turn and drawn.min() >= 0 and drawn.max() < scenes_
+    assert known.draws[7] == rounds if floor == 1.0 else known.draws[7] > 3 * np.median(known.draws)
+
+
+def test_failing_draws_new_scenes_of_an_endless_source():
+    known = samplers.drawn(samplers.empty(None), np.arange(10))
+    known = samplers.learnt(known, np.array([2, 3, 3]), np.array([4, 1, 3]), np.array([0, 5, 3]), memory=0.5)
+    np.testing.assert_array_equal(known.successes[:4], [0, 0, 0, 4])  # never more than lives
+    drawn = samplers.failing(known, 6, seed=0, floor=0.5)
+    assert set(drawn[:2]) == {2, 3} and list(drawn[2:]) == [10, 11, 12, 13]  # only two were driven in: new ones fill up
+    with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: 0\.0; .* scenes could starve"):
+        samplers.failing(known, 6, seed=0, floor=0.0)
+
+
+def test_what_was_learnt_earlier_fades():
+    known = table([1, 1], np.array([8.0, 8.0]), np.array([2.0, 2.0]))
+    after = samplers.learnt(known, np.array([1, 1, 0]), np.array([3, 1, 0]), np.array([3, 1, 0]), memory=0.5)
+    np.testing.assert_array_equal(after.episodes, [8.0, 8.0])  # nobody's life ended in world 0: nothing is forgotten
+    np.testing.assert_array_equal(after.successes, [2.0, 5.0])
+
+
+# ---- what is loaded
+
+
+def entry(*overrides, **trouble):
+    """A training config whose generator makes streets; see `streets.street`."""
+    found = hydra_config.load("train", "experiment=smoke", "stream=shuffled", *SHORT, *overrides)
+    troubles = {"unusable": [], "broken": [], "deadly": [], "endless": []} | trouble
+    found["scenes"]["generate"] = {"_target_": "support.streets.street"} | troubles
+    return found
+
+
+def flowing(found):
+    """A flow with its scenes as they come, and what puts them where they belong."""
+
+    def put(leaf, row, worlds):
+        leaf = np.array(leaf)
+        leaf[worlds] = row
+        return leaf
+
+    def swap(state, held, worlds, fresh):
+        return state, jax.tree.map(lambda leaf, row: put(leaf, row, worlds), held, fresh)
+
+    return stream.flowing(found, mesh=None, before=None), swap
+
+
+def alone(found, index, sizes):
+    """One street, stacked by itself at the stream's sizes."""
+    return batches.load(batches.open(found["scenes"]), None, [index], fit(found, sizes)).scene
+
+
+def fit(found, sizes, excess="cut"):
+    return batches.Fit(sizes, found["scenes"]["cells"], excess)
+
+
+def measured(found, source, *, sample=8, **given):
+    return batches.measure(source, None, grid=found["scenes"]["cells"], sample=sample, headroom=1.0, given=given, seed=0)
+
+
+def test_every_world_holds_the_scene_that_the_stream_says():
+    found = entry("worlds=6")
+    context, swap = flowing(found)
+    with context as flow:
+        held = flow.scenes()
+        for _ in range(4):
+            _, held = flow.exchange(swap, None, held)
+            flow.draw()
+            flow.note(np.full(6, 2), np.array([0, 0, 0, 2, 2, 2]))
+        told = flow.state()
+    assert told["placed"] == [12, 13, 14, 15, 16, 17] and told["waiting"] == [[18, 19, 20], [21, 22, 23]]  # three by three, in turn
+    for world, index in enumerate(told["placed"]):
+        same(jax.tree.map(lambda leaf, world=world: np.asarray(leaf)[[world]], held), alone(found, index, told["sizes"]))
+    settled = np.asarray(told["episodes"])[:12]
+    assert (settled[3:] > 0).all() and told["draws"] == [1] * 24
+
+
+def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
+    monkeypatch.setattr(bank_reader, "SHARD", 2)  # scenes 1 and 4 lie in different files
+    found = entry("scenes.pack.agents=3")
+    plain = {"unusable": [], "broken": [], "deadly": [], "endless": []}
+    written_bank = bank_reader.write(tmp_path / "bank", [street(0, index, **plain) for index in range(5)], settings={})
+    banked = {**found, "scenes": {**found["scenes"], "path": str(tmp_path / "bank")}}
+    sources = [batches.open(one["scenes"]) for one in (found, banked)]
+    sizes = [measured(found, one, sample=5, side=60) for one in sources]
+    assert [one.count for one in sources] == [None, 5] and sizes[0] == sizes[1] and sources[1].name(3) == "street 3"
+    generated, loaded = (batches.load(one, None, [4, 1, 4], fit(found, sizes[0])) for one in sources)
+    same(generated.scene, loaded.scene)
+    whole, _ = bank_reader.load(
+        written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, workers=1,
+        check=build(found["scenes"]["check"], builtins="scenefactory_jax.data.packing.validation", where="check"),
+        pack=build(found["scenes"]["pack"], builtins="scenefactory_jax.data.packing.pack", where="pack"),
+    )  # fmt: skip
+    same(
+        loaded.scene, spatial_grid.attach(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES})
+    )
+
+
+def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
+    for name in ("one", "two"):
+        written(tmp_path, document(name=name, objects=[thing(0, id=7, speed=40)]), f"{name}.json")
+    (tmp_path / "broken.json").write_text("{}")
+    found = hydra_config.load("train", "experiment=smoke", "scenes=womd", f"scenes.path={tmp_path}")
+    files = batches.open(found["scenes"])
+    assert files.count == 3 and files.name(0).endswith("broken.json")
+    sizes = measured(found, files)
+    batch = batches.load(files, None, [0, 1, 2], fit(found, sizes))
+    assert list(batch.indices) == [1, 1, 2] and list(batch.refused) == [str(tmp_path / "broken.json")]
+    with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*no reader knows this format"):
+        batches.load(files, None, [0], fit(found, sizes))
+
+
+def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
+    found = entry()
+    streets = batches.open(found["scenes"])
+    sizes = measured(found, streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
+    load = lambda excess, **changes: batches.load(streets, None, range(8), fit(found, sizes | changes, excess))  # noqa: E731
+    cut, skipped = load("cut"), load("skip")
+    assert (cut.cut, list(cut.indices), cut.refused) == (5, list(range(8)), {})
+    assert (skipped.cut, list(skipped.indices[:3]), len(skipped.refused)) == (0, [0, 1, 2], 5) and set(skipped.indices) == {0, 1, 2}
+    assert "cut to capacity lanes=70" in skipped.refused["generated scene 7"]
+    small = load("cut", side=20)
+    assert small.refused and all("capacity.side: 20; the cells of the scene need" in reason for reason in small.refused.values())
+
+
+def test_room_for_more_changes_no_look_up():
+    found = entry()
+    sizes = measured(found, batches.open(found["scenes"]))
+    places = np.random.default_rng(0).uniform(-90.0, 90.0, (200, 2)).astype(np.float32)
+    seen = []
+    for one in (sizes, sizes | {"side": 45, "rows": 30_000, "most": 400}):
+        grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).cells)
+        rows, listed = map(np.asarray, spatial_grid.listed(grid, *spatial_grid.part(grid, jnp.asarray(places))))
+        seen.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
+    assert seen[0] == seen[1] and any(seen[0])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["stream.capacity.road=8"], r"stream\.capacity\.road: 8; all 4 scenes of the sample need more: 177 to 213"),
+        (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
+        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
+        (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
+        (["stream.share=1.5"], r"stream\.share: 1\.5; wanted is a number from 0 to 1"),
+        (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
+        (["stream.excess=drop"], r"stream\.excess: 'drop'"),
+        (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),
+        (["+stream.speed=2"], r"stream\.speed: unknown key"),
+    ],
+)
+def test_mistakes_are_named(overrides, message):
+    with pytest.raises(ConfigError, match=message), stream.flowing(entry(*overrides), mesh=None, before=None):
+        pass
+
+
+def test_errors_of_the_loader_surface_by_name_and_never_hang(capsys):
+    context, swap = flowing(entry(unusable=[6], broken=[9]))
+    with pytest.raises(RuntimeError, match="generated scene 9: cannot be loaded: ZeroDivisionError: a bug"), context as flow:
+        held = flow.scenes()
+        for _ in range(9):
+            _, held = flow.exchange(swap, None, held)
+            flow.draw()
+    assert "left out generated scene 6: street 6: nobody drives here" in capsys.readouterr().out
+    context, swap = flowing(entry("stream.wait_s=2.0", unusable=list(range(4, 99))))
+    with pytest.raises(SceneError, match="none of 2 scenes to load can be used: generated scene 4: street 4: nobody"), context as flow:
+        flow.exchange(swap, None, flow.scenes())
+    with pytest.raises(SceneError, match="not one of 4 can be used: street 0: nobody"), flowing(entry(unusable=list(range(9))))[0]:
+        pass
+
+
+@pytest.mark.slow
+def test_processes_that_die_or_hang_end_the_run_by_name():
+    context, swap = flowing(entry("stream.workers=1", deadly=[5]))
+    with pytest.raises(RuntimeError, match=r"generated scene [45]: cannot be loaded: BrokenProcessPool"), context as flow:
+        flow.exchange(swap, None, flow.scenes())
+    context, swap = flowing(entry("stream.workers=1", "stream.wait_s=20.0", endless=[5]))
+    with pytest.raises(RuntimeError, match=r"stream\.wait_s: no scenes after 20 s from scenes from the generator"), context as flow:
+        flow.exchange(swap, None, flow.scenes())
+
+
+# ---- training
+
+
+def streamed(folder, *overrides):
+    """A run of seconds on streets that come and go."""
+    found = smoke(folder, "stream=failing", *SHORT, "evaluation.enable=false", *overrides)
+    found["scenes"]["generate"] = entry()["scenes"]["generate"]
+    return found
+
+
+def test_a_killed_and_resumed_run_is_the_unbroken_one(tmp_path):
+    whole = run_train(streamed(tmp_path / "whole", "iterations=5", "checkpoint_every=2"))
+
+    def killed(state, row):
+        if row["iteration"] == 3:
+            raise KeyboardInterrupt
+
+    with contextlib.suppress(KeyboardInterrupt):
+        run_train(streamed(tmp_path / "run", "iterations=5", "checkpoint_every=2"), on_iteration=killed)
+    assert checkpoint.latest(tmp_path / "run" / "checkpoints") == 2
+    with pytest.raises(ConfigError, match=r"resume=true: stream=None \(the run has \{\.\.\.\}\)"):
+        run_train(streamed(tmp_path / "run", "iterations=5", "resume=true") | {"stream": None})
+    resumed = run_train(streamed(tmp_path / "run", "iterations=5", "checkpoint_every=2", "resume=true"))
+    same(resumed.state, whole.state)
+    told, again = (checkpoint.restore_host(tmp_path / name / "checkpoints") for name in ("whole", "run"))
+    assert told == again and told is not None and told["exchanges"] == 4
+    rows, others = metrics_csv.read(tmp_path / "whole"), metrics_csv.read(tmp_path / "run")
+    assert len(rows) == 5 and [row["stream/scenes"] for row in rows][-1] == len(told["draws"])
+    for row, other in zip(rows, others, strict=True):
+        assert {name: row[name] for name in row if name not in CLOCK} == {name: other[name] for name in other if name not in CLOCK}
+    np.testing.assert_array_equal(told["record"], [whole.state.record.episodes, whole.state.record.successes])
+
+
+def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
+    row = {"name": "in memory", "fits": True, "scope": "training", "worlds": 64, "slots": 16, "devices": 1, "horizon": 32, "per_s": 9.0,
+           "slots_per_s": 2000.0, "ms_a_control_step": 512.0}  # fmt: skip
+    told = {"swapped": 4, "wait_ms": 12.34, "scenes": 4096, "cut": 3, "refused": 1}
+    moving = row | {"name": "shuffled", "slots_per_s": 1900.0, "ms_a_control_step": 500.0, "stream": told}
+    other = moving | {"name": "larger", "worlds": 128}
+    table = throughput_report.streamed({"rows": [row | {"devices": 2, "slots_per_s": 1.0}, row, moving, other]}).splitlines()[2:]
+    assert table[0] == "| shuffled | 4 of 64 | 0.2 | 9 | 1,900 | 5.0 % of `in memory` | 12.3 | 4,096 | 3 and 1 |"
+    assert "of `in memory`" not in table[1] and throughput_report.streamed({"rows": [row]}) == ""
+    with pytest.raises(ConfigError, match=r"stream: scenes are exchanged while training; scope=physics has stream=none"):
+        streaming.measure(hydra_config.load("bench", "stream=shuffled", "scope=physics"), mesh=None)

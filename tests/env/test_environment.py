@@ -1,0 +1,637 @@
+"""Facts, ends, rewards, observations, spawns and the environment, on a stand-in body that moves as it is told."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.hand_scenes import road_of, scene_of
+
+import scenefactory_jax
+from scenefactory_jax.core import geometry
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.track_interpolation import nobody
+from scenefactory_jax.core.types import Dynamics, Motion, Step
+from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, surrogate_safety, termination, traffic
+from scenefactory_jax.evaluation import episodes
+from scenefactory_jax.roadgraph import queries
+from scenefactory_jax.weather.road_condition import keep
+
+CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
+
+
+def glide() -> Dynamics:
+    """Cars that keep their velocity; action 0 steers the speed directly. Throttle above 0.99 breaks the car (NaN)."""
+
+    def init(key, scene):
+        a = scene.agents
+        return {"p": a.position, "yaw": a.yaw, "v": a.speed, "force": jnp.zeros_like(a.speed)}
+
+    def advance(scene, body, action, active):
+        v = jnp.where(active, body["v"] + action[:, 0], body["v"])
+        v = jnp.where(action[:, 0] > 0.99, jnp.nan, v)
+        p = body["p"] + jnp.where(active, v / 30, 0.0)[:, None] * geometry.heading(body["yaw"])
+        return {**body, "p": p, "v": v, "force": jnp.where(action[:, 2] > 0.5, 100.0, 0.0)}
+
+    def read(body):
+        zero = jnp.zeros_like(body["v"])
+        flat = lambda xy, z: jnp.concatenate([xy, z[:, None]], axis=1)  # noqa: E731
+        velocity = body["v"][:, None] * geometry.heading(body["yaw"])
+        place, speed = flat(body["p"], zero + 0.6), flat(velocity, zero)
+        return Motion(place, speed, body["yaw"], zero, zero + 1, zero, body["force"], zero + 1, zero, zero)
+
+    return Dynamics(init, advance, read)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return scenefactory_jax.load("task")
+
+
+def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.ignore, hold=1):
+    parts = environment.Parts(
+        dynamics=glide(),
+        command=actions.pedals,
+        hold=hold,
+        draw_agents=draw,
+        draw_weather=keep,
+        others=beside,
+        measure=functools.partial(step_metrics.measure, **config["facts"]),
+        judge=functools.partial(termination.judge, ending=ending or config["ends"]["ending"]),
+        terms=rewards.make(config["reward"]),
+        groups=observations.make({**config["observe"], "road": {**config["observe"]["road"], "count": 40}}),
+        episode_steps=steps,
+        control_dt=1 / 30,
+        respawn_clear_m=respawn,
+    )
+    return environment.assemble(parts)
+
+
+# ---- geometry and conflicts ----
+
+
+def test_angles_wrap_and_frames_invert():
+    angle = jnp.array([0.0, 4.0, -4.0, 100.0])
+    wrapped = geometry.wrap_angle(angle)
+    assert jnp.all(jnp.abs(wrapped) <= jnp.pi)
+    np.testing.assert_allclose(jnp.cos(wrapped), jnp.cos(angle), atol=1e-5)
+    vector = jnp.array([[1.0, 2.0]] * 4)
+    np.testing.assert_allclose(geometry.to_frame(geometry.rotate(vector, angle), angle), vector, atol=1e-5)
+
+
+def test_norm_has_a_gradient_at_rest():
+    assert jnp.all(jnp.isfinite(jax.grad(lambda v: geometry.norm(v).sum())(jnp.zeros((2, 2)))))
+
+
+def test_car_circles_are_the_published_ones():
+    centres, radius = geometry.car_circles(jnp.zeros((1, 2)), jnp.zeros(1), jnp.array([[4.0, 2.0]]), **CIRCLES)
+    np.testing.assert_allclose(radius, [1.1], rtol=1e-6)
+    np.testing.assert_allclose(centres[0, :, 0], [1.12, 0, -1.12], atol=1e-6)
+
+
+def brute_force_ttc(centres, radius, velocity, yaw, dt=0.002, until=12.0):
+    count = len(radius)
+    found = np.full((count, count), np.inf)
+    for i in range(count):
+        forward = np.array([np.cos(yaw[i]), np.sin(yaw[i])])
+        for j in range(count):
+            if i == j:
+                continue
+            pairs = [(a, b) for a in range(3) for b in range(3) if (centres[j, b] - centres[i, a]) @ forward > 0]
+            for t in np.arange(0, until, dt):
+                apart = [np.linalg.norm(centres[j, b] - centres[i, a] + (velocity[j] - velocity[i]) * t) for a, b in pairs]
+                if apart and min(apart) <= radius[i] + radius[j]:
+                    found[i, j] = t
+                    break
+    return found
+
+
+def test_ttc_equals_a_simulated_one():
+    rng = np.random.default_rng(0)
+    position, yaw = rng.uniform(-12, 12, (5, 2)), rng.uniform(-3, 3, 5)
+    velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
+    centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
+    moving = (jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32))
+    ttc, drac, *_ = surrogate_safety.pairwise(centres, radius, *moving, drac_gap_floor_m=1.0)
+    ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
+    expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
+    assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
+    np.testing.assert_allclose(ttc, expected, atol=0.02)
+    assert np.all(np.diag(drac) == 0) and np.all(np.asarray(drac) >= 0)
+
+
+def test_head_on_ttc_and_drac_by_hand():
+    yaw, size = jnp.array([0.0, jnp.pi]), jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
+    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
+    velocity = jnp.array([[5.0, 0], [-5.0, 0]])
+    ttc, drac, away, ahead = surrogate_safety.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    gap = 20 - 2 * 1.12 - 2 * 1.1
+    for distances in (away, ahead):
+        np.testing.assert_allclose(distances, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
+    np.testing.assert_allclose(ttc[0, 1], gap / 10, rtol=1e-5)
+    np.testing.assert_allclose(drac[0, 1], 100 / (2 * gap), rtol=1e-5)
+
+
+def test_parting_cars_never_meet():
+    size = jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
+    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
+    ttc, *_ = surrogate_safety.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
+    assert jnp.isinf(ttc).all()
+
+
+def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
+    """Followers 10 m behind, 1.5 m to the side; the third car is 2.3 m beside the first, just out of its way."""
+    size = jnp.tile(jnp.array([4.0, 2.0]), (3, 1))
+    place = jnp.array([[0.0, 0], [10.0, 1.5], [10.0, -2.3]])
+    centres, radius = geometry.car_circles(place, jnp.zeros(3), size, **CIRCLES)
+    ahead = surrogate_safety.pairwise(centres, radius, jnp.zeros((3, 2)), jnp.zeros(3), drac_gap_floor_m=1.0).ahead
+    free = 10 - 2 * 1.12 - np.sqrt(2.2**2 - 1.5**2)
+    np.testing.assert_allclose(ahead, [[np.inf, free, np.inf], [np.inf] * 3, [np.inf] * 3], rtol=1e-5)
+
+
+def test_first_hits_keeps_storage_order():
+    rng = np.random.default_rng(1)
+    hits = rng.random((7, 90)) < 0.2
+    index, mask = queries.first_hits(jnp.asarray(hits), count=12)
+    for row in range(7):
+        expected = np.flatnonzero(hits[row])[:12]
+        assert list(np.asarray(index[row])[np.asarray(mask[row])]) == list(expected)
+
+
+# ---- the environment ----
+
+
+@pytest.fixture(scope="module")
+def env(config):
+    return build_env(config)
+
+
+@pytest.fixture(scope="module")
+def two_cars():
+    return scene_of([[0, 0], [30, 0.5]], [[20, 0], [60, 0.5]], speeds=[6.0, 0.0])
+
+
+def test_reset_is_pure_and_shapes_are_the_published_ones(env, two_cars, config):
+    state, observation = env.reset(jax.random.key(0), two_cars)
+    again, _ = env.reset(jax.random.key(0), two_cars)
+    data = lambda leaf: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf  # noqa: E731
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(data(a), data(b))
+    assert observation["ego"].shape == (2, 7) and observation["weather"].shape == (2, 4)
+    assert observation["road"].features.shape == (2, 40, 5) and observation["neighbours"].features.shape == (2, 24, 7)
+    np.testing.assert_allclose(observation["ego"][0], [0.2, 0, 0, 1, 0.2, 0.6, 0], atol=1e-6)
+    np.testing.assert_allclose(observation["neighbours"].features[0, 0, :4], [0.3, 0.005, 0.04, 0.02], atol=1e-6)
+    assert config["observe"]["road"]["count"] == 350
+
+
+def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
+    _, observation = env.reset(jax.random.key(0), two_cars)
+    rows = observation["road"]
+    points = np.asarray(two_cars.road.midpoint)
+    near = [i for i in range(len(points)) if np.hypot(*(points[i] - [0, 0])) <= 10][:40]
+    np.testing.assert_allclose(rows.features[0, : len(near), :2] * 10, points[near], atol=1e-5)
+    assert rows.mask[0].sum() == len(near)
+
+
+def test_encounters_by_hand_and_from_any_frame(env):
+    """Head on, 1 m beside each other: centres are closest in 2 s, circles of the fronts meet before; a third car is far behind."""
+    numbers = scenefactory_jax.load("task", "observe=encounters")["observe"]["neighbours"]
+    del numbers["_target_"]
+
+    def seen(turn, shift):
+        place = geometry.rotate(jnp.array([[0.0, 0], [20, 1], [-180, 0]]), jnp.float32(turn)) + jnp.array(shift)
+        yaw = np.array([0, np.pi, 0]) + turn
+        scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
+        state, _ = env.reset(jax.random.key(0), scene)
+        state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.1, 0.3, 0.0])))
+        return jax.tree.map(np.asarray, observations.encounters(scene, state, **numbers))
+
+    rows = seen(0.0, [0.0, 0.0])
+    squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
+    meet = (20 - 2 * 1.12 - np.sqrt(2.2**2 - 1)) / 10
+    gap = np.hypot(20 - 2.24, 1.0) - 2.2
+    expected = [squash(20, 20), squash(1, 20), -1.0, 0.0, 0.0, -1.0, 0.3, 0.8, 0.4, squash(gap, 2), 2 / 5, squash(1, 2), 5 / (5 + meet)]
+    np.testing.assert_allclose(rows.features[0, 0], expected, atol=1e-4)
+    np.testing.assert_allclose(rows.features[0, 1, :4], [-0.9, 0, -0.5, 0], atol=1e-4)
+    assert rows.features.shape == (3, 16, 13) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
+    moved = seen(0.9, [7.0, -3.0])
+    np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
+
+
+def test_one_pedal_brakes_below_zero():
+    asked = jnp.array([[0.6, -0.2, -1.0], [-0.3, 0.1, -1.0], [-0.3, 0.0, 0.7], [0.5, 1.0, 0.4], [-1.0, 0.0, 0.0]])
+    wanted = [[0.6, -0.2, -0.6], [0.0, 0.1, 0.3], [0.0, 0.0, 0.7], [0.5, 1.0, 0.4], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(actions.one_pedal(asked), wanted, rtol=1e-6)
+    np.testing.assert_array_equal(actions.pedals(asked), asked)
+
+
+def test_controls_are_what_dynamics_and_rewards_are_given(config):
+    """Off the throttle a bicycle rolls on; with one pedal it brakes."""
+    own = scenefactory_jax.load("task", "dynamics=bicycle", "spawn=logged", "observe.road=null")
+    scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]], speeds=[10.0])
+
+    def speed_after(entry):
+        env = environment.make({**own, "controls": {"command": entry, "every": 1}})
+        state, _ = env.reset(jax.random.key(0), scene)
+        state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
+        return float(geometry.norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
+
+    rolled, braked = speed_after({"_target_": "pedals"}), speed_after({"_target_": "one_pedal"})
+    assert rolled[0] == pytest.approx(10.0, abs=0.01) and braked[0] < 9.95
+    np.testing.assert_allclose(braked[1], [0, 0, 0.5])
+
+
+def test_an_action_stands_until_the_next_is_read(config):
+    """Every third is read, the first one first; who begins anew in between waits with free pedals."""
+    env = build_env(config, hold=3)
+    scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]])
+    state, _ = env.reset(jax.random.key(0), scene)
+    step, taken = jax.jit(env.transition), []
+    for throttle in range(7):
+        state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
+        taken.append(float(state.previous_action[0, 0]))
+    np.testing.assert_allclose(taken, [0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
+    for every, message in ((7, "controls.every: 7; wanted is a divisor of the 1500 control steps"), (0, "controls.every: 0; wanted")):
+        with pytest.raises(ConfigError, match=message):
+            environment.make({**config, "controls": {**config["controls"], "every": every}})
+
+
+def test_a_step_is_an_action_with_all_its_control_steps(config):
+    """The first car passes its goal in the second of three control steps: it has part in two of them."""
+    env = build_env(config, hold=3)
+    scene = scene_of([[0.0, 0.0], [0.0, 9.0]], [[3.4, 0.0], [90.0, 9.0]], speeds=[10.0, 10.0])
+    state, _ = env.reset(jax.random.key(0), scene)
+    action = jnp.array([[0.5, 0.0, 0.0]] * 2)
+    after, outcome = jax.jit(env.step)(scene, state, action)
+    control, paid, reached = jax.jit(env.transition), np.zeros(2), []
+    for _ in range(3):
+        driving = np.asarray(state.active)
+        state, single = control(scene, state, action)
+        paid += np.where(driving, single.reward, 0.0)
+        reached.append(bool(single.events.reached[0]))
+    assert reached == [False, True, False]
+    np.testing.assert_allclose(outcome.reward, paid, rtol=1e-6)
+    np.testing.assert_allclose(sum(outcome.terms.values()), paid, rtol=1e-5)
+    assert outcome.events.reached.tolist() == outcome.done.tolist() == [True, False] and not outcome.over
+    jax.tree.map(np.testing.assert_array_equal, after.motion, state.motion)
+    assert int(after.step) == 3 and float(outcome.facts.goal_distance[1]) == pytest.approx(float(single.facts.goal_distance[1]))
+    jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
+
+
+def test_a_life_that_begins_within_an_action_has_no_part_in_it(config):
+    """The action takes the car to its goal in the first of two control steps, 10.5 / 30 m on. In the second a new life goes on at 10 m/s
+    with free pedals, and what that earns is no part of what the action is paid."""
+    env = build_env(config, hold=2, respawn=10.0)
+    scene = scene_of([[0.0, 0.0]], [[3.345, 0.0]], speeds=[10.0])
+    state, _ = env.reset(jax.random.key(0), scene)
+    after, outcome = jax.jit(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
+    assert outcome.done.tolist() == outcome.events.reached.tolist() == after.active.tolist() == [True] and after.age.tolist() == [1]
+    assert float(outcome.terms["goal"][0]) == 45.0 and float(outcome.terms["progress"][0]) == pytest.approx(2 * 10.5 / 30, abs=1e-5)
+    assert not after.previous_action.any() and float(after.motion.velocity[0, 0]) == 10.0
+
+
+def test_a_car_knows_how_it_turns(env):
+    scene = scene_of([[0.0, 0], [0, 9]], [[50.0, 0]] * 2)
+    state, _ = env.reset(jax.random.key(0), scene)
+    state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.4, -1.0]), steer=jnp.array([-0.1, 0.2])))
+    seen = observations.turning(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
+    np.testing.assert_allclose(seen, [[0.2, -0.2], [-0.5, 0.4]], rtol=1e-6)
+
+
+def test_the_lane_ahead_by_hand(env):
+    """With the lane and 1 m left of it, against it, and 12 m before its end at x = 60, where the places stay."""
+    numbers = scenefactory_jax.load("task", "observe=foresight")["observe"]["lane"]
+    del numbers["_target_"]
+    yaws = [0.1, np.pi, 0.0]
+    scene = scene_of([[0.2, 1.0], [0.0, -2.0], [48.0, 0.0]], [[9, 9]] * 3, yaws=yaws, speeds=[0.0, 0, 5])
+    state, _ = env.reset(jax.random.key(0), scene)
+    seen = np.asarray(jax.jit(functools.partial(observations.lane, **numbers))(scene, state))
+    squash = lambda length, scale: length / (scale + np.abs(length))  # noqa: E731
+    assert seen.shape == (3, 15)
+    np.testing.assert_allclose(seen[0, :3], [squash(1.0, 2), np.sin(0.1), np.cos(0.1)], atol=1e-4)
+    np.testing.assert_allclose(seen[1, :3], [squash(-2.0, 2), 0, -1], atol=1e-4)
+    gap = 6 - 0.05 - 2.0 - 1.1
+    np.testing.assert_allclose(seen[1, 3:5], [squash(gap, 2), 0], atol=1e-3)
+    ahead = np.array([5.0, 10, 20, 30, 45])
+    places = np.stack([ahead, np.full(5, -1.0)], 1) @ np.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
+    np.testing.assert_allclose(seen[0, 5:].reshape(5, 2), squash(places, 20), atol=1e-4)
+    np.testing.assert_allclose(seen[1, 5:].reshape(5, 2), squash(np.stack([ahead, np.full(5, -2.0)], 1), 20), atol=1e-4)
+    np.testing.assert_allclose(seen[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
+
+
+def test_without_road_edges_every_observation_is_finite():
+    """The nearest edge is then infinitely far, and as far as it can read."""
+    numbers = scenefactory_jax.load("task", "observe=foresight", "dynamics=bicycle")
+    scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
+    scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
+    _, seen = environment.make(numbers).reset(jax.random.key(0), scene)
+    assert set(seen) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
+    np.testing.assert_allclose(seen["lane"][:, 3:5], [[1.0, 0.0]] * 2)
+    slope = jax.grad(lambda length: observations._squashed(length, 2.0).sum())(jnp.array([jnp.inf, 1.0]))
+    np.testing.assert_allclose(slope, [0.0, 2 / 9], rtol=1e-6)
+
+
+def test_an_episode_may_begin_at_a_later_moment(config):
+    """Starts are drawn beside the others as they are then, and it has rained until then."""
+    one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), nobody())
+    moving = lambda scene, step: replace(one, position=jnp.array([[1.0, 0.0]]) * step)  # noqa: E731
+    beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.boxes.position[:1], scene.agents.goal.shape))  # noqa: E731
+    env, scene = build_env(config, draw=beside, beside=moving), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
+    late = env.start(jax.random.key(0), scene, 60)
+    assert int(late.step) == 60 and float(late.weather.rain.now_s) == pytest.approx(2.0) and float(late.agents.goal[0, 0]) == 60.0
+    assert float(env.start(jax.random.key(0), scene).agents.goal[0, 0]) == 0.0
+
+
+def drive(env, scene, action, steps, key=0):
+    state, _ = env.reset(jax.random.key(key), scene)
+    step = jax.jit(env.step)
+    history = []
+    for _ in range(steps):
+        state, outcome = step(scene, state, action)
+        history.append(outcome)
+    return state, history
+
+
+def test_goal_ends_a_car_once_and_pays_once(env, two_cars):
+    state, history = drive(env, two_cars, jnp.zeros((2, 3)), 110)
+    goals = np.array([h.terms["goal"][0] for h in history])
+    assert goals.sum() == 45.0 and np.count_nonzero(goals) == 1
+    when = int(np.argmax(goals))
+    assert history[when].done[0] and abs(when / 30 - 17 / 6) < 0.05  # 20 m - 3 m at 6 m/s
+    assert not state.active[0] and state.active[1]
+    assert all(h.reward[0] == 0 for h in history[when + 1 :]), "a finished car earns nothing"
+    assert not history[-1].observation["neighbours"].mask[1].any(), "a finished car is not seen"
+    assert not any(leaf[0].any() for leaf in jax.tree.leaves(history[-1].observation)), "and sees nothing"
+    assert all(float(jnp.abs(h.reward - sum(h.terms.values())).max()) < 1e-5 for h in history)
+
+
+def test_progress_sums_to_the_way_driven(env, two_cars):
+    _, history = drive(env, two_cars, jnp.zeros((2, 3)), 60)
+    np.testing.assert_allclose(sum(float(h.facts.progress[0]) for h in history), 60 * 6 / 30, rtol=1e-4)
+
+
+def test_collision_needs_force_and_grace(env, two_cars):
+    action = jnp.array([[0.0, 0, 0], [0.0, 0, 1.0]])
+    _, history = drive(env, two_cars, action, 30)
+    collided = [bool(h.events.collided[1]) for h in history]
+    assert collided.index(True) == 23, "the first 23 control steps are masked"
+    assert sum(collided) == 1
+
+
+def test_terms_beyond_the_published_ones_by_hand(env):
+    """Two cars side by side, one of them against its lane, 1.4 m and 0.85 m from the edges at +-6 m; the third is alone."""
+    goals = [[50, 3.5], [50, -4.0], [90, 0], [90, 0]]
+    scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], goals, yaws=[np.pi, 0.0, 0.0, 0.0], speeds=[0.0, 0, 3, 3])
+    state, (outcome,) = drive(env, scene, jnp.zeros((4, 3)), 1)
+    facts = outcome.facts
+    step = Step(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, facts=facts, events=outcome.events)
+    beside, behind = 7.5 - 2.2, 6.0 - 2.24 - 2.2
+    np.testing.assert_allclose(facts.gap, [beside, beside, behind, behind], rtol=1e-4)
+    np.testing.assert_allclose(facts.lane_heading, [-1, 1, 1, 1], atol=1e-5)
+    stop = np.asarray(facts.speed[2]) ** 2 / (2 * 9.81 * np.asarray(facts.grip[2]))
+    np.testing.assert_allclose(facts.stopping_margin, [np.inf, np.inf, behind - stop, np.inf], rtol=1e-4)
+    edge = np.asarray(facts.edge_gap)
+    np.testing.assert_allclose(edge[:2], [6 - 0.05 - 3.5 - 1.1, 6 - 0.05 - 4.0 - 1.1], atol=0.02)
+    np.testing.assert_allclose(rewards.clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)
+    np.testing.assert_allclose(rewards.edge_clearance(step, limit_m=1.0), np.clip(1 - edge, 0, 1), atol=1e-5)
+    np.testing.assert_allclose(rewards.wrong_way(step), [1, 0, 0, 0], atol=1e-5)
+    late = replace(step, facts=replace(facts, stopping_margin=jnp.array([jnp.inf, 2.0, -1.0, -9.0])))
+    np.testing.assert_allclose(rewards.stopping(late, limit_m=4.0), [0, 0, 0.25, 1], atol=1e-6)
+    before = replace(state, previous_action=jnp.tile(jnp.array([0.5, -0.4, 0.0]), (4, 1)))
+    turned = replace(step, before=before, action=jnp.array([[0.5, -0.4, 0.0], [-0.5, -0.4, 0.5], [0.5, 0.6, 0.0], [-0.5, 0.6, 0.5]]))
+    np.testing.assert_allclose(rewards.steer_rate(turned), [0, 0, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(rewards.action_rate(turned), [0, 1.25, 1, 2.25], atol=1e-6)
+
+
+def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
+    action = jnp.array([[1.0, 0, 0], [0.0, 0, 0]])
+    state, history = drive(env, two_cars, action, 2)
+    assert history[0].events.fault[0] and not history[0].events.fault[1]
+    for leaf in jax.tree.leaves((state.motion, state.body, history[0].reward, history[0].observation, history[1].observation)):
+        assert jnp.all(jnp.isfinite(leaf))
+    assert not state.active[0] and state.active[1]
+
+
+def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
+    """It breaks in the first step: nothing is known of it but its start. Nor is a speed a number whose square is none."""
+    notes = scenefactory_jax.load("evaluate", "run=town")["failures"]["notes"]
+    broken = lambda parameters, observation: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
+    episode = episodes.begin(env, jax.random.key(0), two_cars)
+    far = episode.tally.goal_distance
+    tally = episodes.play(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
+    assert tally.happened.fault.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
+    assert float(tally.goal_distance[0]) == float(far[0]) and not tally.speed_sum.any()
+    motion = replace(episode.state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
+    assert step_metrics.is_finite(motion).tolist() == [False, True]
+
+
+def test_edges_are_touched_by_circles(config):
+    env = build_env(config)
+    scene = scene_of([[0, 4.6]], [[50, 0]], yaws=[np.pi / 2], speeds=[3.0])
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 3)
+    # front circle: 4.6 + 1.12 + 1.10 reaches the edge at 6 - 0.05 already in the first step
+    assert history[0].events.touched_edge[0]
+    assert history[0].facts.edge_gap[0] < 0
+
+
+def test_leaving_the_box_is_a_crash(config):
+    env = build_env(config)
+    scene = scene_of([[95, 0]], [[0, 50]], speeds=[6.0], half_width=60, length=120)
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 30)
+    crashed = [bool(h.events.crashed[0]) for h in history]
+    assert crashed.index(True) == 25, "x > 100 m after 26 steps of 0.2 m"
+
+
+def test_invincible_cars_drive_on(config):
+    env = build_env(config, ending=["fault", "reached"])
+    scene = scene_of([[0, 5.4]], [[50, 5.4]], speeds=[5.0])
+    state, history = drive(env, scene, jnp.zeros((1, 3)), 20)
+    assert sum(bool(h.events.touched_edge[0]) for h in history) == 1, "noted once"
+    assert state.active[0]
+
+
+def test_time_out_and_over(config):
+    env = build_env(config, steps=5)
+    scene = scene_of([[0, 0]], [[50, 0]])
+    _, history = drive(env, scene, jnp.zeros((1, 3)), 5)
+    assert [bool(h.truncated) for h in history] == [False] * 4 + [True]
+    assert bool(history[-1].over)
+
+
+def test_absent_agents_change_nothing(config):
+    env = build_env(config)
+    alone = scene_of([[0, 0], [30, 0.5]], [[20, 0], [60, 0.5]], speeds=[6, 0], present=[True, False])
+    moved = scene_of([[0, 0], [3, 0.5]], [[20, 0], [60, 0.5]], speeds=[6, 9], present=[True, False])
+    _, a = drive(env, alone, jnp.zeros((2, 3)), 3)
+    _, b = drive(env, moved, jnp.zeros((2, 3)), 3)
+    for x, y in zip(jax.tree.leaves(a[-1].observation), jax.tree.leaves(b[-1].observation), strict=True):
+        np.testing.assert_array_equal(x[0], y[0])
+        assert not np.any(np.asarray(x[1])), "an absent car sees nothing"
+    np.testing.assert_array_equal(a[-1].reward, b[-1].reward)
+
+
+def test_se2_equivariance(env, two_cars):
+    """Turning and moving the whole world changes no reward and no observation."""
+    angle, shift = 0.7, jnp.array([11.0, -5.0])
+    turn = lambda p: geometry.rotate(p, jnp.float32(angle)) + shift  # noqa: E731
+    road = lambda r: replace(r, midpoint=turn(r.midpoint), direction=geometry.rotate(r.direction, jnp.float32(angle)))  # noqa: E731
+    cars = two_cars.agents
+    agents = replace(cars, position=turn(cars.position), goal=turn(cars.goal), yaw=cars.yaw + angle)
+    moved = replace(two_cars, road=road(two_cars.road), lanes=road(two_cars.lanes), edges=road(two_cars.edges), agents=agents)
+    _, a = drive(env, two_cars, jnp.zeros((2, 3)), 2)
+    _, b = drive(env, moved, jnp.zeros((2, 3)), 2)
+    np.testing.assert_allclose(a[-1].reward, b[-1].reward, atol=2e-4)
+    np.testing.assert_allclose(a[-1].observation["ego"], b[-1].observation["ego"], atol=1e-4)
+    np.testing.assert_allclose(a[-1].observation["neighbours"].features, b[-1].observation["neighbours"].features, atol=1e-4)
+
+
+def test_a_fresh_state_shares_nothing(env, two_cars):
+    """Neither with itself nor with its scene: a step may be given it to keep (`donate_argnums`)."""
+
+    def buffers(tree):
+        plain = [leaf for leaf in jax.tree.leaves(tree) if leaf.size and not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+        return [leaf.unsafe_buffer_pointer() for leaf in plain]
+
+    scene = jax.tree.map(jnp.asarray, two_cars)
+    state, _ = env.reset(jax.random.key(0), scene)
+    own = buffers(state)
+    assert len(set(own)) == len(own) and not set(own) & set(buffers(scene))
+
+
+def test_steps_trace_once_under_vmap(env, two_cars):
+    scenes = jax.tree.map(lambda x: jnp.stack([x, x]), two_cars)
+    traces = []
+
+    @jax.jit
+    def step(scenes, states, action):
+        traces.append(1)
+        return jax.vmap(env.step)(scenes, states, action)
+
+    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2), scenes)
+    for _ in range(3):
+        states, _ = step(scenes, states, jnp.zeros((2, 2, 3)))
+    assert len(traces) == 1
+
+
+# ---- spawns ----
+
+
+def test_random_pairs_keep_their_promises():
+    x = np.arange(-60, 60.1, 0.5)
+    lines = [(2, np.stack([x, 0 * x + y], -1)) for y in (-4.0, 0.0, 4.0)]
+    slots = 8
+    scene = scene_of(np.zeros((slots, 2)), np.ones((slots, 2)))
+    scene = replace(scene, lanes=road_of(lines, capacity=900))
+    numbers = scenefactory_jax.load("task", "spawn=random_pairs")["spawn"]["draw"] | {"travel_max_m": 50.0}
+    del numbers["_target_"]
+    draw = jax.jit(jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers)))
+    agents = draw(jax.random.split(jax.random.key(3), 20))
+    assert agents.present.mean() > 0.9
+    for world_index in range(20):
+        rows = np.flatnonzero(agents.present[world_index])
+        start, goal = np.asarray(agents.position[world_index])[rows], np.asarray(agents.goal[world_index])[rows]
+        travel = np.linalg.norm(goal - start, axis=1)
+        np.testing.assert_allclose(travel, agents.route[world_index][rows], atol=0.05)
+        assert travel.min() >= 9.9 and travel.max() <= 50.1
+        assert np.abs(start[:, 0]).max() <= 58.1 and np.abs(goal[:, 0]).max() <= 58.1
+        assert np.all(np.isin(np.round(start[:, 1], 3), [-4, 0, 4])) and np.allclose(start[:, 1], goal[:, 1], atol=1e-3)
+        apart = np.linalg.norm(start[:, None] - start[None], axis=-1) + 1e3 * np.eye(len(rows))
+        assert apart.min() >= 8.0
+        assert np.all(goal[:, 0] > start[:, 0]), "along the lane's own direction"
+
+
+def test_cars_underway_start_on_their_recorded_ways():
+    """Three cars drive 40 m, 40 m beside them and 6 m; the fourth is absent. Rows in between are not valid now and then."""
+    scene = scene_of([[0, 0], [0, 4], [0, 8], [0, 12]], [[40, 0], [40, 4], [6, 8], [9, 12]], present=[True, True, True, False], steps=81)
+    share = np.linspace(0, 1, 81)[None, :, None]
+    start, goal = np.asarray(scene.agents.position)[:, None], np.asarray(scene.agents.goal)[:, None]
+    position = start + share * (goal - start)
+    valid = np.ones((4, 81), bool)
+    valid[0, 30:34] = valid[2, :6] = False
+    position[0, 30:34] = position[2, :6] = 1e4  # the last car is first seen when it has driven 0.45 m
+    speed = np.broadcast_to((goal - start) / 8.0, position.shape)
+    tracks = {"position": jnp.asarray(position, jnp.float32), "velocity": jnp.asarray(speed, jnp.float32)}
+    log = replace(scene.log, **tracks, valid=jnp.asarray(valid))
+    numbers = scenefactory_jax.load("task", "spawn=underway", "spawn.draw.start_gap_m=4.0")["spawn"]["draw"]
+    del numbers["_target_"]
+    draw = jax.jit(jax.vmap(lambda key: spawning.underway(key, replace(scene, log=log), **numbers)))
+    agents = jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(4), 200)))
+    assert agents.present[:, :3].mean() > 0.95 and not agents.present[:, 3].any()
+    for car, whole in ((0, 40.0), (1, 40.0), (2, 6.0)):
+        here = agents.present[:, car]
+        x, goal_x, route = agents.position[here, car, 0], agents.goal[here, car, 0], agents.route[here, car]
+        np.testing.assert_allclose(agents.position[here, car, 1], 4.0 * car, atol=1e-4)
+        np.testing.assert_allclose(goal_x - x, route, atol=2.6 if car == 0 else 1e-3)  # the gap in the recording is not counted
+        assert x.min() >= -1e-4 and np.allclose(goal_x, whole) and route.min() >= min(10.0, 5.55 if car == 2 else whole) - 1e-3
+    assert np.ptp(agents.position[:, 0, 0]) > 20 and np.ptp(agents.position[:, 2, 0]) < 1e-3
+    apart = np.linalg.norm(agents.position[:, :, None] - agents.position[:, None], axis=-1) + 1e3 * np.eye(4)
+    assert np.where(agents.present[:, :, None] & agents.present[:, None], apart, 1e3).min() >= 4.0 - 1e-4
+    resting = ~agents.speed.any(axis=1)
+    assert abs(resting.mean() - 0.5) < 0.12
+    np.testing.assert_allclose(agents.speed[~resting & agents.present[:, 0], 0], 5.0, rtol=1e-4)
+
+
+def test_a_mixture_draws_each_part_as_often_as_its_share():
+    x = np.arange(-60, 60.1, 0.5)
+    scene = scene_of(np.zeros((4, 2)), np.ones((4, 2)), speeds=4 * [3.0])
+    scene = replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))], capacity=300))
+    entry = scenefactory_jax.load("task", "spawn=mixed", "spawn.draw.parts.random.share=1.5")["spawn"]["draw"]
+    agents = jax.jit(jax.vmap(lambda key: spawning.make(entry)(key, scene)))(jax.random.split(jax.random.key(0), 400))
+    recorded = (agents.position == scene.agents.position).all(axis=(1, 2))
+    assert abs(recorded.mean() - 0.25) < 0.07 and not agents.speed.any()
+    np.testing.assert_array_equal(agents.goal[recorded], np.broadcast_to(scene.agents.goal, (recorded.sum(), 4, 2)))
+    assert (agents.route[~recorded] >= 9.9 * agents.present[~recorded]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parts": None}, "spawn.draw.parts: None; wanted are entries"),
+        ({"parts": {"a": {"draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: missing"),
+        ({"parts": {"a": {"share": 0.0, "draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: 0; wanted is a number above 0"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "nobody"}}}}, "spawn.draw.parts.a.draw._target_: 'nobody' is not in"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "respawn_clear_m": 5.0}}}, "a.respawn_clear_m: 5.0; it belongs"),
+        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "shar": 3}}}, "spawn.draw.parts.a.shar: unknown key"),
+        ({"parts": {"a": None}}, "spawn.draw.parts: {'a': None}; wanted are entries"),
+        ({"shares": [1.0]}, "spawn.draw.shares: unknown key of mixed"),
+    ],
+)
+def test_mistakes_in_a_mixture_are_named(change, message):
+    with pytest.raises(ConfigError, match=message):
+        spawning.make({"_target_": "mixed", **change})
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("spawn.draw.candidates=0", "spawn.draw.candidates: 0; wanted is a number of at least 1"),
+        ("spawn.draw.travel_min_m=-50", "spawn.draw.travel_min_m: -50; wanted is a number of at least 0"),
+        ("spawn.draw.travel_max_m=5", r"spawn.draw.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
+        ("spawn.draw.car_size_m=[4.0]", r"spawn.draw.car_size_m: \[4.0\]; wanted is \[length, width\]"),
+        ("spawn.respawn_clear_m=-1", "spawn.respawn_clear_m: -1; wanted is a number of at least 0"),
+        ("+spawn.respawn_clear=4", "spawn.respawn_clear: unknown key; valid: draw, respawn_clear_m"),
+        ("~controls.every", "controls.every: missing; controls needs command, every"),
+        ("timing.episode_s=inf", "timing.episode_s: inf; wanted is a finite number above 0"),
+        ("timing.episode_s=0.001", "timing.episode_s: 0.001; wanted is a control step, 0.0333333 s, or more"),
+        ("ends.ending=null", "ends.ending: None is of type NoneType"),
+    ],
+)
+def test_numbers_that_cannot_work_are_refused_by_name(override, message):
+    with pytest.raises(ConfigError, match=message):
+        environment.make(scenefactory_jax.load("task", "spawn=random_pairs", "dynamics=bicycle", override))
+
+
+def test_respawn_starts_finished_cars_again(config):
+    env = build_env(config, respawn=10.0)
+    scene = scene_of([[0, 0], [40, 0]], [[6, 0], [60, 0]], speeds=[6.0, 0.0])
+    state, history = drive(env, scene, jnp.zeros((2, 3)), 40)
+    assert sum(bool(h.events.reached[0]) for h in history) >= 2, "the car reaches its goal, starts again and reaches it again"
+    assert state.active.all() and not any(bool(h.over) for h in history)
+
+
+def test_unknown_ending_is_refused():
+    with pytest.raises(ConfigError, match="unknown event 'colided'; valid: fault, reached"):
+        termination.check(["fault", "reached", "colided"], where="ends")

@@ -1,0 +1,302 @@
+"""The laws' ability to fail, and the command at toy size."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from experiments.validation import engines, friction_patches, motion_laws, random_drives, target_check
+from experiments.validation import run as command
+from experiments.validation import validation_report as report
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.parallel.process_pool import spreading
+from scenefactory_jax.dynamics.articulated import parameters as cars
+
+G = 9.81
+RATES = dict(physics_hz=120.0, control_hz=30.0)
+CLOCK = dict(control_hz=30.0)
+MU = [0.002, 0.1, 0.3, 0.8]
+STANDING = dict(frictions=MU, speed_max=2.0, brake_s=1.0, settle_s=4.0, hold_s=2.0, **CLOCK)
+
+
+def entry_of(name, **car):
+    entry = load("task", f"dynamics={name}")["dynamics"]
+    return {**entry, "car": {**entry["car"], **car}} if car else entry
+
+
+@pytest.fixture(scope="module")
+def entry():
+    return entry_of("mjx_car")
+
+
+@pytest.fixture(scope="module")
+def car(entry):
+    return cars.numbers(entry)[0]
+
+
+@pytest.fixture(scope="module")
+def drive(entry):
+    return motion_laws.driver(entry, slippery=0.125, width=4, **RATES)
+
+
+def slid(drive, frictions=(0.1, 0.3, 0.8), seconds=6.0):
+    return motion_laws.stopping(drive, frictions=list(frictions), speed=5.0, seconds=seconds, **CLOCK)
+
+
+def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, car):
+    found = slid(drive)
+    limit = motion_laws.grip_limit_m(car, 5.0, found["friction"])
+    assert found["stopped"].all() and found["aside_m"].max() < 0.1
+    np.testing.assert_allclose(found["distance_m"][:2], limit[:2], rtol=0.03)
+    assert found["distance_m"][2] == pytest.approx(motion_laws.brake_limit_m(car, 5.0), rel=0.03)
+    assert found["distance_m"][2] > 1.3 * limit[2], "the brakes are the limit there: the same check would fail for them"
+    assert not slid(drive, [0.1], seconds=1.0)["stopped"].any()
+
+
+def test_the_brakes_limit_solves_its_equation(car):
+    inertia = motion_laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    speed, way, dt = 15.0, 0.0, 1e-4
+    while speed > 0.0:
+        way += speed * dt
+        torque = 2 * (car.brake_torque_front + car.brake_torque_rear) + 4 * car.wheel_damping * speed / car.wheel_radius
+        force = (torque + 4 * car.rolling_torque) / car.wheel_radius + car.air_drag * speed**2
+        speed -= force / inertia * dt
+    assert motion_laws.brake_limit_m(car, 15.0) == pytest.approx(way, rel=1e-3)
+    assert motion_laws.mass(car) == pytest.approx(1980.03, abs=0.01)
+
+
+def test_braked_cars_stand(drive):
+    held = motion_laws.standing(drive, **STANDING)
+    assert held["brake_creep_mm"].max() < 0.1 and held["brake_rest"].max() < 1e-3
+
+    def released(cases):
+        cases.controls[..., 2] = 0.0
+        return drive(cases)
+
+    assert motion_laws.standing(released, **STANDING)["brake_creep_mm"].max() > 1.0
+
+
+def test_an_engine_against_the_brakes_does_not_creep_in_either_engine(drive, entry):
+    """MuJoCo's friction loss is soft: a held torque would yield at a rate in proportion (`forces.held`)."""
+    cases = motion_laws.held([0.1, 0.8], 0.0, motion_laws.FULL_BOTH, steps=60)
+    options = dict(slippery=1.0, friction_min=0.0, friction_scale=1.0, nudge=0.0, iterations=100, line_search=50)
+    truth = engines.drive_c(entry, cases, **RATES, **options).qpos[:, -1, 0, 0]
+    assert np.abs(truth).max() < 1e-3 and np.abs(drive(cases).position[:, -1, 0]).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_latched_brakes_shake(drive):
+    latched = motion_laws.driver({**entry_of("mjx_car", rolling_torque=0.0), "brakes": "latched"}, slippery=0.125, width=4, **RATES)
+    held, shaken = motion_laws.standing(drive, **STANDING), motion_laws.standing(latched, **STANDING)
+    assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max()
+
+
+def test_cornering_ends_at_the_grip(drive, car):
+    numbers = dict(frictions=[0.1, 0.9], speeds=[3.0, 12.0], from_s=1.0, to_s=2.0, wheelbase=car.wheelbase, **CLOCK)
+    found = motion_laws.cornering(drive, steer=0.5, **numbers)
+    limit = found["friction"][:, None] * G
+    assert (found["lateral"] <= 1.05 * limit).all() and found["demand"][0, 1] > 5 * limit[0, 0]
+    assert 0.8 < found["lateral"][0, 1] / limit[0, 0] < 1.05
+    assert found["yaw_ratio"][1, 0] == pytest.approx(1.0, abs=0.03) and found["yaw_ratio"][0, 1] < 0.2
+    right = motion_laws.cornering(drive, steer=-0.5, **numbers)
+    np.testing.assert_allclose(right["yaw_ratio"][1, 0], found["yaw_ratio"][1, 0], atol=1e-3)
+
+
+def test_a_kinematic_car_knows_no_grip(entry):
+    free = motion_laws.driver(entry_of("bicycle"), slippery=0.125, width=4, **RATES)
+    found = motion_laws.cornering(free, frictions=[0.1], speeds=[3.0, 12.0], steer=0.5, from_s=1.0, to_s=2.0, wheelbase=2.6, **CLOCK)
+    np.testing.assert_allclose(found["lateral"], found["demand"], rtol=0.01)
+    assert found["lateral"].max() > 5 * 0.1 * G
+    own = slid(free)
+    assert np.ptp(own["distance_m"]) < 1e-4
+
+
+def test_split_friction_turns_to_the_grip_and_is_mirrored(drive):
+    found = motion_laws.split(drive, friction=0.8, speed=10.0, seconds=1.0, **CLOCK)
+    yaw = found["yaw"]
+    assert yaw[0, -1] < -0.05 and yaw[1, -1] > 0.05 and found["aside_m"][0, -1] < 0 < found["aside_m"][1, -1]
+    np.testing.assert_allclose(yaw[0], -yaw[1], atol=0.01 * np.abs(yaw).max())
+
+
+def test_the_car_rides_on_its_springs(drive, car):
+    found = motion_laws.ride(drive, car, friction=0.9, seconds=2.0, **CLOCK)
+    assert found["on_springs"] == 1.0 and np.abs(found["travel_m"]).max() < 1e-3
+    assert found["load_sum"] == pytest.approx(1.0, abs=1e-3) and found["height_m"] == pytest.approx(0.755, abs=0.005)
+
+    def lying(cases):
+        trace = drive(cases)
+        trace.qpos[..., [7, 10, 13, 15]] = 0.186
+        return trace
+
+    soft = dataclasses.replace(car, suspension_stiffness=1080.0, suspension_preload=0.0, suspension_travel=0.175)
+    assert motion_laws.ride(lying, soft, friction=0.9, seconds=2.0, **CLOCK)["on_springs"] == pytest.approx(0.044, abs=0.001)
+
+
+@pytest.mark.slow
+def test_the_published_car_rides_on_its_stops():
+    published = entry_of("mjx_published")
+    hard = motion_laws.driver(published, slippery=1.0, width=4, **RATES)
+    lying = motion_laws.ride(hard, cars.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
+    assert 0.03 < lying["on_springs"] < 0.06 and lying["travel_m"].min() > lying["room_m"]
+    assert lying["load_sum"] == pytest.approx(1.0, abs=5e-3)
+
+
+def test_rolling_cars_gain_nothing_and_driven_ones_do(drive, entry, car):
+    numbers = dict(frictions=[0.1, 0.9], steers=[0.0, 0.6], speed=10.0, seconds=2.0, **CLOCK)
+    found = motion_laws.rolling(drive, entry, **numbers)
+    assert found["rise"].max() < 2e-3 and (found["spent"][:, -1] > 0.02).all()
+    assert found["spent"][3, -1] > 1.5 * found["spent"][2, -1], "sliding costs more than rolling"
+
+    def pushed(cases):
+        cases.controls[..., 0] = 1.0
+        return drive(cases)
+
+    assert motion_laws.rolling(pushed, entry, **numbers)["rise"].min() > 0.05
+
+
+def test_pieces_do_not_matter(drive, entry):
+    """Five cases in pieces of four, of a second each, are the five cases, one by one."""
+    cases = motion_laws.held([0.1, 0.3, 0.5, 0.7, 0.9], 5.0, (0.2, 0.1, 0.0), steps=40)
+    whole = drive(cases)
+    assert whole.position.shape == (5, 40, 3) and whole.qpos.shape == (5, 40, 17)
+    last = drive(random_drives.Sequences(*(column[4:] for column in cases)))
+    np.testing.assert_allclose(last.position[0], whole.position[4], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_ice_pushes_wide_and_splits(entry):
+    grip = load("task")["weather"]["grip"]
+    options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
+    found = friction_patches.patches(entry, grip, **RATES, **options)
+    wide = np.array(found["bend"]["wide_m"])
+    assert (wide[[0, 3]] > 3.0).all() and (wide[[1, 4]] > 1.0).all() and np.abs(wide[[2, 5]]).max() < 1.0
+    np.testing.assert_allclose(wide[:3], wide[3:], atol=0.3)
+    yaw = found["split"]["yaw"][:, -1]
+    assert yaw[0] < -0.03 and yaw[1] > 0.03 and abs(yaw[2]) < 0.005
+
+
+# ---- the command
+
+TOY = (  # as many cases, as long, as in test_validation: these programs are compiled once for both
+    "parts=[drives,encounters]", "validation.drives.draw.count=13", "validation.drives.draw.seconds=2.0", "validation.bound.horizon_s=0.5",
+    "validation.encounters.draw.count=15", "validation.encounters.draw.seconds=2.0", "validation.worst=3",
+)  # fmt: skip
+
+
+def toy(out, *overrides):
+    return command.validate(load("validate", f"out={out}", *TOY, *overrides))
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    out = tmp_path_factory.mktemp("validation")
+    return out, toy(out)
+
+
+def test_a_run_writes_numbers_figures_and_verdicts(measured, capsys):
+    out, results = measured
+    assert list(results) == ["drives", "encounters"]
+    text = (out / "validation.md").read_text()
+    assert "## Verdicts" in text and "| yes |" in text and "sequence " in text and "encounter " in text and "nan" not in text
+    for name in ("errors", "forces", "collisions"):
+        assert (out / f"{name}.png").is_file() and f"({name}.png)" in text
+    assert results["drives"]["result"]["count"] == 13 and results["drives"]["seconds"] > 0
+
+
+def test_resume_keeps_what_fits_and_no_parts_write_the_report_anew(measured, capsys):
+    out, results = measured
+    (out / "validation.md").unlink()
+    assert toy(out, "resume=true") == results
+    assert "drives: kept\nencounters: kept\n" in capsys.readouterr().out and (out / "validation.md").is_file()
+    (out / "validation.md").unlink()
+    assert toy(out, "parts=[]", "validation.targets.within_min=1.1") == results
+    assert "**no**" in (out / "validation.md").read_text() and "NOT MET" in capsys.readouterr().out
+
+
+def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, capsys):
+    out, results = measured
+    (tmp_path / "results").mkdir()
+    for name in results:
+        (tmp_path / "results" / f"{name}.json").write_bytes((out / "results" / f"{name}.json").read_bytes())
+    again = []
+    for name, part in list(command.PARTS.items()):
+        known = results.get(name, {}).get("result")
+        fake = part._replace(run=lambda config, spread, name=name, known=known: (again.append(name), known)[1])
+        monkeypatch.setitem(command.PARTS, name, fake)
+    toy(tmp_path, "resume=true", "validation.encounters.draw.speed_max=19")
+    assert again == ["encounters"]
+    toy(tmp_path, "resume=true", "validation.encounters.draw.speed_max=19", "workers=2", "validation.targets.creep_mm=2")
+    assert again == ["encounters"]
+    toy(tmp_path)
+    assert again == ["encounters", "drives", "encounters"]
+
+
+def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
+    for override, message in {
+        "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws, extremes, faults, costs",
+        "workers=0": "workers: 0; wanted is at least 1",
+        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: 'fast' is of type str, wanted float",
+        "validation.drives.draw.seconds=0.4": "validation.drives.draw.seconds: 0.4; at least 0.5, validation.bound.horizon_s",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            toy(tmp_path, override)
+
+
+def test_verdicts_can_fail(measured):
+    _, results = measured
+    targets = load("validate")["validation"]["targets"]
+    worse = json.loads(json.dumps(results))
+    worse["drives"]["result"]["within"] = 0.5
+    rows = worse["encounters"]["result"]["contacts"]["spring"]["rows"]
+    rows["lost"] = [-1.0 for _ in rows["lost"]]
+    honest, broken = (target_check.of(r, targets) for r in (results, worse))
+    assert [a.what for a, b in zip(honest, broken, strict=True) if a.met and not b.met] == [honest[0].what, honest[-1].what]
+
+
+def test_the_committed_report_is_made_of_its_results(tmp_path):
+    """No number in it was typed in."""
+    committed = configs.folder().parent / "experiments" / "validation"
+    results = command.read(committed)
+    assert list(results) == list(command.PARTS)
+    written = report.write(tmp_path, results, load("validate")["validation"]["targets"])
+    assert written.read_text() == (committed / "validation.md").read_text()
+    assert {path.name for path in tmp_path.glob("*.png")} == {path.name for path in committed.glob("*.png")}
+
+
+def square(cases):
+    """Runs in a process of its own."""
+    return engines.Run(*[cases.speed[:, None] ** 2] * 7)
+
+
+def test_cases_spread_over_processes_come_back_in_order():
+    cases = motion_laws.held([0.1] * 5, np.arange(5.0), motion_laws.COAST, steps=1)
+    with spreading(1) as here, spreading(2) as there:
+        np.testing.assert_array_equal(here(square, cases).qpos, there(square, cases).qpos)
+
+
+@pytest.mark.parametrize("size", ["reduced", "full"])
+def test_sizes_compose(size):
+    config = load("validate", f"validation={size}")
+    assert config["validation"]["drives"]["draw"]["count"] >= 48 and config["validation"]["settings"]["trials"]
+    assert {"mjx_car", "latched", "published", "bicycle"} == set(config["backends"])
+
+
+@pytest.mark.slow
+def test_all_parts(tmp_path):
+    small = (
+        "validation.settings.count=4", "validation.settings.fine_hz=240",
+        "validation.settings.trials=[{name: few, physics_hz: 120, iterations: 2}, {name: coarse, physics_hz: 60}]",
+        "validation.laws.stopping.frictions=[0.3,1.0]", "validation.laws.stopping.seconds=6.0",
+        "validation.laws.standing.frictions=[0.01,0.8]", "validation.extremes.seconds=1.0", "validation.extremes.heap=3",
+        "validation.costs.worlds=2", "validation.costs.steps=2", "validation.costs.repeats=1",
+    )  # fmt: skip
+    results = toy(tmp_path, f"parts=[{','.join(command.PARTS)}]", *small)
+    text = (tmp_path / "validation.md").read_text()
+    assert list(results) == list(command.PARTS) and "is refused: dynamics.car" in text and "mjx_published" in text
+    for title in ("Extremes", "Faults", "Determinism", "What features cost"):
+        assert f"## {title}" in text
+    assert [row["name"] for row in results["costs"]["result"]["rows"]] == ["plain", "all of it"]
+    assert len(list(tmp_path.glob("*.png"))) == 8

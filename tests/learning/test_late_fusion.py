@@ -1,0 +1,158 @@
+"""Late fusion: masks, sets, sizes, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.types import Rows
+from scenefactory_jax.learning.networks import late_fusion
+
+TINY = dict(
+    vector=[8],
+    rows={"road": [8, 8]},
+    rows_default=[4],
+    trunk=[8],
+    activation="elu",
+    mean_init=[0.5, 0.0, -1.0],
+    log_std_init=-0.5,
+    actor_head_scale=1.0,
+    dtype="float32",
+    kernels=True,
+)
+W, A, K = 2, 3, 5
+
+
+def observe(key, *, rows=K, batch=(W, A)):
+    """Two vector groups and a set; agent (0, 0) sees an empty set."""
+    keys = jax.random.split(key, 4)
+    mask = jax.random.bernoulli(keys[3], 0.6, (*batch, rows)).at[(0,) * len(batch)].set(False)
+    return {
+        "ego": jax.random.normal(keys[0], (*batch, 7)),
+        "weather": jax.random.normal(keys[1], (*batch, 4)),
+        "road": Rows(jax.random.normal(keys[2], (*batch, rows, 5)), mask),
+    }
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    policy = late_fusion.make(**TINY)
+    policy = policy._replace(apply=jax.jit(policy.apply))
+    observation = observe(jax.random.key(0))
+    return policy, jax.jit(policy.init)(jax.random.key(1), observation), observation
+
+
+def test_any_leading_axes_give_the_same_numbers(tiny):
+    policy, parameters, observation = tiny
+    mean, log_std, value = policy.apply(parameters, observation)
+    assert mean.shape == (W, A, 3) and log_std.shape == (3,) and value.shape == (W, A)
+    flat = policy.apply(parameters, jax.tree.map(lambda x: x.reshape(W * A, *x.shape[2:]), observation))
+    one = policy.apply(parameters, jax.tree.map(lambda x: x[1], observation))
+    np.testing.assert_allclose(flat[0].reshape(mean.shape), mean, atol=1e-6)
+    np.testing.assert_allclose(one[2], value[1], atol=1e-6)
+
+
+def test_widths_of_none_are_widths_that_nobody_named(tiny):
+    _, parameters, observation = tiny
+    same = late_fusion.make(**{**TINY, "rows": {"road": [8, 8], "neighbours": None}}).init(jax.random.key(1), observation)
+    assert jax.tree.map(jnp.shape, same) == jax.tree.map(jnp.shape, parameters)
+
+
+def test_hidden_rows_and_their_order_change_nothing(tiny):
+    policy, parameters, observation = tiny
+    road, order = observation["road"], jnp.array([3, 1, 4, 0, 2])
+    poisoned = {**observation, "road": Rows(jnp.where(road.mask[..., None], road.features, 1e6), road.mask)}
+    shuffled = {**observation, "road": Rows(road.features[..., order, :], road.mask[..., order])}
+    longer = {**observation, "road": jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x)], axis=2), road)}
+    wanted = policy.apply(parameters, observation)
+    for other in (poisoned, shuffled, longer):
+        for a, b in zip(policy.apply(parameters, other), wanted, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_empty_sets_read_zero_and_all_gradients_stay_finite(tiny):
+    policy, parameters, observation = tiny
+    nothing = {**observation, "road": Rows(observation["road"].features, jnp.zeros((W, A, K), bool))}
+
+    def loss(parameters, observation):
+        mean, log_std, value = policy.apply(parameters, observation)
+        return jnp.sum(mean**2) + jnp.sum(value**2) + jnp.sum(log_std)
+
+    derive = jax.jit(jax.grad(loss))
+    for seen in (observation, nothing):
+        gradient = derive(parameters, seen)
+        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(gradient))
+    assert float(jnp.abs(gradient["params"]["actor"]["road_rows"]["layer_0"]["kernel"]).max()) == 0.0
+    assert not late_fusion.pool(jnp.ones((2, 3, 4)), jnp.zeros((2, 3), bool)).any()
+    assert not late_fusion.pool(jnp.ones((2, 0, 4)), jnp.zeros((2, 0), bool)).any()
+
+
+@pytest.mark.parametrize("activation", sorted(late_fusion.ACTIVATIONS))
+@pytest.mark.parametrize("widths", [(6,), (6, 4)])
+def test_gradient_through_the_winners_is_the_plain_gradient(activation, widths):
+    road = observe(jax.random.key(2))["road"]
+    keys, sizes = jax.random.split(jax.random.key(3), 2 * len(widths)), (5, *widths)
+    weights = [
+        (jax.random.normal(keys[2 * i], (sizes[i], sizes[i + 1])), jax.random.normal(keys[2 * i + 1], (sizes[i + 1],)))
+        for i in range(len(widths))
+    ]
+
+    def plain(weights, x):
+        return late_fusion.pool(late_fusion.affine(activation, "float32", weights, x), road.mask)
+
+    def quick(weights, x):
+        return late_fusion.encode_set(activation, "float32", True, weights, x, road.mask)
+
+    direction = jax.random.normal(jax.random.key(4), (W, A, widths[-1]))
+    np.testing.assert_allclose(plain(weights, road.features), quick(weights, road.features), atol=1e-6)
+
+    def slope(encode):
+        return jax.jit(jax.grad(lambda weights, x: jnp.sum(encode(weights, x) * direction), (0, 1)))(weights, road.features)
+
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), slope(plain), slope(quick))
+
+
+def test_pooling_before_the_activation_is_pooling_after_it():
+    road = observe(jax.random.key(5))["road"]
+    for activate in late_fusion.ACTIVATIONS.values():
+        after = late_fusion.pool(activate(road.features), road.mask)
+        np.testing.assert_array_equal(activate(late_fusion.pool(road.features, road.mask)), after)
+
+
+def test_new_groups_need_no_code(tiny):
+    policy, _, observation = tiny
+    extra = {**observation, "memory": jnp.ones((W, A, 2)), "lights": Rows(jnp.ones((W, A, 2, 9)), jnp.ones((W, A, 2), bool))}
+    actor = jax.eval_shape(policy.init, jax.random.key(0), extra)["params"]["actor"]
+    assert actor["vector"]["layer_0"]["kernel"].shape == (7 + 4 + 2, 8)
+    assert actor["lights_rows"]["layer_0"]["kernel"].shape == (9, 4)
+    assert actor["trunk"]["layer_0"]["kernel"].shape == (8 + 8 + 4, 8)
+
+
+def test_published_network_has_the_published_size():
+    policy = build(configs.load("train")["policy"], builtins=late_fusion, where="policy")()
+    observation = {**observe(jax.random.key(0)), "neighbours": Rows(jnp.ones((W, A, 2, 7)), jnp.ones((W, A, 2), bool))}
+    parameters = jax.eval_shape(policy.init, jax.random.key(1), observation)
+    assert sum(leaf.size for leaf in jax.tree.leaves(parameters)) == 132_359  # the paper's, without LayerNorm
+
+
+def test_bfloat16_is_near_and_stays_inside(tiny):
+    policy, parameters, observation = tiny
+    half = late_fusion.make(**{**TINY, "dtype": "bfloat16"})
+    mean, _, value = half.apply(parameters, observation)
+    assert mean.dtype == value.dtype == jnp.float32
+    np.testing.assert_allclose(value, policy.apply(parameters, observation)[2], atol=0.05)
+    gradient = jax.jit(jax.grad(lambda p: jnp.sum(half.apply(p, observation)[2])))(parameters)
+    assert {leaf.dtype for leaf in jax.tree.leaves(gradient)} == {jnp.dtype("float32")}
+
+
+def test_mistakes_are_named(tiny):
+    with pytest.raises(ConfigError, match=r"policy\.trunk: \[\] are no layer widths"):
+        late_fusion.make(**{**TINY, "trunk": []})
+    with pytest.raises(ConfigError, match=r"policy\.mean_init: \[0\.0\] holds 1 numbers, wanted 3"):
+        late_fusion.make(**{**TINY, "mean_init": [0.0]})
+    with pytest.raises(ConfigError, match=r"policy\.rows\.roads: .* valid: road"):
+        late_fusion.make(**{**TINY, "rows": {"roads": [8]}}).init(jax.random.key(0), tiny[2])
+    with pytest.raises(ConfigError, match=r"policy\.activation: 'gelu'"):
+        build({"_target_": "make", **TINY, "activation": "gelu"}, builtins=late_fusion, where="policy")

@@ -1,0 +1,362 @@
+"""PPO: advantages, loss and minibatches against plain arithmetic; then five probe environments."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.stats import norm
+from support.probes import NUMBERS, PRESENT, SMALL, probe, scenes
+
+from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.pytree import unchecked
+from scenefactory_jax.core.types import Env
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import gae, loss, rollout, train_iteration, update
+
+T, W, A = 12, 2, 3
+WORLDS = 8
+
+
+def test_advantages_equal_a_plain_loop():
+    keys = jax.random.split(jax.random.key(0), 6)
+    reward, value = jax.random.normal(keys[0], (T, W, A)), jax.random.normal(keys[1], (T, W, A))
+    bootstrap = jax.random.normal(keys[2], (W, A))
+    active, done = jax.random.bernoulli(keys[3], 0.8, (T, W, A)), jax.random.bernoulli(keys[4], 0.2, (T, W, A))
+    truncated = jax.random.bernoulli(keys[5], 0.2, (T, W, A))
+    estimate = jax.jit(functools.partial(gae.estimate, gamma=0.9, gae_lambda=0.8))
+    advantage, returns = estimate(reward, value, bootstrap, active, done, truncated)
+
+    reward, value, bootstrap, active, done, truncated = map(np.asarray, (reward, value, bootstrap, active, done, truncated))
+    wanted = np.zeros((T, W, A))
+    for index in np.ndindex(W, A):
+        following, carried = float(bootstrap[index]), 0.0
+        for t in reversed(range(T)):
+            at = (t, *index)
+            if done[at] or not active[at]:
+                carried = float(reward[at]) * bool(active[at]) - float(value[at])
+            elif truncated[at]:
+                carried = 0.0
+            else:
+                carried = float(reward[at]) + 0.9 * following - float(value[at]) + 0.9 * 0.8 * carried
+            following, wanted[at] = float(value[at]), carried
+    np.testing.assert_allclose(advantage, wanted, atol=1e-5)
+    np.testing.assert_allclose(returns, wanted + np.asarray(value), atol=1e-5)
+
+
+def test_gaussians_agree_with_their_definitions():
+    action, mean, other = jax.random.normal(jax.random.key(1), (3, 4, 3))
+    log_std, log_std_old = jnp.array([-0.5, 0.0, 0.4]), jnp.array([-0.2, 0.1, 0.3])
+    wanted = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
+    np.testing.assert_allclose(loss.log_probability(action, mean, log_std), wanted, rtol=1e-5)
+
+    draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
+    own = loss.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
+    difference = own - loss.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
+    np.testing.assert_allclose(loss.kl(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
+    np.testing.assert_allclose(loss.gaussian_entropy(log_std_old), -own.mean(), rtol=0.01)
+    assert float(jnp.abs(loss.kl(mean, log_std, mean, log_std)).max()) == 0.0
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Policy, parameters and samples; every third one without weight."""
+    policy, keys, count = late_fusion.make(**SMALL), jax.random.split(jax.random.key(3), 8), 24
+    observation = {"cue": jax.random.normal(keys[0], (count, 1))}
+    parameters = jax.jit(policy.init)(keys[1], observation)
+    mean, log_std, value = policy.apply(parameters, observation)
+    action = mean + jnp.exp(log_std) * jax.random.normal(keys[2], mean.shape)
+    old = mean + 0.1 * jax.random.normal(keys[3], mean.shape)
+    samples = loss.Batch(
+        observation=observation,
+        action=action,
+        mean=old,
+        log_probability=loss.log_probability(action, old, log_std),
+        value=value + 0.3 * jax.random.normal(keys[4], value.shape),
+        advantage=jax.random.normal(keys[5], value.shape),
+        returns=jax.random.normal(keys[6], value.shape),
+        weight=(jnp.arange(count) % 3 > 0).astype(jnp.float32),
+    )
+    return policy, parameters, samples, log_std
+
+
+def test_loss_equals_its_definition(batch):
+    policy, parameters, samples, log_std_old = batch
+    numbers = dict(clip=0.2, value_clip=0.2, entropy=0.01, value=0.5)
+    total, facts = loss.ppo(parameters, samples, log_std_old, policy=policy, **numbers)
+    mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
+    surrogates, values = [], []
+    for i in np.flatnonzero(np.asarray(samples.weight)):
+        now = norm.logpdf(samples.action[i], mean[i], np.exp(log_std)).sum()
+        ratio, gain = np.exp(now - samples.log_probability[i]), float(samples.advantage[i])
+        surrogates.append(min(ratio * gain, np.clip(ratio, 0.8, 1.2) * gain))
+        old, target = float(samples.value[i]), float(samples.returns[i])
+        values.append(max((estimate[i] - target) ** 2, (old + np.clip(estimate[i] - old, -0.2, 0.2) - target) ** 2))
+    entropy = 3 * 0.5 * np.log(2 * np.pi * np.e) + log_std.sum()
+    np.testing.assert_allclose(total, -np.mean(surrogates) + 0.5 * np.mean(values) - 0.01 * entropy, rtol=1e-4)
+    assert 0.0 < float(facts["clip_fraction"]) < 1.0
+
+
+def test_samples_without_weight_change_nothing(batch):
+    policy, parameters, samples, log_std = batch
+    empty = samples.weight == 0
+    garbage = dataclasses.replace(
+        samples,
+        observation={"cue": jnp.where(empty[:, None], 9.0, samples.observation["cue"])},
+        action=jnp.where(empty[:, None], 50.0, samples.action),
+        advantage=jnp.where(empty, jnp.nan, samples.advantage),
+        returns=jnp.where(empty, 1e6, samples.returns),
+    )
+    gradient = jax.jit(jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)[0]))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
+    normal, weight = loss.normalise(garbage.advantage, samples.weight), samples.weight
+    np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
+    assert float(loss.weighted_mean(garbage.returns, jnp.zeros(24))) == 0.0
+    assert not loss.normalise(garbage.returns, jnp.zeros(24)).any()
+
+
+def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
+    rng, none = np.random.default_rng(0), jnp.zeros((T, W, A))
+    active, truncated = (jnp.asarray(rng.random((T, W, A)) < share) for share in (0.7, 0.3))
+    observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
+    samples = unchecked(  # with the axis of time before that of worlds
+        rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
+        done=jnp.zeros((T, W, A), bool), truncated=truncated,
+    )  # fmt: skip
+    batch = train_iteration._batch(samples, none[0], gamma=0.9, gae_lambda=0.8, normalise_advantage=True, groups=1, axis=None)
+    np.testing.assert_array_equal(batch.weight, np.ravel(active & ~truncated))
+
+
+def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
+    weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
+    whole = update.split(jax.random.key(5), weight, minibatches=4, size=24)
+    assert sorted(whole.reshape(-1).tolist()) == list(range(96))
+    assert np.ptp(np.asarray(weight[whole].sum(1))) <= 1
+    part = update.split(jax.random.key(5), weight, minibatches=4, size=12)
+    assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
+
+
+def test_what_is_left_out_is_counted_group_by_group(batch):
+    """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
+    policy, parameters, samples, log_std = batch
+    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
+    numbers = dict(loss=objective, optimiser=adam, rate=update.AdaptiveRate(None, 1e-5, 1e-2, None), epochs=1, minibatches=2, size=6)
+    samples = dataclasses.replace(samples, weight=(jnp.arange(24) < 14).astype(jnp.float32))
+    given = (parameters, adam.init(parameters), samples, log_std, jax.random.key(0), jnp.int32(0))
+    *_, facts = update.learn(*given, **numbers, permute_each_epoch=False, groups=2)
+    assert float(facts["left_out"]) == pytest.approx(6 / 14)
+
+
+@pytest.fixture(scope="module")
+def learn(batch):
+    """Two minibatches of 12: (samples, numbers of the rate, iteration) -> (parameters, optimiser state, facts)."""
+    policy, parameters, _, log_std = batch
+    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
+    numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
+
+    @jax.jit
+    def run(samples, rate, iteration):
+        return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), iteration, rate=rate, **numbers)
+
+    return lambda samples, *rate, iteration=0: run(samples, update.AdaptiveRate(*rate), iteration)
+
+
+def test_what_is_not_finite_moves_nothing_and_is_counted(batch, learn):
+    _, parameters, samples, _ = batch
+    broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # in one of the two minibatches
+    after, state, facts = learn(broken, 0.01, 1e-5, 1e-2)
+    assert float(facts["skipped"]) == 1.0 and int(state[-1].count) == 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, facts)))
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parameters), strict=True))
+
+    after, _, facts = learn(dataclasses.replace(samples, weight=jnp.zeros(24)), 0.01, 1e-5, 1e-2)
+    jax.tree.map(np.testing.assert_array_equal, after, parameters)
+    assert float(facts["skipped"]) == 0.0
+
+
+def test_learning_rate_follows_the_divergence(batch, learn):
+    def rate(*numbers):
+        return float(learn(batch[2], *numbers)[2]["learning_rate"])
+
+    divergence = float(learn(batch[2], 1.0, 1e-5, 1e-2)[2]["kl"])
+    np.testing.assert_allclose(rate(divergence / 9, 1e-5, 1e-2), 1e-3 / 1.5**2, rtol=1e-5)  # once in each minibatch
+    np.testing.assert_allclose(rate(divergence, 1e-5, 1e-2), 1e-3, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence * 9, 1e-5, 1e-2), 1e-3 * 1.5**2, rtol=1e-5)
+    np.testing.assert_allclose(rate(divergence / 9, 9e-4, 1e-2), 9e-4, rtol=1e-5)
+
+
+def test_the_largest_learning_rate_falls_as_one_over_time(batch, learn):
+    """A half after `halved` iterations, a third after twice as many, never below the least; it bounds a rate that nothing adapts, too."""
+
+    def rate(iteration, *, halved=10.0, least=1e-5, desired_kl=1e3):
+        return float(learn(batch[2], desired_kl, least, 8e-4, halved, iteration=iteration)[2]["learning_rate"])
+
+    np.testing.assert_allclose([rate(0), rate(10), rate(20), rate(70)], [8e-4, 4e-4, 8e-4 / 3, 1e-4], rtol=1e-5)
+    np.testing.assert_allclose([rate(10**6), rate(10, halved=None), rate(30, desired_kl=None)], [1e-5, 8e-4, 2e-4], rtol=1e-5)
+
+
+def counted(env: Env):
+    """The environment, and how often its transition was traced."""
+    traces = []
+
+    def transition(scene, state, action):
+        traces.append(1)
+        return env.transition(scene, state, action)
+
+    return env._replace(transition=transition), traces
+
+
+@pytest.fixture(scope="module")
+def course():
+    """Agents who would live 5 steps in worlds of 4: all run out of time."""
+    env, traces = counted(probe(life=5, episode_steps=4))
+    return train_iteration.make(
+        env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 4}
+    ), traces
+
+
+def run(trainer, stage, iterations, seed=0):
+    train_state, history = trainer.init(jax.random.key(seed), stage), []
+    for _ in range(iterations):
+        train_state, metrics = trainer.iterate(train_state, stage)
+        history.append(metrics)
+    return train_state, history
+
+
+def test_one_trace_same_seed_same_numbers_and_scenes_survive_donation(course):
+    trainer, traces = course
+    stage = scenes(WORLDS)
+    first, history = run(trainer, stage, 3)
+    second, _ = run(trainer, stage, 3)
+    other = jax.tree.map(lambda x: x + jnp.ones_like(x), stage)
+    trainer.iterate(second, other)
+    assert len(traces) <= 2  # the scan traces its body once, or twice to settle the carry; never again in later iterations
+    stage.agents.position.block_until_ready()
+    again, _ = run(trainer, stage, 3)
+    same = jax.tree.map(lambda a, b: bool((a == b).all()), (first.parameters, first.worlds), (again.parameters, again.worlds))
+    assert all(jax.tree.leaves(same))
+    assert all(bool(jnp.isfinite(value)) for metrics in history for value in metrics.values())
+    assert train_iteration.spawned_steps(first) == 3 * 16 * WORLDS * int(PRESENT.sum()) and int(first.iteration) == 3
+
+
+def test_metrics_count_what_happened(course):
+    trainer, _ = course
+    _, history = run(trainer, scenes(WORLDS), 2)
+    metrics = {name: float(value) for name, value in history[-1].items()}
+    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["share/active"] == 1.0
+    assert metrics["reward"] == pytest.approx(metrics["reward/paid"]) and -4.0 < metrics["reward"] < 0.0
+    assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
+    assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
+    assert metrics["events/reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
+
+
+@pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
+def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length):
+    """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
+    env, policy, stage = probe(life=life, episode_steps=length)._replace(hold=3), late_fusion.make(**SMALL), scenes(2, 1)
+    worlds = jax.vmap(env.start)(jax.random.split(jax.random.key(0), 2), stage)
+    seen = jax.vmap(env.observe)(stage, worlds)
+    parameters = policy.init(jax.random.key(1), seen)
+    begin = (stage, worlds, seen, rollout.no_lives(worlds), jax.random.key(2))
+    after, _, lives, samples, tally, record = jax.jit(functools.partial(rollout.collect, env, policy, horizon=4))(parameters, *begin)
+    lived = min(life, length)
+    held = samples.active[..., :2]
+    assert held.all() and not samples.active[..., 2].any()
+    np.testing.assert_array_equal(samples.reward[:, 0, 0], [3, lived - 3, 3, lived - 3])
+    assert float(samples.reward[..., 2].sum()) == 0.0
+    ends = np.array([False, True, False, True])
+    assert (samples.done[..., 0] == (ends & (life < length))[:, None]).all() and not samples.done[..., 2].any()
+    assert (samples.truncated[..., 1] == (ends & (life > length))[:, None]).all()
+    assert {name: float(tally[name]) for name in ("spawned", "active", "ended", "length", "return")} == {
+        "spawned": 2 * 2 * 12, "active": 2 * 2 * 2 * lived, "ended": 8, "length": 8 * lived, "return": 8 * lived}  # fmt: skip
+    assert record.episodes.tolist() == [4, 4] and not lives.steps.any() and (after.step == 0).all()
+
+
+def test_worlds_begin_where_an_action_is_read():
+    env = probe(life=5, episode_steps=12)._replace(hold=3)
+    trainer = train_iteration.make(env, late_fusion.make(**SMALL), **{**NUMBERS, "initial_phase": True, "episode_steps": 12})
+    steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
+    assert set(steps.tolist()) == {0, 3, 6, 9}
+
+
+def test_restart_keeps_what_was_learnt(course):
+    trainer, _ = course
+    stage = scenes(WORLDS)
+    train_state, _ = run(trainer, stage, 1)
+    learnt = jax.tree.map(np.asarray, train_state.parameters)
+    train_state = trainer.restart(train_state, stage)
+    jax.tree.map(np.testing.assert_array_equal, learnt, train_state.parameters)
+    assert len(set(train_state.worlds.step.tolist())) > 1 and not train_state.lives.steps.any()  # at random phases of 4 steps
+
+
+def test_mistakes_are_named():
+    env, policy = probe(), late_fusion.make(**SMALL)
+    with pytest.raises(ConfigError, match=r"16 x 8 worlds x 3 agents = 384 samples .* 7 minibatches"):
+        train_iteration.make(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
+    with pytest.raises(ConfigError, match=r"ppo\.gamma: 1\.5"):
+        train_iteration.make(env, policy, **{**NUMBERS, "gamma": 1.5})
+    with pytest.raises(ConfigError, match=r"ppo\.learning_rate: 1\.0 is outside"):
+        train_iteration.make(env, policy, **{**NUMBERS, "learning_rate": 1.0})
+    wrong = {"desired_kl": -0.01, "value_clip": 0.0, "entropy": float("nan"), "value": -1.0, "max_grad_norm": 0.0}
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=rf"ppo\.{name}: {value:g}; wanted is a .*number"):
+            train_iteration.make(env, policy, **{**NUMBERS, name: value})
+
+
+@pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])
+def test_configs_build(name):
+    entry = {"_target_": "make", **configs.load("train", f"ppo={name}")["ppo"]}
+    trainer = build(entry, builtins=train_iteration, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
+    assert trainer.iterate
+
+
+@pytest.fixture(scope="module")
+def probes():
+    """One compiled trainer for all probes: task -> (action mean and value for cues, metrics of every iteration)."""
+    policy = late_fusion.make(**SMALL)
+    trainer = train_iteration.make(probe(), policy, **{**NUMBERS, "sample_share": 0.75})  # two of three slots are spawned
+    apply = jax.jit(policy.apply)
+
+    def train_on(task, iterations):
+        train_state, history = run(trainer, scenes(2 * WORLDS, task), iterations)
+
+        def look(*cues):
+            mean, _, value = apply(train_state.parameters, {"cue": jnp.array(cues, jnp.float32)[:, None]})
+            return mean[:, 0], value
+
+        return look, history
+
+    return train_on
+
+
+def test_probe_1_value(probes):
+    look, _ = probes(1, 25)
+    np.testing.assert_allclose(look(0.0)[1], [1.0], atol=0.05)
+
+
+def test_probe_2_value_of_what_is_seen(probes):
+    look, history = probes(2, 25)
+    np.testing.assert_allclose(look(-1.0, 1.0)[1], [-1.0, 1.0], atol=0.05)
+    assert float(history[-1]["ppo/explained_variance"]) > 0.95
+
+
+def test_probe_3_value_of_what_comes_later(probes):
+    look, _ = probes(3, 25)
+    np.testing.assert_allclose(look(0.0, 1.0)[1], [NUMBERS["gamma"], 1.0], atol=0.05)
+
+
+def test_probe_4_action(probes):
+    look, _ = probes(4, 40)
+    np.testing.assert_allclose(look(0.0)[0], [0.5], atol=0.1)
+
+
+def test_probe_5_action_that_depends_on_what_is_seen(probes):
+    look, history = probes(5, 40)
+    np.testing.assert_allclose(look(-1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
+    assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1
+    assert float(history[-1]["ppo/left_out"]) == 0.0

@@ -1,0 +1,100 @@
+"""The kernels of sets against plain JAX, in Pallas's interpreter; that they lower to a GPU's code."""
+
+import contextlib
+import itertools
+from importlib.metadata import version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from scenefactory_jax.learning.networks import late_fusion, set_kernel
+
+
+def layers(key, *sizes):
+    keys = iter(jax.random.split(key, 2 * len(sizes)))
+    normal = lambda *shape: jax.random.normal(next(keys), shape)  # noqa: E731
+    return [(normal(i, o) / i**0.5, 0.3 * normal(o)) for i, o in itertools.pairwise(sizes)]
+
+
+def sets(key, *, batch, rows, features):
+    """Rows with gaps; the first set is empty, the second ends early, in the third two far rows are the same."""
+    keys = jax.random.split(key, 2)
+    x, mask = jax.random.normal(keys[0], (*batch, rows, features)), jax.random.bernoulli(keys[1], 0.7, (*batch, rows))
+    mask = mask.at[(0,) * len(batch)].set(False).at[(*(0,) * (len(batch) - 1), 1), 5:].set(False)
+    third = (*(0,) * (len(batch) - 1), 2)
+    far = 4.0 * x[(*third, 1)]
+    return x.at[(*third, 1)].set(far).at[(*third, rows - 1)].set(far), mask.at[third].set(True)
+
+
+@pytest.mark.parametrize("activation", sorted(late_fusion.ACTIVATIONS))
+@pytest.mark.parametrize(("rows", "features", "widths"), [(150, 5, (96, 96)), (24, 7, (32, 64)), (70, 15, (64, 32))])
+def test_kernels_are_the_plain_encoder_and_its_gradient(activation, rows, features, widths):
+    weights = layers(jax.random.key(0), features, *widths)
+    x, mask = sets(jax.random.key(1), batch=(2, 4), rows=rows, features=features)
+
+    plain = jax.jit(lambda weights: late_fusion.encode_set(activation, "float32", False, weights, x, mask))
+    wanted, pull = jax.vjp(plain, weights)
+    pooled, winner = jax.jit(lambda w: set_kernel.encode(activation, "float32", w, x, mask, interpret=True))(weights)
+    np.testing.assert_allclose(pooled, wanted, atol=2e-5)
+
+    values = jnp.where(mask[..., None], late_fusion.affine(activation, "float32", weights, x), -jnp.inf)
+    taken = jnp.take_along_axis(values, winner[..., None, :], axis=-2)[..., 0, :]
+    shown = mask.any(-1)
+    np.testing.assert_allclose(taken[shown], wanted[shown], atol=2e-5)
+    assert not winner[~shown].any() and not pooled[~shown].any()
+    assert (winner[0, 2] < rows - 1).all() and (winner[0, 2] == 1).any()  # of two rows that are the same the first
+
+    direction = jnp.where(shown[..., None], jax.random.normal(jax.random.key(2), pooled.shape), 0.0)
+    steep = lambda w: set_kernel.gradient(activation, "float32", w, x, winner, direction, programs=3, interpret=True)  # noqa: E731
+    for found, expected in zip(jax.tree.leaves(jax.jit(steep)(weights)), jax.tree.leaves(pull(direction)[0]), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_half_precision_rounds_what_plain_jax_rounds():
+    weights = layers(jax.random.key(0), 5, 96, 96)
+    x, mask = sets(jax.random.key(1), batch=(6,), rows=40, features=5)
+    pooled, _ = set_kernel.encode("elu", "bfloat16", weights, x, mask, interpret=True)
+    np.testing.assert_allclose(pooled, late_fusion.encode_set("elu", "bfloat16", False, weights, x, mask), atol=2e-2)
+    full = late_fusion.encode_set("elu", "float32", False, weights, x, mask)
+    assert 1e-5 < np.abs(pooled - full).max() < 5e-2
+
+
+def test_nothing_to_encode():
+    weights = layers(jax.random.key(0), 5, 32, 32)
+    for batch, rows in (((2,), 0), ((0,), 3)):
+        x, mask = jnp.zeros((*batch, rows, 5)), jnp.zeros((*batch, rows), bool)
+        pooled, winner = set_kernel.encode("elu", "float32", weights, x, mask)
+        assert pooled.shape == winner.shape == (*batch, 32) and not pooled.any()
+        gradient = set_kernel.gradient("elu", "float32", weights, x, winner, pooled)
+        assert jax.tree.map(jnp.shape, gradient) == jax.tree.map(jnp.shape, weights)
+        assert not any(leaf.any() for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize(("sizes", "made"), [((5, 96, 96), True), ((15, 32, 128), True), ((16, 32, 32), False), ((5, 96), False),
+                                             ((5, 48, 32), False), ((5, 32, 160), False), ((5, 32, 32, 32), False)])  # fmt: skip
+def test_which_layers_they_are_made_for(sizes, made):
+    assert set_kernel.fits(layers(jax.random.key(0), *sizes)) == made
+
+
+def imagined_gpu():
+    """Since 0.11 JAX wants to know for which GPU it lowers a kernel, where there is none."""
+    if not hasattr(jax.sharding, "AbstractDevice") or version("jaxlib") < "0.11":
+        return contextlib.nullcontext()
+    gpu = jax.sharding.AbstractDevice("NVIDIA H200", None, "cuda")
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), abstract_device=gpu))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
+    weights = layers(jax.random.key(0), 5, 96, 96)
+    x, mask = sets(jax.random.key(1), batch=(4,), rows=40, features=5)
+
+    def text(kernels, platform):
+        loss = jax.jit(jax.grad(lambda weights: late_fusion.encode_set("elu", dtype, kernels, weights, x, mask).sum()))
+        with imagined_gpu():
+            return loss.trace(weights).lower(lowering_platforms=(platform,)).as_text()
+
+    assert "encode_set" in text(True, "cuda") and "encode_set_gradient" in text(True, "cuda")
+    assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")

@@ -1,0 +1,89 @@
+"""The same training on one device, on several, and in several processes; devices are virtual ones of the CPU."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from support.probes import NUMBERS, SMALL, probe, scenes
+from support.running import ROOT
+
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration
+
+# compiles in half the time; what runs here runs for a moment, and all that is compared is compiled alike
+PLAIN = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+def start(pairs, *more, visible=4):
+    flags = f"{os.environ['XLA_FLAGS']} {PLAIN} --xla_force_host_platform_device_count={visible}"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    arguments = [sys.executable, "-m", "support.sharding", pairs, *more]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def result(process):
+    out, error = process.communicate(timeout=240)
+    assert process.returncode == 0, error[-3000:]
+    return json.loads(next(line for line in out.splitlines() if line.startswith("RESULT")).removeprefix("RESULT"))
+
+
+def agree(one, other):
+    assert one["record"] == other["record"]
+    np.testing.assert_allclose(one["parameters"], other["parameters"], atol=2e-5)
+    for mine, theirs in zip(one["metrics"], other["metrics"], strict=True):
+        assert mine.keys() == theirs.keys()
+        np.testing.assert_allclose(list(mine.values()), list(theirs.values()), rtol=1e-3, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """(devices, shards) -> what was learnt."""
+    pairs = [(1, 4), (2, 4), (4, 4), (2, 2)]
+    return dict(zip(pairs, result(start(",".join(f"{devices}:{shards}" for devices, shards in pairs))), strict=True))
+
+
+@pytest.mark.parametrize("devices", [2, 4])
+def test_more_devices_learn_the_same(found, devices):
+    assert found[devices, 4]["devices"] == 4
+    agree(found[devices, 4], found[1, 4])
+
+
+def test_scenes_pass_through_shared_out_worlds_without_compiling_again(found):
+    """In which worlds other scenes were, the record tells: it counts from the swap on."""
+    for (devices, _), one in found.items():
+        assert sorted(one["compiled"]) == (["jit(_iterate)", "jit(_swap)"] if devices == 1 else ["jit(exchanged)", "jit(spread)"])
+        latest, before, never = (np.asarray(one["record"])[rows] for rows in ([7, 3, 4, 6], [2, 5], [0, 1]))
+        assert latest.max() < before.min() and before.max() < never.min()
+
+
+def test_two_processes_learn_the_same(found):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        place = f"localhost:{free.getsockname()[1]}"
+    both = [start("2:4", place, "2", str(index), visible=1) for index in range(2)]
+    for [one] in map(result, both):
+        assert (one["devices"], one["processes"]) == (2, 2)
+        agree(one, found[1, 4])
+
+
+def test_other_groups_learn_something_else(found):
+    """Or the comparisons above could not fail."""
+    with pytest.raises(AssertionError):
+        agree(found[2, 2], found[1, 4])
+
+
+def test_mistakes_are_named():
+    env, policy = probe(), late_fusion.make(**SMALL)
+    with pytest.raises(ConfigError, match=r"ppo\.shards: 0"):
+        train_iteration.make(env, policy, **{**NUMBERS, "shards": 0})
+    with pytest.raises(ConfigError, match=r"worlds: 8 do not divide into 3 shards"):
+        train_iteration.make(env, policy, **{**NUMBERS, "shards": 3}).init(jax.random.key(0), scenes(8))
+    with pytest.raises(ConfigError, match=r"devices: 99; there are \d+"):
+        sharding.mesh(99)

@@ -1,0 +1,139 @@
+"""The kernels that ask the road against plain JAX, in Pallas's interpreter; that they lower to a GPU's code; derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_set_kernel import imagined_gpu
+
+from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.core import geometry
+from scenefactory_jax.core.pytree import replace, unchecked
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.roadgraph import queries, road_kernels, spatial_grid
+
+CARS = 24
+EDGES = {"half_width_m": 0.05, "range_m": 40.0}
+ROWS = {"radius_m": 10.0, "kind_scale": 20.0}
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Two worlds with more segments than a program takes at once, the second with gaps in its tables."""
+    loaded = scene_source.training(load("train", "scenes.count=2")["scenes"]).scene
+    loaded = spatial_grid.attach(jax.tree.map(np.asarray, replace(loaded, cells=None)), radius_m=10.0, size_m=5.0)
+    assert min(loaded.lanes.valid.shape[1], loaded.edges.valid.shape[1]) >= road_kernels.LOOK
+    gaps = {name: np.array(getattr(loaded, name).valid) for name in ("lanes", "edges")}
+    for valid in gaps.values():
+        valid[1, ::3] = False
+    tables = {name: unchecked(type(loaded.road), **(vars(getattr(loaded, name)) | {"valid": valid})) for name, valid in gaps.items()}
+    return jax.tree.map(jnp.asarray, unchecked(type(loaded), **(vars(loaded) | tables)))
+
+
+@pytest.fixture(scope="module")
+def cars(scenes):
+    """What `look` is told of cars on the road, around it and far away; every third is not active."""
+    rng, worlds = np.random.default_rng(0), 2
+    road = np.asarray(scenes.road.midpoint)
+    position = np.stack([rng.choice(road[world][np.asarray(scenes.road.valid[world])], CARS) for world in range(worlds)])
+    position = (position + rng.normal(0.0, 3.0, position.shape)).astype(np.float32)
+    position[:, 0] = 1e4
+    yaw = rng.uniform(-3.0, 3.0, (worlds, CARS)).astype(np.float32)
+    size = np.broadcast_to(np.array([4.0, 2.0], np.float32), position.shape)
+    shape = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
+    circles, radius = jax.vmap(lambda *at: geometry.car_circles(*at, **shape))(position, yaw, size)
+    velocity = rng.normal(0.0, 6.0, position.shape).astype(np.float32)
+    velocity[:, 2] = 0.0
+    active = np.broadcast_to(np.arange(CARS) % 3 > 0, (worlds, CARS))
+    return tuple(map(jnp.asarray, (circles, radius, velocity, yaw, position, active)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_blocks():
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("LOOK", "GATHER"):
+            patch.setattr(road_kernels, name, 64)  # several blocks of what is small enough for a test
+        yield
+
+
+def looked(scenes, cars, find):
+    """Of active cars."""
+    found = jax.vmap(find)(scenes, *cars)
+    return [np.asarray(value)[np.asarray(cars[-1])] for value in found]
+
+
+def test_looking_is_what_plain_jax_finds(scenes, cars):
+    def kernel(scene, circles, radius, velocity, yaw, position, active):
+        ahead = geometry.heading(yaw)
+        return road_kernels.look(scene.lanes, scene.edges, circles, radius, velocity, ahead, position, active, **EDGES, interpret=True)
+
+    row, squared, rate = looked(scenes, cars, kernel)
+    wanted = looked(scenes, cars, lambda scene, *car: queries.look(scene, *car, **EDGES, kernels=False))
+    np.testing.assert_array_equal(row, wanted[0])
+    np.testing.assert_allclose(np.sqrt(squared), wanted[1], rtol=1e-5, atol=1e-5)
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(1.0 / rate, wanted[2], rtol=1e-4)
+    assert np.isfinite(wanted[2]).sum() > CARS / 4 and (wanted[1] < 1.0).any()
+
+
+def test_a_world_without_a_road_has_nothing_to_find(scenes, cars):
+    def find(scene, circles, radius, velocity, yaw, position, active):
+        lanes, edges = (replace(table, valid=table.valid & False) for table in (scene.lanes, scene.edges))
+        return road_kernels.look(lanes, edges, circles, radius, velocity, geometry.heading(yaw), position, active, **EDGES, interpret=True)
+
+    row, squared, rate = jax.vmap(find)(scenes, *cars)
+    assert not row.any() and np.isinf(squared).all() and not rate.any()
+
+
+@pytest.mark.parametrize("count", [20, 350])
+def test_gathering_is_what_plain_jax_finds(scenes, cars, count):
+    *_, yaw, position, active = cars
+
+    def kernel(scene, position, yaw, active):
+        first, last = spatial_grid.part(scene.cells, position)
+        turn = geometry.heading(-yaw)
+        last = jnp.where(active, last, first)
+        return road_kernels.gather(scene.road, scene.cells, first, last, position, turn, count=count, **ROWS, interpret=True)
+
+    features, mask = jax.vmap(kernel)(scenes, position, yaw, active)
+    wanted = jax.vmap(lambda *given: queries.around(*given, count=count, **ROWS, kernels=False))(scenes, position, yaw, active)
+    np.testing.assert_array_equal(mask, wanted.mask)
+    np.testing.assert_allclose(features, wanted.features, atol=1e-5)
+    assert mask.all(axis=-1).any() == (count == 20) and mask.any() and not mask[~np.asarray(active)].any()
+
+
+def test_derivatives_are_those_of_plain_jax(scenes, cars):
+    """Of both modes, through the choice between kernel and plain JAX."""
+    scene = jax.tree.map(lambda leaf: leaf[0], scenes)
+    circles, radius, velocity, yaw, position, active = (value[0, 3:] for value in cars)
+
+    def told(kernels):
+        def total(shift, turn):
+            beside = queries.look(
+                scene, circles + shift, radius, velocity, yaw + turn, position + shift, active, **EDGES, kernels=kernels
+            )  # fmt: skip
+            seen = queries.around(scene, position + shift, yaw + turn, active, count=20, **ROWS, kernels=kernels)
+            edges = jnp.where(active & jnp.isfinite(beside.edge), beside.edge, 0.0).sum()
+            times = jnp.where(active & jnp.isfinite(beside.edge_ttc), jnp.minimum(beside.edge_ttc, 10.0), 0.0).sum()
+            return edges + times + (seen.features**3).sum()
+
+        return total
+
+    point = (jnp.float32([0.1, 0.2]), jnp.float32(0.05))
+    for mode in (jax.grad, jax.jacfwd):
+        found, wanted = (jax.jit(mode(told(kernels), argnums=(0, 1)))(*point) for kernels in (True, False))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), found, wanted)
+        assert all(np.abs(value).max() > 0 for value in wanted)
+
+
+def test_a_gpu_gets_kernels_and_other_devices_plain_jax(scenes, cars):
+    def text(kernels, platform):
+        def both(scene, circles, radius, velocity, yaw, position, active):
+            seen = queries.around(scene, position, yaw, active, count=20, **ROWS, kernels=kernels)
+            return seen, queries.look(scene, circles, radius, velocity, yaw, position, active, **EDGES, kernels=kernels)
+
+        with imagined_gpu():
+            return jax.jit(jax.vmap(both)).trace(scenes, *cars).lower(lowering_platforms=(platform,)).as_text()
+
+    assert "look_at_road" in text(True, "cuda") and "gather_road" in text(True, "cuda")
+    assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")

@@ -1,0 +1,90 @@
+"""Looking the road up by cells is looking through all of it, bit for bit."""
+
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.running import SHARED
+
+from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.core.pytree import replace, unchecked
+from scenefactory_jax.core.types import Motion
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.env import observations
+from scenefactory_jax.roadgraph import spatial_grid
+
+WOMD = SHARED / "womd" / "test"
+PLACES = 256
+
+
+@pytest.fixture(scope="module", params=["procedural", "womd"])
+def scenes(request):
+    """Stacked scenes without cells."""
+    overrides = ["scenes.count=3", "scenes.cells.radius_m=null"]
+    if request.param == "womd":
+        if not WOMD.is_dir():
+            pytest.skip(f"no data at {WOMD}")
+        first = sorted(WOMD.iterdir())[0]
+        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.cells.radius_m=null"]
+    return scene_source.training(load("train", *overrides)["scenes"]).scene
+
+
+def places(scene, seed):
+    """Positions on the road, around it, far outside, and on the corners of cells."""
+    rng = np.random.default_rng(seed)
+    road = np.asarray(scene.road.midpoint)[np.asarray(scene.road.valid)]
+    on = rng.choice(road, PLACES // 2) + rng.normal(0.0, 3.0, (PLACES // 2, 2))
+    around = rng.uniform(-150.0, 150.0, (PLACES // 4, 2))
+    corners = np.asarray(scene.cells.origin) + 5.0 * rng.integers(0, scene.cells.side + 1, (PLACES // 4 - 2, 2))
+    return np.concatenate([on, around, corners, [[1e4, -1e4], [np.inf, 0.0]]]).astype(np.float32)
+
+
+def look(count):
+    """The road observation of cars at positions."""
+
+    def at(scene, position):
+        agents = len(position)
+        zeros = jnp.zeros(agents, jnp.float32)
+        motion = Motion(
+            position=jnp.concatenate([position, zeros[:, None]], axis=1), velocity=jnp.zeros((agents, 3)), yaw=0.1 * jnp.arange(agents),
+            **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "grip", "grip_use", "slip"), zeros),
+        )  # fmt: skip
+        state = type("State", (), {"motion": motion, "active": jnp.ones(agents, bool)})()
+        return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
+
+    return jax.jit(at)
+
+
+@pytest.mark.parametrize(("size_m", "count"), [(5.0, 350), (3.0, 20), (25.0, 64)])
+def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
+    quick, find = spatial_grid.attach(scenes, radius_m=10.0, size_m=size_m), look(count)
+    for world in range(len(scenes.log.dt)):
+        one = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), quick)  # noqa: B023
+        position = places(one, world)
+        found, wanted = find(one, position), find(replace(one, cells=None), position)
+        jax.tree.map(np.testing.assert_array_equal, found, wanted)
+        assert wanted.mask.any(axis=1).sum() > PLACES // 4 and not wanted.mask[-2:].any()
+        assert int(one.cells.most) < int(one.road.valid.sum())
+
+
+def test_a_larger_radius_looks_through_all(scenes):
+    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), spatial_grid.attach(scenes, radius_m=4.0, size_m=5.0))
+    find, position = look(350), places(narrow, 0)
+    jax.tree.map(np.testing.assert_array_equal, find(narrow, position), find(replace(narrow, cells=None), position))
+
+
+def test_a_world_without_a_road_has_empty_lists(scenes):
+    road = scenes.road
+    bare = unchecked(type(scenes), **(vars(scenes) | {"road": unchecked(type(road), **(vars(road) | {"valid": road.valid & False}))}))
+    made = spatial_grid.attach(bare, radius_m=10.0, size_m=5.0).cells
+    assert not made.first.any() and made.most == 1
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made)
+    _, listed = spatial_grid.listed(one, *spatial_grid.part(one, jnp.zeros((3, 2))))
+    assert not listed.any()
+
+
+def test_configs_look_as_far_as_their_observation():
+    assert load("train", "experiment=published")["scenes"]["cells"]["radius_m"] == 10.0
+    assert load("train", "observe.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
+    assert load("convert")["scenes"]["cells"]["radius_m"] is None

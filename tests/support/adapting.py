@@ -1,0 +1,24 @@
+"""What the tests of the adapters share: few scenes of one car each, or of several, and fleets of adapters over them."""
+
+import functools
+
+import numpy as np
+
+from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.data.loading import scene_source
+
+SMOKE = "experiment=smoke"
+ALONE = [SMOKE, "scenes.pack.agents=1"]
+
+
+@functools.cache
+def scenes(*, agents: int = 1) -> scene_source.Scenes:
+    """The four scenes of the smallest config."""
+    return scene_source.training(hydra_config.load("train", SMOKE, f"scenes.pack.agents={agents}")["scenes"])
+
+
+def actions(steps, worlds, *, seed=0):
+    """Full throttle in the first world, which leaves the road, and random driving in the others."""
+    drawn = np.random.default_rng(seed).uniform(-1, 1, (steps, worlds, 3)).astype(np.float32)
+    drawn[:, 0] = [1.0, 0.6, -1.0]
+    return drawn

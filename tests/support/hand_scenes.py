@@ -1,0 +1,68 @@
+"""Scenes made by hand for tests: a road of polylines, and a straight street with cars."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from scenefactory_jax.core.track_interpolation import nobody, unrecorded
+from scenefactory_jax.core.types import Agents, Log, Road, Scene
+from scenefactory_jax.weather.friction import uniform
+
+
+def road_of(lines, capacity=None) -> Road:
+    """Polylines [(kind, points [N,2]), ...] -> padded Road, as the packer lays it out."""
+    columns = {"midpoint": [], "direction": [], "half_length": [], "kind": [], "polyline": [], "arc": []}
+    for index, (kind, points) in enumerate(lines):
+        points = np.asarray(points, float)
+        delta = np.diff(points, axis=0)
+        length = np.linalg.norm(delta, axis=1)
+        columns["midpoint"].append((points[1:] + points[:-1]) / 2)
+        columns["direction"].append(delta / length[:, None])
+        columns["half_length"].append(length / 2)
+        columns["kind"].append(np.full(len(length), kind))
+        columns["polyline"].append(np.full(len(length), index))
+        columns["arc"].append(np.cumsum(length) - length / 2)
+    count = sum(len(c) for c in columns["kind"])
+    capacity = capacity or count
+
+    def column(name, tail, dtype):
+        rows = np.concatenate([np.asarray(c, float).reshape(-1, *tail) for c in columns[name]]) if lines else np.zeros((0, *tail))
+        return jnp.asarray(np.concatenate([rows, np.zeros((capacity - count, *tail))]), dtype)
+
+    return Road(
+        midpoint=column("midpoint", (2,), jnp.float32),
+        direction=column("direction", (2,), jnp.float32),
+        half_length=column("half_length", (), jnp.float32),
+        kind=column("kind", (), jnp.int32),
+        polyline=column("polyline", (), jnp.int32),
+        arc=column("arc", (), jnp.float32),
+        valid=jnp.arange(capacity) < count,
+    )
+
+
+def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=6.0, length=60.0, steps=3, size=(4.0, 2.0)) -> Scene:
+    """A straight road along x with one lane at y=0, edges at +-half_width, and cars where asked."""
+    starts, goals = np.asarray(starts, np.float32), np.asarray(goals, np.float32)
+    count = len(starts)
+    x = np.arange(-length, length + 1e-6, 1.0)
+    lane = (2, np.stack([x, 0 * x], -1))
+    edges = [(15, np.stack([x, 0 * x + half_width], -1)), (15, np.stack([x[::-1], 0 * x - half_width], -1))]
+    agents = Agents(
+        position=jnp.asarray(starts),
+        yaw=jnp.zeros(count, jnp.float32) if yaws is None else jnp.asarray(yaws, jnp.float32),
+        speed=jnp.zeros(count, jnp.float32) if speeds is None else jnp.asarray(speeds, jnp.float32),
+        size=jnp.tile(jnp.asarray(size, jnp.float32), (count, 1)),
+        goal=jnp.asarray(goals),
+        route=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
+        present=jnp.ones(count, bool) if present is None else jnp.asarray(present, bool),
+    )
+    log = Log(
+        position=jnp.tile(agents.position[:, None], (1, steps, 1)),
+        yaw=jnp.tile(agents.yaw[:, None], (1, steps)),
+        velocity=jnp.zeros((count, steps, 2), jnp.float32),
+        valid=jnp.ones((count, steps), bool),
+        dt=jnp.float32(0.1),
+    )
+    return Scene(
+        road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
+        weather=uniform(jnp.float32(0.0), jnp.int32(0)), others=unrecorded(steps), boxes=nobody(),
+    )

@@ -1,0 +1,137 @@
+"""Probe environments: the smallest tasks that each break on one fault of a learning algorithm.
+
+Each is an `Env` of one world whose body is one number an agent, the cue. The last of its three slots is never spawned, and pays poison.
+"""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+
+from scenefactory_jax.core.types import Env, Events, Facts, Motion, Outcome, Scene, State
+from scenefactory_jax.weather.friction import uniform
+
+AGENTS = 3
+SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0}
+PRESENT = jnp.array([True, True, False])
+POISON = 1e6
+
+NUMBERS = dict(
+    horizon=16,
+    epochs=4,
+    minibatches=4,
+    sample_share=1.0,
+    permutation="each_epoch",
+    learning_rate=3e-3,
+    desired_kl=None,
+    learning_rate_min=1e-5,
+    learning_rate_max=1e-2,
+    learning_rate_halved=None,
+    gamma=0.9,
+    gae_lambda=0.95,
+    clip=0.2,
+    value_clip=0.2,
+    entropy=0.0,
+    value=1.0,
+    max_grad_norm=1.0,
+    normalise_advantage=True,
+    initial_phase=False,
+    average=None,
+    episode_steps=1000,
+    shards=None,
+)
+
+SMALL = dict(
+    vector=[16],
+    rows={},
+    rows_default=[16],
+    trunk=[16],
+    activation="tanh",
+    mean_init=[0.0, 0.0, 0.0],
+    log_std_init=-0.7,
+    actor_head_scale=0.01,
+    dtype="float32",
+    kernels=True,
+)
+
+
+def blank(cls, **known):
+    """A struct of zeros wherever a probe has nothing to say."""
+
+    def zeros(kind):
+        if isinstance(kind, types.UnionType):  # what a scene may be without
+            return None
+        if dataclasses.is_dataclass(kind):
+            return blank(kind)
+        shape = tuple(int(size) if size.isdigit() else SIZES[size] for size in kind.dim_str.split())
+        return jnp.zeros(shape, next((d for d in (jnp.float32, jnp.int32, bool) if jnp.dtype(d).name in kind.dtypes), bool))
+
+    return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
+
+
+def scenes(worlds: int, task: int = 5) -> Scene:
+    """Scenes that hold nothing but the number of a probe."""
+    scene = blank(Scene, weather=uniform(jnp.float32(0.0), jnp.int32(task)))
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), scene)
+
+
+def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
+    """Agents whose cue is -1 or +1. Which of the five probes it is stands in the scene, so that all share one compilation.
+
+    | task | sees | lives | is paid | what it proves |
+    | 1 | 0 | 1 step | 1 | value |
+    | 2 | cue | 1 step | cue | value of what is seen |
+    | 3 | age | 2 steps | 1 in the second | discounting |
+    | 4 | 0 | 1 step | -(throttle - 0.5)^2 | action |
+    | 5 | cue | 1 step | -(throttle - 0.5 cue)^2 | action that depends on what is seen |
+    """
+
+    def pay(task, cue, action, age):
+        throttle, later = action[:, 0], (age == 1).astype(jnp.float32)
+        paid = [jnp.ones(AGENTS), cue, later, -((throttle - 0.5) ** 2), -((throttle - 0.5 * cue) ** 2)]
+        return jnp.stack(paid)[task - 1]
+
+    def see(task, cue, age):
+        return jnp.select([task == 2, task == 3, task == 5], [cue, age.astype(jnp.float32), cue], 0.0)
+
+    def start(key, scene, step=0):
+        cue_key, key = jax.random.split(key)
+        return State(
+            body=jax.random.rademacher(cue_key, (AGENTS,), jnp.float32),
+            motion=blank(Motion),
+            agents=dataclasses.replace(scene.agents, present=PRESENT),
+            weather=scene.weather,
+            active=PRESENT,
+            happened=blank(Events),
+            age=jnp.zeros(AGENTS, jnp.int32),
+            previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
+            step=jnp.asarray(step, jnp.int32),
+            key=key,
+        )
+
+    def transition(scene, state, action):
+        task = scene.weather.surface
+        paid = jnp.where(state.active, pay(task, state.body, jnp.clip(action, -1.0, 1.0), state.age), POISON)
+        done = state.active & (state.age + 1 >= (life or jnp.where(task == 3, 2, 1)))
+        after = dataclasses.replace(
+            state, active=state.active & ~done, age=state.age + 1, step=state.step + 1, previous_action=jnp.clip(action, -1.0, 1.0)
+        )
+        truncated = after.step >= episode_steps
+        over = truncated | ~jnp.any(after.active)
+        events = blank(Events, reached=done)
+        facts = blank(Facts, speed=jnp.where(state.active, 2.0, POISON))
+        return after, Outcome(None, paid, {"paid": paid}, events, done, truncated, over, facts)
+
+    def observe(scene, state):
+        return {"cue": jnp.where(state.active, see(scene.weather.surface, state.body, state.age), 0.0)[:, None]}
+
+    def reset(key, scene):
+        state = start(key, scene)
+        return state, observe(scene, state)
+
+    def step(scene, state, action):
+        state, outcome = transition(scene, state, action)
+        return state, dataclasses.replace(outcome, observation=observe(scene, state))
+
+    return Env(reset, step, start, transition, observe, lambda scene, state: scene)

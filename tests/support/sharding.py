@@ -1,0 +1,55 @@
+"""Runs in processes of its own: a few iterations of PPO on so many devices in so many shards; prints what was learnt as JSON.
+
+    python sharding.py DEVICES:SHARDS[,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+"""
+
+import itertools
+import json
+import sys
+
+import jax
+
+if len(sys.argv) > 2:
+    jax.distributed.initialize(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+
+import numpy as np
+
+from scenefactory_jax.core import sharding
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration
+from support.probes import NUMBERS, SMALL, probe, scenes
+
+WORLDS = 8
+OURS = ("jit(_iterate)", "jit(_swap)", "jit(spread)", "jit(exchanged)")  # the first two on one device, the others on several
+
+
+def learn(devices, shards):
+    """Parameters and metrics after three iterations, other scenes in half of the worlds between them; and what was compiled."""
+    mesh = sharding.mesh(devices)
+    numbers = {**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 6, "sample_share": 0.75, "shards": shards}
+    trainer = train_iteration.make(probe(life=5, episode_steps=6), late_fusion.make(**SMALL), **numbers, mesh=mesh)
+    stage = sharding.place(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
+    fresh = sharding.place(jax.tree.map(np.asarray, scenes(WORLDS // 2, task=2)), mesh)
+    compiled, history = [], []
+
+    def note(event, _, **of):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(of["fun_name"])
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    state = trainer.init(jax.random.key(3), stage)
+    for iteration in range(3):
+        if iteration:
+            state, stage = trainer.swap(state, stage, np.array([5, 1, 2, 4]) + iteration, fresh)
+        state, metrics = trainer.iterate(state, stage)
+        history.append({name: float(value) for name, value in metrics.items()})
+    jax.monitoring.unregister_event_duration_listener(note)
+    found = {"record": np.asarray(state.record.episodes).tolist(), "compiled": [name for name in compiled if name in OURS]}
+    state = trainer.restart(state, stage)
+    learnt = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(train_iteration.parameters_of(state))]
+    found |= {"devices": len(jax.devices()), "processes": jax.process_count()}
+    return {"parameters": [*itertools.chain(*learnt)], "metrics": history, **found}
+
+
+if __name__ == "__main__":
+    print("RESULT", json.dumps([learn(*map(int, pair.split(":"))) for pair in sys.argv[1].split(",")]), flush=True)

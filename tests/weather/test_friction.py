@@ -1,0 +1,202 @@
+"""Friction against the reference table, the published cells and the model's own differential equation; laws; drawing; config errors."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from support.hand_scenes import scene_of
+from support.running import ROOT, SHARED
+
+from scenefactory_jax.cli import physics as command
+from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.core import result_file
+from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.types import SURFACES
+from scenefactory_jax.weather import friction, road_condition
+from scenefactory_jax.weather.friction import uniform
+
+CONF = ROOT / "conf" / "weather"
+BASE = yaml.safe_load((CONF / "base.yaml").read_text())
+TYRE = friction.Tyre(**BASE["grip"]["tyre"])
+SURFACE = BASE["grip"]["surfaces"]
+FILMS = (0.0, 0.3, 0.5, 1.0, 2.0)
+PUBLISHED = {"AC": (1.105, 0.959, 0.859, 0, 0), "SMA": (1.204, 1.046, 0.937, 0, 0), "OGFC": (1.337, 1.162, 1.041, 0, 0)}
+
+
+@jax.jit
+def mu_of(speed, film, theta, texture, slip):
+    return friction.friction(speed, film, theta, texture, slip, tyre=TYRE)
+
+
+def grip_of(**numbers):
+    return build({**BASE["grip"], **numbers}, builtins=friction, where="weather.grip")
+
+
+@pytest.mark.parametrize(("column", "slip"), [("mu_static_ss", 0.15), ("mu_dynamic_ss", 0.80)])
+def test_friction_matches_the_reference_table(column, slip):
+    table = SHARED.parent / "reference" / "friction_golden.csv"
+    if not table.is_file():
+        pytest.skip(f"needs the reference table {table}")
+    rows = list(csv.DictReader(table.open()))
+    speed, film, theta, texture, wanted = (
+        jnp.array([float(row[name]) for row in rows], jnp.float32) for name in ("speed_mps", "film_mm", "theta", "texture_mm", column)
+    )
+    assert len(rows) == 2280
+    np.testing.assert_allclose(mu_of(speed, film, theta, texture, jnp.full_like(speed, slip)), wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_friction_matches_the_published_cells_to_the_printed_digit(name):
+    film = jnp.array(FILMS)
+    full = lambda x: jnp.full_like(film, x)  # noqa: E731
+    mu = mu_of(full(13.89), film, full(SURFACE[name]["theta"]), full(SURFACE[name]["texture_mm"]), full(0.15))
+    np.testing.assert_allclose(mu, PUBLISHED[name], atol=5e-4)
+
+
+@pytest.mark.parametrize(("film", "slip"), [(0.0, 0.15), (0.3, 0.15), (0.5, 0.8), (0.8, 0.05)])
+def test_closed_form_is_where_the_bristle_comes_to_rest(film, slip):
+    speed, dt, z = 13.89, 1e-4, 0.0
+    theta, texture = SURFACE["SMA"]["theta"], SURFACE["SMA"]["texture_mm"]
+    args = (jnp.float32(speed), jnp.float32(film))
+    y_r = float(friction.spacing(*args, jnp.float32(texture), tyre=TYRE))
+    contact = theta * y_r - float(friction.lift(*args, tyre=TYRE))
+    b1, b2, b3, b4 = TYRE.stribeck_velocity
+    stribeck = b1 * np.exp(b2 * film + b3) + b4
+    g = TYRE.coulomb + (TYRE.static - TYRE.coulomb) * np.exp(-np.sqrt(slip * speed / stribeck))
+    pull = TYRE.bristle_stiffness * slip * speed / g + 7 / (6 * TYRE.patch_length) * (1 + slip) * speed
+    for _ in range(5000):  # 0.5 s of dz/dt = v_r - theta Y_R (sigma0 v_r / g + K w_r) z
+        z += dt * (slip * speed - theta * y_r * pull * z)
+    wanted = contact * theta * y_r * TYRE.bristle_stiffness * z
+    got = mu_of(*(jnp.float32(x) for x in (speed, film, theta, texture, slip)))
+    assert float(got) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_friction_falls_with_water_and_speed():
+    film, speed = jnp.linspace(0.0, 3.0, 61), jnp.linspace(1.0, 40.0, 40)
+    one = jnp.ones
+    by_film = mu_of(13.89 * one(61), film, one(61), 0.65 * one(61), 0.15 * one(61))
+    by_speed = mu_of(speed, 0.5 * one(40), one(40), 0.65 * one(40), 0.15 * one(40))
+    assert (np.diff(by_film) <= 1e-6).all() and (np.diff(by_speed) < 0).all()
+    assert ((by_film >= 0) & (by_film < 1.5)).all()
+
+
+def test_gradients_are_finite_at_rest_on_dry_roads_and_beyond_the_cliff():
+    slope = jax.jit(jax.vmap(jax.grad(lambda v, h, s: mu_of(v, h, jnp.float32(1.0), jnp.float32(0.65), s), argnums=(0, 1, 2))))
+    speed, film = jnp.meshgrid(jnp.array([0.0, 1e-12, 1e-3, 13.89, 60.0]), jnp.array([0.0, 1e-20, 1e-6, 0.3, 0.8, 0.805, 1.0, 1e3]))
+    for slip in (0.0, 0.15):
+        for part in slope(speed.ravel(), film.ravel(), jnp.full(speed.size, slip)):
+            assert jnp.isfinite(part).all()
+
+
+@pytest.mark.parametrize("mode", ["static", "dynamic", "speed"])
+def test_grip_modes(mode):
+    condition = uniform(jnp.float32(0.3), jnp.int32(1))
+    speed = jnp.array([[0.0, 5.0, 13.89, 30.0]] * 2)
+    mu = jax.jit(grip_of(mode=mode))(condition, jnp.zeros((2, 4, 2)), speed)
+    assert mu.shape == (2, 4) and mu.dtype == jnp.float32
+    if mode == "speed":
+        assert (np.diff(mu) < 0).all() and mu[0, 0] < 1.6
+        assert mu[0, 2] == pytest.approx(1.046, abs=1e-3)
+    else:
+        np.testing.assert_allclose(mu, {"static": 1.046, "dynamic": 0.905}[mode], atol=1e-3)
+
+
+def test_the_floor_holds_where_the_tyre_floats():
+    mu = grip_of()(uniform(jnp.float32(2.0), jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
+    np.testing.assert_allclose(mu, 1e-3)
+
+
+def test_draw_follows_the_weights_and_keep_keeps():
+    cases = [
+        {"surface": "AC", "film_mm": 0.0, "weight": 3.0},
+        {"surface": "OGFC", "film_mm": 0.5, "weight": 1.0},
+        {"surface": "SMA", "film_mm": 9.0, "weight": 0.0},
+    ]
+    scene = scene_of([[0, 0]], [[1, 0]])
+    drawn = jax.vmap(lambda key: road_condition.draw(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
+    assert set(np.unique(drawn.surface)) == {0, 2}
+    assert float((drawn.surface == 0).mean()) == pytest.approx(0.75, abs=0.03)
+    np.testing.assert_array_equal(drawn.film_mm == 0.5, drawn.surface == 2)
+    assert road_condition.keep(jax.random.key(0), scene) is scene.weather
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"mode": "wet"}, "weather.grip.mode"),
+        ({"tyre": {**BASE["grip"]["tyre"], "wdith": 1.0}}, "tyre.wdith"),
+        ({"tyre": {k: v for k, v in BASE["grip"]["tyre"].items() if k != "load"}}, "tyre.load"),
+        ({"surfaces": {"AC": SURFACE["AC"]}}, "SMA"),
+        ({"surfaces": {**SURFACE, "AC": {"theta": 1.0}}}, "surfaces.AC.texture_mm"),
+        ({"floor": 0.0}, "weather.grip.floor: 0; wanted is a number above 0"),
+        ({"slip_static": -0.15}, "weather.grip.slip_static: -0.15; wanted is a number of at least 0"),
+        ({"reference_speed": -1.0}, "weather.grip.reference_speed"),
+        ({"tyre": {**BASE["grip"]["tyre"], "load": -3469.0}}, "weather.grip.tyre.load"),
+        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"weather.grip.tyre.stribeck_velocity\[3\]"),
+        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, "stribeck_velocity: .*; wanted are b1, b2, b3, b4"),
+        ({"surfaces": {**SURFACE, "ICE": {"theta": 0.1, "texture_mm": 0.0}}}, "weather.grip.surfaces.ICE.texture_mm"),
+    ],
+)
+def test_grip_refuses_by_name(change, named):
+    """When it is made, as an environment does, not when it is first asked."""
+    with pytest.raises(ConfigError, match=named):
+        friction.make({**BASE["grip"], **change})
+
+
+@pytest.mark.parametrize(
+    ("case", "named"),
+    [
+        ({"surface": "MUD", "film_mm": 0.0, "weight": 1.0}, "AC, SMA, OGFC"),
+        ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
+        ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
+        ({"surface": "AC", "weight": 1.0}, "film_mm"),
+        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: nan; wanted is a finite number of at least 0"),
+    ],
+)
+def test_draw_refuses_by_name(case, named):
+    with pytest.raises(ConfigError, match=named):
+        road_condition.draw(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
+
+
+@pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
+def test_every_shipped_weather_draws_a_drivable_road(name):
+    config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    draw = build({**BASE["draw"], **config["draw"]}, builtins=road_condition, where="weather.draw")
+    scene = scene_of([[0, 0]], [[1, 0]])
+    drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
+    mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
+    assert mu.min() > 0.5 and mu.max() < 1.4
+
+
+@pytest.mark.parametrize(("name", "least"), [("mixed", "0.80"), ("winter", "0.1")])
+def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
+    text = (CONF / f"{name}.yaml").read_text()
+    cases = yaml.safe_load(text)["draw"]["cases"]
+    roads = [uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
+    mu = [float(grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0]) for road in roads]
+    assert (min(mu), max(mu)) == pytest.approx((float(least), 1.10), abs=0.006)
+    assert f"friction 1.10 down to {least}" in text.splitlines()[0]
+    assert "between 0.80 and 1.10" in (ROOT / "conf" / "study" / "friction.yaml").read_text()
+
+
+def test_the_command_tells_what_the_model_says(tmp_path):
+    found = command.weather(load("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
+    for name, row in PUBLISHED.items():
+        wanted = [mu for film, mu in zip(FILMS, row, strict=True) if film in (0.0, 0.3, 1.0)]
+        np.testing.assert_allclose(found["table"][name]["static"], wanted, atol=1e-3)
+    assert found == result_file.read(tmp_path / "weather.json") and (tmp_path / "weather.png").is_file()
+    text = (tmp_path / "weather.md").read_text()
+    assert "| AC | 1.105 (1.144) | 0.959 (0.830) | 0.000 (0.000) |" in text and "| SMA | 1.204 / 1.204 | 1.046 / 1.046 |" in text
+    with pytest.raises(ConfigError, match=r"slips: \[0.5, 0.1\]; wanted is \[least, most\]"):
+        command.weather(load("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
+
+
+def test_what_is_committed_is_what_the_model_says(tmp_path):
+    committed = result_file.read(ROOT / "experiments" / "weather" / "weather.json")
+    found = command.weather(load("weather", f"out={tmp_path}"))
+    for name, row in committed["table"].items():
+        for kind in row:
+            np.testing.assert_allclose(found["table"][name][kind], row[kind], atol=1e-4)
