@@ -2,11 +2,11 @@
 
     import jax, scenefactory_jax as sf
 
-    config = sf.load("train", "experiment=demo")    # the same config as on the command line
+    config = sf.load_config("train", "experiment=demo")    # the same config as on the command line
     env = sf.make(config)                           # pure functions for one world: env.reset, env.step (one action)
     scenes = sf.load_scenes(config["scenes"])       # worlds stacked along the first axis
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
-    run = sf.train(config)                          # and sf.evaluate(sf.load("evaluate", f"run={run.folder}"))
+    run = sf.train(config)                          # and sf.evaluate(sf.load_config("evaluate", f"run={run.folder}"))
 
 Everything under `run/` (`train`, `evaluate`, `replay`, `convert`, `render`) takes such a config.
 """
@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
     from mujoco import mjx as _mjx  # noqa: F401
 
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.loading.raw_scenes import read
-from scenefactory_jax.data.loading.scene_source import training as load_scenes
-from scenefactory_jax.env.environment import Parts, assemble, make
+from scenefactory_jax.data.loading.scene_source import load_training_scenes as load_scenes
+from scenefactory_jax.env.environment import EnvParts, assemble
+from scenefactory_jax.env.environment import make_env as make
 
 if TYPE_CHECKING:
     from scenefactory_jax.cli.view import replay
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
     from scenefactory_jax.learning.training_loop import train
 
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "Parts", "__version__", "assemble", "evaluate", "load", "load_policy", "load_scenes", "make", "read", "replay"]
+__all__ = ["ConfigError", "EnvParts", "__version__", "assemble", "evaluate", "load_config", "load_policy", "load_scenes"]
+__all__ += ["make", "read", "replay"]
 __all__ += ["train"]
 
 

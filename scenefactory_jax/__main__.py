@@ -16,7 +16,7 @@ import hydra
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 
 USAGE = f"""usage: python -m scenefactory_jax COMMAND [key=value ...] [-m] [--help] [--cfg job]
 
@@ -80,9 +80,9 @@ def _run(command: str, arguments: Sequence[str]) -> None:
         configs.load_with_choices(command, *configs.as_overrides(flags))
     elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
         varied = _check(command, configs.as_overrides(flags), sweeps=flags.multirun)
-    sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quoted, arguments)]
+    sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quote_override, arguments)]
     name = flags.config_name or command
-    hydra.main(version_base="1.3", config_path=str(configs.folder()), config_name=name)(_job(command, varied))()
+    hydra.main(version_base="1.3", config_path=str(configs.find_conf()), config_name=name)(_job(command, varied))()
 
 
 def _help(command: str, settings: Sequence[str]) -> str:
@@ -92,13 +92,13 @@ def _help(command: str, settings: Sequence[str]) -> str:
     purpose, keys = re.findall(rf"^  {command} +(.*?) +(\S+=.*)$", USAGE, re.MULTILINE)[0]
     chosen = ["study=navigation"] if command == "study" and not any(word.startswith("study=") for word in settings) else []
     last = "KEY=VALUE on the command line sets any of these; --cfg job shows what a command line gives, --hydra-help Hydra's own flags."
-    return f"{command}: {purpose}; {keys}\n\n{annotated_config.write(command, *chosen, *settings)}\n\n{last}"
+    return f"{command}: {purpose}; {keys}\n\n{annotated_config.annotate(command, *chosen, *settings)}\n\n{last}"
 
 
 def _check(command: str, settings: Sequence[str], *, sweeps: bool) -> set[str]:
     """The keys that vary in a sweep. A wrong key is explained here, with the valid ones; and no two jobs may judge into one folder."""
     if not sweeps:
-        configs.load(command, *settings)
+        configs.load_config(command, *settings)
         return set()
     first, varied = configs.sweep(settings)
     out = next((word for word in settings if word.startswith("out=")), "")
@@ -106,14 +106,14 @@ def _check(command: str, settings: Sequence[str], *, sweeps: bool) -> set[str]:
     if command == "evaluate" and varied and not apart:
         raise ConfigError("out: the jobs of this sweep would write to one folder; give each its own: 'out=${run}/judged-${hydra:job.num}'")
     if not any("${hydra:" in word for word in settings):  # it is known within a job alone
-        configs.load(command, *first)
+        configs.load_config(command, *first)
     return varied
 
 
 def _end(error: Exception | str) -> NoReturn:
     """One line on stderr, and exit code 2."""
     text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
-    print("\n".join(map(for_terminal, f"error: {text}".split("\n"))), file=sys.stderr)
+    print("\n".join(map(escape_for_terminal, f"error: {text}".split("\n"))), file=sys.stderr)
     raise SystemExit(2) from None
 
 
@@ -123,9 +123,9 @@ def _job(command: str, varied: set[str]):
     def job(config) -> None:
         module = importlib.import_module(MODULES.get(command, f"scenefactory_jax.cli.{command}"))
         try:
-            settings = configs.plain(config)
+            settings = configs.to_dict(config)
             if command == "train" and varied and settings["out"] is None:
-                settings["out"] = str(module.train_folder.fresh(settings["name"], configs.changes(varied)))
+                settings["out"] = str(module.train_folder.fresh(settings["name"], configs.format_changes(varied)))
             getattr(module, command)(settings)
         except BrokenPipeError:
             raise
@@ -145,7 +145,7 @@ def _trouble(error: Exception, config) -> str | None:
     """What the machine or a library lacks, in one line; imported when there is trouble."""
     from scenefactory_jax.cli import error_messages
 
-    return error_messages.explain(error, configs.plain(config))
+    return error_messages.explain_error(error, configs.to_dict(config))
 
 
 if __name__ == "__main__":

@@ -21,13 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from scenefactory_jax.adapters import episodes, flat
+from scenefactory_jax.adapters import episodes, flatten_observation
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.hydra_config import versions
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.pytree import choose
+from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import agent_metrics
@@ -60,8 +60,8 @@ def measure(config: Mapping[str, Any]) -> list[dict[str, Any]]:
     scene_source.use_compilation_cache()
     rows = []
     alone = config["scenes"]["pack"]["agents"] == 1
-    for settings in (config,) if alone else (config, configs.amend(config, [ALONE])):
-        scenes = scene_source.training(settings["scenes"])
+    for settings in (config,) if alone else (config, configs.apply_overrides(config, [ALONE])):
+        scenes = scene_source.load_training_scenes(settings["scenes"])
         for case in _cases(settings, scenes):
             rows.append(_row(case, rows, horizon=config["ppo"]["horizon"], warmup=config["warmup"], repeats=config["repeats"]))
             print(f"{rows[-1]['name']}: {rows[-1]['per_s']:,.0f} steps/s", flush=True)
@@ -111,15 +111,18 @@ def _cases(config: Mapping[str, Any], scenes: scene_source.Scenes) -> Iterator[C
 
 
 def _own(config: Mapping[str, Any], scenes: scene_source.Scenes, actions: np.ndarray) -> Stepped:
-    env, held = environment.make(config), scene_source.assign(scenes, len(actions), seed=config["seed"])[0]
+    env, held = environment.make_env(config), scene_source.assign_scenes(scenes, len(actions), seed=config["seed"])[0]
 
     def step(held: Any, carry: Any) -> tuple[Any, Any]:
         states, given, key = carry
         start_key, key = jax.random.split(key)
         after, outcome = jax.vmap(env.transition)(held, states, given)
         fresh = jax.vmap(env.start)(jax.random.split(start_key, len(given)), held)
-        states = choose(outcome.over, fresh, after)
-        return (states, given, key), (jax.vmap(lambda scene, state: flat(env.observe(scene, state)))(held, states), outcome.reward)
+        states = tree_where(outcome.over, fresh, after)
+        return (states, given, key), (
+            jax.vmap(lambda scene, state: flatten_observation(env.observe(scene, state)))(held, states),
+            outcome.reward,
+        )
 
     states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), len(actions)), held)
     return step, held, (states, jnp.asarray(actions), jax.random.key(config["seed"]))
@@ -251,6 +254,6 @@ def adapters(config: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 if __name__ == "__main__":
     try:
-        adapters(configs.load("bench", *sys.argv[1:]))
+        adapters(configs.load_config("bench", *sys.argv[1:]))
     except ConfigError as error:
         raise SystemExit(f"error: {error}") from None

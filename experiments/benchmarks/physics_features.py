@@ -12,7 +12,7 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Scene, Tracks
+from scenefactory_jax.core.types import Scene, TrafficLog
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import phase_timing
 
@@ -56,18 +56,18 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     }
     columns = {name: jnp.asarray(column, jnp.float32) for name, column in columns.items()}
     columns |= {"valid": jnp.ones((*shape, steps), bool), "kind": jnp.zeros(shape, jnp.int32)}
-    tracks = jax.vmap(lambda columns: Tracks(**columns))(columns)
+    tracks = jax.vmap(lambda columns: TrafficLog(**columns))(columns)
     return replace(worlds, others=tracks)
 
 
 def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, seed: int) -> dict[str, Any]:
     """One variant: compiled, warmed up, and the median of several timed scans."""
-    parts = environment.parts_of(configs.load("task", *overrides))
+    parts = environment.make_parts(configs.load_config("task", *overrides))
     env = environment.assemble(parts)
     slots = worlds.agents.present.shape
     states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(seed), slots[0]), worlds)
-    run = phase_timing.acting("physics", parts, env, steps=steps)
-    found = phase_timing.timed(run, states, lambda repeat: (worlds, jax.random.key(repeat)), warmup=1, repeats=repeats)
+    run = phase_timing.make_acting_phase("physics", parts, env, steps=steps)
+    found = phase_timing.time_phase(run, states, lambda repeat: (worlds, jax.random.key(repeat)), warmup=1, repeats=repeats)
     done = slots[0] * slots[1] * steps
     return {
         "per_s": done / found.median,

@@ -25,8 +25,8 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
     """
     if config["scope"] != "training":
         raise ConfigError(f"stream: scenes are exchanged while training; scope={config['scope']} has stream=none")
-    trainer = make_trainer(config, environment.make(config), make_policy(config), mesh=mesh)
-    with stream.flowing(config, mesh=mesh, before=None) as flow:
+    trainer = make_trainer(config, environment.make_env(config), make_policy(config), mesh=mesh)
+    with stream.open_stream(config, mesh=mesh, before=None) as flow:
         scenes = flow.scenes()
         state = trainer.init(jax.random.key(config["seed"]), scenes)
         begun = time.perf_counter()

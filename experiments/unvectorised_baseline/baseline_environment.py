@@ -35,7 +35,7 @@ from experiments.unvectorised_baseline import baseline_agent as one
 from experiments.unvectorised_baseline.baseline_agent import Agent, Crowd, Observation, Place
 from experiments.validation import engines
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import parameters as cars
@@ -47,7 +47,7 @@ PHASES = ("policy", "physics", "facts + rewards + ends", "restart", "observation
 class Engine(NamedTuple):
     """Cars of the C engine."""
 
-    rig: Callable[[int], mujoco_c.Rig]  # of so many cars; compiled once for each number
+    rig: Callable[[int], mujoco_c.CEngineCars]  # of so many cars; compiled once for each number
     still: Float[np.ndarray, "17"]  # qpos at rest
     substeps: int
     apart_m: float  # between cars off stage, and of them from the road: the side of a world's square
@@ -72,7 +72,7 @@ class World:
 
     scene: Scene  # numpy leaves
     place: Place
-    rig: mujoco_c.Rig
+    rig: mujoco_c.CEngineCars
     agents: list[Agent]  # of the slots that are present, as the rig's cars
     mu: float  # friction under every wheel
     step: int = 0
@@ -161,7 +161,7 @@ def make(config: Mapping[str, Any]) -> Task:
         ConfigError: a part that exists for the vectorised environment only, by name.
     """
     _refuse(config)
-    bound = functools.partial(build, builtins=one)
+    bound = functools.partial(instantiate, builtins=one)
     entries = {name: entry for name, entry in config["observe"].items() if entry is not None}
     groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
     terms = []
@@ -169,8 +169,8 @@ def make(config: Mapping[str, Any]) -> Task:
         if entry is not None:
             numbers = {key: value for key, value in entry.items() if key != "weight"}
             terms.append((entry["weight"], bound(numbers, where=f"reward.{name}")))
-    parts = device.parts_of(config)
-    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    parts = device.make_parts(config)
+    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
 
     def draw(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Any, Any]:
         agents_key, weather_key, _ = jax.random.split(key, 3)  # the draws of `world.make`
@@ -199,7 +199,7 @@ def _refuse(config: Mapping[str, Any]) -> None:
     dynamics, weather = config["dynamics"], config["weather"]
     if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
-    if config["controls"] != {"command": {"_target_": "pedals"}, "every": 1}:
+    if config["controls"] != {"command": {"_target_": "separate_pedals"}, "every": 1}:
         raise ConfigError(f"controls: {config['controls']}; the baseline has pedals, read at every control step")
     if config["others"]["_target_"] != "ignore":
         raise ConfigError(f"others._target_: {config['others']['_target_']}; the baseline has ignore")
@@ -215,17 +215,17 @@ def _refuse(config: Mapping[str, Any]) -> None:
 
 def _engine(config: Mapping[str, Any]) -> Engine:
     """The articulated car with Newton's method; `solve.newton` is the same for one car on the device."""
-    car, solver = cars.numbers(config["dynamics"])
+    car, solver = cars.read_parameters(config["dynamics"])
     newton = dataclasses.replace(solver, algorithm="Newton")
     timing = config["timing"]
     limits = {"physics_dt": 1.0 / timing["physics_hz"], "iterations": solver.iterations, "line_search": solver.line_search}
     # the spring law of two cars in MuJoCo's terms, with the impedance that validation has found to be it
-    impedance = configs.load("validate")["validation"]["encounters"]["impedances"]["spring"]
+    impedance = configs.load_config("validate")["validation"]["encounters"]["impedances"]["spring"]
     touch = engines.touch(config["dynamics"], impedance=impedance)
-    alone = mujoco_c.single(car, newton, **limits)
+    alone = mujoco_c.simulate_one(car, newton, **limits)
     return Engine(
-        rig=functools.cache(lambda count: mujoco_c.meeting(car, newton, touch, count=count, **limits)),
-        still=cars.rest(alone.model, car),
+        rig=functools.cache(lambda count: mujoco_c.make_encounter(car, newton, touch, count=count, **limits)),
+        still=cars.find_rest_pose(alone.model, car),
         substeps=round(timing["physics_hz"] / timing["control_hz"]),
         apart_m=config["facts"]["box_m"],
     )
@@ -275,7 +275,7 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
             rig.qpos[row], rig.qvel[row] = engine.still, 0.0
             rig.qpos[row, :3] = engine.apart_m * (row + 1), 0.0, engine.apart_m
     force = mujoco_c.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
-    if mujoco_c.broken(rig):
+    if mujoco_c.is_broken(rig):
         rig.qpos[:] = np.nan
     world.step += 1
     for row, agent in enumerate(world.agents):
@@ -284,7 +284,7 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
             agent.age += 1
 
 
-def _read(rig: mujoco_c.Rig, row: int, agent: Agent, contact_force: float) -> None:
+def _read(rig: mujoco_c.CEngineCars, row: int, agent: Agent, contact_force: float) -> None:
     """What the rest of the world may know of a car of the rig."""
     x, y, z, qw, qx, qy, qz = (float(value) for value in rig.qpos[row, :7])
     agent.position, agent.elevation = np.array([x, y], np.float32), z

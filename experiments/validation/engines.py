@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from experiments.validation.encounters import Encounters
 from experiments.validation.random_drives import PATTERNS, Sequences
-from scenefactory_jax.core.instantiate import build
-from scenefactory_jax.core.track_interpolation import nobody, unrecorded
-from scenefactory_jax.core.types import Agents, Dynamics, Log, Road, Scene, Weather
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
+from scenefactory_jax.core.types import AgentLog, Agents, Dynamics, Road, Scene, Weather
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import parameters as cars
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.weather.friction import make_uniform
 
 
 class Run(NamedTuple):
@@ -55,7 +55,7 @@ def dynamics(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, 
     """The backend of a config, on roads whose friction the cases say."""
     road = functools.partial(grip, slippery=slippery, friction_min=friction_min)
     context = {"grip": road, "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
-    return build(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+    return instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 def scenes(
@@ -87,9 +87,9 @@ def scenes(
             present=jnp.ones(count, bool),
         )
         none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
-        log = Log(position=place[:, None], yaw=heading[:, None], **none)
-        alone = {"others": unrecorded(1), "boxes": nobody()}
-        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=uniform(mu, row), **alone)
+        log = AgentLog(position=place[:, None], yaw=heading[:, None], **none)
+        alone = {"others": make_empty_log(1), "boxes": make_empty_boxes()}
+        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=make_uniform(mu, row), **alone)
 
     place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))
     return jax.vmap(world)(place, heading, pace, mu, jnp.asarray(pattern, jnp.int32), road())
@@ -117,7 +117,7 @@ def drive(
     entry: Mapping[str, Any], cases: Sequences, *, physics_hz: float, control_hz: float, slippery: float, friction_min: float
 ) -> Run:
     """Single cars on the batched path."""
-    car, _ = cars.numbers(entry)
+    car, _ = cars.read_parameters(entry)
     backend = dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, slippery=slippery, friction_min=friction_min)
     count = len(cases.speed)
     zero = np.zeros((count, 1), np.float32)
@@ -128,7 +128,7 @@ def drive(
 
 def meet(entry: Mapping[str, Any], cases: Encounters, *, physics_hz: float, control_hz: float) -> Run:
     """Encounters on the batched path."""
-    car, _ = cars.numbers(entry)
+    car, _ = cars.read_parameters(entry)
     backend = dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, slippery=1.0, friction_min=0.0)
     even = np.zeros(len(cases.kind), np.int32)
     worlds = scenes(cases.position, cases.yaw, cases.speed, cases.friction, even, size=(car.length, car.width))
@@ -155,10 +155,10 @@ def drive_c(
         nudge: added to the start speed, m/s; two runs that differ in it tell how sensitive the drives themselves are.
         iterations: of the solver, and `line_search`: enough to converge, or as few as a setting has.
     """
-    car, solver = cars.numbers(entry)
+    car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
-    rig = mujoco_c.single(car, dataclasses.replace(solver, algorithm="Newton"), **settings)
-    still, substeps = cars.rest(rig.model, car), round(physics_hz / control_hz)
+    rig = mujoco_c.simulate_one(car, dataclasses.replace(solver, algorithm="Newton"), **settings)
+    still, substeps = cars.find_rest_pose(rig.model, car), round(physics_hz / control_hz)
     mu = wheel_friction(jnp.asarray(cases.friction), jnp.asarray(cases.pattern), slippery=slippery, friction_min=friction_min)
     mu = friction_scale * np.asarray(mu, np.float64)
     paths = []
@@ -186,23 +186,23 @@ def meet_c(
         impedance: of the contact between the cars, see `oracle.meeting`.
         nudge: added to both cars' start speeds, m/s.
     """
-    car, solver = cars.numbers(entry)
+    car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
     newton = dataclasses.replace(solver, algorithm="Newton")
-    rig = mujoco_c.meeting(car, newton, touch(entry, impedance=impedance), **settings)
-    still, substeps = cars.rest(mujoco_c.single(car, newton, **settings).model, car), round(physics_hz / control_hz)
+    rig = mujoco_c.make_encounter(car, newton, touch(entry, impedance=impedance), **settings)
+    still, substeps = cars.find_rest_pose(mujoco_c.simulate_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
     paths, first = [], []
     for index in range(len(cases.kind)):
         position, yaw, speed = (x[index].astype(float) for x in (cases.position, cases.yaw, cases.speed))
         mujoco_c.place(rig, still, position, yaw, speed + nudge)
         mu = np.full((2, 4), float(cases.friction[index]))
-        story = mujoco_c.meet(rig, cases.controls[index].astype(float), mu, substeps=substeps)
+        story = mujoco_c.simulate_encounter(rig, cases.controls[index].astype(float), mu, substeps=substeps)
         paths.append([*story.path, story.contact_force])
         first.append(story.first_contact_s)
     return Run(*(np.array(column) for column in zip(*paths, strict=True))), np.array(first)
 
 
-def touch(entry: Mapping[str, Any], *, impedance: float) -> mujoco_c.Touch:
+def touch(entry: Mapping[str, Any], *, impedance: float) -> mujoco_c.ContactParameters:
     """The contact between cars that a config's dynamics has, for the C engine."""
     contact = entry["contact"]
-    return mujoco_c.Touch(contact["stiffness"], contact["damping"], contact["friction"], impedance)
+    return mujoco_c.ContactParameters(contact["stiffness"], contact["damping"], contact["friction"], impedance)

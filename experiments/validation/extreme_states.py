@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from experiments.validation import engines
 from experiments.validation.equivalence import SPIN
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Boxes, Dynamics, Scene
 from scenefactory_jax.dynamics.articulated import equations_of_motion, randomization
@@ -113,7 +113,7 @@ def run(
             height at rest), of the ground over `lowest`, of `acceleration` (m/s^2) and of `gain`.
     """
     crowd = [*cases, *(Case(f"heap of {heap} cars at one place") for _ in range(heap))]
-    car, _ = cars.numbers(entry)
+    car, _ = cars.read_parameters(entry)
     backend = _backend(entry, crowd, car, physics_hz=physics_hz, control_hz=control_hz)
     scene, start, lanes = _begin(backend, crowd, car, heap=heap, wall_m=wall_m)
     qpos, qvel = _drive(backend, scene, start, _actions(crowd, round(seconds * control_hz), round(hold_s * control_hz)))
@@ -148,7 +148,7 @@ def _backend(entry: Mapping[str, Any], crowd: Sequence[Case], car: CarParameters
     high = [car.mass_height if case.mass_height is None else case.mass_height for case in crowd]
     changed = {**entry, "fleet": {"_target_": f"{__name__}.heights", "mass_height": high}}
     context = {"grip": lambda weather, position, speed: jnp.asarray(mu), "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
-    return build(changed, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+    return instantiate(changed, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 def _begin(
@@ -243,7 +243,7 @@ def _judge(
 
 def energy(car: CarParameters, qpos: Float[np.ndarray, "T 17"], qvel: Float[np.ndarray, "T 16"]) -> Float[np.ndarray, " T"]:
     """Mechanical energy over the ground, J: the whole mass at the box's centre, the chassis' and the wheels' rotation."""
-    mass = equations_of_motion.mass(car)
+    mass = equations_of_motion.total_mass(car)
     moving = 0.5 * mass * (qvel[:, :3] ** 2).sum(-1) + mass * cars.GRAVITY * qpos[:, 2]
     turning = 0.5 * (np.asarray(car.inertia) * qvel[:, 3:6] ** 2).sum(-1)
     return moving + turning + 0.5 * car.wheel_inertia[0] * (qvel[:, SPIN] ** 2).sum(-1)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Env, Outcome, Scene, State
+from scenefactory_jax.core.types import Env, Scene, State, StepResult
 from scenefactory_jax.learning.ppo.train_iteration import Trainer
 
 STEERING = np.array([8, 11])  # the steering hinges in a car's qpos
@@ -92,8 +92,8 @@ def player(env: Env, *, seed: int) -> Play:
     """A compiled run of all worlds: states and outcomes of every step."""
 
     @jax.jit
-    def play(scenes: Scene, actions: Array, harm: Harm) -> tuple[State, Outcome]:
-        def step(worlds: State, now: tuple[Array, Harm]) -> tuple[State, tuple[State, Outcome]]:
+    def play(scenes: Scene, actions: Array, harm: Harm) -> tuple[State, StepResult]:
+        def step(worlds: State, now: tuple[Array, Harm]) -> tuple[State, tuple[State, StepResult]]:
             action, harm = now
             worlds, action = jax.vmap(hurt)(worlds, action, harm)
             worlds, outcome = jax.vmap(env.step)(scenes, worlds, action)

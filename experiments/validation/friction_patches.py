@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from experiments.validation import engines, motion_laws
 from experiments.validation.motion_laws import FULL_BRAKE, Trace
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches, Scene
 
@@ -71,8 +71,8 @@ def patches(
         circle of the dry one, m. `split`: for ice on the left, on the right and on no side the yaw [3, T] and the way aside.
     """
     context = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
-    road = build(grip, builtins="scenefactory_jax.weather.friction", where="weather.grip")
-    backend = build(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
+    road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
     run = motion_laws.tracer(backend, control_hz=control_hz, width=6)
     size = motion_laws.footprint(entry)
     spot = [(ahead_m, 0.0), (ahead_m, 0.0)]

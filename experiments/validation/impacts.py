@@ -149,9 +149,9 @@ def balance(
     control_hz: float,
 ) -> Balance:
     """Momentum and energy that the two cars together gained or lost between two control steps."""
-    car, solver = cars.numbers(entry)
+    car, solver = cars.read_parameters(entry)
     touch = engines.touch(entry, impedance=0.5)  # no contact force enters here
-    rig = mujoco_c.meeting(car, solver, touch, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
+    rig = mujoco_c.make_encounter(car, solver, touch, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mass = float(rig.model.body_subtreemass[0])
     momentum, angular, lost = [], [], []
     for case, (start, end) in enumerate(zip(before, after, strict=True)):

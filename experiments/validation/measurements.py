@@ -9,7 +9,7 @@ import numpy as np
 from experiments.validation import encounters as meetings
 from experiments.validation import engines, equivalence, extreme_states, friction_patches, impacts, motion_laws, random_drives
 from experiments.validation.engines import Run
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 Spread = Callable[..., Any]  # (function, cases) -> what the function makes of all cases, computed in pieces
@@ -17,7 +17,7 @@ Spread = Callable[..., Any]  # (function, cases) -> what the function makes of a
 
 def bound(entry: Mapping[str, Any], module: Any, function: str, where: str, **context: Any) -> Callable[..., Any]:
     """Numbers of the config bound to a function of this package, refused by name where they do not fit."""
-    return build({**entry, "_target_": function}, builtins=module, where=where, **context)
+    return instantiate({**entry, "_target_": function}, builtins=module, where=where, **context)
 
 
 def _sequences(config: Mapping[str, Any], count: int, **changes: Any) -> random_drives.Sequences:
@@ -158,7 +158,7 @@ def _impacts(seen: impacts.Impacts, cases: meetings.Encounters, most: int) -> di
 def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Every backend against the laws that it is meant to obey, and the car on patches of the real weather."""
     settings, rates = config["validation"]["laws"], _rates(config)
-    car, _ = cars.numbers(config["dynamics"])
+    car, _ = cars.read_parameters(config["dynamics"])
     speed = settings["stopping"]["speed"]
     on_patches = bound(settings["patches"], friction_patches, "patches", "validation.laws.patches", **rates)
     return {
@@ -194,7 +194,7 @@ def _obeys(
     found: dict[str, Any] = {law: experiment(law)(drive) for law in ("stopping", "standing", "cornering")}
     if "car" not in entry:
         return found
-    car, _ = cars.numbers(entry)
+    car, _ = cars.read_parameters(entry)
     found |= {"split": experiment("split")(drive), "ride": experiment("ride")(drive, car), "rolling": experiment("rolling")(drive, entry)}
     if name not in settings["locked"]:
         return found

@@ -18,7 +18,7 @@ from scenefactory_jax.core.types import Dynamics, Scene
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated import parameters as cars
-from scenefactory_jax.dynamics.articulated.equations_of_motion import mass
+from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY, CarParameters
 
 FULL_BRAKE, FULL_BOTH, COAST = (0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 0.0, 0.0)  # throttle, steer, brake
@@ -135,7 +135,7 @@ def way(position: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, " N"]:
 
 def grip_limit_m(car: CarParameters, speed: float, friction: Any) -> Any:
     """The way to a halt if all tyres slide: v^2 / (2 mu g), and a little less for the air, v dv/dx = -(mu g + k v^2)."""
-    k, slides = max(car.air_drag / mass(car), 1e-12), np.asarray(friction, float) * GRAVITY
+    k, slides = max(car.air_drag / total_mass(car), 1e-12), np.asarray(friction, float) * GRAVITY
     return np.log1p(k * speed**2 / slides) / (2.0 * k)
 
 
@@ -145,7 +145,7 @@ def brake_limit_m(car: CarParameters, speed: float) -> float:
     v dv/dx = -(a + c v + k v^2), with a from the torques of brakes and rolling resistance, c from the bearings, k from the air, and the
     wheels' inertia in the mass.
     """
-    inertia = mass(car) + 4.0 * car.wheel_inertia[0] / car.wheel_radius**2
+    inertia = total_mass(car) + 4.0 * car.wheel_inertia[0] / car.wheel_radius**2
     a = (2.0 * (car.brake_torque_front + car.brake_torque_rear) + 4.0 * car.rolling_torque) / car.wheel_radius / inertia
     c = 4.0 * car.wheel_damping / car.wheel_radius**2 / inertia
     v = np.linspace(0.0, speed, 1001)
@@ -231,7 +231,7 @@ def ride(drive: Drive, car: CarParameters, *, control_hz: float, friction: float
     spring = car.suspension_stiffness * travel + car.suspension_preload * load
     stop = car.stop_stiffness * np.sign(travel) * np.maximum(np.abs(travel) - car.suspension_travel, 0.0)
     assert trace.normal is not None
-    weight = mass(car) * GRAVITY
+    weight = total_mass(car) * GRAVITY
     return {
         "height_m": trace.position[0, -1, 2],
         "travel_m": travel,
@@ -253,8 +253,8 @@ def rolling(
     drive: Drive, entry: Mapping[str, Any], *, control_hz: float, frictions: list[float], steers: list[float], speed: float, seconds: float
 ) -> dict[str, np.ndarray]:
     """Rolling without engine: energy over time, and the largest rise between any two times, as shares of the start's kinetic energy."""
-    car, solver = cars.numbers(entry)
-    rig = mujoco_c.single(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
+    car, solver = cars.read_parameters(entry)
+    rig = mujoco_c.simulate_one(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mu, steer = (x.ravel() for x in np.meshgrid(frictions, steers, indexing="ij"))
     cases = held(mu, speed, COAST, steps=round(seconds * control_hz))
     cases.controls[..., 1] = steer[:, None]
@@ -264,7 +264,7 @@ def rolling(
         [sum(mujoco_c.mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
         for path in zip(trace.qpos, trace.qvel, strict=True)
     ])  # fmt: skip
-    scale = 0.5 * mass(car) * speed**2
+    scale = 0.5 * total_mass(car) * speed**2
     rise = (energy - np.minimum.accumulate(energy, axis=1)).max(1)
     spent = energy[:, :1] - energy
     return {"friction": mu, "steer": steer, "time_s": _times(trace, control_hz), "spent": spent / scale, "rise": rise / scale}

@@ -23,9 +23,9 @@ def faults(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """One broken car after the other in whole worlds, and the same seed twice: what differs, bit for bit."""
     del spread  # all in this process
     own = dict(config["validation"]["faults"])
-    settings = configs.load("train", *own.pop("task"))
+    settings = configs.load_config("train", *own.pop("task"))
     worlds = _worlds(settings["scenes"], settings["worlds"], config["validation"]["seed"])
-    env = environment.make(settings)
+    env = environment.make_env(settings)
     present = np.flatnonzero(np.asarray(worlds.agents.present[own["world"]]))
     seed = config["validation"]["seed"]
     own["agent"] = int(present[min(own["agent"], len(present) - 1)])
@@ -48,7 +48,7 @@ def costs(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Physics alone with its features one by one."""
     del spread
     own = dict(config["validation"]["costs"])
-    scenes = configs.load("bench", *own.pop("scenes"))["scenes"]
+    scenes = configs.load_config("bench", *own.pop("scenes"))["scenes"]
     worlds, everything = _worlds(scenes, own.pop("worlds"), config["validation"]["seed"]), own.pop("everything")
     rows = bound(own, timing, "costs", "validation.costs", seed=config["validation"]["seed"])(worlds)
     present = worlds.agents.present
@@ -57,4 +57,4 @@ def costs(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
 
 
 def _worlds(scenes: Mapping[str, Any], count: int, seed: int) -> Scene:
-    return scene_source.assign(scene_source.training(scenes), count, seed=seed)[0]
+    return scene_source.assign_scenes(scene_source.load_training_scenes(scenes), count, seed=seed)[0]

@@ -29,10 +29,10 @@ Code in the style of purejaxrl, with one `jit` around everything, needs no adapt
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.types import Observation, Rows
+from scenefactory_jax.core.types import Observation, SetObservation
 
 
-def flat(observation: Observation) -> Float[Array, "..."]:
+def flatten_observation(observation: Observation) -> Float[Array, "..."]:
     """One vector for each car, [A, F]: the groups in the order of their names, a set as its rows and then its mask.
 
     Any axes before the last of a vector, and the last two of a set, are kept: [W, A, F] of many worlds.
@@ -40,7 +40,7 @@ def flat(observation: Observation) -> Float[Array, "..."]:
     parts = []
     for name in sorted(observation):
         group = observation[name]
-        if isinstance(group, Rows):
+        if isinstance(group, SetObservation):
             kept = group.mask.shape[:-1]
             parts += [jnp.where(group.mask[..., None], group.features, 0.0).reshape(*kept, -1), group.mask.astype(jnp.float32)]
         else:
@@ -53,7 +53,7 @@ def layout(observation: Observation) -> dict[str, slice]:
     found, at = {}, 0
     for name in sorted(observation):
         group = observation[name]
-        if isinstance(group, Rows):
+        if isinstance(group, SetObservation):
             rows, features = group.features.shape[-2:]
             widths = {name: rows * features, f"{name}.mask": rows}
         else:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Observation, Rows
+from scenefactory_jax.core.types import Observation, SetObservation
 from scenefactory_jax.env.observations import ANY, Group
 
 LIMIT = 10.0  # of its scale, at which a column without a bound of its own is clipped
@@ -22,9 +22,9 @@ LIMIT = 10.0  # of its scale, at which a column without a bound of its own is cl
 def clip(group: Group) -> Group:
     """The group with every column clipped to its bounds; without effect on columns that declare them."""
 
-    def clipped(scene: Any, state: Any) -> Array | Rows:
+    def clipped(scene: Any, state: Any) -> Array | SetObservation:
         seen = group(scene, state)
-        if isinstance(seen, Rows):
+        if isinstance(seen, SetObservation):
             return replace(seen, features=jnp.clip(seen.features, *_columns(group, seen.features.shape[-1])))
         return jnp.clip(seen, *_columns(group, seen.shape[-1]))
 
@@ -41,11 +41,11 @@ def flat_bounds(groups: Mapping[str, Callable], observation: Observation) -> tup
     low, high = [], []
     for name in sorted(observation):
         seen = observation[name]
-        features = seen.features if isinstance(seen, Rows) else seen
-        rows = features.shape[-2] if isinstance(seen, Rows) else 1
+        features = seen.features if isinstance(seen, SetObservation) else seen
+        rows = features.shape[-2] if isinstance(seen, SetObservation) else 1
         bounds = _columns(groups[name], features.shape[-1])
         for found, bound, mask in zip((low, high), bounds, (0.0, 1.0), strict=True):
-            found += [*np.tile(bound, rows), *([mask] * rows if isinstance(seen, Rows) else [])]
+            found += [*np.tile(bound, rows), *([mask] * rows if isinstance(seen, SetObservation) else [])]
     return np.array(low, np.float32), np.array(high, np.float32)
 
 

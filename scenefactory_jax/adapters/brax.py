@@ -31,7 +31,7 @@ from jaxtyping import Array
 from scenefactory_jax.adapters import episodes
 from scenefactory_jax.adapters.episodes import Episode
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.pytree import choose
+from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env.termination import EVENTS
 
@@ -51,18 +51,18 @@ class Drive(Env):
     def __init__(
         self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
-        self.pool = episodes.pool(config, overrides, scenes, alone=True)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=True)
 
     def reset(self, rng: Array) -> State:
         """A fresh episode."""
-        episode, observation = episodes.begin(self.pool.env, self.pool.scenes, rng)
+        episode, observation = episodes.begin_episode(self.pool.env, self.pool.scenes, rng)
         names = [*(f"reward/{name}" for name in self.pool.terms), *(f"events/{name}" for name in EVENTS)]
         zero = jnp.float32(0.0)
         return State(episode, observation[0], zero, zero, {name: jnp.float32(0.0) for name in names}, {})  # pyright: ignore
 
     def step(self, state: State, action: Array) -> State:
         """One action."""
-        episode, moment = episodes.advance(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
+        episode, moment = episodes.step_worlds(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
         told = {f"reward/{name}": term[0] for name, term in moment.terms.items()}
         told |= {f"events/{name}": event[0].astype(jnp.float32) for name, event in moment.events.items()}
         ended = (moment.over & ~moment.truncated[0]).astype(jnp.float32)
@@ -96,7 +96,7 @@ class Drive(Env):
         return "scenefactory_jax"
 
 
-class Anew(Wrapper):
+class AutoResetWrapper(Wrapper):
     """Worlds that are done begin their next episode, in another scene; `info["final_obs"]` keeps what was seen last before."""
 
     def reset(self, rng: Array) -> State:
@@ -113,8 +113,8 @@ class Anew(Wrapper):
         after, last = Drive.episode_of(state), state.obs
 
         def anew() -> tuple[Episode, Any]:
-            fresh = jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key)
-            now = choose(state.done > 0, fresh, after)
+            fresh = jax.vmap(lambda key: episodes.start_episodes(env, scenes, key))(after.key)
+            now = tree_where(state.done > 0, fresh, after)
             return now, jax.vmap(lambda world: episodes.observe(env, scenes, world))(now)[:, 0]
 
         now, first = jax.lax.cond(jnp.any(state.done > 0), anew, lambda: (after, last))
@@ -130,7 +130,7 @@ def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn
     """
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/fleet=spread, weather=mixed")
-    return Anew(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+    return AutoResetWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
 @contextlib.contextmanager

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.adapters import bounds, flat
+from scenefactory_jax.adapters import bounds, flatten_observation
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.pytree import struct
+from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Scene, State
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
@@ -46,7 +46,7 @@ class Pool(NamedTuple):
         return [f"car_{slot}" for slot in range(self.agents)]
 
 
-@struct
+@pytree_dataclass
 class Episode:
     """What changes while one world runs through its episodes."""
 
@@ -55,8 +55,8 @@ class Episode:
     key: PRNGKeyArray  # of the episodes to come
 
 
-@struct
-class Moment:
+@pytree_dataclass
+class WorldStep:
     """What one step gave the cars of one world. The observation is the one after the step, before anything begins anew."""
 
     observation: Float[Array, "A F"]
@@ -69,7 +69,7 @@ class Moment:
     over: Bool[Array, ""]  # nobody drives any more, or the time is up
 
 
-def pool(
+def make_pool(
     config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: scene_source.Scenes | None, *, alone: bool, lives: bool = False
 ) -> Pool:
     """The pool of a config.
@@ -85,38 +85,38 @@ def pool(
         ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
     """
     if config is None:
-        config = configs.load("train", *([ALONE] if alone else []), *overrides)
+        config = configs.load_config("train", *([ALONE] if alone else []), *overrides)
     elif overrides:
-        config = configs.amend(config, overrides)
+        config = configs.apply_overrides(config, overrides)
     if not lives and config["spawn"]["respawn_clear_m"] is not None:
         raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; here a car that ended stays so: set it to null")
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
     scene_source.use_compilation_cache()
-    parts = environment.parts_of(config)
+    parts = environment.make_parts(config)
     env = environment.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
-    found = scene_source.training(config["scenes"]) if scenes is None else scenes
+    found = scene_source.load_training_scenes(config["scenes"]) if scenes is None else scenes
     held = jax.device_put(found.scene)
     slots = held.agents.present.shape[1]
     if alone and slots != 1:
         where = "the scenes given" if scenes is not None else f"scenes.capacity.agents={config['scenes']['capacity']['agents']}"
         raise ConfigError(f"{where}: {slots} slots a scene; this environment drives one car: set {ALONE} scenes.capacity.agents=null")
-    episode = jax.eval_shape(functools.partial(start, env), held, jax.random.key(0))
+    episode = jax.eval_shape(functools.partial(start_episodes, env), held, jax.random.key(0))
     seen = jax.eval_shape(lambda scenes, at: env.observe(_one(scenes, at.scene), at.state), held, episode)
     low, high = bounds.flat_bounds(parts.groups, seen)
-    moment = jax.eval_shape(functools.partial(advance, env), held, episode, jnp.zeros((slots, 3)))[1]
+    moment = jax.eval_shape(functools.partial(step_worlds, env), held, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(moment.terms))
     steps, step_hz = environment.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
     return Pool(env, held, found.names, slots, low, high, terms, steps, step_hz)
 
 
-def begin(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
+def begin_episode(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
     """A fresh episode of one world, in a scene drawn from all or in the given one, and what its cars see."""
-    episode = start(env, scenes, key, scene)
+    episode = start_episodes(env, scenes, key, scene)
     return episode, observe(env, scenes, episode)
 
 
-def start(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> Episode:
+def start_episodes(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> Episode:
     """`begin` without the observation."""
     scene_key, start_key, key = jax.random.split(key, 3)
     drawn = jax.random.randint(scene_key, (), 0, len(scenes.agents.present))
@@ -126,34 +126,34 @@ def start(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | in
 
 def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
     """What the cars of one world see."""
-    return flat(env.observe(_one(scenes, episode.scene), episode.state))
+    return flatten_observation(env.observe(_one(scenes, episode.scene), episode.state))
 
 
-def advance(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
+def step_worlds(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
     """One action of one world, which may end the episode; nothing begins anew."""
     episode, moment = transition(env, scenes, episode, action)
     return episode, _seen(moment, observe(env, scenes, episode))
 
 
-def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Moment]:
+def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
     control = lambda state: env.transition(scene, state, action)  # noqa: E731
-    state, _, outcome, _ = environment.act(control, episode.state, hold=env.hold)
-    moment = Moment(
+    state, _, outcome, _ = environment.repeat_action(control, episode.state, hold=env.hold)
+    moment = WorldStep(
         observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
         events=vars(outcome.events),
         terminated=outcome.done,
-        truncated=environment.out_of_time(outcome, episode.state.active),
+        truncated=environment.find_truncated_agents(outcome, episode.state.active),
         active=state.active,
         over=outcome.over,
     )
     return Episode(episode.scene, state, episode.key), moment
 
 
-class Told(NamedTuple):
+class CarStep(NamedTuple):
     """What one step gave one car, on the host."""
 
     observation: np.ndarray
@@ -164,37 +164,37 @@ class Told(NamedTuple):
     info: dict[str, Any]  # scene, terms, events
 
 
-def packed(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Float[Array, "A N"]]:
+def pack_observation(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Float[Array, "A N"]]:
     """`advance` with all that it gave in one array: a host fetches one far sooner than thirty. `told` takes a row of it apart."""
-    after, moment = advance(env, scenes, episode, action)
+    after, moment = step_worlds(env, scenes, episode, action)
     shared = [jnp.full_like(moment.reward, moment.over), jnp.full_like(moment.reward, after.scene)]
     columns = [moment.reward, moment.terminated, moment.truncated, *shared]
     columns += [*(moment.terms[name] for name in sorted(moment.terms)), *(moment.events[name] for name in EVENTS)]
     return after, jnp.concatenate([moment.observation, jnp.stack([one.astype(jnp.float32) for one in columns], axis=1)], axis=1)
 
 
-def told(pool: Pool, row: np.ndarray) -> Told:
+def unpack_car_step(pool: Pool, row: np.ndarray) -> CarStep:
     """One car's row of `packed`."""
     reward, terminated, truncated, over, scene, *rest = row[pool.columns :].tolist()
     terms, events = dict(zip(pool.terms, rest, strict=False)), rest[len(pool.terms) :]
     info = {"scene": int(scene), "terms": terms, "events": {name: bool(new) for name, new in zip(EVENTS, events, strict=True)}}
-    return Told(row[: pool.columns], reward, bool(terminated), bool(truncated), bool(over), info)
+    return CarStep(row[: pool.columns], reward, bool(terminated), bool(truncated), bool(over), info)
 
 
-def _seen(moment: Moment, observation: Float[Array, "A F"]) -> Moment:
-    return Moment(**{**vars(moment), "observation": observation})
+def _seen(moment: WorldStep, observation: Float[Array, "A F"]) -> WorldStep:
+    return WorldStep(**{**vars(moment), "observation": observation})
 
 
 def _one(scenes: Scene, index: Int[Array, ""]) -> Scene:
     return jax.tree.map(lambda leaf: leaf[index], scenes)
 
 
-def seeded(seed: int) -> np.uint32:
+def make_key(seed: int) -> np.uint32:
     """A seed of any size as what `jax.random.key` takes on the device."""
     return np.uint32(seed % 2**32)
 
 
-def chosen(options: Mapping[str, Any] | None, count: int, worlds: int | None = None) -> np.ndarray:
+def choose_scene(options: Mapping[str, Any] | None, count: int, worlds: int | None = None) -> np.ndarray:
     """The scene that `options["scene"]` of a `reset` names, or ANY; of several worlds, [worlds].
 
     Raises:

@@ -57,13 +57,13 @@ class Drive(gymnasium.Env):
         render_mode: str | None = None,
     ):
         pictures.check_mode(render_mode)
-        self.pool = episodes.pool(config, overrides, scenes, alone=True)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode = self.pool.names, render_mode
         self.metadata = {**METADATA, "render_fps": self.pool.step_hz}
         self.observation_space = spaces.Box(self.pool.low, self.pool.high, dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)  # throttle, steer, brake
-        self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
-        self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
+        self._begin = jax.jit(functools.partial(episodes.begin_episode, self.pool.env))
+        self._advance = jax.jit(functools.partial(episodes.pack_observation, self.pool.env))
         self._painter = pictures.Painter(self.pool)
         self._episode: Episode | None = None
 
@@ -74,11 +74,11 @@ class Drive(gymnasium.Env):
             ConfigError: `options["scene"]` is no scene's index.
         """
         super().reset(seed=seed)
-        scene = episodes.chosen(options, len(self.names))
+        scene = episodes.choose_scene(options, len(self.names))
         if seed is None and self._episode is not None:
             key = self._episode.key
         else:
-            key = jax.random.key(episodes.seeded(seed if seed is not None else int(self.np_random.integers(2**32))))
+            key = jax.random.key(episodes.make_key(seed if seed is not None else int(self.np_random.integers(2**32))))
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
         return np.array(observation)[0], {"scene": int(episode.scene)}
@@ -94,7 +94,7 @@ class Drive(gymnasium.Env):
             raise ResetNeeded("step: no episode has begun; call reset first")
         episodes.check_action(action, self.action_space.shape)
         self._episode, rows = self._advance(self.pool.scenes, self._episode, np.asarray(action, np.float32)[None])
-        told = episodes.told(self.pool, np.array(rows)[0])
+        told = episodes.unpack_car_step(self.pool, np.array(rows)[0])
         return told.observation, told.reward, told.over and not told.truncated, told.truncated, told.info
 
     def render(self) -> np.ndarray | None:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from scenefactory_jax.adapters import episodes, pictures
 from scenefactory_jax.adapters.episodes import Episode
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.pytree import choose
+from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 
@@ -55,7 +55,7 @@ class DriveVector(VectorEnv):
         if arrays not in ("numpy", "jax"):
             raise ConfigError(f"arrays: {arrays!r}; valid: numpy, jax")
         pictures.check_mode(render_mode)
-        self.pool = episodes.pool(config, overrides, scenes, alone=True)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=True)
         self.names, self.render_mode, self.num_envs, self.arrays = self.pool.names, render_mode, num_envs, arrays
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": list(pictures.MODES), "render_fps": self.pool.step_hz, "autoreset_mode": self.mode}
@@ -89,9 +89,9 @@ class DriveVector(VectorEnv):
         if first:  # nothing to go on from: what has no seed takes a random one
             given = [int(self.np_random.integers(2**32)) if one is None else one for one in given]
         anew = np.array([one is not None for one in given])
-        known = np.array([episodes.seeded(one or 0) for one in given], np.uint32)
+        known = np.array([episodes.make_key(one or 0) for one in given], np.uint32)
         mask = everywhere if first else np.asarray((options or {}).get("reset_mask", everywhere), bool)
-        scene = episodes.chosen(options, len(self.names), self.num_envs)
+        scene = episodes.choose_scene(options, len(self.names), self.num_envs)
         worlds, observation = self._begin(self.pool.scenes, self._worlds, known, anew, mask, scene)
         self._worlds, self._ended = worlds, self._ended & ~mask
         return self._out((observation, _paired({"scene": worlds.scene}, mask)))
@@ -105,7 +105,7 @@ class DriveVector(VectorEnv):
         step = self.advance(actions)
         return step.observation, step.reward, step.terminated, step.truncated, self._info(step)
 
-    def advance(self, actions: Any) -> "Stepped":
+    def advance(self, actions: Any) -> "StepArrays":
         """`step` without Gymnasium's layout of `info`, for other interfaces.
 
         Raises:
@@ -135,7 +135,7 @@ class DriveVector(VectorEnv):
             raise ResetNeeded("render: no episode has begun; call reset first")
         return tuple(self._painter.draw(self._worlds))
 
-    def _info(self, step: "Stepped") -> dict[str, Any]:
+    def _info(self, step: "StepArrays") -> dict[str, Any]:
         """Gymnasium's layout of what is known beside observation and reward."""
         info = _paired(step.told, step.told_for) | _paired({"scene": step.scene}, step.every)
         if self.mode is not AutoresetMode.SAME_STEP or (self.arrays == "numpy" and not step.ended.any()):
@@ -165,12 +165,12 @@ def _begin(
     """Fresh episodes where `mask` says, of the seeds where `anew` says, else the next ones of their worlds."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     keys = keys if worlds is None else jnp.where(anew, keys, worlds.key)
-    fresh = jax.vmap(functools.partial(episodes.start, env, scenes))(keys, jnp.asarray(scene))
-    worlds = fresh if worlds is None else choose(jnp.asarray(mask), fresh, worlds)
+    fresh = jax.vmap(functools.partial(episodes.start_episodes, env, scenes))(keys, jnp.asarray(scene))
+    worlds = fresh if worlds is None else tree_where(jnp.asarray(mask), fresh, worlds)
     return worlds, _observe(env, scenes, worlds)
 
 
-class Stepped(NamedTuple):
+class StepArrays(NamedTuple):
     """What a step of all worlds gave, every array once: a host fetches each on its own."""
 
     observation: Array  # [W, F]
@@ -188,21 +188,21 @@ class Stepped(NamedTuple):
 
 def _step(
     env: Env, mode: AutoresetMode, scenes: Scene, worlds: Episode, ended: Bool[Any, " W"], actions: Float[Array, "W 3"]
-) -> tuple[Episode, Stepped]:
+) -> tuple[Episode, StepArrays]:
     """One action, and what begins anew."""
     after, moment = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
     ended, late, every = jnp.asarray(ended), moment.truncated[:, 0], jnp.ones(len(actions), bool)
     anew = {AutoresetMode.SAME_STEP: moment.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]
     now = after
     if mode is not AutoresetMode.DISABLED:
-        now = choose(anew, jax.vmap(lambda key: episodes.start(env, scenes, key))(after.key), after)
+        now = tree_where(anew, jax.vmap(lambda key: episodes.start_episodes(env, scenes, key))(after.key), after)
     observation, last = _observe(env, scenes, now), None
     if mode is AutoresetMode.SAME_STEP:
         last = jax.lax.cond(jnp.any(anew), lambda: _observe(env, scenes, after), lambda: observation)
     counts = ~ended if mode is AutoresetMode.NEXT_STEP else every
     over = moment.over & counts
     told = {"terms": moment.terms, "events": moment.events}
-    return now, Stepped(
+    return now, StepArrays(
         observation=observation,
         reward=jnp.where(counts, moment.reward[:, 0], 0.0),
         terminated=over & ~late,

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from scenefactory_jax.adapters import episodes
-from scenefactory_jax.adapters.episodes import Episode, Moment
+from scenefactory_jax.adapters.episodes import Episode, WorldStep
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import scene_source
 
@@ -55,7 +55,7 @@ class Drive(MultiAgentEnv):
     def __init__(
         self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
-        self.pool = episodes.pool(config, overrides, scenes, alone=False, lives=True)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=False, lives=True)
         super().__init__(num_agents=self.pool.agents)
         self.agents = self.pool.cars
         self.scenes = self.pool.scenes
@@ -72,7 +72,7 @@ class Drive(MultiAgentEnv):
     @functools.partial(jax.jit, static_argnums=(0,))
     def reset(self, key: Array) -> tuple[Named, Episode]:
         """A fresh episode."""
-        episode, observation = episodes.begin(self.pool.env, self.scenes, key)
+        episode, observation = episodes.begin_episode(self.pool.env, self.scenes, key)
         return self._named(observation), episode
 
     @functools.partial(jax.jit, static_argnums=(0,))
@@ -82,14 +82,14 @@ class Drive(MultiAgentEnv):
         """One action; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
         place of two."""
         after, moment = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
-        fresh = episodes.start(self.pool.env, self.scenes, key) if reset_state is None else reset_state
+        fresh = episodes.start_episodes(self.pool.env, self.scenes, key) if reset_state is None else reset_state
         now = jax.tree.map(lambda new, old: jnp.where(moment.over, new, old), fresh, after)
         return self.get_obs(now), now, *self._told(state, moment)
 
     def step_env(self, key: Array, state: Episode, actions: Named) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
         """One action, without beginning anew."""
         del key  # the environment draws nothing in a step
-        after, moment = episodes.advance(self.pool.env, self.scenes, state, self._stacked(actions))
+        after, moment = episodes.step_worlds(self.pool.env, self.scenes, state, self._stacked(actions))
         return self._named(moment.observation), after, *self._told(state, moment)
 
     def get_obs(self, state: Episode) -> Named:
@@ -106,7 +106,7 @@ class Drive(MultiAgentEnv):
         """All cars are of one kind."""
         return {"cars": self.agents}
 
-    def _told(self, before: Episode, moment: Moment) -> tuple[Named, Named, dict[str, Any]]:
+    def _told(self, before: Episode, moment: WorldStep) -> tuple[Named, Named, dict[str, Any]]:
         done = ~moment.active | moment.truncated
         info = {"terms": moment.terms, "events": moment.events, "truncated": moment.truncated, "acted": before.state.active}
         return self._named(moment.reward), {**self._named(done), "__all__": moment.over}, info

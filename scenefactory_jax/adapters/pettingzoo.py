@@ -45,7 +45,7 @@ class Drive(ParallelEnv):
     def __init__(
         self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
-        self.pool = episodes.pool(config, overrides, scenes, alone=False)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=False)
         self.names, self.render_mode = self.pool.names, None
         self.metadata = {"name": "scenefactory_jax_v0", "render_modes": [], "render_fps": self.pool.step_hz, "is_parallelizable": True}
         self.possible_agents = self.pool.cars
@@ -53,8 +53,8 @@ class Drive(ParallelEnv):
         self.observation_spaces = {name: spaces.Box(self.pool.low, self.pool.high, dtype=np.float32) for name in self.possible_agents}
         self.action_spaces = {name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in self.possible_agents}
         self._slot = {name: slot for slot, name in enumerate(self.possible_agents)}
-        self._begin = jax.jit(functools.partial(episodes.begin, self.pool.env))
-        self._advance = jax.jit(functools.partial(episodes.packed, self.pool.env))
+        self._begin = jax.jit(functools.partial(episodes.begin_episode, self.pool.env))
+        self._advance = jax.jit(functools.partial(episodes.pack_observation, self.pool.env))
         self._episode: Episode | None = None
 
     def observation_space(self, agent: str) -> spaces.Space:
@@ -71,11 +71,11 @@ class Drive(ParallelEnv):
         Raises:
             ConfigError: `options["scene"]` is no scene's index.
         """
-        scene = episodes.chosen(options, len(self.names))
+        scene = episodes.choose_scene(options, len(self.names))
         if seed is None and self._episode is not None:
             key = self._episode.key
         else:
-            key = jax.random.key(episodes.seeded(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
+            key = jax.random.key(episodes.make_key(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
         active, scene = jax.device_get((episode.state.active, episode.scene))
@@ -101,7 +101,7 @@ class Drive(ParallelEnv):
             given[self._slot[name]] = actions[name]
         self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
         rows = np.array(rows)  # a copy: what a caller gets may be written to
-        told = {name: episodes.told(self.pool, rows[self._slot[name]]) for name in self.agents}
+        told = {name: episodes.unpack_car_step(self.pool, rows[self._slot[name]]) for name in self.agents}
         self.agents = [name for name, one in told.items() if not one.terminated and not one.truncated]
         names = ("observation", "reward", "terminated", "truncated", "info")
         observations, rewards, terminations, truncations, infos = ({car: getattr(one, name) for car, one in told.items()} for name in names)

@@ -17,7 +17,7 @@ MODES = ("rgb_array",)
 _PIXELS, _SIDE_M = 400, 80.0  # side of a picture, and of the square around the car that it shows
 
 
-class Shown(NamedTuple):
+class ShownWorld(NamedTuple):
     """What is drawn of one world at one moment, beside its road."""
 
     scene: Array  # index into the pool
@@ -60,7 +60,7 @@ class Painter:
             others=drawing.Others(*(np.asarray(column)[None] for column in _columns(shown.boxes))),
         )
         left, bottom = place[0] - _SIDE_M / 2
-        return video.picture(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
+        return video.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
 
     def _scene(self, index: int) -> Scene:
         if index not in self._scenes:
@@ -78,10 +78,10 @@ def check_mode(mode: Any) -> None:
         raise ConfigError(f"render_mode: {mode!r}; valid: None, {', '.join(MODES)}")
 
 
-def _shown(env: Env, scenes: Scene, world: Episode) -> Shown:
+def _shown(env: Env, scenes: Scene, world: Episode) -> ShownWorld:
     state = world.state
     now = env.now(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
-    return Shown(world.scene, state.motion, state.active, state.happened, state.agents, state.weather, now.boxes)
+    return ShownWorld(world.scene, state.motion, state.active, state.happened, state.agents, state.weather, now.boxes)
 
 
 def _columns(boxes: Boxes) -> list[np.ndarray]:

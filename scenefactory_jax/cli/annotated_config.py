@@ -15,7 +15,7 @@ WIDTH = 140  # a comment that would reach farther stands above its line
 Place = tuple[str, ...]  # of a key, from the top level down
 
 
-def write(command: str, *overrides: str) -> str:
+def annotate(command: str, *overrides: str) -> str:
     """The composed config as text, each key with its comment, each group with the options that it has.
 
     Raises:
@@ -37,7 +37,7 @@ def _place(group: str) -> Place:
 
 def _files(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[Path, Place]]:
     """The files that a config is composed of and where their keys lie, those that others build on first."""
-    root = configs.folder()
+    root = configs.find_conf()
     yield from _with_bases(root / f"{command}.yaml", ())
     for group, chosen in choices.items():
         for option in chosen if isinstance(chosen, list) else [chosen]:
@@ -100,7 +100,7 @@ def _lines(node: Mapping[str, Any], place: Place, comments: Mapping[Place, str],
 
 def _options(group: str, chosen: Any) -> str:
     """What a group is set to, and what else there is."""
-    others = [file.stem for file in sorted((configs.folder() / group).glob("*.yaml")) if file.stem != chosen]
+    others = [file.stem for file in sorted((configs.find_conf() / group).glob("*.yaml")) if file.stem != chosen]
     return f"{group}={chosen or 'null'}{'; or ' if others else ''}{', '.join(others)}."
 
 

@@ -22,7 +22,7 @@ from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import phase_timing
-from scenefactory_jax.learning.phase_timing import Timed
+from scenefactory_jax.learning.phase_timing import PhaseTimes
 from scenefactory_jax.learning.ppo import rollout
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.visualization.report import throughput_report as report
@@ -50,15 +50,15 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     if config["baseline"] is not None:
         schema.check(config["baseline"], schema.BASELINE, where="baseline")
     scene_source.use_compilation_cache()
-    meshes, loaded, versions = {name: sharding.mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
+    meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
     out = None if config["out"] is None else Path(config["out"])
     before = _kept(out) if config["resume"] else {"rows": [], "baseline": None}
-    result = {"command": configs.command("bench"), "versions": versions, "rows": [], "baseline": None}
+    result = {"command": configs.format_command("bench"), "versions": versions, "rows": [], "baseline": None}
 
     def scenes_of(task: Mapping[str, Any]) -> scene_source.Scenes:
         source = result_file.digest(task["scenes"])
         if source not in loaded:
-            loaded[source] = scene_source.training(task["scenes"])
+            loaded[source] = scene_source.load_training_scenes(task["scenes"])
         return loaded[source]
 
     for name, task in tasks.items():
@@ -122,7 +122,7 @@ def unvectorised(config: Mapping[str, Any], scenes: scene_source.Scenes, numbers
     """The same task as loops in Python over the C engine, on the scenes with the most cars; acting only."""
     fullest = np.argsort(-np.asarray(scenes.scene.agents.present).sum(axis=1), kind="stable")[: numbers["worlds"]]
     chosen = [scenes[int(index)] for index in fullest]
-    env, policy = environment.make(config), make_policy(config)
+    env, policy = environment.make_env(config), make_policy(config)
     seen = env.reset(jax.random.key(config["seed"]), chosen[0])[1]
     parameters = policy.init(jax.random.key(config["seed"]), seen)
     timing = {"steps": numbers["steps"], "repeats": numbers["repeats"], "seed": config["seed"]}
@@ -136,7 +136,7 @@ def _measured(
     try:
         if config["stream"] is not None:
             return {"fits": True, **streaming.measure(config, mesh=mesh)}
-        worlds, chosen = scene_source.assign(scenes_of(config), config["worlds"], seed=config["seed"], mesh=mesh)
+        worlds, chosen = scene_source.assign_scenes(scenes_of(config), config["worlds"], seed=config["seed"], mesh=mesh)
         print(f"{name}: {chosen}", flush=True)
         return {"fits": True, **measure(config, worlds, mesh=mesh)}
     except jax.errors.JaxRuntimeError as error:
@@ -147,16 +147,16 @@ def _measured(
 
 def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = None) -> dict[str, Any]:
     """One configuration on worlds that are already on the device, or on those of a mesh; phases are measured on one device only."""
-    parts = environment.parts_of(config)
+    parts = environment.make_parts(config)
     env, scope = environment.assemble(parts), config["scope"]
     horizon = phase_timing.control_steps(config)
     slots = worlds.agents.present.shape
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
-    def act(level: str) -> Timed:
+    def act(level: str) -> PhaseTimes:
         start = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
-        run = phase_timing.acting(level, parts, env, steps=horizon)
-        return phase_timing.timed(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
+        run = phase_timing.make_acting_phase(level, parts, env, steps=horizon)
+        return phase_timing.time_phase(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
 
     if scope == "training":
         whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
@@ -179,7 +179,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
         "spawned_share": spawned / (slots[0] * slots[1] * horizon),
         "active_share": active,
         "ms_a_control_step": ms * whole.median,
-        "phases_ms": {name: ms * seconds for name, seconds in phase_timing.parts_of_the_whole(nested).items()},
+        "phases_ms": {name: ms * seconds for name, seconds in phase_timing.time_phases(nested).items()},
         "compile_s": whole.compile_s,
         "memory_gib": whole.memory_gib,
         "repeats": config["repeats"],
@@ -194,22 +194,22 @@ def _size(config: Mapping[str, Any], shape: tuple[int, ...], mesh: Mesh | None) 
 
 def _learn(
     config: Mapping[str, Any], env: Env, worlds: Scene, mesh: Mesh | None, *, warmup: int, repeats: int
-) -> tuple[Timed, dict[str, float], Callable[[], Timed]]:
+) -> tuple[PhaseTimes, dict[str, float], Callable[[], PhaseTimes]]:
     """Whole iterations of PPO, the last one's metrics, and a function that times the rollout alone."""
     policy = make_policy(config)
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
-    whole = phase_timing.timed(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
+    whole = phase_timing.time_phase(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
     state, metrics = whole.left
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
         now, seen, lives = carry
-        acted = rollout.collect(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
+        acted = rollout.collect_rollout(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
         return acted[:3], acted[3]
 
-    def roll() -> Timed:
+    def roll() -> PhaseTimes:
         begin = (state.worlds, state.observation, state.lives)
         given = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731
-        return phase_timing.timed(collect, begin, given, warmup=warmup, repeats=repeats)
+        return phase_timing.time_phase(collect, begin, given, warmup=warmup, repeats=repeats)
 
     return whole, {name: float(value) for name, value in jax.device_get(metrics).items()}, roll

@@ -22,7 +22,7 @@ ASIDE += ("scenes.take.seed",)  # follows the seed
 DIGITS = 6
 
 
-class Read(NamedTuple):
+class ReadRun(NamedTuple):
     """One run, as its folder holds it."""
 
     folder: Path
@@ -52,13 +52,13 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
                 f"metrics: {run.folder / metrics_csv.FILE} has no column {missing[0]!r}; there are: {', '.join(run.metrics[0])}"
             )
     differing = _differing(run.settings for run in runs)
-    groups: dict[str, list[Read]] = {}
+    groups: dict[str, list[ReadRun]] = {}
     for run in runs:
         label = ", ".join(f"{key}={_shown(run.settings.get(key))}" for key in differing) or str(run.config["name"])
         groups.setdefault(label, []).append(run)
     found = {label: _group(members, config) for label, members in groups.items()}
     shown = {key: config[key] for key in ("metrics", "window", "last")}
-    result = {"command": configs.command("compare"), "settings": shown, "groups": found}
+    result = {"command": configs.format_command("compare"), "settings": shown, "groups": found}
     result = result_file.plain(result, digits=DIGITS)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
@@ -85,14 +85,14 @@ def _find(patterns: Iterable[str]) -> list[Path]:
     return list(found.values())
 
 
-def _read(folder: Path) -> Read:
-    config, metrics = configs.values(folder), metrics_csv.read(folder)
+def _read(folder: Path) -> ReadRun:
+    config, metrics = configs.read_values(folder), metrics_csv.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
     settings = {
         key: value for key, value in evaluation_report.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")
     }
-    return Read(folder, config, settings, metrics, result_file.records(folder))
+    return ReadRun(folder, config, settings, metrics, result_file.records(folder))
 
 
 def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -106,9 +106,9 @@ def _shown(value: Any) -> str:
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _group(runs: list[Read], config: Mapping[str, Any]) -> dict[str, Any]:
+def _group(runs: list[ReadRun], config: Mapping[str, Any]) -> dict[str, Any]:
     """Curves of each seed up to the length of the shortest, and the evaluations of all seeds, resampled by seed, scene and agent."""
-    seeds: dict[int, Read] = {}
+    seeds: dict[int, ReadRun] = {}
     for run in runs:
         other = seeds.setdefault(run.config["seed"], run)
         if other is not run:
@@ -117,7 +117,7 @@ def _group(runs: list[Read], config: Mapping[str, Any]) -> dict[str, Any]:
     length = min(len(run.metrics) for run in runs)
     tail = max(1, round(config["last"] * length))
 
-    def column(run: Read, name: str) -> np.ndarray:
+    def column(run: ReadRun, name: str) -> np.ndarray:
         return np.array([row[name] for row in run.metrics[:length]])
 
     curves = {name: [_running(column(run, name), config["window"]) for run in runs] for name in config["metrics"]}

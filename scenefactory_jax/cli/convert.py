@@ -8,7 +8,7 @@ import numpy as np
 from rich.progress import Progress
 
 from scenefactory_jax.cli import schema
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.data.conversion import Summary, complete, describe
 from scenefactory_jax.data.conversion import convert as to_bank
@@ -36,9 +36,9 @@ def convert(config: Mapping[str, Any]) -> Summary:
     settings = {key: scenes[key] for key in ("formats", "check", "pack")} | {key: config[key] for key in own}
     judged = {"rules": quality_gate.make(config["quality"]["rules"]), **{key: config["quality"][key] for key in ("reject", "drop")}}
     quality_gate.check_names(**judged)
-    rebuild = build(config["lanes"]["topology"], builtins=f"{built_in}.topology", where="lanes.topology")
+    rebuild = instantiate(config["lanes"]["topology"], builtins=f"{built_in}.topology", where="lanes.topology")
     rebuild(NOTHING)  # which refuses numbers that make no sense, before a file is read
-    readers = scene_source.readers(scenes)
+    readers = scene_source.make_readers(scenes)
     gate = functools.partial(quality_gate.gate, check=readers["check"], **judged)
     with Progress(disable=not config["progress"]) as bar:
         task = bar.add_task("convert")
@@ -47,9 +47,9 @@ def convert(config: Mapping[str, Any]) -> Summary:
             config["out"],
             **readers,
             refine=functools.partial(complete, check=readers["check"], rebuild=rebuild, gate=gate),
-            features=None if features is None else build(features, builtins=f"{built_in}.catalogue", where="features"),
+            features=None if features is None else instantiate(features, builtins=f"{built_in}.catalogue", where="features"),
             settings=settings,
-            spread=build(config["spread"], builtins=f"{built_in}.spread", where="spread"),
+            spread=instantiate(config["spread"], builtins=f"{built_in}.spread", where="spread"),
             **config["bank"],
             on_file=lambda done, total: bar.update(task, completed=done, total=total),
         )

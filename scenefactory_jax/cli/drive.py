@@ -23,7 +23,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment as worlds
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
-from scenefactory_jax.visualization.mujoco.keyboard_control import COMMANDS, PEDALS, Drive, Feel, World
+from scenefactory_jax.visualization.mujoco.keyboard_control import COMMANDS, PEDALS, Drive, KeyboardResponse, World
 
 NAMED = ("up", "down", "left", "right", "space", "enter", "home", "end", "insert", "delete")
 CODES = {name: getattr(glfw, f"KEY_{name.upper()}") for name in NAMED}
@@ -51,23 +51,23 @@ def drive(config: Mapping[str, Any]) -> Drive:
     check_display()
     scene_source.use_compilation_cache()
     settings = dict(config) if config["run"] is None else _of_run(config)
-    shown = replays.chosen(settings["scenes"], count=1, skip=config["skip"])
+    shown = replays.choose_scenes(settings["scenes"], count=1, skip=config["skip"])
     scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
     slots = np.flatnonzero(np.asarray(scene.agents.present))
     if config["car"] is not None and config["car"] not in slots:
         raise ConfigError(f"car: {config['car']}; the scene's cars are {', '.join(map(str, slots))}")
     car = int(slots[0]) if config["car"] is None else config["car"]
-    env = worlds.make(settings)
-    act, parameters = replays.driver({**config, "act": "policy"}, settings, slots=scene.agents.yaw.shape[0])
+    env = worlds.make_env(settings)
+    act, parameters = replays.select_policy({**config, "act": "policy"}, settings, slots=scene.agents.yaw.shape[0])
     dt = 1.0 / settings["timing"]["control_hz"]
     built = keyboard_control.world(env, scene, act, parameters, car=car, dt=dt, off_map_m=config["off_map_m"])
     print(f"{shown.names[0]}: you drive car {car} of {len(slots)}; compiling", flush=True)
     begun = keyboard_control.advance(built, keyboard_control.start(built, seed=config["seed"]), set(), set(), feel=feel)
     print("; ".join(f"{command}: {key}" for command, key in config["keys"].items()), flush=True)
-    return _window(built, begun, scene, replays.looks(settings), feel=feel, view=view, codes=codes)
+    return _window(built, begun, scene, replays.choose_film_settings(settings), feel=feel, view=view, codes=codes)
 
 
-def _check(config: Mapping[str, Any]) -> tuple[Feel, View, dict[int, str]]:
+def _check(config: Mapping[str, Any]) -> tuple[KeyboardResponse, View, dict[int, str]]:
     """What keys feel like, where the camera stands, and which command each key code means."""
     schema.check(config, schema.DRIVE)
     for group, own in {"keys": schema.DRIVE_KEYS, "feel": schema.FEEL, "view": schema.VIEW}.items():
@@ -83,7 +83,7 @@ def _check(config: Mapping[str, Any]) -> tuple[Feel, View, dict[int, str]]:
         if CODES[key] in codes:
             raise ConfigError(f"keys.{command}: {key!r} is the key of {codes[CODES[key]]}, too")
         codes[CODES[key]] = command
-    return Feel(**config["feel"]), View(**config["view"]), codes
+    return KeyboardResponse(**config["feel"]), View(**config["view"]), codes
 
 
 def check_display() -> None:
@@ -109,7 +109,7 @@ def check_display() -> None:
 
 
 def _of_run(config: Mapping[str, Any]) -> dict[str, Any]:
-    return replays.of_run({**config, "overrides": [*FREE, *config["overrides"]]}, command="drive")
+    return replays.load_run_config({**config, "overrides": [*FREE, *config["overrides"]]}, command="drive")
 
 
 class Keyboard:
@@ -135,7 +135,7 @@ class Keyboard:
 
 
 def _window(
-    built: World, begun: Drive, scene: Any, car: Any, *, feel: Feel, view: View, codes: Mapping[int, str]
+    built: World, begun: Drive, scene: Any, car: Any, *, feel: KeyboardResponse, view: View, codes: Mapping[int, str]
 ) -> Drive:  # fmt: skip
     """The viewer's window until it is closed, at the pace of the control steps."""
     import mujoco.viewer  # it loads the windowing library
@@ -160,16 +160,16 @@ def _window(
 
 
 def _show(
-    viewer: Any, stand: scene_model.Stage, data: mujoco.MjData, now: Drive, built: World, *, car: Any, spin: Any, heading: float, view: View
+    viewer: Any, stand: scene_model.RenderModel, data: mujoco.MjData, now: Drive, built: World, *, car: Any, spin: Any, heading: float, view: View
 ) -> float:  # fmt: skip
     """Put everybody where they are and the camera behind the car; returns the camera's heading."""
     seen = now.shot
     assert seen is not None
     position, yaw, steer = (np.asarray(leaf, float) for leaf in (seen.position, seen.yaw, seen.steer))
-    level = scene_model.posture(car, position, yaw, steer, spin)
+    level = scene_model.set_posture(car, position, yaw, steer, spin)
     joints = level if seen.joints is None else np.asarray(seen.joints, float)
-    scene_model.put(stand, data, joints, np.asarray(seen.active, float))
-    scene_model.light(data, joints[built.car, :3])
+    scene_model.place_actor(stand, data, joints, np.asarray(seen.active, float))
+    scene_model.place_light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0
     actors.add_others(marks, drawing.Others(*(np.asarray(getattr(seen.others, name))[None] for name in drawing.Others._fields)), 0)

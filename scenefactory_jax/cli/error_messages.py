@@ -11,7 +11,7 @@ import jax
 from scenefactory_jax.core.instantiate import ConfigError
 
 
-def explain(error: Exception, config: Mapping[str, Any]) -> str | None:
+def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
     """One line for an error of the machine or of a library below, with the way out; None for anything else, whose traceback is of use.
 
     Args:

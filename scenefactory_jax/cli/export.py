@@ -33,7 +33,7 @@ def export(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"out: {out} holds something already; give a new folder")
     folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
-    episodes = {named(what, folder): result_file.judged(folder).get("episodes", {}) for what, folder in folders.items()}
+    episodes = {named(what, folder): result_file.read_evaluated(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
@@ -46,7 +46,7 @@ def export(config: Mapping[str, Any]) -> Path:
     versions = yaml.safe_load((out / "versions.yaml").read_text())
     text = policy_card.markdown(
         out.name, config["card"]["about"], config=own, versions=versions, training=metrics_csv.read(trained.folder), judged=judged,
-        episodes=episodes, outside=sorted(set(trusted_targets.outside(own).values())),
+        episodes=episodes, outside=sorted(set(trusted_targets.find_outside_targets(own).values())),
     )  # fmt: skip
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
@@ -55,7 +55,7 @@ def export(config: Mapping[str, Any]) -> Path:
 
 def named(what: str, folder: Path) -> str:
     """What was driven, and with what it differed from the run's own held-out scenes and settings; of paths the names alone."""
-    noted = result_file.judged(folder)
+    noted = result_file.read_evaluated(folder)
     told = [] if noted["scenes"] is None else [Path(noted["scenes"]).name]
     told += [] if (protocol := noted.get("protocol", "trained")) == "trained" else [f"protocol={protocol}"]
     told += [override for override in noted["overrides"] if "path=" not in override]

@@ -35,7 +35,7 @@ FILE = "config.yaml"  # of a run's folder
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
 
 
-def command(name: str) -> str:
+def format_command(name: str) -> str:
     """How the process was called, for reports; where the files went is nobody else's business."""
     arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
     program, _, called = sys.argv[0].rpartition(" ")  # as `__main__` leaves it
@@ -43,7 +43,7 @@ def command(name: str) -> str:
     return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if ours else f"{name}(config)"
 
 
-def folder() -> Path:
+def find_conf() -> Path:
     """The folder of the configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
@@ -52,7 +52,7 @@ def folder() -> Path:
     raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
 
 
-def load(name: str = "train", *overrides: str) -> dict[str, Any]:
+def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
     """A command's config as a plain dict: `load("train", "experiment=demo", "worlds=8")`.
 
     Args:
@@ -62,7 +62,7 @@ def load(name: str = "train", *overrides: str) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown config, key or option, naming it and what would be valid.
     """
-    return plain(_open(name, overrides))
+    return to_dict(_open(name, overrides))
 
 
 def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -87,7 +87,7 @@ def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> li
     found = []
     for value in values:
         OmegaConf.update(opened, key, value)
-        found.append(plain(opened))  # what refers to the key follows it
+        found.append(to_dict(opened))  # what refers to the key follows it
     return found
 
 
@@ -97,13 +97,13 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     Raises:
         ConfigError: see `load`.
     """
-    known = sorted(path.stem for path in folder().glob("*.yaml"))
+    known = sorted(path.stem for path in find_conf().glob("*.yaml"))
     if name not in known:
         raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
-            plain(opened)
+            to_dict(opened)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key}: missing; give {error.full_key}=..., as `{name} --help` describes it") from None
     except (ConfigCompositionException, HydraException, OmegaConfBaseException) as error:
@@ -120,7 +120,7 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
     Raises:
         ConfigError: with what empties a mapping, and what drops one of its entries.
     """
-    for one in OverridesParser.create().parse_overrides([quoted(override) for override in overrides]):
+    for one in OverridesParser.create().parse_overrides([quote_override(override) for override in overrides]):
         if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
             key, entry = one.key_or_group, next(iter(held))
             way = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
@@ -129,11 +129,11 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
 
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(folder()), version_base="1.3"):
-        return hydra_compose(name, overrides=[quoted(override) for override in overrides], return_hydra_config=whole)
+    with initialize_config_dir(str(find_conf()), version_base="1.3"):
+        return hydra_compose(name, overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
 
 
-def plain(config: Any) -> dict[str, Any]:
+def to_dict(config: Any) -> dict[str, Any]:
     """An OmegaConf config with everything resolved, as dicts and lists."""
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # pyright: ignore[reportReturnType]
 
@@ -146,14 +146,14 @@ def _explain(name: str, error: Exception) -> str:
         text = text.partition(" Config search path:")[0]
     if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
         group, option = missing.groups()
-        valid = ", ".join(sorted(path.stem for path in (folder() / group).glob("*.yaml")))
+        valid = ", ".join(sorted(path.stem for path in (find_conf() / group).glob("*.yaml")))
         return f"{group}: unknown option {option!r}; valid: {valid}"
     match = re.search(r"Could not override '([^']+)'", text)
     if not match:
         return text
     path = match.group(1).split(".")
     try:
-        node: Any = plain(_compose(name, []))
+        node: Any = to_dict(_compose(name, []))
     except (ConfigCompositionException, HydraException, OmegaConfBaseException):
         return text  # the config itself is at fault
     for depth, key in enumerate(path):
@@ -174,12 +174,12 @@ def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
     Raises:
         ConfigError: no such run, naming the folder; a file that holds no config; or one that names such functions without `trust`.
     """
-    found = values(path)
-    trusted_targets.check(found, Path(path) / FILE, trust=trust)
+    found = read_values(path)
+    trusted_targets.check_targets(found, Path(path) / FILE, trust=trust)
     return found
 
 
-def values(path: Path) -> dict[str, Any]:
+def read_values(path: Path) -> dict[str, Any]:
     """What a run's `config.yaml` says, to compare or to show: nothing may be built from it, for its targets are not checked.
 
     Raises:
@@ -197,7 +197,7 @@ def values(path: Path) -> dict[str, Any]:
     return found
 
 
-def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A run's config with other settings: `dynamics=bicycle` replaces a whole group of the environment, `timing.episode_s=20` one number.
 
     A run's config holds values, no references: what follows another key in `conf/` (`observe.road.kernels` follows `facts.kernels`) does
@@ -212,7 +212,7 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
         *parents, last = path.split(".")
         if not separator:
             raise ConfigError(f"overrides: {override!r} is no setting; write key=value")
-        if not parents and (folder() / last).is_dir():
+        if not parents and (find_conf() / last).is_dir():
             *outer, inner = last.split("/")  # `dynamics/fleet=spread`: a group within a group
             fresh, node = copy.deepcopy(_task(override)), result
             for name in outer:
@@ -233,15 +233,15 @@ def amend(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
     """The environment with one other setting, or with a policy that judges beside it; a study asks for the same ones again and again."""
-    return load("task", f"+{override}" if override.startswith("policy=") else override)
+    return load_config("task", f"+{override}" if override.startswith("policy=") else override)
 
 
 def write(path: Path, config: Mapping[str, Any]) -> None:
     """Keep a run's config, and the commit and the versions it ran with, beside its results."""
     Path(path).mkdir(parents=True, exist_ok=True)
-    with atomic_file.replaced(Path(path) / FILE) as half:  # a run without its config is lost
+    with atomic_file.write_atomically(Path(path) / FILE) as half:  # a run without its config is lost
         half.write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": commit(), **versions()}, sort_keys=False))
+    (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": find_commit(), **versions()}, sort_keys=False))
 
 
 def versions() -> dict[str, str]:
@@ -255,7 +255,7 @@ def versions() -> dict[str, str]:
     return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
 
 
-def commit() -> str:
+def find_commit() -> str:
     """The commit that runs, as `git describe` says it; the package's version where there is no git."""
     import scenefactory_jax
 
@@ -274,7 +274,7 @@ def _version(name: str) -> str:
         return "not installed"
 
 
-def quoted(override: str) -> str:
+def quote_override(override: str) -> str:
     """An override as Hydra's grammar wants it: `overrides=[dynamics=bicycle,weather=wet]` with its entries quoted, for it takes no bare `=`
     inside a list, and the condition of `filter=vehicles >= 8` as one text."""
     if condition := re.fullmatch(r"filter=(?!null$)([^'\"].*)", override, re.DOTALL):
@@ -322,7 +322,7 @@ def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
         ConfigError: an override that is none.
     """
     try:
-        parsed = OverridesParser.create().parse_overrides([quoted(override) for override in overrides])
+        parsed = OverridesParser.create().parse_overrides([quote_override(override) for override in overrides])
     except HydraException as error:
         raise ConfigError(" ".join(str(error).split())) from None
     fixed = [one.input_line for one in parsed if not one.is_sweep_override() and one.input_line]
@@ -330,6 +330,6 @@ def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
     return [*fixed, *first], {one.key_or_group for one in parsed if one.is_sweep_override()}
 
 
-def changes(varied: Set[str]) -> list[str]:
+def format_changes(varied: Set[str]) -> list[str]:
     """The overrides of the present job of a sweep whose keys vary, but its name, which its folder has anyway."""
     return [word for word in HydraConfig.get().overrides.task if word.partition("=")[0].lstrip("+~") in varied - {"name"}]

@@ -10,7 +10,7 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
-from scenefactory_jax.core.instantiate import build, check_range
+from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.visualization.report import friction_tables as report
 from scenefactory_jax.weather import friction as model
 
@@ -30,19 +30,19 @@ def weather(config: Mapping[str, Any]) -> dict[str, Any]:
     schema.check(config, schema.WEATHER)
     (slowest, fastest), (least, most) = (check_range(config[name], where=name) for name in ("speeds_mps", "slips"))
     grip = config["weather"]["grip"]
-    tyre = build({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()
+    tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()
     slips, reference = {"static": grip["slip_static"], "dynamic": grip["slip_dynamic"]}, grip["reference_speed"]
 
     def friction(surface: str, speed: Any, film_mm: Any, slip: Any) -> np.ndarray:
         numbers = grip["surfaces"][surface]
         given = (speed, film_mm, numbers["theta"], numbers["texture_mm"], slip)
-        return np.asarray(model.friction(*jnp.broadcast_arrays(*(jnp.asarray(x, jnp.float32) for x in given)), tyre=tyre))
+        return np.asarray(model.compute_lugre_friction(*jnp.broadcast_arrays(*(jnp.asarray(x, jnp.float32) for x in given)), tyre=tyre))
 
     films = np.linspace(0.0, config["film_most_mm"], POINTS)
     speeds, slip = np.linspace(slowest, fastest, POINTS), np.linspace(least, most, POINTS)
     first = next(iter(grip["surfaces"]))
     found = {
-        "command": configs.command("weather"),
+        "command": configs.format_command("weather"),
         "reference": {"speed_mps": reference, "slips": slips, "films_mm": config["films_mm"], "surface": first},
         "table": {
             name: {kind: friction(name, reference, config["films_mm"], value) for kind, value in slips.items()}

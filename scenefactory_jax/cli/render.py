@@ -14,7 +14,7 @@ import numpy as np
 
 from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.scenes import draw
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import scene_source
@@ -33,13 +33,13 @@ def render(config: Mapping[str, Any]) -> Path:
         SceneError: nothing usable at the path.
     """
     schema.check(config, schema.RENDER)
-    loaded = scene_source.training(config["scenes"])
+    loaded = scene_source.load_training_scenes(config["scenes"])
     index, count = config["index"], len(loaded)
     if not 0 <= index < count:
         raise ConfigError(f"index: {index}; valid: 0 to {count - 1}")
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), loaded.scene)
     context = {"control_dt": 1.0 / config["timing"]["control_hz"]}
-    who = build(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context)
+    who = instantiate(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context)
     scene = replace(scene, boxes=who(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
     spec = world(config, scene)
     out = Path(config["out"])
@@ -68,8 +68,8 @@ def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
     dynamics = config["dynamics"]
     if "car" not in dynamics or "solver" not in dynamics:
         raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: mjx_car, mjx_published")
-    parameters, solver = cars.numbers(dynamics)
-    car = cars.spec(parameters, visual=True, brake_rows=False)
+    parameters, solver = cars.read_parameters(dynamics)
+    car = cars.build_mjspec(parameters, visual=True, brake_rows=False)
     spec = world_mjcf.world(scene, car, box_m=config["scenes"]["pack"]["box_m"], **config["world"])
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):
         cars.add_ground_pairs(spec, parameters, ground="ground", prefix=f"agent{slot}/")
@@ -87,5 +87,5 @@ def photograph(model: mujoco.MjModel, *, width: int, height: int) -> np.ndarray:
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = model.stat.center, 1.1 * model.stat.extent, 90.0, -50.0
-    with offscreen_renderer.painter(model, data, width=width, height=height) as paint:
+    with offscreen_renderer.make_painter(model, data, width=width, height=height) as paint:
         return paint(camera, lambda scene: None)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.data.curation import distribution_distance as report
 from scenefactory_jax.data.loading import raw_scenes
@@ -30,7 +30,7 @@ def compare(config: Mapping[str, Any]) -> Path:
     own, limit = config["scenes"], config["compare"]["limit"]
     scenes = {Path(own["path"]).name if own["path"] is not None else "scenes": own}
     for other in config["compare"]["others"]:
-        entry = configs.load("scenes", f"scenes={other}")["scenes"] if other in _entries() else {**own, "path": other}
+        entry = configs.load_config("scenes", f"scenes={other}")["scenes"] if other in _entries() else {**own, "path": other}
         scenes[other if Path(other).name in scenes else Path(other).name] = entry
     reference = next(iter(scenes))
     box_m = float(scenes[reference]["pack"]["box_m"])
@@ -40,18 +40,18 @@ def compare(config: Mapping[str, Any]) -> Path:
         if not len(samples["vehicles"]):
             raise SceneError(f"{entry['path']}: no usable scene to compare as {name!r}")
         sets[name] = samples
-    path = report.write(Path(config["out"]), reference, sets, box_m=box_m, command=configs.command("scenes"))
+    path = report.write(Path(config["out"]), reference, sets, box_m=box_m, command=configs.format_command("scenes"))
     print(f"{report.table(reference, sets)}\n{path}", flush=True)
     return path
 
 
 def _entries() -> list[str]:
-    return sorted(path.stem for path in (configs.folder() / "scenes").glob("*.yaml") if path.stem != "base")
+    return sorted(path.stem for path in (configs.find_conf() / "scenes").glob("*.yaml") if path.stem != "base")
 
 
 def _checked(config: Mapping[str, Any], limit: int) -> Iterator[RawScene]:
     """The first scenes of a config that pass its check."""
-    check = build(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check")
+    check = instantiate(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check")
     for raw in raw_scenes.scenes(config, limit=limit):
         if isinstance(raw, str):
             continue

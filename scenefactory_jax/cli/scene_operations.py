@@ -10,9 +10,9 @@ from typing import Any
 import pyarrow as pa
 from rich.progress import Progress
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
-from scenefactory_jax.core.safe_names import for_file, for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal, to_file_name
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import duplicates, operations
@@ -31,12 +31,12 @@ def info(config: Mapping[str, Any]) -> dict[str, Any]:
         print(json.dumps(found, indent=1), flush=True)
         return found
     for value, summary in found.items():
-        title = "" if config["info"]["by"] is None else for_terminal(f"{config['info']['by']} = {value}: ")
+        title = "" if config["info"]["by"] is None else escape_for_terminal(f"{config['info']['by']} = {value}: ")
         print(f"{title}{summary['scenes']} scenes\n{_table(summary)}")
         for name, counts in summary["texts"].items():
             more = f", and {len(counts) - SHOWN} more" if len(counts) > SHOWN else ""
             shown = ", ".join(f"{text} in {number}" for text, number in list(counts.items())[:SHOWN])
-            print(for_terminal(f"{name}: {shown}{more}"), flush=True)
+            print(escape_for_terminal(f"{name}: {shown}{more}"), flush=True)
     return found
 
 
@@ -82,7 +82,7 @@ def dedupe(config: Mapping[str, Any]) -> Bank:
     """One scene of every recording."""
     made = duplicates.dedupe(*_opened(config), **config["dedupe"])
     for group in made.account["groups"][:SHOWN]:
-        print(for_terminal(f"one recording: {', '.join(group)}"))
+        print(escape_for_terminal(f"one recording: {', '.join(group)}"))
     if (more := len(made.account["groups"]) - SHOWN) > 0:
         print(f"... and {more} groups more")
     return _written(config, made)
@@ -115,18 +115,18 @@ def export(config: Mapping[str, Any]) -> int:
         raise ConfigError(f"export.format: {name!r}; valid: {', '.join(EXPORTS)}")
     if out is None:
         raise ConfigError("out: null; give a folder for the files")
-    bank, check = _open(_path(config)), scene_source.readers(config["scenes"])["check"]
+    bank, check = _open(_path(config)), scene_source.make_readers(config["scenes"])["check"]
     refused: list[str] = []
     repaired: Counter[str] = Counter()
     files.make_folder(Path(out))
     with Progress(disable=not config["progress"], transient=True) as bar:
-        whole = bar.track(banks.raws(bank, range(len(bank))), total=len(bank), description="export")
+        whole = bar.track(banks.read_raws(bank, range(len(bank))), total=len(bank), description="export")
         written = EXPORTS[name](_checked(whole, check, refused, repaired), Path(out), refused)
     lines = [f"not written: {reason}" for reason in refused[:SHOWN]]
     lines += [f"... and {len(refused) - SHOWN} more"] if len(refused) > SHOWN else []
     lines += [f"in {number} scenes: {repair}" for repair, number in repaired.items()]
     lines.append(f"{out}: {written} of {len(bank)} scenes in the format of {name}")
-    print("\n".join(map(for_terminal, lines)), flush=True)
+    print("\n".join(map(escape_for_terminal, lines)), flush=True)
     return written
 
 
@@ -146,11 +146,11 @@ def _as_json(scenes: Iterable[RawScene], folder: Path, refused: list[str]) -> in
     """A file for each scene, in the layout of GPUDrive."""
     written: set[Path] = set()
     for raw in scenes:
-        path = folder / f"{for_file(raw.name)}.json"
+        path = folder / f"{to_file_name(raw.name)}.json"
         try:
             if path in written:
                 raise SceneError(f"{raw.source}: {path} is written already; two scenes need two names")
-            content = gpudrive.encoded(raw)
+            content = gpudrive.encode_json(raw)
         except SceneError as error:
             refused.append(f"{raw.name}: {error}")
             continue
@@ -180,15 +180,15 @@ def _open(path: str) -> Bank:
 def _opened(config: Mapping[str, Any]) -> tuple[Bank, pa.Table]:
     """The bank at `scenes.path`, and its metadata with every feature."""
     bank = _open(_path(config))
-    features = build(config["features"], builtins="scenefactory_jax.data.curation.features", where="features")
-    quiet = not config["progress"] or not len(operations.undescribed(bank))
+    features = instantiate(config["features"], builtins="scenefactory_jax.data.curation.features", where="features")
+    quiet = not config["progress"] or not len(operations.find_missing_columns(bank))
     with Progress(disable=quiet, transient=True) as bar:
         task = bar.add_task("features", total=None)
-        table = operations.described(bank, features, on_scene=lambda done, total: bar.update(task, completed=done, total=total))
+        table = operations.describe_scenes(bank, features, on_scene=lambda done, total: bar.update(task, completed=done, total=total))
     return bank, table
 
 
-def _written(config: Mapping[str, Any], made: operations.Made) -> Bank:
+def _written(config: Mapping[str, Any], made: operations.BankResult) -> Bank:
     """Print a result's account, and write it where `out` says so."""
     kept, scenes = made.account["kept"], made.account["scenes"]
     print(f"{config['op']}: {kept} of {scenes} scenes" + ("" if config["out"] else "; out=BANK writes them"), flush=True)

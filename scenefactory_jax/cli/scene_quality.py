@@ -40,7 +40,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
     rng = np.random.default_rng(numbers["seed"])
     counts, chosen = dict.fromkeys(rules, Count(0, 0, 0)), {name: [] for name in rules}
     scenes, refused, dropped, unread = 0, 0, 0, []
-    check = scene_source.readers(config["scenes"])["check"]
+    check = scene_source.make_readers(config["scenes"])["check"]
     for raw in raw_scenes.scenes(config["scenes"]):
         if isinstance(raw, str):
             unread.append(raw)
@@ -50,7 +50,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
         except SceneError as error:
             unread.append(str(error))
             continue
-        verdict = judging.judge(raw, rules, **names)
+        verdict = judging.find_defects(raw, rules, **names)
         scenes, refused = scenes + 1, refused + bool(verdict.rejected)
         dropped += 0 if verdict.rejected else len(verdict.dropped)
         for name in rules:
@@ -60,7 +60,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
         raise SceneError("\n".join(["scenes.path: no scene that can be read", *unread]))
     path = report.write(
         Path(config["out"]), scenes=scenes, counts=counts, entries={name: settings["rules"][name] for name in rules}, examples=chosen,
-        refused=refused, dropped=dropped, unread=unread, window_m=numbers["window_m"], command=configs.command("scenes"), **names,
+        refused=refused, dropped=dropped, unread=unread, window_m=numbers["window_m"], command=configs.format_command("scenes"), **names,
     )  # fmt: skip
     print(agent_metrics.grid(["rule", "findings", "scenes", "objects"], [[name, *count] for name, count in counts.items()]))
     print(f"{scenes} scenes judged, {refused} refused, {dropped} objects left out, {len(unread)} not read\n{path}", flush=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenefactory_jax.cli import scene_comparison, scene_operations, scene_quality, schema
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.safe_names import for_file
+from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import agent_metrics, scene_simulation
 from scenefactory_jax.visualization.birds_eye import contact_sheet, figures
@@ -36,7 +36,7 @@ def scenes(config: Mapping[str, Any]) -> Any:
 
 def check(config: Mapping[str, Any]) -> scene_source.Scenes:
     """Pack the scenes and print what was kept, dropped and refused, scene by scene."""
-    loaded = scene_source.training(config["scenes"])
+    loaded = scene_source.load_training_scenes(config["scenes"])
     table = [[name, *_row(jax.tree.map(lambda leaf, i=index: leaf[i], loaded.scene))] for index, name in enumerate(loaded.names)]
     print(agent_metrics.grid(["scene", "agents", "segments", "lane m", "edge m", "route m"], table))
     print(loaded.account, flush=True)
@@ -66,7 +66,7 @@ def draw(loaded: scene_source.Scenes, folder: Path, *, limit: int) -> list[Path]
     paths = []
     for index, name in enumerate(loaded.names[:limit]):
         scene = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)
-        paths.append(plots.save(figures.scene_figure(scene, title=name), folder / f"{for_file(name)}.png"))
+        paths.append(plots.save(figures.scene_figure(scene, title=name), folder / f"{to_file_name(name)}.png"))
     return paths
 
 

@@ -117,7 +117,7 @@ def check_train(config: Mapping[str, Any]) -> None:
 
 
 def _check_protocols(protocols: list[str], *, where: str) -> None:
-    known = sorted(path.stem for path in (configs.folder() / "ends").glob("*.yaml"))
+    known = sorted(path.stem for path in (configs.find_conf() / "ends").glob("*.yaml"))
     for protocol in protocols or [None]:
         if protocol not in known:
             raise ConfigError(f"{where}: {protocols}; valid: one or more of {', '.join(known)}")

@@ -16,19 +16,19 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import study_plan, study_results
-from scenefactory_jax.cli.study_plan import Judging, Plan, Training
+from scenefactory_jax.cli.study_plan import Evaluation, Plan, Training
 from scenefactory_jax.cli.study_results import RESULT, TRAINED
 from scenefactory_jax.core import atomic_file, folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.evaluation.protocols import make_examiner
+from scenefactory_jax.evaluation.protocols import make_evaluator
 from scenefactory_jax.learning import checkpoint, policy_io, training_loop
 
 COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
 LOOKS, COUNTED = "looks.json", ("policies", "curve points", "seconds")
 
-Work = TypeVar("Work", Training, Judging)
+Work = TypeVar("Work", Training, Evaluation)
 Examine = Callable[[Any], tuple[dict[str, np.ndarray], list]]
 
 
@@ -59,11 +59,11 @@ def study(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _do(
-    part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock", claims: gpu_processes.Claims | None = None
+    part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock", claims: gpu_processes.TaskClaims | None = None
 ) -> bool:
     """One part of a study in this process; whether all could be done."""
     work = _train if part == "train" else _judge
-    return work(plan, Shared(config, looks, claims or gpu_processes.Claims(None)), clock)
+    return work(plan, Shared(config, looks, claims or gpu_processes.TaskClaims(None)), clock)
 
 
 def _do_together(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks", clock: "Clock") -> bool:
@@ -72,7 +72,7 @@ def _do_together(part: str, config: Mapping[str, Any], plan: Plan, looks: "Looks
         folder = Path(name)
         try:
             shares = {**config, "until_s": clock.left_s()}
-            done = gpu_processes.run(_do_share, config["processes"], part, shares, folder, per_gpu=config["per_gpu"])
+            done = gpu_processes.run_on_gpus(_do_share, config["processes"], part, shares, folder, per_gpu=config["per_gpu"])
         finally:
             looks.gather(folder)
     return all(done)
@@ -82,7 +82,7 @@ def _do_share(index: int, part: str, config: Mapping[str, Any], folder: Path) ->
     """What one of several processes does."""
     scene_source.use_compilation_cache()
     looks = Looks(folder / f"{index}-{LOOKS}", command="", cut=config["cut"])
-    return _do(part, config, study_plan.make(config), looks, Clock(config["until_s"]), gpu_processes.Claims(folder))
+    return _do(part, config, study_plan.make(config), looks, Clock(config["until_s"]), gpu_processes.TaskClaims(folder))
 
 
 class Clock:
@@ -152,20 +152,20 @@ class Looks:
 class Shared:
     """What several trainings and judgings use: scenes, each read once, the count of looks, and what is this process's to do."""
 
-    def __init__(self, config: Mapping[str, Any], looks: Looks, claims: gpu_processes.Claims):
+    def __init__(self, config: Mapping[str, Any], looks: Looks, claims: gpu_processes.TaskClaims):
         self.config, self.looks, self.claims = config, looks, claims
         self._scenes: dict[str, scene_source.Scenes] = {}
 
     def training_scenes(self, task: Mapping[str, Any]) -> scene_source.Scenes:
         """Before `scenes.take`."""
         entry = task["scenes"]
-        return self._kept("train " + study_plan.scenes_key(entry, entry["path"]), lambda: scene_source.everything(entry))
+        return self._kept("train " + study_plan.scenes_key(entry, entry["path"]), lambda: scene_source.load_all_scenes(entry))
 
     def heldout(self, task: Mapping[str, Any]) -> scene_source.Scenes:
         """Those that policies are judged on."""
         entry, path = task["scenes"], self.config["test_scenes"]
         key = study_plan.scenes_key(entry, path) + result_file.digest(entry["heldout"])
-        return self._kept("test " + key, lambda: scene_source.heldout(entry, path=path))
+        return self._kept("test " + key, lambda: scene_source.load_heldout_scenes(entry, path=path))
 
     def _kept(self, key: str, load: Callable[[], scene_source.Scenes]) -> scene_source.Scenes:
         if key not in self._scenes:
@@ -173,11 +173,11 @@ class Shared:
             print(self._scenes[key].account, flush=True)
         return self._scenes[key]
 
-    def examiner(self, judging: Judging, kind: str) -> Examine:
+    def examiner(self, judging: Evaluation, kind: str) -> Examine:
         """Plays the held-out scenes under a judging's condition and protocol."""
         settings = {**judging.config["evaluation"], **self.config["evaluation"]}
         scenes = self.heldout(judging.config)
-        return self.looks.counted(make_examiner(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind)
+        return self.looks.counted(make_evaluator(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind)
 
     def wanted(self, variant: str) -> bool:
         return self.config["only"] is None or variant in self.config["only"]
@@ -200,7 +200,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
                 return False
             begun = time.monotonic()
             prepared = prepared or training_loop.prepare(one.config)
-            watched = study_plan.watched(plan, one) if one.config["evaluation"]["every"] else []
+            watched = study_plan.is_watched(plan, one) if one.config["evaluation"]["every"] else []
             examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
             own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
             sharing = min(shared.config["per_gpu"], shared.config["processes"])
@@ -212,7 +212,7 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             spent[program] = time.monotonic() - begun
             result_file.write(one.folder / TRAINED, note, digits=None)
             if shared.config["slim"]:
-                checkpoint.strip(one.folder / study_plan.TRAINED)
+                checkpoint.drop_training_state(one.folder / study_plan.TRAINED)
     return True
 
 
@@ -245,9 +245,9 @@ def _train_one(one: Training, prepared: training_loop.Prepared) -> dict[str, Any
     config = {**one.config, "out": str(one.folder), "resume": resume}
     last = training_loop.train(config, prepared=prepared).metrics[-1]
     note = {"digest": one.digest, "seed": one.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
-    note |= {"minutes": last["minutes"], "commit": configs.commit(), "versions": configs.versions()}
+    note |= {"minutes": last["minutes"], "commit": configs.find_commit(), "versions": configs.versions()}
     if prepared.scenes is not None:
-        scenes = scene_source.taken(prepared.scenes, config["scenes"])
+        scenes = scene_source.take_scenes(prepared.scenes, config["scenes"])
         note |= {"scenes": len(scenes), "agents": int(np.asarray(scenes.scene.agents.present).sum())}
     return note
 
@@ -269,7 +269,7 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
                 return False
             examine = examine or shared.examiner(one, "policies")
             records, _ = examine(_weights(one, shared))
-            with atomic_file.replaced(one.file) as half:
+            with atomic_file.write_atomically(one.file) as half:
                 agent_metrics.write_csv(half, records)
             counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("reached", "clean", "collided")]
             print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
@@ -277,12 +277,12 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
     return True
 
 
-def _is_ready(one: Judging) -> bool:
+def _is_ready(one: Evaluation) -> bool:
     """Whether there is what is to be judged; what learns nothing has its place in the folder of a run that was begun."""
     return (one.training.folder / configs.FILE).is_file() if one.weights == study_plan.UNTRAINED else is_trained(one.training)
 
 
-def _weights(one: Judging, shared: Shared) -> Any:
+def _weights(one: Evaluation, shared: Shared) -> Any:
     if one.weights == study_plan.UNTRAINED:
         return policy_io.draw_untrained(one.config, shared.heldout(one.config)[0])
     return checkpoint.restore_parameters(one.training.folder / one.weights)
@@ -299,7 +299,7 @@ def _listed(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _command(config: Mapping[str, Any]) -> str:
     """How the study was called, without saying where this machine keeps its files."""
-    command = configs.command("study")
+    command = configs.format_command("study")
     for name in ("train_scenes", "test_scenes", "runs"):
         if config[name] is not None:
             command = command.replace(str(config[name]), Path(config[name]).name)

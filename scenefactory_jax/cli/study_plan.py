@@ -34,7 +34,7 @@ class Training(NamedTuple):
     program: str
 
 
-class Judging(NamedTuple):
+class Evaluation(NamedTuple):
     """One policy under one condition and protocol."""
 
     row: str  # of the report: a variant, or a floor
@@ -52,7 +52,7 @@ class Plan(NamedTuple):
 
     name: str
     trainings: list[Training]
-    judgings: list[Judging]
+    judgings: list[Evaluation]
 
 
 def make(config: Mapping[str, Any]) -> Plan:
@@ -72,7 +72,7 @@ def make(config: Mapping[str, Any]) -> Plan:
     return Plan(study["name"], trainings, sorted(judgings, key=lambda one: (places[one.condition], rows[one.row])))
 
 
-def watched(plan: Plan, training: Training) -> list[Judging]:
+def is_watched(plan: Plan, training: Training) -> list[Evaluation]:
     """How a variant is judged while it trains: under its first condition, in every protocol."""
     own = [one for one in plan.judgings if one.row == training.variant and one.training.seed == training.seed]
     return [one for one in own if one.condition == own[0].condition]
@@ -124,7 +124,7 @@ def check(config: Mapping[str, Any]) -> None:
         raise ConfigError("study: without trainings or without conditions there is nothing to find out")
 
 
-def later_wins(overrides: Sequence[str]) -> list[str]:
+def merge_overrides(overrides: Sequence[str]) -> list[str]:
     """Overrides without those that a later one of the same key replaces; Hydra takes no group twice."""
     last = {override.partition("=")[0].lstrip("+"): index for index, override in enumerate(overrides)}
     return [override for index, override in enumerate(overrides) if last[override.partition("=")[0].lstrip("+")] == index]
@@ -135,10 +135,10 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
     study = config["study"]
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
     scenes += [] if config["test_scenes"] is None else [f"scenes.heldout.path={_quoted(config['test_scenes'])}"]
-    overrides = later_wins([*study["base"], *scenes, *study["common"], *study["trainings"][variant], *config["common"]])
+    overrides = merge_overrides([*study["base"], *scenes, *study["common"], *study["trainings"][variant], *config["common"]])
     fixed = ["loggers=[]", "evaluation.enable=false", f"progress={str(config['progress']).lower()}"]
     try:
-        each = configs.load_each("train", *later_wins([*overrides, *fixed]), key="seed", values=seeds)
+        each = configs.load_each("train", *merge_overrides([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:
         raise ConfigError(f"study.trainings.{variant}: {error}") from None
     return [_training({**one, "name": f"{study['name']}, {variant}"}, variant, overrides, runs) for one in each]
@@ -157,7 +157,7 @@ def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs
     return Training(variant, seed, overrides, settings, folder, digest, program)
 
 
-def _judgings(config: Mapping[str, Any], training: Training, *, first: int) -> list[Judging]:
+def _judgings(config: Mapping[str, Any], training: Training, *, first: int) -> list[Evaluation]:
     """All that is judged of one training: its policy, and the floors that begin with it."""
     study = config["study"]
     everywhere = list(study["conditions"])
@@ -174,10 +174,10 @@ def _judgings(config: Mapping[str, Any], training: Training, *, first: int) -> l
 
 def _judging(
     config: Mapping[str, Any], training: Training, row: str, weights: str, condition: str, own: list[str], protocol: str
-) -> Judging:
+) -> Evaluation:
     study = config["study"]
     try:
-        examined = configs.amend(training.config, [*study["examined"], *study["conditions"][condition], *own])
+        examined = configs.apply_overrides(training.config, [*study["examined"], *study["conditions"][condition], *own])
     except ConfigError as error:
         raise ConfigError(f"study.conditions.{condition}: {error}") from None
     path = config["test_scenes"]
@@ -188,7 +188,7 @@ def _judging(
     drawn = {"scenes": scenes_key(examined["scenes"], path), "heldout": heldout}
     program = result_file.digest(parts | drawn | _printed(path if heldout is None else heldout["path"]))
     file = training.folder / f"judged-{weights}-{program}.csv"
-    return Judging(row, training, weights, condition, protocol, examined, program, file)
+    return Evaluation(row, training, weights, condition, protocol, examined, program, file)
 
 
 def _printed(path: str | None) -> dict[str, str]:

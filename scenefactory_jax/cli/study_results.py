@@ -126,7 +126,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: Judged) -> dict[str,
         "rows": rows,
         "differences": _differences(study["compare"], records, resampling),
         "trainings": {variant: _trained(variant, plan, config["target"]) for variant in study["trainings"]},
-        "made_with": {"commit": configs.commit(), **configs.versions()},
+        "made_with": {"commit": configs.find_commit(), **configs.versions()},
     }
 
 
@@ -211,7 +211,7 @@ def _held_out(
     found: dict[str, dict[int, dict[str, Any]]] = {}
     for one in trainings:
         rows = metrics_csv.read(one.folder, metrics_csv.EVALUATIONS)
-        for judging in study_plan.watched(plan, one):
+        for judging in study_plan.is_watched(plan, one):
             if rows and notes[one.seed].get("watched", {}).get(judging.protocol) == judging.program:
                 found.setdefault(judging.protocol, {})[one.seed] = _curve(rows, judging.protocol, target)
     return found

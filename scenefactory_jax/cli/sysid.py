@@ -18,8 +18,8 @@ from experiments.validation import target_check
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
-from scenefactory_jax.core.instantiate import ConfigError, build
-from scenefactory_jax.core.parallel.process_pool import mapping
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.parallel.process_pool import map_tasks
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.sysid import (
@@ -32,9 +32,9 @@ from scenefactory_jax.sysid import (
     parameter_space,
     reference_recordings,
 )
-from scenefactory_jax.sysid.candidate_simulation import Replay, Suite
-from scenefactory_jax.sysid.manoeuvres import Recording
-from scenefactory_jax.sysid.optimization import Outcome, Refined, Score, Stage
+from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Replay
+from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
+from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
 from scenefactory_jax.sysid.parameter_space import Space
 from scenefactory_jax.visualization.report import sysid_report as report
 
@@ -60,7 +60,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     where = parameter_space.make(settings["space"])
     replay = candidate_simulation.make(config["dynamics"], where, settings["friction"], physics_hz=float(config["physics_hz"]))
     plan = candidate_simulation.suite(lessons)
-    score = candidate_simulation.scorer(replay, plan, width=settings["width"])
+    score = candidate_simulation.make_scorer(replay, plan, width=settings["width"])
     outcomes = stages(config, out, lessons, where, score)
     refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
     places, along = optimization.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
@@ -68,7 +68,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     samples = drawn(known, settings["samples"])
     judged = {name: judge(known, *car, weights=settings["weights"], samples=samples) for name, car in drivers.items()}
     result = {
-        "command": configs.command("sysid"),
+        "command": configs.format_command("sysid"),
         "versions": configs.versions(),
         "manoeuvres": {name: len(recordings) for name, recordings in known.items()},
         "space": where._asdict(),
@@ -88,7 +88,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def judge(
-    known: Mapping[str, Sequence[Recording]],
+    known: Mapping[str, Sequence[ManoeuvreRecording]],
     replay: Replay,
     row: np.ndarray,
     *,
@@ -107,20 +107,22 @@ def judge(
             "name": [recording.manoeuvre.name for recording in recordings],
             "family": [recording.manoeuvre.family for recording in recordings],
             "loss": [float((square**2).sum()) for square in squares],
-            **error_metrics.measure(path, recordings)._asdict(),
+            **error_metrics.compute_errors(path, recordings)._asdict(),
         }
         named = [(i, name) for i, name in enumerate(found[name]["name"]) if name in samples]
         traces |= {name: jax.tree.map(lambda leaf, i=i: leaf[i], path) for i, name in named}
     return found, traces
 
 
-def drawn(known: Mapping[str, Sequence[Recording]], samples: Sequence[str]) -> list[str]:
+def drawn(known: Mapping[str, Sequence[ManoeuvreRecording]], samples: Sequence[str]) -> list[str]:
     """The samples that the teacher has driven, or the first manoeuvre of each suite."""
     names = [recording.manoeuvre.name for recordings in known.values() for recording in recordings]
     return [name for name in samples if name in names] or [recordings[0].manoeuvre.name for recordings in known.values()]
 
 
-def shown(known: Mapping[str, Sequence[Recording]], samples: Sequence[str], traces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def shown(
+    known: Mapping[str, Sequence[ManoeuvreRecording]], samples: Sequence[str], traces: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
     """The samples of the report, ten times a second: sample -> teacher and cars -> time, position, speed, yaw rate."""
     stride = round(manoeuvres.RATE_HZ / 10.0)
     taught = {recording.manoeuvre.name: recording for recordings in known.values() for recording in recordings}
@@ -154,12 +156,12 @@ def fitted(where: Space, row: np.ndarray) -> dict[str, Any]:
             "friction": {name: found[name] for name in parameter_space.FRICTION if name in found}}  # fmt: skip
 
 
-def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]:
+def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRecording]]:
     """What the teacher did on the published manoeuvres, on ours and on those kept out of the fit: from files of these settings, or now.
 
     Of each suite every `sysid.every`-th manoeuvre.
     """
-    instructor = build(config["teacher"], builtins=multibody_model, where="teacher")(cars.numbers(config["dynamics"])[0])
+    instructor = instantiate(config["teacher"], builtins=multibody_model, where="teacher")(cars.read_parameters(config["dynamics"])[0])
     suites = {
         "training": manoeuvres.training,
         "extra": manoeuvres.extra,
@@ -167,7 +169,7 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]
     }
     masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
     every, found = config["sysid"]["every"], {}
-    with mapping(config["workers"]) as each:
+    with map_tasks(config["workers"]) as each:
         for name, suite in suites.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
             made = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
@@ -184,7 +186,7 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[Recording]]
     return found
 
 
-def stages(config: Mapping[str, Any], out: Path, lessons: Sequence[Recording], where: Space, score: Score) -> list[Outcome]:
+def stages(config: Mapping[str, Any], out: Path, lessons: Sequence[ManoeuvreRecording], where: Space, score: Score) -> list[Outcome]:
     """The search, each stage from where the one before ended."""
     settings = config["sysid"]
     found: dict[str, Outcome] = {}
@@ -213,7 +215,7 @@ def stages(config: Mapping[str, Any], out: Path, lessons: Sequence[Recording], w
 
 
 def _stage(
-    name: str, entry: Mapping[str, Any], settings: Mapping[str, Any], where: Space, lessons: Sequence[Recording]
+    name: str, entry: Mapping[str, Any], settings: Mapping[str, Any], where: Space, lessons: Sequence[ManoeuvreRecording]
 ) -> tuple[Stage, list[int]]:  # fmt: skip
     """A stage of the config, and the manoeuvres that it looks at; no families are all of them, no parameters likewise."""
     families = entry["families"] or sorted({recording.manoeuvre.family for recording in lessons})
@@ -226,12 +228,14 @@ def _stage(
     return Stage(name, tuple(families), tuple(entry["tuned"]) or where.names, entry["window"], population, generations), rows
 
 
-def refinement(config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: Suite, begin: np.ndarray) -> Refined:
+def refinement(
+    config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: ManoeuvreBatch, begin: np.ndarray
+) -> RefinementResult:
     """Least squares on all manoeuvres."""
     settings = config["sysid"]
     made = result_file.digest({"refine": settings["refine"], "start": begin.tolist(), "shared": _shared(config)})
     path = out / "stages" / "refine.json"
-    found = _kept(path, made, Refined) if config["resume"] else None
+    found = _kept(path, made, RefinementResult) if config["resume"] else None
     if found is None:
         weights, index = optimization.weight_row(settings["weights"]), np.arange(len(plan.frames))
         together = max(1, settings["width"] // len(index) // 4)  # candidates whose whole traces are on the device at once

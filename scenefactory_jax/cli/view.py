@@ -12,7 +12,7 @@ from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import raw_scenes, scene_source
 from scenefactory_jax.data.packing.pack import Packed, prepare
@@ -30,12 +30,12 @@ ENDINGS = (".html", *film.SUFFIXES, ".rrd")
 SHOWN = 3  # reasons in a message
 
 
-class Shown(NamedTuple):
+class RecordedWorlds(NamedTuple):
     """The scenes of a page, worlds along the first axis, and what stands on their maps."""
 
     scene: Scene
     names: tuple[str, ...]
-    posts: tuple[replay_data.Posts, ...]
+    posts: tuple[replay_data.RoadPosts, ...]
 
 
 def replay(config: Mapping[str, Any]) -> Path:
@@ -48,10 +48,10 @@ def replay(config: Mapping[str, Any]) -> Path:
     """
     _check(config)
     scene_source.use_compilation_cache()
-    settings = config if config["run"] is None else of_run(config, command="replay")
+    settings = config if config["run"] is None else load_run_config(config, command="replay")
     count = 1 if Path(config["out"]).suffix in film.SUFFIXES else config["worlds"]
-    env, shown = environment.make(settings), chosen(settings["scenes"], count=count, skip=config["skip"])
-    act, parameters = driver(config, settings, slots=shown.scene.agents.yaw.shape[1])
+    env, shown = environment.make_env(settings), choose_scenes(settings["scenes"], count=count, skip=config["skip"])
+    act, parameters = select_policy(config, settings, slots=shown.scene.agents.yaw.shape[1])
     steps = max(round(min(config["seconds"], settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
     print(f"{len(shown.names)} worlds, {steps} control steps each: {', '.join(shown.names)}", flush=True)
     recording = jax.device_get(record(env, act, parameters, shown.scene, jax.random.key(config["seed"]), steps=steps))
@@ -79,23 +79,23 @@ def _check(config: Mapping[str, Any]) -> None:
         rerun_file.check()
 
 
-def _write(config: Mapping[str, Any], settings: Mapping[str, Any], recording: Recording, shown: "Shown") -> Path:
+def _write(config: Mapping[str, Any], settings: Mapping[str, Any], recording: Recording, shown: "RecordedWorlds") -> Path:
     out, goal = Path(config["out"]), settings["facts"]["goal_radius_m"]
     title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
     if out.suffix in film.SUFFIXES:
-        return film.write(out, recording, car=looks(settings), look=film.Look(**config["film"], goal_radius_m=goal))
+        return film.write(out, recording, car=choose_film_settings(settings), look=film.FilmSettings(**config["film"], goal_radius_m=goal))
     if out.suffix == ".rrd":
         return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal)
     return replay_page.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal)
 
 
-def looks(settings: Mapping[str, Any]) -> cars.CarParameters:
+def choose_film_settings(settings: Mapping[str, Any]) -> cars.CarParameters:
     """The car to draw: the dynamics' own, or the articulated one where it has none."""
     own = settings["dynamics"]
-    return cars.numbers(own if "car" in own else configs.load("task")["dynamics"])[0]
+    return cars.read_parameters(own if "car" in own else configs.load_config("task")["dynamics"])[0]
 
 
-def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
+def load_run_config(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
     """The run's own config with the overrides, and with the scenes that are asked for.
 
     Args:
@@ -104,11 +104,11 @@ def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
     Raises:
         ConfigError: no such run, a group that the run decides, or no scenes.
     """
-    plain = configs.load(command)
+    plain = configs.load_config(command)
     for group in environment.GROUPS:  # what a run has of its own
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
-    trained = configs.amend(configs.read(policy_io.find(config["run"]), trust=config["trust"]), config["overrides"])
+    trained = configs.apply_overrides(configs.read(policy_io.find(config["run"]), trust=config["trust"]), config["overrides"])
     own, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
     if asked["path"] is not None:
         return trained | {"scenes": own | {"path": asked["path"]}}
@@ -120,7 +120,7 @@ def of_run(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
     return trained | {"scenes": own | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
+def select_policy(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
     """Who drives, and with which parameters."""
     if config["act"] == "policy" and config["run"] is not None:
         policy = make_policy(settings)
@@ -131,12 +131,12 @@ def driver(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int
     return lambda parameters, observation, key: jnp.zeros((slots, 3)), None
 
 
-def chosen(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
+def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> RecordedWorlds:
     """The first usable scenes; no more is read than they take."""
     schema.check_scenes(config)
-    parts = scene_source.readers(config)
+    parts = scene_source.make_readers(config)
     packed: list[Packed] = []
-    posts: list[replay_data.Posts] = []
+    posts: list[replay_data.RoadPosts] = []
     reasons: list[str] = []
     for raw in raw_scenes.scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
         if isinstance(raw, str):
@@ -148,7 +148,7 @@ def chosen(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
             reasons.append(str(error))
             continue
         packed.append(one)
-        posts.append(replay_data.posts(raw, one.report.centre))
+        posts.append(replay_data.find_posts(raw, one.report.centre))
         if len(packed) == skip + count:
             break
     if not packed:
@@ -157,4 +157,6 @@ def chosen(config: Mapping[str, Any], *, count: int, skip: int) -> Shown:
         raise ConfigError(f"skip: {skip}; valid: 0 to {len(packed) - 1}, for {len(packed)} scenes can be used")
     taken, account = packed[skip:], posts[skip:]
     scene, _ = stack([one.scene for one in taken], capacity=config["capacity"])
-    return Shown(scene_source.with_cells(scene, config), tuple(for_terminal(one.report.name) for one in taken), tuple(account))
+    return RecordedWorlds(
+        scene_source.attach_grids(scene, config), tuple(escape_for_terminal(one.report.name) for one in taken), tuple(account)
+    )

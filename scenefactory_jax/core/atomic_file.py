@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
+def write_atomically(path: Path) -> Iterator[Path]:
     """A place beside `path` to write to; what lies there in the end takes the place of the file."""
     half = path.with_name(f"{path.name}.part")
     yield half

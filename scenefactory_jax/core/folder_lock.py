@@ -20,7 +20,7 @@ class Busy(ConfigError):
 
 
 @contextlib.contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder, made if it is not there, against other commands. The system takes the lock back however the process ends.
 
     At the end the lock is removed, and what had to be made of the folder and its parents and is still empty.
@@ -29,7 +29,7 @@ def alone(folder: Path) -> Iterator[None]:
         Busy: another command holds it.
         ConfigError: the folder cannot be written.
     """
-    new = missing(folder)
+    new = find_missing_parents(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = None if fcntl is None else _locked(folder / LOCK)
@@ -46,7 +46,7 @@ def alone(folder: Path) -> Iterator[None]:
         remove_empty(new)
 
 
-def missing(folder: Path) -> list[Path]:
+def find_missing_parents(folder: Path) -> list[Path]:
     """The folder and those of its parents that do not exist, the innermost first."""
     return [place for place in (folder, *folder.parents) if not place.exists()]
 

@@ -13,7 +13,7 @@ def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
-def heading(yaw: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
+def heading_vector(yaw: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
     """Unit vector that a yaw points along."""
     return jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
@@ -29,12 +29,12 @@ def to_frame(vector: Float[Array, "*n 2"], yaw: Float[Array, "*m"]) -> Float[Arr
     return rotate(vector, -yaw)
 
 
-def norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
+def safe_norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Euclidean length whose gradient at zero is zero instead of NaN."""
-    return root(dot(vector, vector))
+    return safe_sqrt(dot(vector, vector))
 
 
-def root(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def safe_sqrt(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Square root whose gradient at zero is zero instead of NaN; NaN stays NaN: a distance that is not known is not short."""
     zero = squared <= 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
@@ -56,7 +56,7 @@ def cross(a: Float[Array, "*n 2"], b: Float[Array, "*m 2"]) -> Float[Array, "*k"
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def car_circles(
+def cover_with_circles(
     position: Float[Array, "A 2"],
     yaw: Float[Array, " A"],
     size: Float[Array, "A 2"],
@@ -74,7 +74,7 @@ def car_circles(
     radius = jnp.maximum(radius_floor_m, radius_share * width)
     spacing = jnp.minimum(spacing_limit_m, jnp.maximum(0.0, 0.5 * length - 0.8 * radius))
     along = spacing[:, None] * jnp.array([1.0, 0.0, -1.0], jnp.float32)
-    centres = position[:, None, :] + along[..., None] * heading(yaw)[:, None, :]
+    centres = position[:, None, :] + along[..., None] * heading_vector(yaw)[:, None, :]
     return centres, radius
 
 
@@ -83,15 +83,15 @@ def distance_to_boxes(
 ) -> Float[Array, "*n B"]:
     """Distance from points to the outlines of oriented boxes; 0 inside."""
     beyond = jnp.abs(to_frame(point[..., None, :] - position, yaw)) - size / 2
-    return norm(jnp.maximum(beyond, 0.0))
+    return safe_norm(jnp.maximum(beyond, 0.0))
 
 
-def running_length(road: Road) -> Float[Array, " P"]:
+def cumulative_length(road: Road) -> Float[Array, " P"]:
     """Length of all valid segments up to the end of each, laid end to end in storage order."""
     return jnp.cumsum(jnp.where(road.valid, 2 * road.half_length, 0.0))
 
 
-def locate(
+def find_point_at_distance(
     road: Road, running: Float[Array, " P"], distance: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
     """Point, yaw, polyline and arc length at a distance along all valid segments laid end to end; `running` is their `running_length`."""

@@ -20,7 +20,7 @@ class ConfigError(ValueError):
     """A config entry that cannot be used; the message names the key, the value and what would be valid."""
 
 
-def build(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
+def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
     """Bind the numbers of `entry` to the function that `_target_` names.
 
     Args:
@@ -34,7 +34,7 @@ def build(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: 
     """
     if not isinstance(entry, Mapping) or "_target_" not in entry:
         raise ConfigError(f"{where}: {entry!r} is no entry; write a mapping with `_target_` and its numbers")
-    function = find(entry["_target_"], builtins=builtins, where=where)
+    function = resolve_target(entry["_target_"], builtins=builtins, where=where)
     parameters = {p.name: p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY}
     numbers = {key: value for key, value in entry.items() if key != "_target_"}
     supplied = {key: value for key, value in context.items() if key in parameters}
@@ -51,7 +51,7 @@ def build(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: 
     return functools.partial(function, **numbers, **supplied)
 
 
-def find(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
+def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
     """The function that `target` names: a public one of `builtins`, or a dotted path to import.
 
     Raises:
@@ -70,12 +70,12 @@ def find(target: str, *, builtins: types.ModuleType | str, where: str) -> Callab
         name = target
     function = getattr(module, name, None)
     if not callable(function) or name.startswith("_") or not _is_own(function, module):
-        valid = ", ".join(names(module))
+        valid = ", ".join(list_functions(module))
         raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path of your own")
     return function
 
 
-def names(module: types.ModuleType) -> list[str]:
+def list_functions(module: types.ModuleType) -> list[str]:
     """Public functions that a module defines itself."""
     own = [n for n, f in vars(module).items() if inspect.isfunction(f) and inspect.unwrap(f).__module__ == module.__name__]
     return sorted(n for n in own if not n.startswith("_"))
@@ -120,7 +120,7 @@ def check_numbers(values: Mapping[str, float], *, where: str, **bounds: float) -
         check_number(value, where=f"{where}.{name}", **bounds)
 
 
-def check_share(value: float | int, *, where: str) -> None:
+def check_fraction(value: float | int, *, where: str) -> None:
     """Refuse a share of the config that is none.
 
     Raises:
@@ -141,13 +141,13 @@ def check_range(span: Sequence[float | int], *, where: str, least: float | None 
     return span[0], span[1]
 
 
-def differing(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
+def find_differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
     """Dotted keys of which two configs have different values -> both; None, or a group as a whole, where one of them has no such key."""
     found = {}
     for key in {**before, **now}:
         held, wanted = before.get(key), now.get(key)
         if isinstance(held, Mapping) and isinstance(wanted, Mapping):
-            found |= differing(held, wanted, f"{prefix}{key}.")
+            found |= find_differences(held, wanted, f"{prefix}{key}.")
         elif held != wanted:
             found[f"{prefix}{key}"] = held, wanted
     return found

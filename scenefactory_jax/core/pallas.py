@@ -25,7 +25,7 @@ def whole(operand: Any) -> pl.BlockSpec:
     return pl.BlockSpec(operand.shape, lambda *programs: (0,) * len(operand.shape))
 
 
-def shown(mask: Bool[Array, "*n K"]) -> Int[Array, "*n"]:
+def block_of(mask: Bool[Array, "*n K"]) -> Int[Array, "*n"]:
     """How many entries of the last axis there are up to the last true one."""
     count = jnp.arange(1, mask.shape[-1] + 1, dtype=jnp.int32)
     return jnp.max(jnp.where(mask, count, 0), axis=-1, initial=0)

@@ -24,7 +24,7 @@ LARGEST = 1e12  # no length, speed or force of a car comes near; beyond, float32
 KINDS = {"float": jnp.floating, "int": jnp.integer, "bool": jnp.bool_}
 
 
-def choose(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
+def tree_where(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
     """Row by row of two pytrees whose leaves all start with the axis of `condition`: agents, or worlds."""
 
     def pick(a: Array, b: Array) -> Array:
@@ -100,7 +100,7 @@ def _shown(shape: Iterable[Any]) -> str:
     return f"({', '.join(map(str, shape))})"
 
 
-def strong(tree: T) -> T:
+def to_strong_type(tree: T) -> T:
     """Cast away weak types: a carried state with one traces its function a second time."""
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
@@ -119,7 +119,7 @@ def static(**options: Any) -> Any:
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static))
-def struct(cls: type[T]) -> type[T]:
+def pytree_dataclass(cls: type[T]) -> type[T]:
     """Make `cls` a frozen dataclass and a pytree; every field not declared `static()` is a child."""
     return pytree(dataclasses.dataclass(frozen=True, eq=False)(cls))
 

@@ -24,11 +24,11 @@ class SceneError(ValueError):
     kind: str | None = None  # a short name for counting, of what packing refuses
 
 
-class OtherFormat(SceneError):
+class FormatMismatch(SceneError):
     """The file is not in the format of this reader; the next reader may try."""
 
 
-class OtherContent(OtherFormat):
+class OtherContent(FormatMismatch):
     """The file is of this reader's container (JSON, pickle, parquet, TFRecord, counts that fit), but what it holds is of another format."""
 
 

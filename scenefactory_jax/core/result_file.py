@@ -28,7 +28,7 @@ def write(path: Path, content: Mapping[str, Any], *, digits: int | None) -> None
     Args:
         digits: significant ones that numbers keep; None keeps all.
     """
-    with atomic_file.replaced(path) as half:
+    with atomic_file.write_atomically(path) as half:
         half.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
 
 
@@ -69,7 +69,7 @@ def begin(folder: Path, judged: Mapping[str, Any]) -> None:
     write(folder / JUDGED, judged, digits=None)
 
 
-def judged(folder: Path) -> dict[str, Any]:
+def read_evaluated(folder: Path) -> dict[str, Any]:
     """What `begin` noted; nothing of an evaluation that did not yet."""
     return read(folder / JUDGED) if (folder / JUDGED).is_file() else {"scenes": None, "overrides": []}
 

@@ -4,12 +4,12 @@ import re
 import unicodedata
 
 
-def for_file(name: str) -> str:
+def to_file_name(name: str) -> str:
     """A name that stays within its folder, whatever was in it."""
     return re.sub(r"[^\w.-]", "_", name)
 
 
-def for_terminal(text: str) -> str:
+def escape_for_terminal(text: str) -> str:
     """A line that can be printed: what a terminal would obey or cannot show is spelled out.
 
     That is what Unicode counts as control, format (which turns the direction of writing), half a surrogate pair (which JSON may hold),

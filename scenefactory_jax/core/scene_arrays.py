@@ -28,7 +28,7 @@ class Points(NamedTuple):
     bounds: Int[np.ndarray, " R1"]
 
 
-def stacked(tracks: Sequence[Track], steps: int) -> Logs:
+def stack_tracks(tracks: Sequence[Track], steps: int) -> Logs:
     """The tracks of one log."""
     rows = {name: [getattr(track, name) for track in tracks] for name in Logs._fields}
     tails = {"xyz": (steps, 3), "yaw": (steps,), "velocity": (steps, 2), "valid": (steps,), "size": (3,)}
@@ -47,7 +47,7 @@ def grid(times: Float[np.ndarray, " L"], current: int, *, step_s: float, near: f
     return np.clip(times[current] + step_s * np.arange(-before, after + 1), times[0], times[-1]), before
 
 
-def sampled(logs: Logs, times: Float[np.ndarray, " L"], wanted: Float[np.ndarray, " K"], *, near: float) -> Logs:
+def sample_tracks(logs: Logs, times: Float[np.ndarray, " L"], wanted: Float[np.ndarray, " K"], *, near: float) -> Logs:
     """The tracks at other times, in straight lines between steps; valid where the steps on both sides are, zeros elsewhere.
 
     Args:
@@ -63,25 +63,25 @@ def sampled(logs: Logs, times: Float[np.ndarray, " L"], wanted: Float[np.ndarray
     def between(table: Float[np.ndarray, "T L D"], turn: bool = False) -> Float[np.ndarray, "T K D"]:
         known = np.where(logs.valid[..., None], table, 0.0)
         step = known[:, before + 1] - known[:, before]
-        found = known[:, before] + share[:, None] * (wrapped(step) if turn else step)
+        found = known[:, before] + share[:, None] * (wrap_angles(step) if turn else step)
         return np.where(valid[..., None], found, 0.0)
 
     yaw = between(logs.yaw[..., None], turn=True)[..., 0]
     return Logs(between(logs.xyz), yaw, between(logs.velocity), valid, logs.size)
 
 
-def joined(lines: Sequence[Polyline]) -> Points:
+def join_lines(lines: Sequence[Polyline]) -> Points:
     """The points of polylines, and where each begins."""
     xyz = [line.xyz for line in lines]
     bounds = np.cumsum([0, *map(len, xyz)])
     return Points(np.concatenate(xyz) if xyz else np.zeros((0, 3)), bounds)
 
 
-def wrapped(angle: Any) -> Any:
+def wrap_angles(angle: Any) -> Any:
     """The same angles, or angle, in [-pi, pi)."""
     return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
-def lengths(delta: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N"]:
+def segment_lengths(delta: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N"]:
     """Of vectors in the plane: the bits of `np.linalg.norm`, without its detours."""
     return np.sqrt(delta[..., 0] * delta[..., 0] + delta[..., 1] * delta[..., 1])

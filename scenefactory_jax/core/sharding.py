@@ -18,39 +18,39 @@ AXIS = "worlds"
 Tree = TypeVar("Tree")
 
 
-def total(tree: Tree, axis: str | None) -> Tree:
+def sum_over_devices(tree: Tree, axis: str | None) -> Tree:
     """Sums over the devices, of every leaf."""
     return tree if axis is None else jax.lax.psum(tree, axis)
 
 
-def gathered(tree: Tree, axis: str | None) -> Tree:
+def gather_over_devices(tree: Tree, axis: str | None) -> Tree:
     """Rows of all devices one after the other, on every device."""
     return tree if axis is None else jax.lax.all_gather(tree, axis, tiled=True)
 
 
-def own(rows: Int[Array, " N"], count: int, axis: str | None) -> Int[Array, " N"]:
+def to_local_index(rows: Int[Array, " N"], count: int, axis: str | None) -> Int[Array, " N"]:
     """Numbers among all worlds -> among this device's `count` worlds; `count` for the worlds of others, which a scatter can drop."""
     here = rows if axis is None else rows - jax.lax.axis_index(axis) * count
     return jnp.where((here >= 0) & (here < count), here, count)
 
 
-def keys(key: PRNGKeyArray, count: int, axis: str | None) -> Key[Array, " {count}"]:
+def world_keys(key: PRNGKeyArray, count: int, axis: str | None) -> Key[Array, " {count}"]:
     """A key for each of this device's `count` worlds (or groups of them), by its number among all of them."""
     first = 0 if axis is None else jax.lax.axis_index(axis) * count
     return jax.vmap(jax.random.fold_in, (None, 0))(key, first + jnp.arange(count))
 
 
-def apart(tree: Any) -> Any:
+def make_sharded_specs(tree: Any) -> Any:
     """Places of a tree whose leaves all have worlds along their first axis."""
     return jax.tree.map(lambda _: PartitionSpec(AXIS), tree)
 
 
-def everywhere(tree: Any) -> Any:
+def make_replicated_specs(tree: Any) -> Any:
     """Places of a tree that every device holds whole."""
     return jax.tree.map(lambda _: PartitionSpec(), tree)
 
 
-def on_each(run: Callable, arguments: Sequence[tuple[Any, Any]], places: Callable[[Any], Any], over: Mesh) -> Any:
+def map_over_devices(run: Callable, arguments: Sequence[tuple[Any, Any]], places: Callable[[Any], Any], over: Mesh) -> Any:
     """`jax.shard_map` from trees onto a tree: `run` on every device with its part of the arguments.
 
     Arrays without elements stay outside: the partitioner of JAX 0.11 crashes on them.
@@ -103,7 +103,7 @@ def _filled(tree: Any, places: Any) -> _Filled:
     return _Filled([leaves[index] for index in kept], [spots[index] for index in kept], refill)
 
 
-def mesh(count: int | None = None) -> Mesh | None:
+def make_mesh(count: int | None = None) -> Mesh | None:
     """The first `count` devices of all processes (None: all of them) in a row; None for a single one, which needs no mesh.
 
     Raises:
@@ -116,7 +116,7 @@ def mesh(count: int | None = None) -> Mesh | None:
     return Mesh(np.array(chosen), (AXIS,)) if len(chosen) > 1 else None
 
 
-def place(scenes: Tree, over: Mesh | None) -> Tree:
+def place_on_devices(scenes: Tree, over: Mesh | None) -> Tree:
     """Arrays onto the devices, by their first axis; every process holds all of them and gives away its part."""
     if over is None:
         return jax.device_put(scenes)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 
-def opened(path: Path, mode: Literal["r", "w"]) -> io.TextIOWrapper:
+def open_text(path: Path, mode: Literal["r", "w"]) -> io.TextIOWrapper:
     """A UTF-8 file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
     if path.suffix == ".xz":
         return io.TextIOWrapper(lzma.LZMAFile(path, mode), newline="", encoding="utf-8")

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import wrap_angle
-from scenefactory_jax.core.types import Boxes, Tracks
+from scenefactory_jax.core.types import Boxes, TrafficLog
 
 
-def around(row: Float[Array, ""], valid: Bool[Array, " L"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def find_bracketing_rows(row: Float[Array, ""], valid: Bool[Array, " L"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """The valid rows next to a fractional row: the last at or before it (-1: none) and the first behind it (L: none)."""
     length = valid.shape[0]
     rows = jnp.arange(length)
@@ -16,7 +16,7 @@ def around(row: Float[Array, ""], valid: Bool[Array, " L"]) -> tuple[Int[Array, 
     return before, jnp.min(jnp.where(valid & (rows > here), rows, length))
 
 
-def sample(
+def interpolate_track(
     row: Float[Array, ""],
     position: Float[Array, "L 2"],
     yaw: Float[Array, " L"],
@@ -30,7 +30,7 @@ def sample(
     At rest before the first valid row and from the last one on; a track without any stays at its first row, at rest.
     """
     length = valid.shape[0]
-    before, after = around(row, valid)
+    before, after = find_bracketing_rows(row, valid)
     moving = (before >= 0) & (after < length)
     before_row, after_row = jnp.where(before >= 0, before, after), jnp.where(after < length, after, before)
     before_row, after_row = jnp.clip(before_row, 0, length - 1), jnp.clip(after_row, 0, length - 1)
@@ -43,13 +43,13 @@ def sample(
     return moved, jnp.where(moving, speed, 0.0), wrap_angle(yaw[before_row] + share * turn), jnp.where(moving, yaw_rate, 0.0)
 
 
-def unrecorded(steps: int) -> Tracks:
+def make_empty_log(steps: int) -> TrafficLog:
     """Tracks of nobody, over that many logged steps."""
     flat, pair = jnp.zeros((0, steps), jnp.float32), jnp.zeros((0, steps, 2), jnp.float32)
-    return Tracks(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, jnp.int32))
+    return TrafficLog(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, jnp.int32))
 
 
-def nobody() -> Boxes:
+def make_empty_boxes() -> Boxes:
     """No boxes: a road with nobody on it but the cars."""
     none, pair = jnp.zeros(0, jnp.float32), jnp.zeros((0, 2), jnp.float32)
     return Boxes(pair, none, none, pair, none, pair, none, none.astype(bool))

@@ -18,13 +18,13 @@ PARTS += ("data.formats", "data.packing", "data.generators", "data.loading.sampl
 SHOWN = 3  # targets in a message
 
 
-def check(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
+def check_targets(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
     """Refuse a config of a folder that names code outside of the package; with `trust`, print what it names instead.
 
     Raises:
         ConfigError: naming the file, the key and the target.
     """
-    if not (found := outside(config)):
+    if not (found := find_outside_targets(config)):
         return
     if trust:
         print(f"{file}: trusted, and runs {', '.join(f'{target} ({place})' for place, target in found.items())}", flush=True)
@@ -37,7 +37,7 @@ def check(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
     )
 
 
-def outside(config: Mapping[str, Any]) -> dict[str, Any]:
+def find_outside_targets(config: Mapping[str, Any]) -> dict[str, Any]:
     """Key -> target, for each `_target_` at any depth that is no part of the package.
 
     A name without a dot is one: `build.find` looks it up in a module of the package.

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from scenefactory_jax.core.pytree import static, struct
+from scenefactory_jax.core.pytree import pytree_dataclass, static
 
 SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
 
@@ -27,7 +27,7 @@ POLYGONS = (CROSSWALK, SPEED_BUMP, DRIVEWAY)
 EDGES = (EDGE_BOUNDARY, EDGE_MEDIAN)
 
 
-@struct
+@pytree_dataclass
 class Road:
     """Road segments in storage order: kind ascending, then polyline order, then along the polyline."""
 
@@ -40,7 +40,7 @@ class Road:
     valid: Bool[Array, " P"]
 
 
-@struct
+@pytree_dataclass
 class Agents:
     """Where the cars of one episode start and what they must reach."""
 
@@ -53,8 +53,8 @@ class Agents:
     present: Bool[Array, " A"]
 
 
-@struct
-class Log:
+@pytree_dataclass
+class AgentLog:
     """What the cars did in the recording, resampled to nothing: the source's own time step."""
 
     position: Float[Array, "A L 2"]
@@ -64,8 +64,8 @@ class Log:
     dt: Float[Array, ""]
 
 
-@struct
-class Tracks:
+@pytree_dataclass
+class TrafficLog:
     """What everybody else on the road did in the recording: who was there and is no agent, at the steps of `Log`."""
 
     position: Float[Array, "O L 2"]
@@ -76,7 +76,7 @@ class Tracks:
     kind: Int[Array, " O"]  # index into ROAD_USERS
 
 
-@struct
+@pytree_dataclass
 class Patches:
     """Places of the road with a condition of their own; where they overlap the last one counts.
 
@@ -93,7 +93,7 @@ class Patches:
     present: Bool[Array, " N"]
 
 
-@struct
+@pytree_dataclass
 class Rain:
     """Water film of the open road over an episode: linear between knots, constant beyond them; it stays as it is without any."""
 
@@ -102,7 +102,7 @@ class Rain:
     film_mm: Float[Array, " K"]
 
 
-@struct
+@pytree_dataclass
 class Weather:
     """Road condition of one world, over the plane and over time; `surface` indexes SURFACES."""
 
@@ -112,7 +112,7 @@ class Weather:
     rain: Rain
 
 
-@struct
+@pytree_dataclass
 class Boxes:
     """Oriented boxes on the road at one moment: cars, and what else they can hit."""
 
@@ -126,8 +126,8 @@ class Boxes:
     present: Bool[Array, " B"]
 
 
-@struct
-class Cells:
+@pytree_dataclass
+class SpatialGrid:
     """A square grid over the road: for each cell, row after row, the segments within a radius of any of its points, in storage order.
 
     The cells at the edge list nothing and stand for everything beyond them, too.
@@ -142,7 +142,7 @@ class Cells:
     most: int = static()  # rows of the longest list
 
 
-@struct
+@pytree_dataclass
 class Scene:
     """One world as the graph sees it: constant in an episode, except for agents and weather, which a reset may redraw, and the boxes.
 
@@ -154,14 +154,14 @@ class Scene:
     lanes: Road
     edges: Road
     agents: Agents
-    log: Log
+    log: AgentLog
     weather: Weather
-    others: Tracks
+    others: TrafficLog
     boxes: Boxes  # where the others are now; nobody is there until an environment says so
-    cells: Cells | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
+    cells: SpatialGrid | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
 
 
-@struct
+@pytree_dataclass
 class Motion:
     """What the rest of the system may know of a car's body, read from any dynamics backend."""
 
@@ -177,7 +177,7 @@ class Motion:
     slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
 
 
-@struct
+@pytree_dataclass
 class Events:
     """What can happen to an agent. At most one is true in one step: the order of the fields is the order of precedence."""
 
@@ -188,8 +188,8 @@ class Events:
     touched_edge: Bool[Array, " A"]
 
 
-@struct
-class Facts:
+@pytree_dataclass
+class StepMetrics:
     """Everything true of one step, measured once. Rewards, ends, metrics and reports only read it."""
 
     speed: Float[Array, " A"]
@@ -216,7 +216,7 @@ class Facts:
     events: Events  # raw: several may be true at once
 
 
-@struct
+@pytree_dataclass
 class State:
     """What changes while a world runs."""
 
@@ -232,20 +232,20 @@ class State:
     key: PRNGKeyArray
 
 
-@struct
-class Step:
+@pytree_dataclass
+class RewardInput:
     """All that a reward term may see."""
 
     scene: Scene
     before: State
     action: Float[Array, "A 3"]
     after: State
-    facts: Facts
+    facts: StepMetrics
     events: Events  # new in this step and exclusive
 
 
-@struct
-class Rows:
+@pytree_dataclass
+class SetObservation:
     """A padded set of feature rows, one set per agent: road segments, neighbours."""
 
     features: Float[Array, "*agents K F"]
@@ -256,8 +256,8 @@ Observation = dict[str, Any]
 """Group name -> Float[Array, "A F"] or Rows. Finished and absent agents read zeros and false masks."""
 
 
-@struct
-class Outcome:
+@pytree_dataclass
+class StepResult:
     """What one step gave, of an action or of a control step. `observation` is None where it was not asked for."""
 
     observation: Observation | None
@@ -267,7 +267,7 @@ class Outcome:
     done: Bool[Array, " A"]  # an event ended the agent in this step
     truncated: Bool[Array, ""]  # the world's time is up
     over: Bool[Array, ""]  # truncated, or no agent is left
-    facts: Facts
+    facts: StepMetrics
 
 
 class Dynamics(NamedTuple):
@@ -292,9 +292,9 @@ class Env(NamedTuple):
     """
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
-    step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
+    step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
     start: Callable[..., State]  # (key, scene, control step at which it begins = 0)
-    transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, Outcome]]
+    transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
     observe: Callable[[Scene, State], Observation]
     now: Callable[[Scene, State], Scene]
     hold: int = 1

@@ -15,10 +15,10 @@ from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel import task_map as spreads
 from scenefactory_jax.core.raw_scene import Companion, RawScene, Reject, SceneError
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, bank_writer, catalogue
 from scenefactory_jax.data.bank.bank_index import Index
-from scenefactory_jax.data.bank.bank_writer import Compression, Piece
+from scenefactory_jax.data.bank.bank_writer import Compression, SourceFileResult
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing.pack import CUTS, DROPS, OTHER_DROPS, Packed, PackReport, prepare
 
@@ -83,24 +83,28 @@ def convert(
     """
     root, out = Path(path).absolute(), Path(out).resolve()
     files = reader_selection.find(root)
-    bank_writer.require_free(out)
+    bank_writer.check_free_space(out)
     work = functools.partial(convert_file, root=root, out=out, formats=dict(formats), check=check, pack=pack)
     work = functools.partial(work, refine=refine, features=features)
 
-    def pieces(waiting: Sequence[Path]) -> Iterator[Piece]:
+    def pieces(waiting: Sequence[Path]) -> Iterator[SourceFileResult]:
         done = len(files) - len(waiting)
         for number, (file, piece) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
-            lost = isinstance(piece, spreads.Lost)
-            yield Piece(_name(file, root), rejects=({"source": str(file), "scene": None, "reason": piece.reason},)) if lost else piece
+            lost = isinstance(piece, spreads.FailedTask)
+            yield (
+                SourceFileResult(_name(file, root), rejects=({"source": str(file), "scene": None, "reason": piece.reason},))
+                if lost
+                else piece
+            )
             if on_file is not None:
                 on_file(number, len(files))
 
-    with folder_lock.alone(out):
+    with folder_lock.lock_folder(out):
         index = _begun(root, out, bank_index.plain({"source": str(root), **settings}))
         known = set(index.files)
         waiting = [file for file in files if _name(file, root) not in known]
         try:
-            index = bank_writer.grow(out, pieces(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
+            index = bank_writer.append_files(out, pieces(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
         finally:
             bank_writer.remove_parts(out)
     return _summary(index)
@@ -141,7 +145,7 @@ def convert_file(
     pack: Callable[..., Any],
     refine: Callable[[RawScene], RawScene] | None,
     features: catalogue.Features | None,
-) -> Piece:
+) -> SourceFileResult:
     """One file's scenes, in a part of the bank's folder; it raises only `ConfigError`, whatever the file or a reader does."""
     number, path = item
     rows: list[dict[str, Any]] = []
@@ -155,7 +159,7 @@ def convert_file(
                 raw = replace(raw, source=str(path))
                 raw = raw if refine is None else refine(raw)
                 tried = try_packing(raw, check=check, pack=pack)
-                row, batch = catalogue.extended(raw, features), arrow_codec.encode(raw)
+                row, batch = catalogue.extend_table(raw, features), arrow_codec.encode(raw)
             except ConfigError:
                 raise  # no file is to blame
             except Exception as error:
@@ -166,13 +170,13 @@ def convert_file(
             yield batch
 
     part = bank_writer.write_part(out, number, batches())
-    return Piece(
+    return SourceFileResult(
         file=_name(path, root),
         part=part,
         rows=tuple(rows),
         rejects=tuple(rejects),
         companions=tuple(companions),
-        account=account(tries),
+        account=count_results(tries),
     )
 
 
@@ -238,7 +242,7 @@ def read(
     rejects: list[dict[str, Any]] = []
     companions: list[dict[str, Any]] = []
     for file, result in zip(files, results, strict=True):
-        lost = isinstance(result, spreads.Lost)
+        lost = isinstance(result, spreads.FailedTask)
         good, bad, beside = ([], [{"source": str(file), "scene": None, "reason": result.reason}], []) if lost else result
         scenes.extend(good)
         rejects.extend(bad)
@@ -274,7 +278,7 @@ def _reason(error: Exception, path: Path) -> str:
     return text if isinstance(error, SceneError) else f"{type(error).__name__}: {text}"
 
 
-def account(tries: Iterable[PackReport | str]) -> dict[str, Any]:
+def count_results(tries: Iterable[PackReport | str]) -> dict[str, Any]:
     """What packing kept, dropped and refused (see `try_packing`), as numbers that add up over scenes."""
     tries = list(tries)
     reports = [report for report in tries if not isinstance(report, str)]
@@ -303,12 +307,12 @@ def summarise(
     """The accounts of many scenes as one."""
     listed = {"rejects": tuple(map(dict, rejects)), "companions": tuple(map(dict, companions))}
     refused = dict(Counter(reject["kind"] for reject in rejects if reject.get("kind") is not None))
-    return replace(Summary(files=files, **listed, **account(reports)), refused=refused)
+    return replace(Summary(files=files, **listed, **count_results(reports)), refused=refused)
 
 
 def _summary(index: Index) -> Summary:
     """That of a bank, as the conversion counted it."""
-    return Summary(files=len(index.files), rejects=index.rejects, companions=index.companions, **account([]) | index.account)
+    return Summary(files=len(index.files), rejects=index.rejects, companions=index.companions, **count_results([]) | index.account)
 
 
 def describe(summary: Summary) -> list[str]:
@@ -328,7 +332,7 @@ def describe(summary: Summary) -> list[str]:
     if summary.refused:
         lines.append(f"packing with these numbers refuses: {count(summary.refused)}; such scenes stay in a bank, for others")
     lines.append(f"{summary.scenes} scenes with {summary.agents_kept} agents from {summary.files} files, {len(summary.rejects)} rejected")
-    return [for_terminal(line) for line in lines]
+    return [escape_for_terminal(line) for line in lines]
 
 
 def _near(source: str) -> Path:

@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import heading, norm, wrap_angle
-from scenefactory_jax.core.instantiate import build, check_number, check_numbers
-from scenefactory_jax.core.pytree import choose, replace, struct
+from scenefactory_jax.core.geometry import heading_vector, safe_norm, wrap_angle
+from scenefactory_jax.core.instantiate import check_number, check_numbers, instantiate
+from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
+from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
 
 
-@struct
+@pytree_dataclass
 class Body:
     """Cars of one world; every leaf has the agent axis first."""
 
@@ -79,19 +79,19 @@ def make(
     pushes = {"acceleration": acceleration, "deceleration": deceleration, "rolling": rolling, "drag": drag, "air_drag": air_drag}
     check_numbers({"rear_length": rear_length, "centre_height": centre_height, **pushes}, where="dynamics", least=0.0)
     entry = {**contact, "_target_": "make"}
-    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
+    meet: Contact = instantiate(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
-        moved = roll(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
+        moved = integrate_bicycle(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
         mu = grip(scene.weather, body.position, body.speed)
-        cars = boxes_of(read(moved, height=centre_height), scene.agents.size, active, mass)
-        _, _, force = meet.forces(cars, later(meet.neighbours(cars, scene.boxes), control_dt))
+        cars = collect_boxes(read(moved, height=centre_height), scene.agents.size, active, mass)
+        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.boxes), control_dt))
         along, across = (moved.speed - body.speed) / control_dt, moved.yaw_rate * moved.speed
-        wanted = norm(jnp.stack([along, across], axis=-1))
+        wanted = safe_norm(jnp.stack([along, across], axis=-1))
         moved = replace(moved, contact_force=force, grip=mu, grip_use=wanted / (mu * GRAVITY))
         held = replace(body, contact_force=jnp.zeros_like(force), grip_use=jnp.zeros_like(force))
-        return choose(active, moved, held)
+        return tree_where(active, moved, held)
 
     return Dynamics(init=init, advance=advance, read=functools.partial(read, height=centre_height))
 
@@ -117,7 +117,7 @@ def init(key: PRNGKeyArray, scene: Scene) -> Body:
     return Body(agents.position, agents.yaw, agents.speed, *zeros)
 
 
-def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:
+def integrate_bicycle(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) -> Body:
     """One integration of throttle, steer and brake over `dt` seconds."""
     throttle, brake = jnp.maximum(action[:, 0], 0.0), jnp.maximum(action[:, 2], 0.0)
     push = limits.acceleration * throttle - limits.deceleration * brake
@@ -127,7 +127,7 @@ def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) 
     steer = limits.steering * action[:, 1]
     slip_angle = jnp.arctan(limits.rear_length / limits.wheelbase * jnp.tan(steer))
     yaw_rate = mean * jnp.cos(slip_angle) * jnp.tan(steer) / limits.wheelbase
-    chord = heading(body.yaw + slip_angle + 0.5 * yaw_rate * dt)  # the chord of an arc points along the heading half way
+    chord = heading_vector(body.yaw + slip_angle + 0.5 * yaw_rate * dt)  # the chord of an arc points along the heading half way
     return replace(
         body,
         position=body.position + (mean * dt)[:, None] * chord,
@@ -141,7 +141,7 @@ def roll(body: Body, action: Float[Array, "A 3"], limits: Limits, *, dt: float) 
 
 def read(body: Body, *, height: float) -> Motion:
     """What the rest of the system may know of the cars."""
-    flat = body.speed[:, None] * heading(body.yaw + body.slip_angle)
+    flat = body.speed[:, None] * heading_vector(body.yaw + body.slip_angle)
     zero = jnp.zeros_like(body.speed)
     return Motion(
         position=jnp.concatenate([body.position, jnp.full_like(zero, height)[:, None]], axis=-1),

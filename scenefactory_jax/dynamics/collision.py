@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import cross, dot, norm
+from scenefactory_jax.core.geometry import cross, dot, safe_norm
 from scenefactory_jax.core.instantiate import ConfigError, check_numbers
 from scenefactory_jax.core.pytree import is_finite, replace
 from scenefactory_jax.core.types import Boxes, Motion
@@ -23,7 +23,7 @@ from scenefactory_jax.core.types import Boxes, Motion
 OFF_CENTRE = 3.7  # times as much mass moves with a contact in the middle of two cars' faces as with one at their corners
 
 
-class Touch(NamedTuple):
+class BoxContact(NamedTuple):
     """Where two boxes touch. The normal points from the first to the second; depths are zero or less where a point does not touch."""
 
     normal: Float[Array, "2"]
@@ -63,7 +63,7 @@ def make(
     if physics_dt is not None:
         _check_stable(stiffness, damping, mass / 2, physics_dt=physics_dt)
     numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, yield_s=yield_s, height=height)
-    return Contact(functools.partial(neighbours, nearest=nearest), functools.partial(forces, **numbers))
+    return Contact(functools.partial(find_neighbours, nearest=nearest), functools.partial(compute_forces, **numbers))
 
 
 def _check_stable(stiffness: float, damping: float, reduced: float, *, physics_dt: float) -> None:
@@ -74,7 +74,7 @@ def _check_stable(stiffness: float, damping: float, reduced: float, *, physics_d
         raise ConfigError(f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {message}")
 
 
-def boxes_of(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
+def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
     """Cars as boxes; `mass` of each, or of all."""
     return Boxes(
         position=motion.position[:, :2],
@@ -88,22 +88,22 @@ def boxes_of(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"
     )
 
 
-def neighbours(cars: Boxes, others: Boxes, *, nearest: int) -> Boxes:
+def find_neighbours(cars: Boxes, others: Boxes, *, nearest: int) -> Boxes:
     """Each car's nearest others that are present, by the distance to the circle around a box: leaves `[A, K, ...]`, K at most `nearest`."""
-    reach = 0.5 * norm(others.size)
-    gap = norm(others.position[None] - cars.position[:, None]) - reach
+    reach = 0.5 * safe_norm(others.size)
+    gap = safe_norm(others.position[None] - cars.position[:, None]) - reach
     gap = jnp.where(_sound(others) & jnp.isfinite(gap), gap, jnp.inf)
     _, rows = jax.lax.top_k(-gap, min(nearest, gap.shape[1]))
     return jax.tree.map(lambda leaf: leaf[rows], others)
 
 
-def later(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
+def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
     """Neighbours `[A, K, ...]` moved on with their present velocities."""
     moved = lambda box: replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)  # noqa: E731
     return jax.vmap(moved)(boxes)
 
 
-def forces(
+def compute_forces(
     cars: Boxes, near: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, yield_s: float, height: float
 ) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
@@ -133,23 +133,23 @@ def forces(
         one = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
         other = _still(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), near), mass)
         pushed = tuple(leaf.reshape(count, beside, *leaf.shape[1:]) for leaf in _between(one, other, yield_s, **numbers)[:2])
-        touched = (norm(pushed[0]) > 0.0).sum(1, dtype=jnp.float32)
+        touched = (safe_norm(pushed[0]) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         first, second = np.triu_indices(count, 1)
         one, other = jax.tree.map(lambda leaf: leaf[first], cars), jax.tree.map(lambda leaf: leaf[second], cars)
         force, torque_one, torque_other = _between(one, other, None, **numbers)
         rows = _rows_of(count)  # each car's pairs, as the first of them or the second
-        touched = touched + jnp.tile(norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
+        touched = touched + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
         share = _share(jnp.maximum(touched[first], touched[second]))
         force = share[:, None] * force
         total = jnp.concatenate([-force, force])[rows].sum(1)
         torque = jnp.concatenate([share * torque_one, share * torque_other])[rows].sum(1)
-        largest = jnp.tile(norm(force), 2)[rows].max(1)
+        largest = jnp.tile(safe_norm(force), 2)[rows].max(1)
     if beside:
         share = _share(touched)[:, None]
         force, torque_one = share[..., None] * pushed[0], share * pushed[1]
         total, torque = total - force.sum(1), torque + torque_one.sum(1)
-        largest = jnp.maximum(largest, norm(force).max(1))
+        largest = jnp.maximum(largest, safe_norm(force).max(1))
     return total, torque, largest
 
 
@@ -174,7 +174,7 @@ def _between(
     height: float,
 ) -> tuple[Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
     """Force on the second box of each pair, which the first feels with opposite sign, and the torques on both."""
-    normal, points, depths = jax.vmap(touch)(one.position, one.yaw, one.size / 2.0, other.position, other.yaw, other.size / 2.0)
+    normal, points, depths = jax.vmap(find_box_contact)(one.position, one.yaw, one.size / 2.0, other.position, other.yaw, other.size / 2.0)
     meet = one.present & other.present & (jnp.abs(one.elevation - other.elevation) < height)
     depths = jnp.where(meet[:, None], depths, 0.0)
 
@@ -214,14 +214,14 @@ def _rows_of(count: int) -> Int[np.ndarray, "A partners"]:
     return np.stack([np.flatnonzero(bodies == car) for car in range(count)])
 
 
-def touch(
+def find_box_contact(
     centre: Float[Array, "2"],
     yaw: Float[Array, ""],
     half: Float[Array, "2"],
     other_centre: Float[Array, "2"],
     other_yaw: Float[Array, ""],
     other_half: Float[Array, "2"],
-) -> Touch:
+) -> BoxContact:
     """Contact of two oriented boxes with half sizes `half`; depths are not positive where they do not overlap."""
     gap = other_centre - centre
     axes, other_axes = _axes(yaw), _axes(other_yaw)
@@ -254,7 +254,7 @@ def touch(
     points = middle + ends[:, None] * along_face
     depths = front - points @ outward
     points = points + 0.5 * depths[:, None] * outward + pick(centre, other_centre)
-    return Touch(normal=normal, points=points, depths=jnp.where(overlap[best] > 0.0, depths, jnp.minimum(depths, 0.0)))
+    return BoxContact(normal=normal, points=points, depths=jnp.where(overlap[best] > 0.0, depths, jnp.minimum(depths, 0.0)))
 
 
 def _axes(yaw: Float[Array, ""]) -> Float[Array, "2 2"]:

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import norm
-from scenefactory_jax.core.instantiate import build
-from scenefactory_jax.core.pytree import choose, replace, struct
-from scenefactory_jax.core.track_interpolation import sample
-from scenefactory_jax.core.types import Dynamics, Log, Motion, Scene
-from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
+from scenefactory_jax.core.geometry import safe_norm
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
+from scenefactory_jax.core.track_interpolation import interpolate_track
+from scenefactory_jax.core.types import AgentLog, Dynamics, Motion, Scene
+from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
 
 
-@struct
+@pytree_dataclass
 class Body:
     """Where each car is in its recording, and what that reads; every leaf has the agent axis first."""
 
@@ -40,11 +40,13 @@ def make(
         ConfigError: an unknown or missing number of `contact`.
     """
     entry = {**contact, "_target_": "make"}
-    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
+    meet: Contact = instantiate(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
 
     def at(scene: Scene, steps: Int[Array, " A"]) -> Motion:
         row = start_row + steps.astype(jnp.float32) * (control_dt / scene.log.dt)
-        position, velocity, yaw, yaw_rate = jax.vmap(lambda r, *track: sample(r, *track, dt=scene.log.dt))(row, *_tracks(scene.log))
+        position, velocity, yaw, yaw_rate = jax.vmap(lambda r, *track: interpolate_track(r, *track, dt=scene.log.dt))(
+            row, *_tracks(scene.log)
+        )
         zero = jnp.zeros_like(yaw)
         return Motion(
             position=jnp.concatenate([position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
@@ -54,7 +56,7 @@ def make(
             upright=jnp.ones_like(zero),
             steer=zero,
             contact_force=zero,
-            grip=grip(scene.weather, position, norm(velocity)),
+            grip=grip(scene.weather, position, safe_norm(velocity)),
             grip_use=zero,
             slip=zero,
         )
@@ -65,13 +67,13 @@ def make(
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         motion = at(scene, body.steps + 1)
-        cars = boxes_of(motion, scene.agents.size, active, mass)
-        _, _, force = meet.forces(cars, later(meet.neighbours(cars, scene.boxes), control_dt))
+        cars = collect_boxes(motion, scene.agents.size, active, mass)
+        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.boxes), control_dt))
         moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
-        return choose(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
+        return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 
     return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
 
 
-def _tracks(log: Log) -> tuple[Array, Array, Array, Array]:
+def _tracks(log: AgentLog) -> tuple[Array, Array, Array, Array]:
     return log.position, log.yaw, log.velocity, log.valid

@@ -40,7 +40,7 @@ class Encounter(NamedTuple):
     first_contact_s: float  # end of the physics step that first pushed; inf if none did
 
 
-class Touch(NamedTuple):
+class ContactParameters(NamedTuple):
     """How two cars push each other, in the words of `contact.forces`, and how rigid MuJoCo's constraint is."""
 
     stiffness: float  # along a whole face, N/m
@@ -49,7 +49,7 @@ class Touch(NamedTuple):
     impedance: float  # 0..1: near 1 a constraint, near 0 a spring (see `meeting`)
 
 
-class Rig(NamedTuple):
+class CEngineCars(NamedTuple):
     """A compiled model of N equal cars and the addresses of what is read and written at every step."""
 
     model: mujoco.MjModel
@@ -90,18 +90,18 @@ def simulate(
         iterations: of the solver, instead of `solver`'s; enough to converge.
         line_search: iterations, likewise.
     """
-    rig = single(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
-    place(rig, cars.rest(rig.model, car), np.zeros((1, 2)), np.zeros(1), np.array([speed]))
+    rig = simulate_one(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    place(rig, cars.find_rest_pose(rig.model, car), np.zeros((1, 2)), np.zeros(1), np.array([speed]))
     return drive(rig, controls[:, None], mu[None], substeps=substeps)
 
 
-def single(car: CarParameters, solver: Solver, *, physics_dt: float, iterations: int, line_search: int) -> Rig:
+def simulate_one(car: CarParameters, solver: Solver, *, physics_dt: float, iterations: int, line_search: int) -> CEngineCars:
     """One car on the ground, to be placed and driven many times."""
     converged = dataclasses.replace(solver, iterations=iterations, line_search=line_search)
-    return _rig(cars.standalone(car, converged, physics_dt=physics_dt, visual=False, brake_rows=True), car, [""])
+    return _rig(cars.build_standalone_model(car, converged, physics_dt=physics_dt, visual=False, brake_rows=True), car, [""])
 
 
-def drive(rig: Rig, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, "1 4"], *, substeps: int) -> Trajectory:
+def drive(rig: CEngineCars, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, "1 4"], *, substeps: int) -> Trajectory:
     """Drive one car on from the state that its rig is in."""
     rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows = []
@@ -118,7 +118,7 @@ def encounter(
     solver: Solver,
     controls: Float[np.ndarray, "T 2 3"],
     mu: Float[np.ndarray, "2 4"],
-    touch: Touch,
+    touch: ContactParameters,
     *,
     position: Float[np.ndarray, "2 2"],
     yaw: Float[np.ndarray, "2"],
@@ -129,13 +129,13 @@ def encounter(
     line_search: int,
 ) -> Encounter:
     """Drive two cars that meet by MuJoCo's box-box contact; arguments as those of `simulate`, with an axis of cars."""
-    rig = meeting(car, solver, touch, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
-    alone = single(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
-    place(rig, cars.rest(alone.model, car), position, yaw, speed)
-    return meet(rig, controls, mu, substeps=substeps)
+    rig = make_encounter(car, solver, touch, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    alone = simulate_one(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    place(rig, cars.find_rest_pose(alone.model, car), position, yaw, speed)
+    return simulate_encounter(rig, controls, mu, substeps=substeps)
 
 
-def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "2 4"], *, substeps: int) -> Encounter:
+def simulate_encounter(rig: CEngineCars, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "2 4"], *, substeps: int) -> Encounter:
     """Drive two cars on from the state that their rig is in."""
     rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows, strongest, first = [], [], np.inf
@@ -153,7 +153,7 @@ def meet(rig: Rig, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "
     return Encounter(path, np.array(strongest), float(first))
 
 
-def advance(rig: Rig, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int) -> Float[np.ndarray, " N"]:
+def advance(rig: CEngineCars, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int) -> Float[np.ndarray, " N"]:
     """Drive all cars on for one control step; the largest force of another car on each in any of its physics steps, N."""
     rig.model.pair_friction[rig.pairs.ravel(), :2] = mu.reshape(-1, 1)
     told, largest = _command(rig, control), np.zeros(len(control))
@@ -165,15 +165,15 @@ def advance(rig: Rig, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "
     return largest
 
 
-def broken(rig: Rig) -> bool:
+def is_broken(rig: CEngineCars) -> bool:
     """Whether the engine met a number that is not finite since the cars were placed; it then starts all of them anew at the origin."""
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
     return any(rig.data.warning[int(kind)].number for kind in bad)
 
 
-def meeting(
-    car: CarParameters, solver: Solver, touch: Touch, *, physics_dt: float, iterations: int, line_search: int, count: int = 2
-) -> Rig:  # fmt: skip
+def make_encounter(
+    car: CarParameters, solver: Solver, touch: ContactParameters, *, physics_dt: float, iterations: int, line_search: int, count: int = 2
+) -> CEngineCars:  # fmt: skip
     """Cars on the ground whose boxes collide, every pair as a spring-damper with Coulomb friction in MuJoCo's terms.
 
     Of a contact that is r deep and closes at rate v, MuJoCo's force f obeys (A + R) f = (b v + k r) / d, if solref is [-k, -b], the
@@ -194,7 +194,7 @@ def meeting(
     spec.worldbody.add_geom(name="ground", type=ground, size=[0, 0, 1], contype=0, conaffinity=0)
     prefixes = [f"{slot}/" for slot in range(count)]
     for prefix in prefixes:
-        spec.attach(cars.spec(car, visual=False, brake_rows=True), prefix=prefix, frame=spec.worldbody.add_frame())
+        spec.attach(cars.build_mjspec(car, visual=False, brake_rows=True), prefix=prefix, frame=spec.worldbody.add_frame())
         cars.add_ground_pairs(spec, car, ground="ground", prefix=prefix)
     cars.set_options(spec, converged, physics_dt=physics_dt)
     for one, other in itertools.combinations(prefixes, 2):
@@ -215,7 +215,7 @@ def meeting(
 
 
 def place(
-    rig: Rig,
+    rig: CEngineCars,
     still: Float[np.ndarray, "17"],
     position: Float[np.ndarray, "N 2"],
     yaw: Float[np.ndarray, " N"],
@@ -240,7 +240,7 @@ class Mechanics(NamedTuple):
     potential_energy: float  # of gravity, springs and stops, J; the tyres' compression is not in it
 
 
-def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
+def mechanics(rig: CEngineCars, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
     """Momentum and energy of a state, of this engine or of another; wheels and suspension count."""
     data = rig.data
     data.qpos[:], data.qvel[:] = qpos.ravel(), qvel.ravel()
@@ -257,7 +257,7 @@ def mechanics(rig: Rig, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray,
     return Mechanics(each.sum(0), angular.sum(0), float(data.energy[1]), float(data.energy[0] + stops))
 
 
-def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> Rig:
+def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> CEngineCars:
     def at(kind: str, wheels: tuple[str, ...], address: str = "dofadr") -> np.ndarray:
         return np.array([getattr(model.joint(f"{prefixes[0]}{kind}_{wheel}"), address)[0] for wheel in wheels])
 
@@ -267,7 +267,7 @@ def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> 
             tyre_of[model.geom(f"{prefix}tyre_{name}").id] = 4 * slot + wheel
     data = mujoco.MjData(model)
     chassis = np.array([model.body(f"{prefix}chassis").id for prefix in prefixes])
-    return Rig(
+    return CEngineCars(
         model=model,
         data=data,
         car=car,
@@ -287,7 +287,7 @@ def _rig(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[str]) -> 
     )
 
 
-class Told(NamedTuple):
+class ControlStepInput(NamedTuple):
     """What holds for a whole control step."""
 
     angle: Float[np.ndarray, " N"]  # wanted, of the front wheels
@@ -295,15 +295,15 @@ class Told(NamedTuple):
     friction: Float[np.ndarray, "N 4"]  # of brakes and rolling, N m
 
 
-def _command(rig: Rig, control: Float[np.ndarray, "N 3"]) -> Told:
+def _command(rig: CEngineCars, control: Float[np.ndarray, "N 3"]) -> ControlStepInput:
     car = rig.car
     throttle, steer, brake = np.clip(control[:, 0], 0.0, 1.0), np.clip(control[:, 1], -1.0, 1.0), np.clip(control[:, 2], 0.0, 1.0)
     strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
     engine = (throttle * car.drive_torque)[:, None] * np.array([1.0, 1.0, 0.0, 0.0])
-    return Told(car.steering_limit * steer, engine, brake[:, None] * strongest + car.rolling_torque)
+    return ControlStepInput(car.steering_limit * steer, engine, brake[:, None] * strongest + car.rolling_torque)
 
 
-def _step(rig: Rig, told: Told) -> None:
+def _step(rig: CEngineCars, told: ControlStepInput) -> None:
     """One physics step. The tyres' rows are given the part of the slip's acceleration that MuJoCo leaves out: see `forces.turning`."""
     model, data = rig.model, rig.data
     _push(rig, told)
@@ -322,7 +322,7 @@ def _step(rig: Rig, told: Told) -> None:
     mujoco.mj_step2(model, data)
 
 
-def _push(rig: Rig, told: Told) -> None:
+def _push(rig: CEngineCars, told: ControlStepInput) -> None:
     """What changes with every physics step: engine and brakes, servo, bump stops, dampings, air drag, and how far the tyres yield."""
     car, qpos, qvel = rig.car, rig.qpos, rig.qvel
     travel = qpos[:, rig.suspension_q]
@@ -350,7 +350,7 @@ def _push(rig: Rig, told: Told) -> None:
         wrench[3:] = (-car.yaw_damping * qvel[slot, 5]) * turn[2::3]
 
 
-def _record(rig: Rig) -> tuple[np.ndarray, ...]:
+def _record(rig: CEngineCars) -> tuple[np.ndarray, ...]:
     """State and tyres of every car, as `Trajectory` has them."""
     model, data = rig.model, rig.data
     count = len(rig.chassis)
@@ -365,12 +365,12 @@ def _record(rig: Rig) -> tuple[np.ndarray, ...]:
     return rig.qpos.copy(), rig.qvel.copy(), model.pair_friction[rig.pairs, 0], normal, tangent, slip
 
 
-def _between(rig: Rig) -> float:
+def _between(rig: CEngineCars) -> float:
     """Force between two cars in the step just taken, N."""
     return float(sum(np.linalg.norm(force) for force in _pushes(rig).values()))
 
 
-def _pushes(rig: Rig) -> dict[tuple[int, int], Float[np.ndarray, "3"]]:
+def _pushes(rig: CEngineCars) -> dict[tuple[int, int], Float[np.ndarray, "3"]]:
     """Force of each pair of cars that touched in the step just taken, summed over its contact points, N."""
     contact, found = rig.data.contact, {}
     hits = np.flatnonzero(np.isin(contact.geom, rig.boxes).all(-1) & (contact.efc_address >= 0))

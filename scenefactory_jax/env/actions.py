@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def pedals(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+def separate_pedals(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """Throttle, steer, brake as they are; dynamics take a pedal below zero as released (the paper's action)."""
     return action
 

@@ -12,9 +12,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_type
-from scenefactory_jax.core.pytree import check, check_array, choose, is_finite, replace, strong, to_jax, unchecked
-from scenefactory_jax.core.types import Agents, Boxes, Dynamics, Env, Events, Facts, Observation, Outcome, Scene, State, Step, Weather
+from scenefactory_jax.core.instantiate import ConfigError, check_number, check_type, instantiate
+from scenefactory_jax.core.pytree import check, check_array, is_finite, replace, to_jax, to_strong_type, tree_where, unchecked
+from scenefactory_jax.core.types import (
+    Agents,
+    Boxes,
+    Dynamics,
+    Env,
+    Events,
+    Observation,
+    RewardInput,
+    Scene,
+    State,
+    StepMetrics,
+    StepResult,
+    Weather,
+)
 from scenefactory_jax.env import observations, rewards, spawning, termination
 from scenefactory_jax.weather import friction, rain, road_condition
 
@@ -34,7 +47,7 @@ def episode_steps(timing: Mapping[str, float | int]) -> int:
     return round(timing["episode_s"] * timing["control_hz"])
 
 
-class Parts(NamedTuple):
+class EnvParts(NamedTuple):
     """What an environment is made of, every part bound to its numbers."""
 
     dynamics: Dynamics
@@ -43,8 +56,8 @@ class Parts(NamedTuple):
     draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
     draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
     others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
-    measure: Callable[[Scene, State, State], Facts]
-    judge: Callable[[Facts, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
+    measure: Callable[[Scene, State, State], StepMetrics]
+    judge: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
     terms: Mapping[str, tuple[float, rewards.Term]]
     groups: Mapping[str, observations.Group]
     episode_steps: int  # control steps after which a world is truncated
@@ -54,16 +67,16 @@ class Parts(NamedTuple):
     respawn_clear_m: float | None
 
 
-def make(config: Mapping[str, Any]) -> Env:
+def make_env(config: Mapping[str, Any]) -> Env:
     """The environment of a config, joined from its `parts_of`.
 
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
-    return assemble(parts_of(config))
+    return assemble(make_parts(config))
 
 
-def parts_of(config: Mapping[str, Any]) -> Parts:
+def make_parts(config: Mapping[str, Any]) -> EnvParts:
     """The parts of a config with the groups timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
 
     Raises:
@@ -81,18 +94,18 @@ def parts_of(config: Mapping[str, Any]) -> Parts:
         check_number(clear_m, where="spawn.respawn_clear_m", least=0.0)
     context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
     grip = friction.make(config["weather"]["grip"])
-    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
-    bound = functools.partial(build, builtins="scenefactory_jax.env.step_metrics")
+    dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    bound = functools.partial(instantiate, builtins="scenefactory_jax.env.step_metrics")
     termination.check(config["ends"].get("ending", []), where="ends")
-    return Parts(
+    return EnvParts(
         dynamics=dynamics,
-        command=build(config["controls"]["command"], builtins="scenefactory_jax.env.actions", where="controls.command"),
+        command=instantiate(config["controls"]["command"], builtins="scenefactory_jax.env.actions", where="controls.command"),
         hold=_hold(config),
         draw_agents=spawning.make(config["spawn"]["draw"]),
         draw_weather=road_condition.make(config["weather"]),
-        others=build(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context),
+        others=instantiate(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context),
         measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
-        judge=build({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.env.termination", where="ends"),
+        judge=instantiate({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.env.termination", where="ends"),
         terms=rewards.make(config["reward"], **context),
         groups=observations.make(config["observe"], **context),
         episode_steps=episode_steps(timing),
@@ -110,7 +123,7 @@ def _hold(config: Mapping[str, Any]) -> int:
     return hold
 
 
-def assemble(parts: Parts) -> Env:
+def assemble(parts: EnvParts) -> Env:
     """Join bound parts into an environment, whose functions refuse arguments of other shapes than `types` says when they are traced."""
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
@@ -123,13 +136,13 @@ def assemble(parts: Parts) -> Env:
         (scene,) = _checked("env.start", scene)
         return _start(parts, key, scene, step)
 
-    def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+    def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         scene, state, action = _checked("env.step", scene, state, action)
         control = functools.partial(_transition, parts, scene, action=action)
-        state, _, outcome, _ = act(control, state, hold=parts.hold)
+        state, _, outcome, _ = repeat_action(control, state, hold=parts.hold)
         return state, replace(outcome, observation=_observe(parts, scene, state))
 
-    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         return _transition(parts, *_checked("env.transition", scene, state, action))
 
     def observe(scene: Scene, state: State) -> Observation:
@@ -159,14 +172,14 @@ def _checked(where: str, scene: Scene, *others: Any) -> tuple[Any, ...]:
     return to_jax((scene, *others))
 
 
-def act(
-    control: Callable[[State], tuple[State, Outcome]],
+def repeat_action(
+    control: Callable[[State], tuple[State, StepResult]],
     state: State,
     noted: Any = None,
     *,
     hold: int,
-    note: Callable[[Any, State, Outcome], tuple[Any, Any]] = lambda *_: (None, None),
-) -> tuple[State, Any, Outcome, Any]:
+    note: Callable[[Any, State, StepResult], tuple[Any, Any]] = lambda *_: (None, None),
+) -> tuple[State, Any, StepResult, Any]:
     """All control steps that one action stands for, of one world or of many.
 
     Args:
@@ -200,26 +213,26 @@ def act(
     drove = jnp.maximum(took.sum(0) - 1, 0)[None]
     facts = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], facts)
     clock = {name: leaf[-1] for name, leaf in clock.items()}
-    return state, noted, unchecked(Outcome, observation=None, facts=facts, **own, **clock), numbers
+    return state, noted, unchecked(StepResult, observation=None, facts=facts, **own, **clock), numbers
 
 
-def out_of_time(outcome: Outcome, active: Bool[Array, "*W A"]) -> Bool[Array, "*W A"]:
+def find_truncated_agents(outcome: StepResult, active: Bool[Array, "*W A"]) -> Bool[Array, "*W A"]:
     """Who drove before an action, of one world or of many, and was still driving when the time was up."""
     return outcome.truncated[..., None] & active & ~outcome.done
 
 
-def _now(parts: Parts, scene: Scene, state: State) -> Scene:
+def _now(parts: EnvParts, scene: Scene, state: State) -> Scene:
     """The scene as it is at a state's moment: this episode's agents and weather, and the others where they are."""
     return replace(scene, agents=state.agents, weather=state.weather, boxes=parts.others(scene, state.step))
 
 
-def _start(parts: Parts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
     """A fresh episode, or one whose clock is already at a later control step: rain and the others are as they are then."""
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
     scene = replace(scene, boxes=parts.others(scene, step))
-    agents = spawning.admit(parts.draw_agents(agents_key, scene))
-    weather = rain.pass_time(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
+    agents = spawning.admit_cars(parts.draw_agents(agents_key, scene))
+    weather = rain.advance_rain(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
     count, motion = agents.present.shape[0], parts.dynamics.read(body)
     agents = replace(agents, present=agents.present & is_finite(motion))
@@ -229,39 +242,39 @@ def _start(parts: Parts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] |
         agents=agents,
         weather=weather,
         active=agents.present,
-        happened=termination.none(count),
+        happened=termination.make_empty_events(count),
         age=jnp.zeros(count, jnp.int32),
         previous_action=jnp.zeros((count, 3), jnp.float32),
         step=step,
         key=key,
     )
-    return strong(state)
+    return to_strong_type(state)
 
 
-def _transition(parts: Parts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, Outcome]:
+def _transition(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
     """One control step, without the observation."""
-    scene = _now(parts, scene, replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt)))
+    scene = _now(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
     action = jnp.where(state.active[:, None], _command(parts, state, action), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
     scene = _now(parts, scene, after)
-    measured, after = _quarantine(parts.measure(scene, state, after), state, after)
+    measured, after = _restore_non_finite(parts.measure(scene, state, after), state, after)
     events, done = parts.judge(measured, state.happened, state.active)
     after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
-    reward, terms = rewards.weigh(Step(scene, state, after.previous_action, after, measured, events), parts.terms)
+    reward, terms = rewards.sum_terms(RewardInput(scene, state, after.previous_action, after, measured, events), parts.terms)
     truncated = after.step >= parts.episode_steps
     if parts.respawn_clear_m is None:
         over = truncated | ~jnp.any(after.active)
     else:
         over = truncated
         after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clear_m)
-    return strong(after), Outcome(None, reward, terms, events, done, truncated, over, measured)
+    return to_strong_type(after), StepResult(None, reward, terms, events, done, truncated, over, measured)
 
 
-def _observe(parts: Parts, scene: Scene, state: State) -> Observation:
+def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
     return observations.observe(_now(parts, scene, state), state, parts.groups)
 
 
-def _command(parts: Parts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+def _command(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """Throttle, steer and brake in this step: what the action means, or what stands since the last one that was read."""
     fresh = jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
     return fresh if parts.hold == 1 else jnp.where(state.step % parts.hold == 0, fresh, state.previous_action)
@@ -280,12 +293,12 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
     )
 
 
-def _quarantine(measured: Facts, before: State, after: State) -> tuple[Facts, State]:
+def _restore_non_finite(measured: StepMetrics, before: State, after: State) -> tuple[StepMetrics, State]:
     """A car whose motion is no longer finite is put back where it last was, and its action forgotten: its NaN reaches neither rewards nor
     observations nor anybody else."""
     fault = measured.events.fault
-    clean = Facts(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
-    body, motion = choose(fault, (before.body, before.motion), (after.body, after.motion))
+    clean = StepMetrics(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
+    body, motion = tree_where(fault, (before.body, before.motion), (after.body, after.motion))
     action = jnp.where(fault[:, None], 0.0, after.previous_action)  # it may be what was broken
     return clean, replace(after, body=body, motion=motion, previous_action=action)
 
@@ -298,12 +311,12 @@ def _finite(value: Array) -> Array:
 def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
     """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
     draw_key, key, body_key = jax.random.split(state.key, 3)
-    fresh = spawning.admit(draw_agents(draw_key, scene))
+    fresh = spawning.admit_cars(draw_agents(draw_key, scene))
     body = dynamics.init(body_key, replace(scene, agents=fresh))
     waiting = ~state.active & fresh.present & is_finite(dynamics.read(body))
     clear = spawning.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
     begins = waiting & clear
-    agents, body = choose(begins, (fresh, body), (state.agents, state.body))
+    agents, body = tree_where(begins, (fresh, body), (state.agents, state.body))
     count = begins.shape[0]
     return replace(
         state,
@@ -311,7 +324,7 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
         motion=dynamics.read(body),
         agents=agents,
         active=state.active | begins,
-        happened=choose(begins, termination.none(count), state.happened),
+        happened=tree_where(begins, termination.make_empty_events(count), state.happened),
         age=jnp.where(begins, 0, state.age),
         previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
         key=key,

@@ -10,53 +10,53 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_type
-from scenefactory_jax.core.types import Step
+from scenefactory_jax.core.instantiate import ConfigError, check_type, instantiate
+from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env.termination import EVENTS
 
-Term = Callable[[Step], Float[Array, " A"]]
+Term = Callable[[RewardInput], Float[Array, " A"]]
 
 
-def event(step: Step, *, name: str) -> Float[Array, " A"]:
+def event(step: RewardInput, *, name: str) -> Float[Array, " A"]:
     """1 in the step in which the named event is new."""
     if name not in EVENTS:
         raise ConfigError(f"reward: unknown event {name!r}; valid: {', '.join(EVENTS)}")
     return getattr(step.events, name).astype(jnp.float32)
 
 
-def progress(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+def progress(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """Metres along the nearest lane towards the goal, clamped to one step's plausible way (arXiv:2605.08528, Table 7, route progress)."""
     return jnp.clip(step.facts.progress, -limit_m, limit_m)
 
 
-def lane_keeping(step: Step, *, sigma_m: float, heading_share: float) -> Float[Array, " A"]:
+def lane_keeping(step: RewardInput, *, sigma_m: float, heading_share: float) -> Float[Array, " A"]:
     """exp(-(offset/sigma)^2) [(1 - share) + share max(0, cos heading error)] (arXiv:2605.08528, Table 7); 0 where there is no lane."""
     near = jnp.exp(-((step.facts.lane_offset / sigma_m) ** 2))
     aligned = (1 - heading_share) + heading_share * jnp.maximum(step.facts.lane_alignment, 0.0)
     return jnp.where(step.facts.has_lane, near * aligned, 0.0)
 
 
-def off_lane(step: Step) -> Float[Array, " A"]:
+def off_lane(step: RewardInput) -> Float[Array, " A"]:
     """1 while the car is off its lane (arXiv:2605.08528, Table 7, off-road)."""
     return step.facts.off_lane.astype(jnp.float32)
 
 
-def idle(step: Step) -> Float[Array, " A"]:
+def idle(step: RewardInput) -> Float[Array, " A"]:
     """1 while the car stands or creeps."""
     return step.facts.idle.astype(jnp.float32)
 
 
-def ttc(step: Step, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
+def ttc(step: RewardInput, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
     """Closeness to a collision with another car: min(alpha / TTC, limit), and the limit below the floor (arXiv:2605.08528, Table 7)."""
     return _urgency(step.facts.ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 
-def edge_ttc(step: Step, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
+def edge_ttc(step: RewardInput, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
     """The same for the road edge ahead."""
     return _urgency(step.facts.edge_ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 
-def clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+def low_clearance(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """Closeness to the nearest other car: 1 where the bounding circles touch, 0 from `limit_m` between them on.
 
     TTC says little of a car that follows another at its own speed a hand's breadth behind it.
@@ -64,12 +64,12 @@ def clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
     return _closeness(step.facts.gap, limit_m)
 
 
-def edge_clearance(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+def edge_clearance(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """The same for the nearest road edge, in any direction."""
     return _closeness(step.facts.edge_gap, limit_m)
 
 
-def stopping(step: Step, *, limit_m: float) -> Float[Array, " A"]:
+def stopping(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """How much longer than the free way straight ahead the way to stop is, on the road's friction: 0 for a car that could stop before
     whoever is ahead, 1 for one that could not by `limit_m` or more.
 
@@ -78,22 +78,22 @@ def stopping(step: Step, *, limit_m: float) -> Float[Array, " A"]:
     return jnp.clip(-step.facts.stopping_margin / limit_m, 0.0, 1.0)
 
 
-def wrong_way(step: Step) -> Float[Array, " A"]:
+def wrong_way(step: RewardInput) -> Float[Array, " A"]:
     """How far the car points against the direction of its nearest lane: 1 against the traffic, 0 across it, with it, and without lanes."""
     return jnp.maximum(-step.facts.lane_heading, 0.0)
 
 
-def speed(step: Step, *, limit_mps: float) -> Float[Array, " A"]:
+def speed(step: RewardInput, *, limit_mps: float) -> Float[Array, " A"]:
     """Speed as a share of a limit, clamped to 1: the optional bonus of the published code, off by default."""
     return jnp.clip(step.facts.speed / limit_mps, 0.0, 1.0)
 
 
-def action_rate(step: Step) -> Float[Array, " A"]:
+def action_rate(step: RewardInput) -> Float[Array, " A"]:
     """Squared change of the action since the last step."""
     return jnp.sum((step.action - step.before.previous_action) ** 2, axis=-1)
 
 
-def steer_rate(step: Step) -> Float[Array, " A"]:
+def steer_rate(step: RewardInput) -> Float[Array, " A"]:
     """Squared change of the steering since the last step: a price on weaving that leaves the pedals alone.
 
     A dear price on every change (`action_rate`) was seen to keep cars from learning to brake.
@@ -125,11 +125,11 @@ def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "rewar
             raise ConfigError(f"{where}.{name}.weight: missing; a reward term is {{_target_: ..., weight: ..., its numbers}}")
         check_type(entry["weight"], float, where=f"{where}.{name}.weight")
         numbers = {key: value for key, value in entry.items() if key != "weight"}
-        terms[name] = (float(entry["weight"]), build(numbers, builtins=__name__, where=f"{where}.{name}", **context))
+        terms[name] = (float(entry["weight"]), instantiate(numbers, builtins=__name__, where=f"{where}.{name}", **context))
     return terms
 
 
-def weigh(step: Step, terms: Mapping[str, tuple[float, Term]]) -> tuple[Float[Array, " A"], dict[str, Float[Array, " A"]]]:
+def sum_terms(step: RewardInput, terms: Mapping[str, tuple[float, Term]]) -> tuple[Float[Array, " A"], dict[str, Float[Array, " A"]]]:
     """The weighted sum and its parts; zero for agents that were not active in the step."""
     active = step.before.active
     parts = {name: jnp.where(active, weight * term(step), 0.0).astype(jnp.float32) for name, (weight, term) in terms.items()}

@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import norm
-from scenefactory_jax.core.pytree import replace, struct
+from scenefactory_jax.core.geometry import safe_norm
+from scenefactory_jax.core.pytree import pytree_dataclass, replace
 from scenefactory_jax.core.types import Boxes, Env, Events, Observation, Scene, State
 from scenefactory_jax.dynamics.articulated.tyres import Tyres
 
 Act = Callable[[Any, Observation, PRNGKeyArray], Array]  # (parameters, observation, key) -> action of every car
 
 
-@struct
-class Shot:
+@pytree_dataclass
+class StepRecord:
     """One control step: where everybody is after it, and what it gave. Facts, actions and rewards mean something where `active` is."""
 
     time_s: Float[Array, ""]  # since the episode began
@@ -46,12 +46,12 @@ class Shot:
     film_mm: Float[Array, ""]  # of water on the open road
 
 
-@struct
+@pytree_dataclass
 class Recording:
     """Worlds `[W, ...]` and their steps `[W, T, ...]`. The scenes hold the episodes' own agents and weather, both as they began."""
 
     scene: Scene
-    shots: Shot
+    shots: StepRecord
 
 
 def record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray, *, steps: int) -> Recording:
@@ -74,27 +74,27 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
     key, start = jax.random.split(key)
     state, observation = env.reset(start, scene)
 
-    def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], Shot]:
+    def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], StepRecord]:
         state, observation, over = carry
         before = replace(state, active=state.active & ~over)
         after, outcome = env.transition(scene, before, act(parameters, observation, key))
-        return (after, env.observe(scene, after), over | outcome.over), shot(env, scene, before, after, outcome)
+        return (after, env.observe(scene, after), over | outcome.over), make_step_record(env, scene, before, after, outcome)
 
     over = ~jnp.any(state.active)
     _, shots = jax.lax.scan(body, (state, observation, over), jax.random.split(key, steps))
     return Recording(replace(scene, agents=state.agents, weather=state.weather), shots)
 
 
-def shot(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> Shot:
+def make_step_record(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> StepRecord:
     """What one control step shows."""
     motion, facts = after.motion, outcome.facts
     tyres, joints = (getattr(after.body, name, None) for name in ("tyres", "qpos"))
-    return Shot(
+    return StepRecord(
         time_s=after.weather.rain.now_s,
         active=before.active,
         position=motion.position[:, :2],
         yaw=motion.yaw,
-        speed=norm(motion.velocity[:, :2]),
+        speed=safe_norm(motion.velocity[:, :2]),
         steer=motion.steer,
         goal=after.agents.goal,
         action=after.previous_action,

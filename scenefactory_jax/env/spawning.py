@@ -8,9 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import CONTIGUOUS_M, distance_to_boxes, heading, locate, norm, running_length
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_range, check_share, check_type
-from scenefactory_jax.core.pytree import choose, is_finite, replace
+from scenefactory_jax.core.geometry import (
+    CONTIGUOUS_M,
+    cumulative_length,
+    distance_to_boxes,
+    find_point_at_distance,
+    heading_vector,
+    safe_norm,
+)
+from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, check_range, check_type, instantiate
+from scenefactory_jax.core.pytree import is_finite, replace, tree_where
 from scenefactory_jax.core.types import Agents, Boxes, Scene
 
 Draw = Callable[[PRNGKeyArray, Scene], Agents]
@@ -27,7 +34,7 @@ def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
         ConfigError: a key that does not fit, by name; a mixture without parts, with a share below 0 or parts that begin anew on their own.
     """
     if not isinstance(entry, Mapping) or entry.get("_target_") != "mixed":
-        draw = build(entry, builtins=__name__, where=where)
+        draw = instantiate(entry, builtins=__name__, where=where)
         if "." not in entry["_target_"]:
             _check(entry, where=where)
         return draw
@@ -38,7 +45,7 @@ def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
     if not chosen:
         raise ConfigError(f"{where}.parts: {parts!r}; wanted are entries of `spawn` by name, each with a share")
     shares, draws = zip(*(_part(part, where=f"{where}.parts.{name}") for name, part in chosen.items()), strict=True)
-    return build({"_target_": "mixed"}, builtins=__name__, where=where, shares=list(shares), draws=list(draws))
+    return instantiate({"_target_": "mixed"}, builtins=__name__, where=where, shares=list(shares), draws=list(draws))
 
 
 def _part(part: Mapping[str, Any], *, where: str) -> tuple[float, Draw]:
@@ -60,27 +67,27 @@ def _check(numbers: Mapping[str, Any], *, where: str) -> None:
     for name, least in LEAST.items():
         if name in numbers:
             check_number(numbers[name], where=f"{where}.{name}", least=least)
-    check_share(numbers.get("standing_share", 0.0), where=f"{where}.standing_share")
+    check_fraction(numbers.get("standing_share", 0.0), where=f"{where}.standing_share")
     if len(numbers.get("car_size_m", (4.0, 2.0))) != 2:
         raise ConfigError(f"{where}.car_size_m: {numbers['car_size_m']}; wanted is [length, width]")
     if "travel_max_m" in numbers:
         check_range([numbers["travel_min_m"], numbers["travel_max_m"]], where=f"{where}.travel_min_m, travel_max_m")
 
 
-def are_usable(agents: Agents) -> Bool[Array, " A"]:
+def find_usable(agents: Agents) -> Bool[Array, " A"]:
     """Whether each agent has finite starts, speeds, goals and routes, and a length and width above 0."""
     numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route
     return is_finite(numbers) & jnp.all(agents.size > 0, axis=1)
 
 
-def admit(agents: Agents) -> Agents:
+def admit_cars(agents: Agents) -> Agents:
     """Drawn agents without those that no car can be made of: they are absent, and their numbers zeros with a size of 1 m.
 
     One NaN would otherwise reach everybody near it.
     """
-    usable = are_usable(agents)
+    usable = find_usable(agents)
     nothing = jax.tree.map(jnp.zeros_like, agents)
-    return choose(usable, agents, replace(nothing, size=jnp.ones_like(agents.size)))
+    return tree_where(usable, agents, replace(nothing, size=jnp.ones_like(agents.size)))
 
 
 def mixed(key: PRNGKeyArray, scene: Scene, *, shares: list[float], draws: list[Draw]) -> Agents:
@@ -98,12 +105,12 @@ def logged(key: PRNGKeyArray, scene: Scene) -> Agents:
     return scene.agents
 
 
-def standing(key: PRNGKeyArray, scene: Scene) -> Agents:
+def logged_from_rest(key: PRNGKeyArray, scene: Scene) -> Agents:
     """The starts and goals of the recording, from rest (the paper's preset)."""
     return replace(scene.agents, speed=jnp.zeros_like(scene.agents.speed))
 
 
-def underway(
+def along_log(
     key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_share: float
 ) -> Agents:
     """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
@@ -115,7 +122,7 @@ def underway(
     log, cars = scene.log, scene.agents
     place_key, rest_key = jax.random.split(key)
     both = log.valid[:, 1:] & log.valid[:, :-1]
-    steps = jnp.where(both, norm(log.position[:, 1:] - log.position[:, :-1]), 0.0)
+    steps = jnp.where(both, safe_norm(log.position[:, 1:] - log.position[:, :-1]), 0.0)
     travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
     whole = travelled[:, -1:]
     begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(whole - travel_min_m, 0.0)
@@ -131,7 +138,7 @@ def underway(
     return Agents(
         position=pick(start),
         yaw=pick(read(log.yaw, row)),
-        speed=moving * pick(norm(read(log.velocity, row))),
+        speed=moving * pick(safe_norm(read(log.velocity, row))),
         size=cars.size,
         goal=jnp.where(present[:, None], cars.goal, 0.0),
         route=pick(whole - read(travelled, row)),
@@ -160,12 +167,12 @@ def random_pairs(
     slots = scene.agents.present.shape[0]
     place_key, travel_key = jax.random.split(key)
     travel = jax.random.uniform(travel_key, (slots, candidates), minval=travel_min_m, maxval=travel_max_m)
-    running = running_length(scene.lanes)
+    running = cumulative_length(scene.lanes)
     begin = jax.random.uniform(place_key, (slots, candidates)) * running[-1]
-    start, start_yaw, start_lane, start_arc = locate(scene.lanes, running, begin)
-    goal, _, goal_lane, goal_arc = locate(scene.lanes, running, begin + travel)
-    _, _, first_lane, first_arc = locate(scene.lanes, running, begin - margin_m)
-    _, _, last_lane, last_arc = locate(scene.lanes, running, begin + travel + margin_m)
+    start, start_yaw, start_lane, start_arc = find_point_at_distance(scene.lanes, running, begin)
+    goal, _, goal_lane, goal_arc = find_point_at_distance(scene.lanes, running, begin + travel)
+    _, _, first_lane, first_arc = find_point_at_distance(scene.lanes, running, begin - margin_m)
+    _, _, last_lane, last_arc = find_point_at_distance(scene.lanes, running, begin + travel + margin_m)
     unbroken = (
         (goal_lane == start_lane)
         & (first_lane == start_lane)
@@ -196,8 +203,8 @@ def _choose(
 
     def place(slot, chosen_so_far):
         starts, goals, chosen, present = chosen_so_far
-        near_start = jnp.any((norm(start[slot][:, None] - starts) < start_gap_m) & present, axis=1)
-        near_goal = jnp.any((norm(goal[slot][:, None] - goals) < goal_gap_m) & present, axis=1)
+        near_start = jnp.any((safe_norm(start[slot][:, None] - starts) < start_gap_m) & present, axis=1)
+        near_goal = jnp.any((safe_norm(goal[slot][:, None] - goals) < goal_gap_m) & present, axis=1)
         free = usable[slot] & ~near_start & ~near_goal
         best = jnp.argmax(free)
         return (
@@ -223,7 +230,7 @@ def is_clear(
     agents: Agents, position: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes, *, clear_m: float
 ) -> Bool[Array, " A"]:
     """Whether no active car stands within `clear_m` of each agent's start, nor the outline of a box within half of it."""
-    near = norm(agents.position[:, None] - position[None]) < clear_m
+    near = safe_norm(agents.position[:, None] - position[None]) < clear_m
     taken = jnp.any(near & active[None] & ~jnp.eye(len(active), dtype=bool), axis=1)
     return ~taken & ~_beside(agents.position, boxes, within_m=0.5 * clear_m)
 
@@ -235,4 +242,4 @@ def _beside(point: Float[Array, "*n 2"], boxes: Boxes, *, within_m: float) -> Bo
 
 def forward(agents: Agents) -> Float[Array, "A 2"]:
     """Velocity at the start."""
-    return agents.speed[:, None] * heading(agents.yaw)
+    return agents.speed[:, None] * heading_vector(agents.yaw)

@@ -7,14 +7,14 @@ reads cost nothing: XLA drops them.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import car_circles, cross, dot, heading, norm
+from scenefactory_jax.core.geometry import cover_with_circles, cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import is_finite
-from scenefactory_jax.core.types import Agents, Events, Facts, Motion, Scene, State
+from scenefactory_jax.core.types import Agents, Events, Motion, Scene, State, StepMetrics
 from scenefactory_jax.env import spawning, surrogate_safety
 from scenefactory_jax.roadgraph import queries
 
 
-def measure(
+def compute(
     scene: Scene,
     before: State,
     after: State,
@@ -37,7 +37,7 @@ def measure(
     drac_gap_floor_m: float,
     gravity_mps2: float,
     kernels: bool,
-) -> Facts:
+) -> StepMetrics:
     """Facts of the step from `before` to `after`, for the agents that were active in it; rows of the others mean nothing.
 
     Definitions follow the published task (arXiv:2605.08528, section 4): planar goal distance; nearest lane midpoint of the whole world, its
@@ -48,29 +48,31 @@ def measure(
     """
     motion, active, cars, fault = after.motion, before.active, len(before.active), _are_broken(after)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
-    everyone = surrogate_safety.bodies(motion, after.agents.size, active & ~fault, scene.boxes)  # a faulty car collides with nothing
-    centres, radius = car_circles(everyone.position, everyone.yaw, everyone.size, **circles)
-    pairs = surrogate_safety.pairwise(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
-    speed, to_goal = norm(velocity), after.agents.goal - position
+    everyone = surrogate_safety.collect_road_users(
+        motion, after.agents.size, active & ~fault, scene.boxes
+    )  # a faulty car collides with nothing
+    centres, radius = cover_with_circles(everyone.position, everyone.yaw, everyone.size, **circles)
+    pairs = surrogate_safety.compare_pairs(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
+    speed, to_goal = safe_norm(velocity), after.agents.goal - position
     edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
-    beside = queries.look(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
+    beside = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
     lane, edge_gap = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
-    strayed = norm(position - after.agents.position)
+    strayed = safe_norm(position - after.agents.position)
     limits = {"upright_min": upright_min, "height_min_m": height_min_m, "box_m": box_m, "stray_m": stray_m, "stray_ratio": stray_ratio}
     events = Events(
         fault=fault,
-        reached=norm(to_goal) <= goal_radius_m,
+        reached=safe_norm(to_goal) <= goal_radius_m,
         collided=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
         crashed=_has_crashed(motion, after.agents, strayed, **limits),
         touched_edge=edge_gap <= 0,
     )
-    return Facts(
+    return StepMetrics(
         speed=speed,
-        goal_distance=norm(to_goal),
+        goal_distance=safe_norm(to_goal),
         **lane,
-        ttc=surrogate_safety.least(pairs.ttc, everyone.present),
-        gap=surrogate_safety.least(pairs.gap, everyone.present),
-        stopping_margin=surrogate_safety.least(pairs.ahead, everyone.present) - _stopping(speed, motion.grip, gravity_mps2),
+        ttc=surrogate_safety.minimum_over_pairs(pairs.ttc, everyone.present),
+        gap=surrogate_safety.minimum_over_pairs(pairs.gap, everyone.present),
+        stopping_margin=surrogate_safety.minimum_over_pairs(pairs.ahead, everyone.present) - _stopping(speed, motion.grip, gravity_mps2),
         edge_ttc=beside.edge_ttc,
         edge_gap=edge_gap,
         drac=jnp.max(jnp.where(everyone.present[None], pairs.drac, 0.0), axis=1),
@@ -84,7 +86,7 @@ def measure(
 
 def _are_broken(state: State) -> Bool[Array, " A"]:
     """Agents with a number in their motion, or in where they start and what they must reach, that nothing can be computed with."""
-    return ~(is_finite(state.motion) & spawning.are_usable(state.agents))
+    return ~(is_finite(state.motion) & spawning.find_usable(state.agents))
 
 
 def _stopping(speed: Float[Array, " A"], grip: Float[Array, " A"], gravity_mps2: float) -> Float[Array, " A"]:
@@ -101,9 +103,7 @@ def _has_crashed(
     return fell | outside | (strayed > jnp.maximum(stray_m, stray_ratio * agents.route))
 
 
-def _measure_lane(
-    scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]
-) -> dict[str, Array]:
+def _measure_lane(scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]) -> dict[str, Array]:
     """Facts relative to a row of the lanes; zeros in a world without lanes."""
     any_lane, position = jnp.any(scene.lanes.valid), motion.position[:, :2]
     direction, midpoint = scene.lanes.direction[row], scene.lanes.midpoint[row]
@@ -114,8 +114,8 @@ def _measure_lane(
     return {
         "progress": jnp.where(any_lane, dot(moved, tangent), zero),
         "lane_offset": jnp.where(any_lane, jnp.abs(cross(tangent, offset)), zero),
-        "lane_distance": jnp.where(any_lane, norm(offset), zero),
-        "lane_alignment": jnp.where(any_lane, dot(heading(motion.yaw), tangent), zero),
-        "lane_heading": jnp.where(any_lane, dot(heading(motion.yaw), direction), zero),
+        "lane_distance": jnp.where(any_lane, safe_norm(offset), zero),
+        "lane_alignment": jnp.where(any_lane, dot(heading_vector(motion.yaw), tangent), zero),
+        "lane_heading": jnp.where(any_lane, dot(heading_vector(motion.yaw), direction), zero),
         "has_lane": jnp.broadcast_to(any_lane, row.shape),
     }

@@ -5,14 +5,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import cross, dot, heading, norm
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import is_finite
 from scenefactory_jax.core.types import Boxes, Motion
 
 SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
 
 
-class Bodies(NamedTuple):
+class RoadUsers(NamedTuple):
     """Everybody on the road: the cars, and the boxes after them."""
 
     position: Float[Array, "B 2"]
@@ -32,15 +32,15 @@ class Pairs(NamedTuple):
     ahead: Float[Array, "A B"]  # m
 
 
-def bodies(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> Bodies:
+def collect_road_users(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes) -> RoadUsers:
     """Cars and boxes as one list; its first rows are the cars. Who has no size, or a number that is not finite, is not present."""
     cars = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], motion.yaw_rate, size, active)
     beside = (boxes.position, boxes.yaw, boxes.velocity, boxes.yaw_rate, boxes.size, boxes.present)
-    everyone = Bodies(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
+    everyone = RoadUsers(*(jnp.concatenate(pair) for pair in zip(cars, beside, strict=True)))
     return everyone._replace(present=everyone.present & is_finite(everyone[:-1]) & jnp.all(everyone.size > 0, axis=1))
 
 
-def pairwise(
+def compare_pairs(
     centres: Float[Array, "B 3 2"],
     radius: Float[Array, " B"],
     velocity: Float[Array, "B 2"],
@@ -59,8 +59,8 @@ def pairwise(
     apart = centres[None, :, None, :, :] - centres[:cars, None, :, None, :]  # [row, column, own circle, other circle, xy]
     relative = (velocity[None] - velocity[:cars, None])[:, :, None, None, :]
     reach = (radius[:cars, None] + radius[None])[:, :, None, None]
-    distance = norm(apart)
-    facing = heading(yaw)[:, None, None, None, :]
+    distance = safe_norm(apart)
+    facing = heading_vector(yaw)[:, None, None, None, :]
     along = dot(apart, facing)
     ahead = along > 0
 
@@ -87,6 +87,6 @@ def pairwise(
     return Pairs(ttc=ttc, drac=jnp.where(own, 0.0, drac), gap=gap, ahead=free)
 
 
-def least(of: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
+def minimum_over_pairs(of: Float[Array, "A B"], other: Bool[Array, " B"]) -> Float[Array, " A"]:
     """Smallest TTC or distance over the columns that count as present; inf where nobody is."""
     return jnp.min(jnp.where(other[None], of, jnp.inf), axis=1)

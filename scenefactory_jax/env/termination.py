@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from scenefactory_jax.core.instantiate import ConfigError, check_type
-from scenefactory_jax.core.types import Events, Facts
+from scenefactory_jax.core.types import Events, StepMetrics
 
 EVENTS = tuple(field.name for field in dataclasses.fields(Events))
 
 
-def judge(facts: Facts, happened: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
+def evaluate(facts: StepMetrics, happened: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
     """New events of this step and the agents that they end.
 
     An event is new once in an agent's life. If several are new in one step, the first in the order of `EVENTS` counts (the paper's events
@@ -44,6 +44,6 @@ def check(ending: Any, *, where: str) -> None:
         raise ConfigError(f"{where}.ending: {ending} must hold 'fault' and 'reached': a broken or a finished car cannot drive on")
 
 
-def none(agents: int) -> Events:
+def make_empty_events(agents: int) -> Events:
     """No event for that many agents."""
     return Events(**{name: jnp.zeros(agents, bool) for name in EVENTS})

@@ -12,18 +12,18 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, Tracks
+from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, TrafficLog
 
 VEHICLE = ROAD_USERS.index("vehicle")
 SNAP = 1e-3  # rows; a control step this near to a logged row is at it: float32 times do not meet exactly
 
 
-def ignore(scene: Scene, step: Int[Array, ""]) -> Boxes:
+def no_traffic(scene: Scene, step: Int[Array, ""]) -> Boxes:
     """Nobody: the cars are alone, and nothing is computed for others."""
-    return track_interpolation.nobody()
+    return track_interpolation.make_empty_boxes()
 
 
-def static(scene: Scene, step: Int[Array, ""], *, parked_m: float, start_row: int, elevation_m: float) -> Boxes:
+def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: float, start_row: int, elevation_m: float) -> Boxes:
     """Parked vehicles only, as boxes that nothing moves, where they stand when the episode begins.
 
     Args:
@@ -46,7 +46,7 @@ def static(scene: Scene, step: Int[Array, ""], *, parked_m: float, start_row: in
     )
 
 
-def replay(
+def log_traffic(
     scene: Scene,
     step: Int[Array, ""],
     *,
@@ -79,9 +79,9 @@ def replay(
     others, dt = scene.others, scene.log.dt
     row = start_row + step.astype(jnp.float32) * (control_dt / dt)
     row = jnp.where(jnp.abs(row - jnp.round(row)) < SNAP, jnp.round(row), row)
-    before, after = jax.vmap(lambda valid: track_interpolation.around(row, valid))(others.valid)
+    before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(others.valid)
     known = (others.position, others.yaw, others.velocity, others.valid)
-    position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.sample(row, *track, dt=dt))(*known)
+    position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.interpolate_track(row, *track, dt=dt))(*known)
 
     seen, ahead, at_row = before >= 0, after < others.valid.shape[1], before == row
     bridged = ahead & ((after - before) * dt <= gap_s + SNAP * dt)
@@ -105,7 +105,7 @@ def replay(
     )
 
 
-def _parked(others: Tracks, within_m: float) -> Bool[Array, " O"]:
+def _parked(others: TrafficLog, within_m: float) -> Bool[Array, " O"]:
     """Vehicles that never leave the place where they are first seen."""
     first = jnp.argmax(others.valid, axis=1)
     begin = jnp.take_along_axis(others.position, first[:, None, None], axis=1)
@@ -113,7 +113,7 @@ def _parked(others: Tracks, within_m: float) -> Bool[Array, " O"]:
     return (others.kind == VEHICLE) & (moved < within_m**2)
 
 
-def _among(others: Tracks, kinds: list[RoadUser]) -> Bool[Array, " O"]:
+def _among(others: TrafficLog, kinds: list[RoadUser]) -> Bool[Array, " O"]:
     return jnp.array([kind in kinds for kind in ROAD_USERS])[others.kind]
 
 

@@ -302,7 +302,7 @@ def write_csv(path: Path, records: Records) -> None:
     check(records)
     names = list(records)
     columns = [np.asarray(records[name]).tolist() for name in names]
-    with text_file.opened(path, "w") as file:
+    with text_file.open_text(path, "w") as file:
         writer = csv.writer(file)
         writer.writerow(names)
         writer.writerows(zip(*columns, strict=True))
@@ -316,7 +316,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     """
     if not path.is_file():
         raise RecordsError(f"{path}: no such file; wanted the CSV of an evaluation")
-    with text_file.opened(path, "r") as file:
+    with text_file.open_text(path, "r") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):

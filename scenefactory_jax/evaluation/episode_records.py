@@ -25,14 +25,14 @@ class Recording(NamedTuple):
 
     batch: Scene  # of all worlds, on the device
     boxes: Callable[[Scene, State], Boxes]  # everybody else over all steps of one world
-    frames: episodes.Frame  # numpy, [W, T, ...]
+    frames: episodes.EpisodeFrame  # numpy, [W, T, ...]
     state: State  # of all worlds at the end
     weather: Weather  # at the start
     names: list[str]
     control_hz: float
 
 
-def make_player(
+def make_episode_runner(
     config: Mapping[str, Any],
     scenes: scene_source.Scenes,
     *,
@@ -51,7 +51,10 @@ def make_player(
         steps: how many of the steps to record; None: all.
     """
     once = {"spawn": {**config["spawn"], "respawn_clear_m": None}}  # an agent is judged by one life, also of a run that starts it again
-    env, policy = environment.make({**config, **once, "ends": configs.load("task", f"ends={protocol}")["ends"]}), make_policy(config)
+    env, policy = (
+        environment.make_env({**config, **once, "ends": configs.load_config("task", f"ends={protocol}")["ends"]}),
+        make_policy(config),
+    )
     index = np.tile(np.arange(len(scenes)), settings["repeats"])
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
@@ -70,7 +73,7 @@ def make_player(
     @functools.partial(jax.jit, donate_argnums=2)
     def play(parameters, batch, episode):
         own = dict(steps=chunk, ttc_limit_s=settings["ttc_limit_s"], notes=numbers["notes"])
-        episode, frames = jax.vmap(functools.partial(episodes.play, env, act, parameters, **own))(batch, episode)
+        episode, frames = jax.vmap(functools.partial(episodes.run_episode_chunk, env, act, parameters, **own))(batch, episode)
         return episode, jax.tree.map(lambda leaf: leaf[:worlds], frames)
 
     @jax.jit
@@ -100,7 +103,7 @@ def make_player(
 
 
 def _records(
-    tally: episodes.Tally, state: State, present, started, weather: Weather, names: list[str], *, seed: int, control_hz: float
+    tally: episodes.EpisodeMetrics, state: State, present, started, weather: Weather, names: list[str], *, seed: int, control_hz: float
 ) -> Records:
     """One row for every spawned agent of every world; film and surface are the open road's at the start."""
     row_world, row_agent = np.nonzero(present)
@@ -135,14 +138,14 @@ def _records(
     }
 
 
-def _clues(tally: episodes.Tally, state: State, present, control_hz: float) -> Records:
+def _clues(tally: episodes.EpisodeMetrics, state: State, present, control_hz: float) -> Records:
     """What `failures.classify` wants to know of every spawned agent."""
     row_world, row_agent = np.nonzero(present)
     of = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[row_world, row_agent], tree)  # noqa: E731
     found, last = of(tally.clues), of(tally.steps)
-    end = unchecked(failure_signals.Moment, step=last, place=of(state.motion.position)[:, :2])
+    end = unchecked(failure_signals.EventMoment, step=last, place=of(state.motion.position)[:, :2])
     moments = {"event": found.first, "closest": found.closest, "rest": found.rest, "against": found.turned, "end": end}
-    first = np.where(found.harmed, np.array(failure_signals.HARMS)[found.harm], failures.NONE)
+    first = np.where(found.harmed, np.array(failure_signals.FAILURE_EVENTS)[found.harm], failures.NONE)
     return {
         **{f"{name}_s": moment.step / control_hz for name, moment in moments.items()},
         **{f"{name}_{axis}_m": moment.place[:, i] for name, moment in moments.items() for i, axis in enumerate("xy")},

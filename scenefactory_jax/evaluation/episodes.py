@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.pytree import replace, struct
-from scenefactory_jax.core.types import Env, Events, Outcome, Scene, State
+from scenefactory_jax.core.pytree import pytree_dataclass, replace
+from scenefactory_jax.core.types import Env, Events, Scene, State, StepResult
 from scenefactory_jax.env import termination
 from scenefactory_jax.evaluation import failure_signals
-from scenefactory_jax.evaluation.failure_signals import Clues
+from scenefactory_jax.evaluation.failure_signals import FailureSignals
 
 Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 
 
-@struct
-class Tally:
+@pytree_dataclass
+class EpisodeMetrics:
     """Running record of one episode."""
 
     happened: Events
@@ -38,11 +38,11 @@ class Tally:
     grip_use_sum: Float[Array, " A"]
     margin_min: Float[Array, " A"]
     force_max: Float[Array, " A"]
-    clues: Clues
+    clues: FailureSignals
 
 
-@struct
-class Frame:
+@pytree_dataclass
+class EpisodeFrame:
     """What one moment looks like from above; where the others are then follows from the scene and the step alone."""
 
     position: Float[Array, "A 2"]
@@ -53,13 +53,13 @@ class Frame:
     events: Events
 
 
-@struct
+@pytree_dataclass
 class Episode:
     """Everything that a running episode carries."""
 
     state: State
     observation: Any
-    tally: Tally
+    tally: EpisodeMetrics
     over: Bool[Array, ""]
 
 
@@ -69,8 +69,8 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
     count = state.active.shape[0]
     zero, none = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32)
     distance = jnp.linalg.norm(state.agents.goal - state.motion.position[:, :2], axis=1)
-    tally = Tally(
-        happened=termination.none(count),
+    tally = EpisodeMetrics(
+        happened=termination.make_empty_events(count),
         ended=jnp.zeros(count, bool),
         steps=none,
         goal_distance=distance,
@@ -89,9 +89,9 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
     return Episode(state, observation, tally, ~jnp.any(state.active))
 
 
-def play(
+def run_episode_chunk(
     env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float, notes: Mapping[str, float]
-) -> tuple[Episode, Frame]:
+) -> tuple[Episode, EpisodeFrame]:
     """Drive on for that many control steps; frames come back with a leading step axis.
 
     Args:
@@ -99,27 +99,29 @@ def play(
         notes: numbers of `clues.note`.
     """
 
-    def body(episode: Episode, _: None) -> tuple[Episode, Frame]:
+    def body(episode: Episode, _: None) -> tuple[Episode, EpisodeFrame]:
         before = replace(episode.state, active=episode.state.active & ~episode.over)
         action = act(parameters, episode.observation)
         state, outcome = env.transition(scene, before, action)
         seen, boxes = episode.tally, env.now(scene, state).boxes
-        found = failure_signals.note(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
+        found = failure_signals.update(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
         tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
         place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
-        frame = Frame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
+        frame = EpisodeFrame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
         return Episode(state, env.observe(scene, state), tally, episode.over | outcome.over), frame
 
     return jax.lax.scan(body, episode, None, length=steps)
 
 
-def _note(tally: Tally, before: State, after: State, outcome: Outcome, found: Clues, *, ttc_limit_s: float) -> Tally:
+def _note(
+    tally: EpisodeMetrics, before: State, after: State, outcome: StepResult, found: FailureSignals, *, ttc_limit_s: float
+) -> EpisodeMetrics:
     facts = outcome.facts
     active = before.active & ~facts.events.fault  # a broken car's facts are no measurements
     seen = active & jnp.isfinite(facts.ttc)
     happened = jax.tree.map(lambda old, new: old | (new & before.active), tally.happened, facts.events)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
-    return Tally(
+    return EpisodeMetrics(
         happened=happened,
         ended=tally.ended | (outcome.done & before.active),
         steps=tally.steps + active.astype(jnp.int32),

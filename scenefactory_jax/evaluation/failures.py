@@ -111,7 +111,7 @@ def classify(
     }  # fmt: skip
 
 
-def of(records: Records) -> dict[str, list[Failure]]:
+def rank_failures(records: Records) -> dict[str, list[Failure]]:
     """The failures of an evaluation by kind, in the order of `KINDS`, the worst of each first; kinds that did not occur are left out.
 
     Raises:
@@ -157,7 +157,7 @@ def scenes(failures: list[Failure]) -> list[tuple[str, int]]:
     return sorted(counts.items(), key=lambda item: -item[1])  # stable: the failures come worst first
 
 
-def worst(failures: list[Failure], count: int) -> list[Failure]:
+def find_worst_failures(failures: list[Failure], count: int) -> list[Failure]:
     """The worst of these failures, each of another scene."""
     first: dict[str, Failure] = {}
     for failure in failures:
@@ -167,7 +167,7 @@ def worst(failures: list[Failure], count: int) -> list[Failure]:
 
 def as_json(records: Records) -> dict[str, Any]:
     """Counts, scenes and the ranked failures of an evaluation, for a file."""
-    found, agents = of(records), len(records["scene"])
+    found, agents = rank_failures(records), len(records["scene"])
     kinds = {
         kind: {
             **KINDS[kind]._asdict(),
@@ -192,21 +192,21 @@ def table(records: Records, *, most: int = 3) -> str:
     agents, clean = len(records["scene"]), int(np.sum(records["clean"]))
     astray = int(np.sum(np.asarray(records["clean"], bool) & np.asarray(records["wrong_way"], bool)))
     rows = [["arrived cleanly", clean, f"{100 * clean / agents:.1f} %", f"{FLAGS['wrong_way']} {astray}" if astray else "", ""]]
-    for kind, failures in of(records).items():
+    for kind, failures in rank_failures(records).items():
         also = [f"{FLAGS[name]} {count}" for name, count in flag_counts(failures).items()]
         most_of = ", ".join(f"{scene} ({count})" for scene, count in scenes(failures)[:most])
         rows.append([KINDS[kind].label, len(failures), f"{100 * len(failures) / agents:.1f} %", ", ".join(also), most_of])
     return agent_metrics.grid(["First that went wrong", "Agents", f"Share of {agents}", "Of these also", "Scenes with the most"], rows)
 
 
-def numbers(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+def list_thresholds(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     """The numbers of the config group `failures` that definitions name."""
     return {**settings["notes"], **settings["kinds"]}
 
 
-def definitions(records: Records, numbers: Mapping[str, float]) -> str:
+def list_definitions(records: Records, numbers: Mapping[str, float]) -> str:
     """What the kinds in these records mean, a line each, with the numbers in place of their names."""
-    seen = [KINDS[kind] for kind in of(records)]
+    seen = [KINDS[kind] for kind in rank_failures(records)]
     text = "\n".join(f"- **{kind.label}**: {kind.definition} Worst first by: {kind.measure}, {kind.unit}." for kind in seen)
     for name, value in numbers.items():
         unit = next((mark for suffix, mark in (("_mps", " m/s"), ("_s", " s"), ("_m", " m")) if name.endswith(suffix)), "")

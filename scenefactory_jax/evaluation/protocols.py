@@ -37,20 +37,26 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     scene_source.use_compilation_cache()
     run = policy_io.find(config["run"])
     protocol = config["protocol"]
-    trained = configs.amend(configs.read(run, trust=config["trust"]), [*protocol["settings"], *config["overrides"]])
-    scenes = scene_source.heldout(trained["scenes"], path=config["scenes"]["path"])
-    out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_shipped(run) else run) / "evaluation")
+    trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), [*protocol["settings"], *config["overrides"]])
+    scenes = scene_source.load_heldout_scenes(trained["scenes"], path=config["scenes"]["path"])
+    out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"]}
     asked |= {"protocol": protocol["name"], "trust": config["trust"]}
-    return judge(trained, run, scenes, out, asked=asked, settings=config, protocols=protocol["ends"])
+    return evaluate_protocols(trained, run, scenes, out, asked=asked, settings=config, protocols=protocol["ends"])
 
 
 def after_training(config: Mapping[str, Any], folder: Path) -> Result:
     """The evaluation that ends `train`: held-out scenes, the run's own settings."""
     settings = config["evaluation"]
-    scenes = scene_source.heldout(config["scenes"], path=None)
-    asked = {"run": str(folder), "scenes": None, "overrides": [], "protocol": "trained", "trust": bool(trusted_targets.outside(config))}
-    return judge(config, folder, scenes, folder, asked=asked, settings=settings, protocols=settings["protocols"])
+    scenes = scene_source.load_heldout_scenes(config["scenes"], path=None)
+    asked = {
+        "run": str(folder),
+        "scenes": None,
+        "overrides": [],
+        "protocol": "trained",
+        "trust": bool(trusted_targets.find_outside_targets(config)),
+    }
+    return evaluate_protocols(config, folder, scenes, folder, asked=asked, settings=settings, protocols=settings["protocols"])
 
 
 def make_watch(
@@ -63,9 +69,9 @@ def make_watch(
     """
     settings = {**config["evaluation"], "repeats": 1}
     if examiners is None:
-        scenes = scene_source.heldout(config["scenes"], path=None)
+        scenes = scene_source.load_heldout_scenes(config["scenes"], path=None)
         examiners = {
-            protocol: make_examiner(config, scenes, protocol=protocol, settings=settings, film=0) for protocol in settings["protocols"]
+            protocol: make_evaluator(config, scenes, protocol=protocol, settings=settings, film=0) for protocol in settings["protocols"]
         }
     file = metrics_csv.MetricsFile(folder, name=metrics_csv.EVALUATIONS, resume_at=resume_at)
 
@@ -82,7 +88,7 @@ def make_watch(
     return watch
 
 
-def judge(
+def evaluate_protocols(
     config: Mapping[str, Any],
     run: Path,
     scenes: scene_source.Scenes,
@@ -110,7 +116,9 @@ def judge(
     for number, protocol in enumerate(protocols):
         film = settings["video"]["worlds"] if settings["video"]["enable"] and number == 0 else 0
         drawn = settings["failures"]["pictures"]["enable"]
-        play = episode_records.make_player(config, scenes, protocol=protocol, settings=settings, worlds=None if drawn else film, steps=None)
+        play = episode_records.make_episode_runner(
+            config, scenes, protocol=protocol, settings=settings, worlds=None if drawn else film, steps=None
+        )
         for name, values in parameters.items():
             label = protocol if name == "trained" else f"{protocol}, {name}"
             records[label], recording = play(values)
@@ -134,7 +142,7 @@ def judge(
     return Result(out, records, summary, report)
 
 
-def make_examiner(
+def make_evaluator(
     config: Mapping[str, Any], scenes: scene_source.Scenes, *, protocol: str, settings: Mapping[str, Any], film: int
 ) -> Callable[[Any], tuple[dict[str, np.ndarray], list[Trajectory]]]:
     """A function parameters -> (records, trajectories) that plays one deterministic episode for every scene and repeat, all at once.
@@ -145,7 +153,7 @@ def make_examiner(
         protocol: an option of the `ends` group.
         film: how many worlds' trajectories to keep.
     """
-    play = episode_records.make_player(
+    play = episode_records.make_episode_runner(
         config, scenes, protocol=protocol, settings=settings, worlds=film, steps=_filmed(config, settings["video"])
     )
 

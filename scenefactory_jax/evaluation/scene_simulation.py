@@ -37,7 +37,7 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
         SceneError: nothing usable at the path.
     """
     scene_source.use_compilation_cache()
-    env, loaded = environment.make(config), scene_source.training(config["scenes"])
+    env, loaded = environment.make_env(config), scene_source.load_training_scenes(config["scenes"])
     steps = max(round(config["simulate"]["seconds"] * config["timing"]["control_hz"]), 1)
     run = jax.jit(jax.vmap(lambda key, scene: drive(env, key, scene, steps=steps)))
     found: dict[str, dict[str, int]] = {}

@@ -68,7 +68,7 @@ def latest(folder: Path | str) -> int | None:
     return max(_steps(Path(folder)), default=None)
 
 
-def strip(folder: Path | str) -> None:
+def drop_training_state(folder: Path | str) -> None:
     """Leave what the policy learnt, as the newest checkpoint holds it, and remove the rest: for a run that is not to go on."""
     newest = latest(folder)
     for place in Path(folder).iterdir():

@@ -18,7 +18,7 @@ STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 
 
 @contextlib.contextmanager
-def deferred() -> Iterator[Callable[[], int | None]]:
+def defer_interrupt() -> Iterator[Callable[[], int | None]]:
     """A function that returns the signal that asked to stop, None if there was none.
 
     That is always None outside of the main thread, where signals do not arrive, and for signals that are ignored, as Ctrl-C is in the

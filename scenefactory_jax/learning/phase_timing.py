@@ -12,16 +12,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
-from scenefactory_jax.core.pytree import choose, replace
+from scenefactory_jax.core.pytree import replace, tree_where
 from scenefactory_jax.core.types import Env, Scene, State
-from scenefactory_jax.env.environment import Parts
+from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.weather import rain
 
 ACTING = ("physics", "facts, rewards, ends", "restarts", "observation")  # with random actions; then come policy and update
 Run = Callable[[State, Scene, PRNGKeyArray], tuple[State, Array]]
 
 
-class Timed(NamedTuple):
+class PhaseTimes(NamedTuple):
     """One program, timed."""
 
     seconds: list[float]  # of each repeat
@@ -39,7 +39,7 @@ def control_steps(config: Mapping[str, Any]) -> int:
     return config["ppo"]["horizon"] * config["controls"]["every"]
 
 
-def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
+def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:
     """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
 
     Returns:
@@ -48,7 +48,7 @@ def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
     depth = ACTING.index(level)
 
     def moved(scene: Scene, state: State, action: Array) -> State:
-        state = replace(state, weather=rain.pass_time(state.weather, dt=parts.control_dt))
+        state = replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt))
         return replace(state, body=parts.dynamics.advance(env.now(scene, state), state.body, action, state.active), step=state.step + 1)
 
     def step(scenes: Scene, worlds: State, key: PRNGKeyArray) -> tuple[State, Array]:
@@ -64,7 +64,7 @@ def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
         after, (over, told) = jax.lax.scan(control, worlds, None, length=env.hold, unroll=env.hold == 1)
         told = told.sum()
         if depth > 1:
-            after = choose(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
+            after = tree_where(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
         if depth > 2:
             seen = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # a learner would keep it: it is written out
             told += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
@@ -77,7 +77,7 @@ def acting(level: str, parts: Parts, env: Env, *, steps: int) -> Run:
     return run
 
 
-def timed(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmup: int, repeats: int) -> Timed:
+def time_phase(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmup: int, repeats: int) -> PhaseTimes:
     """Compile `run(state, *arguments(i))` and call it again and again, each time with the state that it returned, donated."""
     state = jax.tree.map(jnp.copy, state)  # its own buffers: `jit` may have handed a scene's straight through, and donating would delete it
     begun = time.perf_counter()
@@ -88,7 +88,7 @@ def timed(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmu
         begun = time.perf_counter()
         state, rest = jax.block_until_ready(compiled(state, *given))
         seconds.append(time.perf_counter() - begun)
-    return Timed(seconds[warmup:], compile_s, memory_gib(compiled), (state, rest))
+    return PhaseTimes(seconds[warmup:], compile_s, memory_gib(compiled), (state, rest))
 
 
 def memory_gib(compiled: Any) -> float:
@@ -100,7 +100,7 @@ def memory_gib(compiled: Any) -> float:
     return held / 2**30
 
 
-def parts_of_the_whole(nested: Mapping[str, float]) -> dict[str, float]:
+def time_phases(nested: Mapping[str, float]) -> dict[str, float]:
     """Times of nested programs -> what each part adds."""
     before, found = 0.0, {}
     for name, value in nested.items():

@@ -17,7 +17,7 @@ from scenefactory_jax.learning.training_loop import make_policy
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
 
-class Trained(NamedTuple):
+class TrainedPolicy(NamedTuple):
     """A policy with what it learnt, and the config that it was trained with."""
 
     folder: Path
@@ -26,7 +26,7 @@ class Trained(NamedTuple):
     parameters: Any
 
 
-def load_policy(run: str | Path, *, trust: bool = False) -> Trained:
+def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
     """A trained policy to act with, to judge or to train on.
 
         trained = sf.load_policy("runs/demo-...")
@@ -43,7 +43,7 @@ def load_policy(run: str | Path, *, trust: bool = False) -> Trained:
     """
     folder = find(run)
     config = configs.read(folder, trust=trust)
-    return Trained(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
+    return TrainedPolicy(folder, config, make_policy(config), checkpoint.restore_parameters(folder / "checkpoints"))
 
 
 def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
@@ -53,7 +53,7 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
         scene: one world, for the shapes of what is observed.
     """
     key = jax.random.key(config["seed"])
-    seen = jax.eval_shape(environment.make(config).reset, key, scene)[1]
+    seen = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
     blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
     return initial_parameters.draw_parameters(key, make_policy(config), blank)
 
@@ -73,6 +73,6 @@ def find(run: str | Path) -> Path:
     raise ConfigError(f"{run} is no run: it has no {configs.FILE}; give the folder that `train` wrote{known}")
 
 
-def is_shipped(folder: Path) -> bool:
+def is_bundled(folder: Path) -> bool:
     """Whether a policy comes with the package, whose folder is nobody's to write to."""
     return folder.parent == SHIPPED

@@ -11,7 +11,7 @@ from typing import Any
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.instantiate import ConfigError, differing
+from scenefactory_jax.core.instantiate import ConfigError, find_differences
 from scenefactory_jax.learning import checkpoint
 
 MOST = 80  # letters of a sweep's changes in the name of a folder
@@ -21,7 +21,7 @@ FREE += ("loggers", "evaluation", "scenes.heldout")
 
 
 @contextlib.contextmanager
-def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
+def open_run_folder(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
     """The run's folder, and whether there is a checkpoint in it to go on from. Nobody else trains there meanwhile.
 
     Raises:
@@ -30,11 +30,11 @@ def opened(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
     """
     if config["resume"] and config["out"] is None:
         raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
-    with _made(config) as folder, folder_lock.alone(folder):
+    with _made(config) as folder, folder_lock.lock_folder(folder):
         yield folder, _goes_on(folder, config)
 
 
-def fresh(name: str, changes: Sequence[str] = ()) -> Path:
+def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:
     """The folder of a run that begins now: `runs/NAME-TIME`, or in a sweep `runs/NAME-weather_wet-seed_1-TIME`.
 
     Args:
@@ -52,9 +52,9 @@ def fresh(name: str, changes: Sequence[str] = ()) -> Path:
 @contextlib.contextmanager
 def _made(config: Mapping[str, Any]) -> Iterator[Path]:
     """The folder; what had to be made for it and is still empty when an error ends the run was no run's: it goes."""
-    named, base = config["out"] is not None, Path(config["out"] or fresh(config["name"]))
+    named, base = config["out"] is not None, Path(config["out"] or make_folder_name(config["name"]))
     for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
-        new = folder_lock.missing(folder)
+        new = folder_lock.find_missing_parents(folder)
         try:
             folder.mkdir(parents=True, exist_ok=named)
             break
@@ -86,7 +86,7 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
 def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
     """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
     shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
-    found = differing(configs.values(folder), config).items()
+    found = find_differences(configs.read_values(folder), config).items()
     bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
     if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
         more = f"; and {len(told) - 8} more" if len(told) > 8 else ""

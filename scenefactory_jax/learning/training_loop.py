@@ -13,7 +13,7 @@ from scenefactory_jax import loggers
 from scenefactory_jax.cli import error_messages, schema
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
@@ -57,7 +57,7 @@ def prepare(config: Mapping[str, Any]) -> Prepared:
     Raises:
         ConfigError: a key that does not fit, by name.
     """
-    env, policy, mesh = environment.make(config), make_policy(config), sharding.mesh(config["devices"])
+    env, policy, mesh = environment.make_env(config), make_policy(config), sharding.make_mesh(config["devices"])
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 
 
@@ -80,7 +80,7 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
-    with run_folder.opened(config) as (folder, resume):
+    with run_folder.open_run_folder(config) as (folder, resume):
         state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
         if config["evaluation"]["enable"]:
             if scene_source.has_heldout(config["scenes"]):
@@ -117,17 +117,17 @@ def _trained(
 @contextlib.contextmanager
 def _scenes(
     config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
-) -> Iterator[tuple[Scene, stream.Flow | None]]:
+) -> Iterator[tuple[Scene, stream.SceneStream | None]]:
     """The scenes of all worlds on their devices, and where others come from, if they do not stay."""
     if config["stream"] is None:
         given = prepared.scenes
-        loaded = scene_source.training(config["scenes"]) if given is None else scene_source.taken(given, config["scenes"])
-        worlds, chosen = scene_source.assign(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
+        loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
+        worlds, chosen = scene_source.assign_scenes(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
         print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
         yield worlds, None
         return
     before = checkpoint.restore_host(folder / "checkpoints") if resume else None
-    with stream.flowing(config, mesh=prepared.mesh, before=before) as flow:
+    with stream.open_stream(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
         print(f"run {folder}", flush=True)
         yield worlds, flow
@@ -135,13 +135,13 @@ def _scenes(
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
     """The policy of a config's `policy` entry."""
-    return build(config["policy"], builtins=late_fusion, where="policy")()
+    return instantiate(config["policy"], builtins=late_fusion, where="policy")()
 
 
 def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
     """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
     entry = {"_target_": "make", **config["ppo"]}
-    make = build(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
+    make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
     return make(env, policy, mesh=mesh)
 
 
@@ -168,7 +168,7 @@ def _loop(
     trainer: ppo.Trainer,
     worlds,
     state,
-    flow: stream.Flow | None,
+    flow: stream.SceneStream | None,
     watching: Mapping[str, loggers.Logger],
     *,
     resume: bool,
@@ -183,8 +183,8 @@ def _loop(
     file = metrics_csv.MetricsFile(folder, resume_at=first if resume else None)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
-        interrupt.deferred() as asked,
-        loggers.opened(watching, folder, config, after=first if resume else 0) as note,
+        interrupt.defer_interrupt() as asked,
+        loggers.open_loggers(watching, folder, config, after=first if resume else 0) as note,
         metrics_csv.progress(total, enable=config["progress"], start=first) as show,
     ):
         for iteration in range(first + 1, total + 1):
@@ -212,7 +212,7 @@ def _loop(
 
 
 def step(
-    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.Flow | None, *, first: bool
+    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
 ) -> tuple[ppo.TrainState, Scene, dict[str, float | int]]:
     """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
     if flow is None:

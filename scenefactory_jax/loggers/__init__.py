@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 
 Row = Mapping[str, float | int]
 Add = Callable[[Row], None]
@@ -26,11 +26,11 @@ def make(entries: Mapping[str, Any]) -> dict[str, Logger]:
         ConfigError: an entry or key that does not fit, or a package that is not installed, by name.
     """
     chosen = {name: entry for name, entry in entries.items() if entry is not None}
-    return {name: build(entry, builtins=__name__, where=f"loggers.{name}")() for name, entry in chosen.items()}
+    return {name: instantiate(entry, builtins=__name__, where=f"loggers.{name}")() for name, entry in chosen.items()}
 
 
 @contextlib.contextmanager
-def opened(loggers: Mapping[str, Logger], folder: Path, config: Mapping[str, Any], *, after: int) -> Iterator[Add]:
+def open_loggers(loggers: Mapping[str, Logger], folder: Path, config: Mapping[str, Any], *, after: int) -> Iterator[Add]:
     """One `add(row)` for all of them; they close together, also when training breaks off."""
     with contextlib.ExitStack() as stack:
         adds = [stack.enter_context(logger(folder, config, after)) for logger in loggers.values()]

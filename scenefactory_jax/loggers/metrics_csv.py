@@ -22,7 +22,7 @@ class MetricsFile:
         rows = [row for row in read(folder, name) if resume_at is not None and row["iteration"] <= resume_at]
         self.rows = rows
         self.columns = list(rows[0]) if rows else []
-        with atomic_file.replaced(self.path) as half, open(half, "w", newline="") as file:
+        with atomic_file.write_atomically(self.path) as half, open(half, "w", newline="") as file:
             if rows:
                 writer = csv.DictWriter(file, self.columns)
                 writer.writeheader()

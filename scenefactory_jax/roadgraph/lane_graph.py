@@ -13,7 +13,7 @@ from scenefactory_jax.core.types import DRIVABLE
 Pairs = Int[np.ndarray, "E 2"]  # rows of lanes, from and to
 
 
-class Lanes(NamedTuple):
+class LaneGraph(NamedTuple):
     """Lanes for cars with at least two different points. Rows are places in `id`; all lengths are in the plane."""
 
     id: Int[np.ndarray, " N"]
@@ -26,7 +26,7 @@ class Lanes(NamedTuple):
     arc: Float[np.ndarray, " V"]  # length along the lane up to each vertex
 
 
-class Places(NamedTuple):
+class LaneProjections(NamedTuple):
     """Where points lie on lanes: a row for every point and every lane near it."""
 
     point: Int[np.ndarray, " K"]
@@ -37,7 +37,7 @@ class Places(NamedTuple):
     direction: Float[np.ndarray, "K 2"]
 
 
-def make(roads: Sequence[Polyline]) -> Lanes:
+def make(roads: Sequence[Polyline]) -> LaneGraph:
     """The lanes for cars of a map; links to lanes that are not there lead nowhere and are left out."""
     found = []
     for line in roads:
@@ -53,7 +53,7 @@ def make(roads: Sequence[Polyline]) -> Lanes:
     step[first[:-1]] = 0.0
     total = np.cumsum(step)
     arc = total - np.repeat(total[first[:-1]], np.diff(first))
-    return Lanes(
+    return LaneGraph(
         id=np.array([line.id for line, _ in found], int),
         length=arc[first[1:] - 1],
         successor=_pairs(found, row, "exit"),
@@ -71,8 +71,8 @@ def _pairs(found: list[tuple[Polyline, np.ndarray]], row: dict[int, int], relati
     return np.array(pairs, int).reshape(-1, 2)
 
 
-def at(
-    lanes: Lanes, lane: Int[np.ndarray, " K"], arc: Float[np.ndarray, " K"]
+def point_at(
+    lanes: LaneGraph, lane: Int[np.ndarray, " K"], arc: Float[np.ndarray, " K"]
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 2"]]:
     """Points and unit directions at lengths along lanes; beyond an end, the end."""
     before = lanes.first[lane]
@@ -88,25 +88,27 @@ def at(
     return lanes.xyz[segment] + share * along, along[:, :2] / step[:, None]
 
 
-def project(lanes: Lanes, points: Float[np.ndarray, "P 3"], *, within_m: float) -> Places:
+def project(lanes: LaneGraph, points: Float[np.ndarray, "P 3"], *, within_m: float) -> LaneProjections:
     """The nearest place on every lane that comes within a distance of a point, in the plane."""
-    shapes = shapes_of(lanes)
+    shapes = lane_shapes(lanes)
     spots = _spots(points)
     point, lane = shapely.STRtree(shapes).query(spots, predicate="dwithin", distance=within_m)
     return _place(lanes, points, shapes, spots, point, lane)
 
 
-def project_on(lanes: Lanes, points: Float[np.ndarray, "P 3"], lane: Int[np.ndarray, " P"]) -> Places:
+def project_on(lanes: LaneGraph, points: Float[np.ndarray, "P 3"], lane: Int[np.ndarray, " P"]) -> LaneProjections:
     """The nearest place on a given lane for each point, however far, in the plane."""
-    return _place(lanes, points, shapes_of(lanes), _spots(points), np.arange(len(points)), lane)
+    return _place(lanes, points, lane_shapes(lanes), _spots(points), np.arange(len(points)), lane)
 
 
-def _place(lanes: Lanes, points: np.ndarray, shapes: np.ndarray, spots: np.ndarray, point: np.ndarray, lane: np.ndarray) -> Places:
+def _place(
+    lanes: LaneGraph, points: np.ndarray, shapes: np.ndarray, spots: np.ndarray, point: np.ndarray, lane: np.ndarray
+) -> LaneProjections:
     """The nearest places of chosen points on chosen lanes."""
     arc = shapely.line_locate_point(shapes[lane], spots[point])
-    xyz, direction = at(lanes, lane, arc)
+    xyz, direction = point_at(lanes, lane, arc)
     distance = np.linalg.norm(points[point, :2] - xyz[:, :2], axis=1)
-    return Places(point=point, lane=lane, arc=arc, distance=distance, xyz=xyz, direction=direction)
+    return LaneProjections(point=point, lane=lane, arc=arc, distance=distance, xyz=xyz, direction=direction)
 
 
 def _spots(points: Float[np.ndarray, "P 3"]) -> np.ndarray:
@@ -114,7 +116,7 @@ def _spots(points: Float[np.ndarray, "P 3"]) -> np.ndarray:
     return np.asarray(shapely.points(points[:, :2]), object)
 
 
-def shapes_of(lanes: Lanes) -> np.ndarray:
+def lane_shapes(lanes: LaneGraph) -> np.ndarray:
     """The lanes as shapely's lines."""
     owner = np.repeat(np.arange(len(lanes.id)), np.diff(lanes.first))
     return np.asarray(shapely.linestrings(lanes.xyz[:, :2], indices=owner), object)

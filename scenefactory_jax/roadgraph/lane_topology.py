@@ -34,7 +34,7 @@ class Stations(NamedTuple):
     span: Float[np.ndarray, " S"]
 
 
-def rebuild(
+def infer_lane_links(
     raw: RawScene,
     *,
     link_gap_m: float,
@@ -130,7 +130,7 @@ def _stations(lanes: list[Polyline], spacing_m: float) -> Stations:
     owner = np.repeat(np.arange(len(count)), count)
     piece = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     span = (graph.length / count)[owner]
-    xyz, direction = lane_graph.at(graph, owner, (piece + 0.5) * span)
+    xyz, direction = lane_graph.point_at(graph, owner, (piece + 0.5) * span)
     return Stations(np.array([row[lane] for lane in graph.id.tolist()], int)[owner], xyz, direction, span)
 
 

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import cross, dot, heading, root, to_frame
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_sqrt, to_frame
 from scenefactory_jax.core.pallas import on_gpu
-from scenefactory_jax.core.types import Road, Rows, Scene
+from scenefactory_jax.core.types import Road, Scene, SetObservation
 from scenefactory_jax.env.surrogate_safety import SMALLEST
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
 
 
-class Beside(NamedTuple):
+class RoadQuery(NamedTuple):
     """What `look` finds."""
 
     lane: Int[Array, " A"]  # row of the lane segment whose midpoint is nearest; 0 in a world without lanes
@@ -27,7 +27,7 @@ class Beside(NamedTuple):
     edge_ttc: Float[Array, " A"]  # s; inf if no edge is met
 
 
-def look(
+def query_road(
     scene: Scene,
     circles: Float[Array, "A C 2"],
     radius: Float[Array, " A"],
@@ -39,18 +39,18 @@ def look(
     half_width_m: float,
     range_m: float,
     kernels: bool,
-) -> Beside:
+) -> RoadQuery:
     """Lanes and edges of the whole world as each car meets them; what is said of cars that are not active means nothing."""
 
     def plain(lanes: Road, edges: Road, circles: Array, radius: Array, velocity: Array, ahead: Array, position: Array, _: Array):
-        squared = edge_squared(circles, edges, half_width_m=half_width_m)
+        squared = squared_edge_distance(circles, edges, half_width_m=half_width_m)
         return nearest_lane(position, lanes), squared, edge_rate(circles, radius, velocity, ahead, edges, range_m=range_m)
 
-    quick = functools.partial(road_kernels.look, half_width_m=half_width_m, range_m=range_m)
-    given = (scene.lanes, scene.edges, circles, radius, velocity, heading(yaw), position, active)
+    quick = functools.partial(road_kernels.query_road_blocks, half_width_m=half_width_m, range_m=range_m)
+    given = (scene.lanes, scene.edges, circles, radius, velocity, heading_vector(yaw), position, active)
     lane, squared, rate = _answer(quick, plain, *given) if kernels else plain(*given)
     meets = rate > 0
-    return Beside(lane, root(squared), jnp.where(meets, 1.0 / jnp.where(meets, rate, 1.0), jnp.inf))
+    return RoadQuery(lane, safe_sqrt(squared), jnp.where(meets, 1.0 / jnp.where(meets, rate, 1.0), jnp.inf))
 
 
 def nearest_lane(position: Float[Array, "A 2"], lanes: Road) -> Int[Array, " A"]:
@@ -59,14 +59,14 @@ def nearest_lane(position: Float[Array, "A 2"], lanes: Road) -> Int[Array, " A"]
     return jnp.argmin(jnp.where(lanes.valid, dot(offset, offset), jnp.inf), axis=1).astype(jnp.int32)
 
 
-def edge_squared(circles: Float[Array, "A C 2"], edges: Road, *, half_width_m: float) -> Float[Array, " A"]:
+def squared_edge_distance(circles: Float[Array, "A C 2"], edges: Road, *, half_width_m: float) -> Float[Array, " A"]:
     """Squared distance from the nearest of each car's circles' centres to the rectangles that valid segments with a half width are."""
-    each = [segment_squared(circles[:, number], edges, half_width_m=half_width_m) for number in range(circles.shape[1])]
+    each = [squared_segment_distance(circles[:, number], edges, half_width_m=half_width_m) for number in range(circles.shape[1])]
     nearest = functools.reduce(jnp.minimum, each)
     return jnp.min(jnp.where(edges.valid, nearest, jnp.inf), axis=1, initial=jnp.inf)
 
 
-def segment_squared(point: Float[Array, "A 2"], segments: Road, *, half_width_m: float) -> Float[Array, "A P"]:
+def squared_segment_distance(point: Float[Array, "A 2"], segments: Road, *, half_width_m: float) -> Float[Array, "A P"]:
     """Squared distance of each point from the rectangle that each segment with a half width is, valid or not; 0 inside."""
     offset = point[:, None] - segments.midpoint
     along = jnp.maximum(jnp.abs(dot(offset, segments.direction)) - segments.half_length, 0.0)
@@ -104,7 +104,7 @@ def edge_rate(
     return jnp.max(rates, axis=1, initial=0.0)
 
 
-def around(
+def gather_segments(
     scene: Scene,
     position: Float[Array, "A 2"],
     yaw: Float[Array, " A"],
@@ -114,44 +114,46 @@ def around(
     radius_m: float,
     kind_scale: float,
     kernels: bool,
-) -> Rows:
+) -> SetObservation:
     """Segments whose midpoints lie within a radius, the first `count` in storage order: x, y, kind, direction x, y in the car's frame.
 
     A scene with cells of at least that radius is looked up there, with the same result. Cars that are not active see nothing.
     """
     if scene.cells is None or scene.cells.radius_m < radius_m:
         offset = position[:, None, :] - scene.road.midpoint
-        found = first_hits(active[:, None] & scene.road.valid & (dot(offset, offset) <= radius_m**2), count=count)
+        found = first_edge_hits(active[:, None] & scene.road.valid & (dot(offset, offset) <= radius_m**2), count=count)
         return _rows(scene.road, *found, position, yaw, radius_m=radius_m, kind_scale=kind_scale)
 
-    def plain(road: Road, grid: spatial_grid.Cells, first: Array, last: Array, position: Array, yaw: Array):
-        row, listed = spatial_grid.listed(grid, first, last)
+    def plain(road: Road, grid: spatial_grid.SpatialGrid, first: Array, last: Array, position: Array, yaw: Array):
+        row, listed = spatial_grid.list_segments(grid, first, last)
         offset = position[:, None, :] - road.midpoint[row]
-        place, mask = first_hits(listed & (dot(offset, offset) <= radius_m**2), count=count)
+        place, mask = first_edge_hits(listed & (dot(offset, offset) <= radius_m**2), count=count)
         index = jnp.where(mask, jnp.take_along_axis(row, place, axis=1), 0)
         found = _rows(road, index, mask, position, yaw, radius_m=radius_m, kind_scale=kind_scale)
         return found.features, found.mask
 
-    def quick(road: Road, grid: spatial_grid.Cells, first: Array, last: Array, position: Array, yaw: Array):
-        return road_kernels.gather(road, grid, first, last, position, heading(-yaw), count=count, radius_m=radius_m, kind_scale=kind_scale)
+    def quick(road: Road, grid: spatial_grid.SpatialGrid, first: Array, last: Array, position: Array, yaw: Array):
+        return road_kernels.gather_segment_blocks(
+            road, grid, first, last, position, heading_vector(-yaw), count=count, radius_m=radius_m, kind_scale=kind_scale
+        )
 
-    first, last = spatial_grid.part(scene.cells, position)
+    first, last = spatial_grid.find_cell_bounds(scene.cells, position)
     given = (scene.road, scene.cells, first, jnp.where(active, last, first), position, yaw)
-    return Rows(*(_answer(quick, plain, *given) if kernels else plain(*given)))
+    return SetObservation(*(_answer(quick, plain, *given) if kernels else plain(*given)))
 
 
 def _rows(
     road: Road, index: Int[Array, "A K"], mask: Bool[Array, "A K"], position: Array, yaw: Array, *, radius_m: float, kind_scale: float
-) -> Rows:
+) -> SetObservation:
     """Features of segments; zeros where there is none."""
     frame = yaw[:, None]
     place = to_frame(road.midpoint[index] - position[:, None, :], frame) / radius_m
     kind = road.kind[index][..., None].astype(jnp.float32) / kind_scale
     features = jnp.concatenate([place, kind, to_frame(road.direction[index], frame)], axis=-1)
-    return Rows(jnp.where(mask[..., None], features, 0.0), mask)
+    return SetObservation(jnp.where(mask[..., None], features, 0.0), mask)
 
 
-def first_hits(hits: Bool[Array, "A P"], *, count: int) -> tuple[Int[Array, "A {count}"], Bool[Array, "A {count}"]]:
+def first_edge_hits(hits: Bool[Array, "A P"], *, count: int) -> tuple[Int[Array, "A {count}"], Bool[Array, "A {count}"]]:
     """Columns of the first `count` true entries of each row, in order, and which of them exist.
 
     The k-th hit is the first column whose running number of hits reaches k, so a binary search finds it: no sort and no scatter.

@@ -14,14 +14,14 @@ from jax.experimental.pallas import triton as plgpu
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import pallas
-from scenefactory_jax.core.types import Cells, Road
+from scenefactory_jax.core.types import Road, SpatialGrid
 from scenefactory_jax.env.surrogate_safety import SMALLEST
 
 LOOK, GATHER = 128, 128  # segments that a program takes at a time; the fastest of 20 settings on an H200
 LOOK_WARPS, GATHER_WARPS = 4, 4
 
 
-def look(
+def query_road_blocks(
     lanes: Road,
     edges: Road,
     circles: Float[Array, "A C 2"],
@@ -41,7 +41,7 @@ def look(
     """
     cars, count = circles.shape[:2]
     numbers = jnp.concatenate([circles.reshape(cars, -1), radius[:, None], velocity, heading, position], axis=1)
-    limits = jnp.where(active[:, None], jnp.stack([pallas.shown(lanes.valid), pallas.shown(edges.valid)]), 0)
+    limits = jnp.where(active[:, None], jnp.stack([pallas.block_of(lanes.valid), pallas.block_of(edges.valid)]), 0)
     tables = (lanes.midpoint, _flags(lanes), edges.midpoint, edges.direction, edges.half_length, _flags(edges))
     shapes = [jax.ShapeDtypeStruct((cars, 1), kind) for kind in (jnp.int32, jnp.float32, jnp.float32)]
     found = pl.pallas_call(
@@ -102,9 +102,9 @@ def _look(limits, numbers, lane, lane_valid, edge, along, half, edge_valid, row,
     rate[0] = jnp.max(soonest)
 
 
-def gather(
+def gather_segment_blocks(
     road: Road,
-    cells: Cells,
+    cells: SpatialGrid,
     first: Int[Array, " A"],
     last: Int[Array, " A"],
     position: Float[Array, "A 2"],

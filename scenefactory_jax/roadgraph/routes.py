@@ -9,13 +9,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from scenefactory_jax.roadgraph import lane_graph
-from scenefactory_jax.roadgraph.lane_graph import Lanes, Places
+from scenefactory_jax.roadgraph.lane_graph import LaneGraph, LaneProjections
 
 
 class Network(NamedTuple):
     """Lanes cut into pieces. A node is the beginning of a piece; its edges lead to the next piece, the next lanes, or a lane beside it."""
 
-    lanes: Lanes
+    lanes: LaneGraph
     lane: Int[np.ndarray, " N"]
     arc: Float[np.ndarray, " N"]  # of the beginning
     first: Int[np.ndarray, " M"]  # the first node of each lane, and the number of nodes
@@ -34,7 +34,7 @@ class Route(NamedTuple):
     cost: float  # length with what changes of lanes, and places beside a lane, cost
 
 
-def network(lanes: Lanes, *, piece_m: float, change_m: float, change_cost_m: float, change_turn_deg: float, aside_m: float) -> Network:
+def network(lanes: LaneGraph, *, piece_m: float, change_m: float, change_cost_m: float, change_turn_deg: float, aside_m: float) -> Network:
     """What routes over these lanes are sought on.
 
     Args:
@@ -72,7 +72,7 @@ def _changes(net: Network, change_m: float, turn_deg: float, aside_m: float) -> 
     other = np.repeat(pairs[:, 1], size)
     if not len(node):
         return np.zeros((0, 2), int), np.zeros(0)
-    xyz, direction = lane_graph.at(net.lanes, net.lane[node], net.arc[node])
+    xyz, direction = lane_graph.point_at(net.lanes, net.lane[node], net.arc[node])
     place = lane_graph.project_on(net.lanes, xyz, other)
     aligned = np.sum(direction * place.direction, axis=1) >= np.cos(np.deg2rad(turn_deg))
     target = _node_before(net, other, place.arc + change_m)
@@ -88,7 +88,7 @@ def _node_before(net: Network, lane: Int[np.ndarray, " K"], arc: Float[np.ndarra
     return net.first[lane] + np.clip(np.floor(arc / piece).astype(int), 0, count - 1)
 
 
-def search(
+def find_routes(
     net: Network,
     start: Float[np.ndarray, "3"],
     yaw: float,
@@ -139,17 +139,17 @@ def search(
     return sorted(found, key=lambda route: route.cost)
 
 
-def _match(lanes: Lanes, point: np.ndarray, yaw: float | None, reach_m: float, turn_deg: float, rise_m: float) -> Places:
+def _match(lanes: LaneGraph, point: np.ndarray, yaw: float | None, reach_m: float, turn_deg: float, rise_m: float) -> LaneProjections:
     """Places on lanes that a pose may be on."""
     places = lane_graph.project(lanes, point[None], within_m=reach_m)
     fits = np.abs(places.xyz[:, 2] - point[2]) <= rise_m
     if yaw is not None:
         fits &= places.direction @ np.array([np.cos(yaw), np.sin(yaw)]) >= np.cos(np.deg2rad(turn_deg))
-    return Places(*(column[fits] for column in places))
+    return LaneProjections(*(column[fits] for column in places))
 
 
 def _cheapest(
-    net: Network, begins: Places, ends: Places, factor: Float[np.ndarray, " N"], aside_cost: float
+    net: Network, begins: LaneProjections, ends: LaneProjections, factor: Float[np.ndarray, " N"], aside_cost: float
 ) -> tuple[int, int, list[int]] | None:
     """The best of the starts and goals, and the nodes from the piece of the one to that of the other."""
     begin_node, end_node = (_node_before(net, places.lane, places.arc) for places in (begins, ends))
@@ -176,7 +176,9 @@ def _cheapest(
     return begin, end, nodes[::-1] if ahead[begin, end] else [int(begin_node[begin]), *nodes[::-1]]
 
 
-def _route(net: Network, begins: Places, begin: int, ends: Places, end: int, nodes: list[int], aside_cost: float) -> Route:
+def _route(
+    net: Network, begins: LaneProjections, begin: int, ends: LaneProjections, end: int, nodes: list[int], aside_cost: float
+) -> Route:
     """The way through these nodes."""
     # stretches driven on one lane: from where it is entered to where it is left
     stretches: list[list[float]] = [[int(begins.lane[begin]), float(begins.arc[begin]), float(net.arc[nodes[0]])]]
@@ -203,9 +205,9 @@ def _route(net: Network, begins: Places, begin: int, ends: Places, end: int, nod
     return Route(tuple(int(net.lanes.id[int(lane)]) for lane, *_ in stretches), xyz, length, changes, cost)
 
 
-def _stretch(lanes: Lanes, lane: int, low: float, high: float) -> Float[np.ndarray, "N 3"]:
+def _stretch(lanes: LaneGraph, lane: int, low: float, high: float) -> Float[np.ndarray, "N 3"]:
     """The points of a lane between two lengths along it, both ends included."""
     arc = lanes.arc[lanes.first[lane] : lanes.first[lane + 1]]
     inside = arc[(arc > low) & (arc < high)]
     places = np.concatenate([[low], inside, [max(low, high)]])
-    return lane_graph.at(lanes, np.full(len(places), lane), places)[0]
+    return lane_graph.point_at(lanes, np.full(len(places), lane), places)[0]

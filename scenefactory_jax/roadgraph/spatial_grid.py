@@ -12,13 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.types import Cells, Scene
+from scenefactory_jax.core.types import Scene, SpatialGrid
 
 SIZES = ("side", "rows", "most")  # of a grid: cells along it, entries of all its lists, entries of the longest one
 SLACK_M = 0.01  # on the radius, so that rounding loses nobody: far above float32's at the coordinates of a scene
 
 
-def part(cells: Cells, position: Float[Array, "A 2"]) -> tuple[Int[Array, " A"], Int[Array, " A"]]:
+def find_cell_bounds(cells: SpatialGrid, position: Float[Array, "A 2"]) -> tuple[Int[Array, " A"], Int[Array, " A"]]:
     """Where in `cells.rows` the list of each position's cell begins and ends: segments that may lie within the radius of it."""
     place = jnp.floor((position - cells.origin) / cells.size_m).astype(jnp.int32)
     column, row = jnp.clip(place, 0, cells.side - 1).T
@@ -26,14 +26,14 @@ def part(cells: Cells, position: Float[Array, "A 2"]) -> tuple[Int[Array, " A"],
     return cells.first[cell], cells.first[cell + 1]
 
 
-def listed(cells: Cells, first: Int[Array, " A"], last: Int[Array, " A"]) -> tuple[Int[Array, "A N"], Bool[Array, "A N"]]:
+def list_segments(cells: SpatialGrid, first: Int[Array, " A"], last: Int[Array, " A"]) -> tuple[Int[Array, "A N"], Bool[Array, "A N"]]:
     """Segments of lists that begin and end there, in storage order, and which entries are any."""
     at = first[:, None] + jnp.arange(cells.most, dtype=jnp.int32)
     there = at < last[:, None]
     return jnp.where(there, cells.rows[jnp.minimum(at, len(cells.rows) - 1)], 0), there
 
 
-def attach(scene: Scene, *, radius_m: float, size_m: float, capacity: Mapping[str, int] | None = None) -> Scene:
+def attach_grid(scene: Scene, *, radius_m: float, size_m: float, capacity: Mapping[str, int] | None = None) -> Scene:
     """Stacked scenes (numpy leaves `[W, ...]`) with cells for their roads.
 
     Args:
@@ -63,7 +63,7 @@ def attach(scene: Scene, *, radius_m: float, size_m: float, capacity: Mapping[st
     for own, (found, _) in zip(rows, lists, strict=True):
         own[: len(found)] = found
     leaves = {"origin": origin.astype(np.float32), "first": first, "rows": rows}
-    cells = unchecked(Cells, **leaves, side=side, size_m=float(size_m), radius_m=float(radius_m), most=sizes["most"])
+    cells = unchecked(SpatialGrid, **leaves, side=side, size_m=float(size_m), radius_m=float(radius_m), most=sizes["most"])
     return unchecked(Scene, **(vars(scene) | {"cells": cells}))
 
 

@@ -14,22 +14,22 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from experiments.validation import engines
-from scenefactory_jax.core.instantiate import build
-from scenefactory_jax.core.pytree import replace, struct
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.pytree import pytree_dataclass, replace
 from scenefactory_jax.core.types import Dynamics, Scene
 from scenefactory_jax.dynamics import collision
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.sysid import parameter_space as spaces
-from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Recording
+from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 from scenefactory_jax.sysid.parameter_space import Space
 
 TERMS = ("position", "yaw", "speed", "yaw_rate", "wheel_spin", "steer", "end_position", "end_speed")
 
 
-@struct
-class Suite:
+@pytree_dataclass
+class ManoeuvreBatch:
     """M recordings in arrays, padded to the longest; strips of road likewise."""
 
     controls: Float[Array, "M T 3"]
@@ -46,7 +46,7 @@ class Suite:
     steer: Float[Array, "M T"]
 
 
-class Path(NamedTuple):
+class CandidatePath(NamedTuple):
     """What a car did at the end of a frame."""
 
     position: Float[Array | np.ndarray, "*n 2"]
@@ -63,24 +63,24 @@ class Replay(NamedTuple):
     """A compiled car that drives recordings."""
 
     terms: Callable[..., Array]  # (rows [N, P], manoeuvre [N], suite, frames) -> squared errors [N, 8]
-    trace: Callable[..., Path]  # (rows [N, P], manoeuvre [N], suite) -> leaves [N, T, ...]
+    trace: Callable[..., CandidatePath]  # (rows [N, P], manoeuvre [N], suite) -> leaves [N, T, ...]
 
 
-def suite(recordings: Sequence[Recording]) -> Suite:
+def suite(recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreBatch:
     """Recordings stacked. Behind their ends commands and records repeat the last one; `frames` says where that is."""
     frames = [len(recording.yaw) for recording in recordings]
     longest, strips = max(frames), max(len(r.manoeuvre.left) for r in recordings)
 
-    def long(column: Callable[[Recording], np.ndarray]) -> Array:
+    def long(column: Callable[[ManoeuvreRecording], np.ndarray]) -> Array:
         rows = [np.asarray(column(r), float) for r in recordings]
         return jnp.asarray(np.stack([np.concatenate([x, np.repeat(x[-1:], longest - len(x), axis=0)]) for x in rows]), jnp.float32)
 
-    def wide(column: Callable[[Recording], np.ndarray], count: int, fill: float | None, kind: Any) -> Array:
+    def wide(column: Callable[[ManoeuvreRecording], np.ndarray], count: int, fill: float | None, kind: Any) -> Array:
         rows = [np.asarray(column(r)) for r in recordings]
         ends = [np.full(count - len(x), x[-1] if fill is None else fill) for x in rows]
         return jnp.asarray(np.stack([np.concatenate(pair) for pair in zip(rows, ends, strict=True)]), kind)
 
-    return Suite(
+    return ManoeuvreBatch(
         controls=long(lambda r: r.manoeuvre.controls),
         frames=jnp.asarray(frames, jnp.int32),
         speed=jnp.asarray([r.manoeuvre.speed for r in recordings], jnp.float32),
@@ -103,12 +103,12 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
         dynamics: of the articulated car; its fleet is replaced.
         friction: of the surfaces, where the space leaves them alone.
     """
-    car, solver = cars.numbers(dynamics)
-    plant = articulated_car.compiled(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
-    meet = build({**dynamics["contact"], "_target_": "make"}, builtins=collision, where="dynamics.contact", height=car.height)()
+    car, solver = cars.read_parameters(dynamics)
+    plant = articulated_car.compile_car(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
+    meet = instantiate({**dynamics["contact"], "_target_": "make"}, builtins=collision, where="dynamics.contact", height=car.height)()
     empty = _ground(car)
 
-    def bound(row: Array, index: Array, plan: Suite) -> tuple[Dynamics, Scene]:
+    def bound(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Dynamics, Scene]:
         own, mu = spaces.apply(space, car, friction, row)
 
         def grip(weather: Any, position: Float[Array, "1 4 2"], speed: Array) -> Array:
@@ -119,13 +119,13 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         crew = jax.tree.map(lambda leaf: leaf[None], own)
         scene = replace(empty, agents=replace(empty.agents, speed=plan.speed[index][None]))
-        return articulated_car.bind(plant._replace(vary=lambda key, scene: crew), meet, grip), scene
+        return articulated_car.make_dynamics(plant._replace(vary=lambda key, scene: crew), meet, grip), scene
 
-    def driver(row: Array, index: Array, plan: Suite) -> tuple[Any, Callable[[Any, Array], tuple[Any, Path]]]:
+    def driver(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]:
         backend, scene = bound(row, index, plan)
         active = jnp.ones(1, bool)
 
-        def step(body: Any, frame: Array) -> tuple[Any, Path]:
+        def step(body: Any, frame: Array) -> tuple[Any, CandidatePath]:
             body = backend.advance(scene, body, plan.controls[index, frame][None], active)
             return body, _seen(backend, plant, body)
 
@@ -134,10 +134,12 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
     return Replay(jax.jit(functools.partial(_terms, driver)), jax.jit(functools.partial(_trace, driver)))
 
 
-Driver = Callable[[Array, Array, Suite], tuple[Any, Callable[[Any, Array], tuple[Any, Path]]]]  # -> (body at the start, step)
+Driver = Callable[
+    [Array, Array, ManoeuvreBatch], tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]
+]  # -> (body at the start, step)
 
 
-def _terms(driver: Driver, rows: Array, index: Array, plan: Suite, frames: Array) -> Array:
+def _terms(driver: Driver, rows: Array, index: Array, plan: ManoeuvreBatch, frames: Array) -> Array:
     """Squared errors of all pairs, up to `frames`, the longest of their manoeuvres."""
 
     def begin(row: Array, index: Array) -> Any:
@@ -158,17 +160,17 @@ def _terms(driver: Driver, rows: Array, index: Array, plan: Suite, frames: Array
     return jax.lax.fori_loop(0, frames, once, (bodies, jnp.zeros((len(rows), len(TERMS)), jnp.float32)))[1]
 
 
-def _trace(driver: Driver, rows: Array, index: Array, plan: Suite) -> Path:
+def _trace(driver: Driver, rows: Array, index: Array, plan: ManoeuvreBatch) -> CandidatePath:
     """What all pairs do in every frame."""
 
-    def one(row: Array, index: Array) -> Path:
+    def one(row: Array, index: Array) -> CandidatePath:
         body, step = driver(row, index, plan)
         return jax.lax.scan(step, body, jnp.arange(plan.yaw.shape[1]))[1]
 
     return jax.vmap(one)(rows, index)
 
 
-def _errors(path: Path, index: Array, frame: Array, plan: Suite) -> Array:
+def _errors(path: CandidatePath, index: Array, frame: Array, plan: ManoeuvreBatch) -> Array:
     """Squared errors of a frame, TERMS without the last two."""
     gap = path.position - plan.position[index, frame]
     turn = path.yaw - plan.yaw[index, frame]
@@ -178,7 +180,7 @@ def _errors(path: Path, index: Array, frame: Array, plan: Suite) -> Array:
     return jnp.stack([(gap**2).sum(), turn**2, pace**2, rate**2, (spin**2).mean(), (steer**2).mean()])
 
 
-def scorer(replay: Replay, plan: Suite, *, width: int) -> Callable[[np.ndarray, Sequence[int]], Float[np.ndarray, "N M 8"]]:
+def make_scorer(replay: Replay, plan: ManoeuvreBatch, *, width: int) -> Callable[[np.ndarray, Sequence[int]], Float[np.ndarray, "N M 8"]]:
     """(rows [N, P], manoeuvres) -> squared errors [N, M, 8] of every candidate on every manoeuvre, `width` pairs at a time.
 
     Pairs are sorted by length, so that a piece runs no longer than its longest manoeuvre: one compilation for all.
@@ -203,7 +205,9 @@ def scorer(replay: Replay, plan: Suite, *, width: int) -> Callable[[np.ndarray, 
     return score
 
 
-def residuals(path: Path, plan: Suite, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]) -> Float[np.ndarray, "*n R"]:
+def residuals(
+    path: CandidatePath, plan: ManoeuvreBatch, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]
+) -> Float[np.ndarray, "*n R"]:
     """Of traced manoeuvres [M, T], flat: their squares sum to the loss of `fit.losses`."""
     rows = np.asarray(index)
     count = np.asarray(plan.frames)[rows][:, None]
@@ -236,10 +240,10 @@ def _ground(car: CarParameters) -> Scene:
     return jax.tree.map(lambda leaf: leaf[0], worlds)
 
 
-def _seen(backend: Dynamics, plant: articulated_car.Plant, body: Any) -> Path:
+def _seen(backend: Dynamics, plant: articulated_car.CompiledCar, body: Any) -> CandidatePath:
     """Of the only car."""
     motion, at = backend.read(body), plant.places
-    return Path(
+    return CandidatePath(
         position=motion.position[0, :2],
         yaw=motion.yaw[0],
         pace=jnp.sqrt((motion.velocity[0, :2] ** 2).sum() + 1e-12),

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from scenefactory_jax.sysid.candidate_simulation import Path
-from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Recording
+from scenefactory_jax.sysid.candidate_simulation import CandidatePath
+from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 
 STILL = 0.1  # m/s: below it a car stands
 TURNING = 0.02  # rad/s: a teacher that never turns faster has no yaw rate to compare
 
 
-class Measures(NamedTuple):
+class ManoeuvreErrors(NamedTuple):
     """One row a manoeuvre; NaN where a measure makes no sense."""
 
     end_m: Float[np.ndarray, " M"]  # distance of the two cars at the end
@@ -25,12 +25,12 @@ class Measures(NamedTuple):
     lateral_peak: Float[np.ndarray, " M"]  # largest lateral acceleration of the teacher, m/s^2
 
 
-def measure(path: Path, recordings: Sequence[Recording]) -> Measures:
+def compute_errors(path: CandidatePath, recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreErrors:
     """Compare traces [M, T, ...] with the recordings that they replay."""
     rows = []
     for index, teacher in enumerate(recordings):
         count = len(teacher.yaw)
-        own = Path(*(np.asarray(leaf[index], float)[:count] for leaf in path))
+        own = CandidatePath(*(np.asarray(leaf[index], float)[:count] for leaf in path))
         way = np.linalg.norm(np.diff(teacher.position, axis=0, prepend=np.zeros((1, 2))), axis=1).sum()
         end = np.linalg.norm(own.position[-1] - teacher.position[-1])
         peak = np.abs(teacher.yaw_rate).max()
@@ -39,7 +39,7 @@ def measure(path: Path, recordings: Sequence[Recording]) -> Measures:
         stops = stopping_m(controls, teacher.position, teacher.speed), stopping_m(controls, own.position, own.pace)
         rows.append((end, way, end / max(way, 1e-9), nrmse, np.sqrt(np.mean((own.pace - teacher.speed) ** 2)), stops[1] / stops[0] - 1.0,
                      np.abs(teacher.lateral).max()))  # fmt: skip
-    return Measures(*(np.array(column, float) for column in zip(*rows, strict=True)))
+    return ManoeuvreErrors(*(np.array(column, float) for column in zip(*rows, strict=True)))
 
 
 def stopping_m(

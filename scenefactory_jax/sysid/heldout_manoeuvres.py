@@ -17,13 +17,13 @@ from scenefactory_jax.sysid.manoeuvres import RATE_HZ, SIDES, Manoeuvre, on_one_
 from scenefactory_jax.sysid.reference_recordings import advance
 
 
-def heldout(entries: Mapping[str, Mapping[str, Any]], *, teacher: multibody_model.Teacher) -> list[Manoeuvre]:
+def heldout(entries: Mapping[str, Mapping[str, Any]], *, teacher: multibody_model.ReferenceVehicle) -> list[Manoeuvre]:
     """All of them; `teacher` is who drives the lane changes.
 
     Raises:
         ConfigError: an entry that cannot be built, or two manoeuvres of one name.
     """
-    return manoeuvres.suite(entries, builtins=__name__, where="sysid.manoeuvres.heldout", teacher=teacher)
+    return manoeuvres.make_suite(entries, builtins=__name__, where="sysid.manoeuvres.heldout", teacher=teacher)
 
 
 def steady_circle(
@@ -106,13 +106,13 @@ def split_stop(*, speed: float, surfaces: list[str], brakes: list[float], coast_
             legs = [(coast_s, 0.0, 0.0, 0.0), (stop_s, 0.0, 0.0, brake)]
             even = on_one_surface(f"split_stop_{surface}_{brake:g}_left", "split_stop", legs, speed=speed)
             split = even._replace(left=np.array([surface_id(surface)]))
-            found += [split, manoeuvres.mirrored(split)._replace(name=f"split_stop_{surface}_{brake:g}_right")]
+            found += [split, manoeuvres.mirror(split)._replace(name=f"split_stop_{surface}_{brake:g}_right")]
     return found
 
 
 def lane_change(
     *,
-    teacher: multibody_model.Teacher,
+    teacher: multibody_model.ReferenceVehicle,
     track: str,
     sections_m: list[float],
     offset_m: float,
@@ -161,7 +161,7 @@ def lane_change(
 
 
 def _pursuit(
-    centre: Callable[[float], float], teacher: multibody_model.Teacher, *, preview_s: float, preview_least_m: float
+    centre: Callable[[float], float], teacher: multibody_model.ReferenceVehicle, *, preview_s: float, preview_least_m: float
 ) -> Callable[[np.ndarray], float]:
     """State -> steer command."""
 

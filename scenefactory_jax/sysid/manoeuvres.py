@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 
 SURFACES = ("dry", "wet", "gravel")  # index = surface id
 TRAINING = (
@@ -37,7 +37,7 @@ class Manoeuvre(NamedTuple):
     right: Int[np.ndarray, " S"]  # and for y <= 0
 
 
-class Recording(NamedTuple):
+class ManoeuvreRecording(NamedTuple):
     """What a car did, at the end of each frame. It starts at the origin, heading along x; left is positive."""
 
     manoeuvre: Manoeuvre
@@ -57,15 +57,15 @@ def training(entries: Mapping[str, Mapping[str, Any]]) -> list[Manoeuvre]:
     Raises:
         ConfigError: an entry that cannot be built, or two manoeuvres of one name.
     """
-    return suite(entries, builtins=__name__, where="sysid.manoeuvres.training")
+    return make_suite(entries, builtins=__name__, where="sysid.manoeuvres.training")
 
 
 def extra(entries: Mapping[str, Mapping[str, Any]]) -> list[Manoeuvre]:
     """Those that are fitted beside the published ones, from the entries under `extra`."""
-    return suite(entries, builtins=__name__, where="sysid.manoeuvres.extra")
+    return make_suite(entries, builtins=__name__, where="sysid.manoeuvres.extra")
 
 
-def suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str, **context: Any) -> list[Manoeuvre]:
+def make_suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str, **context: Any) -> list[Manoeuvre]:
     """All manoeuvres of the families in `entries`.
 
     Args:
@@ -78,7 +78,7 @@ def suite(entries: Mapping[str, Mapping[str, Any]], *, builtins: str, where: str
     """
     found: list[Manoeuvre] = []
     for key, entry in entries.items():
-        found += build(entry, builtins=builtins, where=f"{where}.{key}", **context)()
+        found += instantiate(entry, builtins=builtins, where=f"{where}.{key}", **context)()
     names = [m.name for m in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise ConfigError(f"{where}: more than one manoeuvre of the name {sorted(twice)[0]!r}; every name must be its own")
@@ -96,7 +96,7 @@ def on_one_surface(name: str, family: str, segments: Sequence[Segment], *, speed
     return Manoeuvre(name, family, speed, commands(segments), np.zeros(0), ground, ground)
 
 
-def mirrored(manoeuvre: Manoeuvre) -> Manoeuvre:
+def mirror(manoeuvre: Manoeuvre) -> Manoeuvre:
     """Left and right exchanged."""
     return manoeuvre._replace(controls=manoeuvre.controls * [1.0, -1.0, 1.0], left=manoeuvre.right, right=manoeuvre.left)
 
@@ -249,7 +249,7 @@ def chirp_steer(
     return [one(throttle) for throttle in throttles]
 
 
-def limit(
+def handling_limit(
     *, speeds: list[float], surfaces: list[str], straight_s: float, ramp_s: float, level_s: float, hold_s: float, stop_s: float
 ) -> list[Manoeuvre]:  # fmt: skip
     """Ours: steering that grows to full lock at speed, then full brakes: what the published suite, which hardly passes 8 m/s, says not of

@@ -60,7 +60,7 @@ READS = (  # all that the teacher takes from our car
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Teacher:
+class ReferenceVehicle:
     """The teacher's numbers: `conf/sysid/teacher.yaml`, and the car whose masses it has. Plain data, may cross processes."""
 
     car: CarParameters
@@ -101,7 +101,7 @@ def make(
     lock_spin: float,
     settle_s: float,
     tolerance: float,
-) -> Teacher:
+) -> ReferenceVehicle:
     """A teacher with the masses of `car`.
 
     Args:
@@ -125,7 +125,7 @@ def make(
     for name, value in {**positive, "stop_speed": stop_speed, "lock_spin": lock_spin, "settle_s": settle_s, "grip": min(grip)}.items():
         if value <= 0.0:
             raise ConfigError(f"sysid.teacher.{name}: {value}; must be above 0")
-    return Teacher(
+    return ReferenceVehicle(
         car=car, sprung_height=sprung_height, drive_torque=drive_torque, brake_torque_front=brake_torque_front,
         brake_torque_rear=brake_torque_rear, rolling_resistance=rolling_resistance, drag_area=drag_area, air_density=air_density,
         steering_lock=steering_lock, steering_lag_s=steering_lag_s, steering_rate_max=steering_rate_max, grip=tuple(grip),
@@ -148,7 +148,7 @@ class Body(types.SimpleNamespace):
 class Vehicle:
     """A teacher at work: the model, its parameters, and a tyre each wheel. Holds what one call of the model needs, no state of the car."""
 
-    def __init__(self, teacher: Teacher) -> None:
+    def __init__(self, teacher: ReferenceVehicle) -> None:
         self.teacher = teacher
         self.model, bmw = _commonroad()
         self.body = body(teacher.car, bmw, sprung_height=teacher.sprung_height)

@@ -124,7 +124,7 @@ def _placed(centre: np.ndarray, rows: Sequence[int], places: np.ndarray) -> np.n
     return whole
 
 
-class Refined(NamedTuple):
+class RefinementResult(NamedTuple):
     """The end of the fit, and how well it is known."""
 
     best: Float[np.ndarray, " P"]
@@ -146,7 +146,7 @@ def refine(
     rounds: int,
     effective: int,
     clock: Callable[[], float],
-) -> Refined:
+) -> RefinementResult:
     """Least squares within the ranges (scipy's dogleg in a box), Jacobian by central differences, all in one batch.
 
     The loss is the sum of the squared residuals. The standard deviations are those of the linearised problem with the residuals' own
@@ -179,7 +179,7 @@ def refine(
     deviation = np.sqrt(np.maximum(np.diag(inverse), 0.0) * loss / max(effective - len(place), 1))
     scale = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
     ends = [values(space, np.clip(found.x[None] + sign * deviation[None], 0.0, 1.0))[0] for sign in (-1.0, 1.0)]
-    return Refined(
+    return RefinementResult(
         best=values(space, found.x[None])[0],
         loss=loss,
         start_loss=start_loss,

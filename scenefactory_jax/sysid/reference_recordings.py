@@ -10,14 +10,14 @@ from scipy.integrate import odeint
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.sysid import multibody_model
-from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Manoeuvre, Recording
-from scenefactory_jax.sysid.multibody_model import Teacher, Vehicle
+from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Manoeuvre, ManoeuvreRecording
+from scenefactory_jax.sysid.multibody_model import ReferenceVehicle, Vehicle
 
 LEAST = 1e-3  # absolute tolerance over the relative one: states count as at least this large
 STEPS_MAX = 50_000  # of the integrator between two frames
 
 
-def record(manoeuvre: Manoeuvre, *, teacher: Teacher) -> Recording:
+def record(manoeuvre: Manoeuvre, *, teacher: ReferenceVehicle) -> ManoeuvreRecording:
     """Drive it open loop. A plain function of plain data: map it over processes as you like.
 
     Raises:
@@ -85,7 +85,7 @@ def road_of(manoeuvre: Manoeuvre, vehicle: Vehicle) -> Callable[[float, float], 
     return at
 
 
-def recording(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, vehicle: Vehicle, road: Any) -> Recording:
+def recording(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, vehicle: Vehicle, road: Any) -> ManoeuvreRecording:
     """Read off the model's states, in our signs and order."""
     forward, sideways, yaw_rate, yaw = (
         states[:, i] for i in (multibody_model.FORWARD, multibody_model.SIDEWAYS, multibody_model.YAW_RATE, multibody_model.YAW)
@@ -96,7 +96,7 @@ def recording(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, vehicl
         multibody_model.rates(state, 0.0, vehicle, command, road)[multibody_model.SIDEWAYS]
         for state, command in zip(states, manoeuvre.controls.tolist(), strict=True)
     ]
-    return Recording(
+    return ManoeuvreRecording(
         manoeuvre=manoeuvre,
         position=states[:, [multibody_model.X, multibody_model.Y]] - ahead * heading,
         yaw=yaw,
@@ -109,7 +109,7 @@ def recording(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, vehicl
     )
 
 
-def save(path: Any, recordings: Sequence[Recording], *, digest: str) -> None:
+def save(path: Any, recordings: Sequence[ManoeuvreRecording], *, digest: str) -> None:
     """One npz of plain arrays, all frames in a row; it is there whole or not at all. `path` is a pathlib.Path."""
     cases = [r.manoeuvre for r in recordings]
     arrays = {
@@ -122,7 +122,7 @@ def save(path: Any, recordings: Sequence[Recording], *, digest: str) -> None:
     }
     for field in Manoeuvre._fields[3:]:
         arrays[field] = np.concatenate([getattr(m, field) for m in cases])
-    for field in Recording._fields[1:]:
+    for field in ManoeuvreRecording._fields[1:]:
         arrays[field] = np.concatenate([getattr(r, field) for r in recordings])
     part = path.with_name(path.name + ".part")
     with part.open("wb") as file:
@@ -130,7 +130,7 @@ def save(path: Any, recordings: Sequence[Recording], *, digest: str) -> None:
     part.replace(path)
 
 
-def load(path: Any, *, digest: str | None) -> list[Recording]:
+def load(path: Any, *, digest: str | None) -> list[ManoeuvreRecording]:
     """Read what `save` wrote.
 
     Raises:
@@ -142,11 +142,11 @@ def load(path: Any, *, digest: str | None) -> list[Recording]:
         raise ConfigError(f"{path}: recorded with other settings ({arrays['digest']}, wanted {digest}); delete it to record anew")
     frames, strips = arrays["frames"], arrays["strips"]
     ends, grounds, edges = (np.cumsum(counts)[:-1] for counts in (frames, strips, strips - 1))
-    cut = {name: np.split(arrays[name], ends) for name in ("controls", *Recording._fields[1:])}
+    cut = {name: np.split(arrays[name], ends) for name in ("controls", *ManoeuvreRecording._fields[1:])}
     cut |= {name: np.split(arrays[name], grounds) for name in ("left", "right")} | {"edges": np.split(arrays["edges"], edges)}
     found = []
     for i, name in enumerate(arrays["name"]):
         road = [cut[field][i] for field in ("controls", "edges", "left", "right")]
         manoeuvre = Manoeuvre(str(name), str(arrays["family"][i]), float(arrays["start_speed"][i]), *road)
-        found.append(Recording(manoeuvre, *(cut[field][i] for field in Recording._fields[1:])))
+        found.append(ManoeuvreRecording(manoeuvre, *(cut[field][i] for field in ManoeuvreRecording._fields[1:])))
     return found

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.env.rollout import Recording, Shot
+from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import world_mjcf
 from scenefactory_jax.visualization.web import replay_data
@@ -86,7 +86,7 @@ def _views(rrb: Any, root: str, name: str) -> Any:
 class _World:
     """The branch of one world, and the stream that it goes to."""
 
-    def __init__(self, rr: Any, stream: Any, root: str, shots: Shot) -> None:
+    def __init__(self, rr: Any, stream: Any, root: str, shots: StepRecord) -> None:
         self.rr, self.stream, self.root, self.shots = rr, stream, root, shots
         self.time = np.asarray(shots.time_s, float)
         self.hz = 1.0 / max(float(np.median(np.diff(self.time))), 1e-6) if len(self.time) > 1 else 1.0
@@ -119,7 +119,7 @@ class _World:
     def _send_map(self, scene: Scene) -> None:
         lines: dict[str, list[Float[np.ndarray, "n 3"]]] = {}
         colours = {}
-        for points, kind in world_mjcf.chains(scene.road, replay_data.STRAIGHT_M):
+        for points, kind in world_mjcf.join_segments(scene.road, replay_data.STRAIGHT_M):
             layer = next((name for name, kinds in replay_data.LAYERS.items() if kind in kinds), "other")
             lines.setdefault(layer, []).append(np.c_[points, np.zeros(len(points))])
             colours[layer] = [round(255 * channel) for channel in world_mjcf.COLOURS.get(kind, world_mjcf.OTHER)[:3]]
@@ -127,7 +127,7 @@ class _World:
             self.log(f"map/{layer}", self.rr.LineStrips3D(strips, colors=[colours[layer]]))
 
     def _send_car(self, car: int, steps: Int[np.ndarray, " n"], size: Float[np.ndarray, "2"], goal_radius_m: float) -> None:
-        rr, shots, colour = self.rr, self.shots, packed(drawing.colour_of(car))
+        rr, shots, colour = self.rr, self.shots, pack_polylines(drawing.colour_of(car))
         place, yaw = np.asarray(shots.position[:, car], float), np.asarray(shots.yaw[steps, car], float)
         zero = np.zeros(len(steps))
         centres = np.c_[place[steps], zero + CAR_M / 2]
@@ -158,7 +158,7 @@ class _World:
         found = sorted((int(t), int(car), name) for name, new in vars(self.shots.events).items() for t, car in np.argwhere(new & active))
         if found:
             text = [f"car {car}: {drawing.MARKS[name].label}" for _, car, name in found]
-            colours = np.array([packed(drawing.MARKS[name].colour) for _, _, name in found])
+            colours = np.array([pack_polylines(drawing.MARKS[name].colour) for _, _, name in found])
             self.columns("events", np.array([step for step, _, _ in found]), self.rr.TextLog.columns(text=text, color=colours))
 
     def _send_others(self) -> None:
@@ -172,12 +172,12 @@ class _World:
             half_sizes=np.c_[size / 2, zero + OTHER_M / 2],
             centers=np.c_[np.asarray(others.position, float)[steps, rows], zero + OTHER_M / 2],
             quaternions=np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)],
-            colors=np.full(len(rows), packed(OTHER)),
+            colors=np.full(len(rows), pack_polylines(OTHER)),
         )
         self.columns("others", np.arange(len(present)), columns.partition(present.sum(axis=1)))
 
 
-def series(shots: Shot) -> Mapping[str, Float[np.ndarray, "T A"]]:
+def series(shots: StepRecord) -> Mapping[str, Float[np.ndarray, "T A"]]:
     """Every number of `SERIES`, of every car at every step; not finite: not there."""
     action = np.asarray(shots.action, float)
     read = {"throttle": action[..., 0], "steer": action[..., 1], "brake": action[..., 2], "friction": shots.grip}
@@ -187,7 +187,7 @@ def series(shots: Shot) -> Mapping[str, Float[np.ndarray, "T A"]]:
     return {name: np.asarray(read[name] if name in read else getattr(shots, name), float) for name in SERIES}
 
 
-def packed(colour: drawing.Colour) -> np.uint32:
+def pack_polylines(colour: drawing.Colour) -> np.uint32:
     """A colour as one number, which every version of rerun takes for one colour."""
     red, green, blue = colour
     return np.uint32(red << 24 | green << 16 | blue << 8 | 255)

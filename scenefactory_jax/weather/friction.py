@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_numbers
+from scenefactory_jax.core.instantiate import ConfigError, check_number, check_numbers, instantiate
 from scenefactory_jax.core.types import SURFACES, Patches, Rain, Weather
-from scenefactory_jax.weather.patches import condition
+from scenefactory_jax.weather.patches import condition_at
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,12 +54,12 @@ def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"
     Raises:
         ConfigError: naming the key that does not fit.
     """
-    bound = build(entry, builtins=__name__, where="weather.grip")
-    jax.eval_shape(bound, uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
+    bound = instantiate(entry, builtins=__name__, where="weather.grip")
+    jax.eval_shape(bound, make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
     return bound
 
 
-def friction(
+def compute_lugre_friction(
     speed: Float[Array, "*shape"],
     film_mm: Float[Array, "*shape"],
     theta: Float[Array, "*shape"],
@@ -74,7 +74,9 @@ def friction(
     speed cancelled from numerator and denominator (v_r = s v, w_r = (1 + s) v). Finite with finite gradients at rest and on a dry road.
     The published bristle dampings sigma1 and sigma2 are zero and left out. It has no floor: zero means that the tyre floats.
     """
-    contact = jnp.maximum(theta * spacing(speed, film_mm, texture_mm, tyre=tyre) - lift(speed, film_mm, tyre=tyre), 0.0)
+    contact = jnp.maximum(
+        theta * asperity_spacing(speed, film_mm, texture_mm, tyre=tyre) - hydrodynamic_lift(speed, film_mm, tyre=tyre), 0.0
+    )
     b1, b2, b3, b4 = tyre.stribeck_velocity
     stribeck = b1 * jnp.exp(b2 * film_mm + b3) + b4
     # the floor keeps the gradient of x^alpha finite at rest; it moves g by less than 4e-5 and only below 1e-7 of a metre a second
@@ -85,7 +87,7 @@ def friction(
     return contact * bristle / (bristle / g + lumping * (1.0 + slip))
 
 
-def spacing(
+def asperity_spacing(
     speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], texture_mm: Float[Array, "*shape"], *, tyre: Tyre
 ) -> Float[Array, "*shape"]:
     """Y_R: the share of the contact patch in which water is squeezed out to the minimum spacing.
@@ -101,7 +103,7 @@ def spacing(
     return jnp.clip(1.0 - squeeze * bracket, 0.0, 1.0)
 
 
-def lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre: Tyre) -> Float[Array, "*shape"]:
+def hydrodynamic_lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre: Tyre) -> Float[Array, "*shape"]:
     """Y_F: the share of the wheel's load that the water wedge in front of the tyre carries."""
     a, q = tyre.patch_length / (2.0 * tyre.radius), jnp.maximum(film_mm, 0.0) * 1e-3 / tyre.radius
     wedge = q * (2.0 * max(1.0 - a * a, 0.0) ** 0.5 - q)
@@ -109,7 +111,7 @@ def lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre
     return jnp.clip(tyre.water_density * tyre.width * tyre.radius * speed**2 / (3.0 * tyre.load) * depth, 0.0, 1.0)
 
 
-def grip(
+def compute_mu(
     weather: Weather,
     position: Float[Array, "*shape 2"],
     speed: Float[Array, "*shape"],
@@ -143,16 +145,16 @@ def grip(
     check_numbers(slips, where="weather.grip", least=0.0)
     if mode not in ("static", "dynamic", "speed"):
         raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
-    film_mm, surface = condition(weather, position)
+    film_mm, surface = condition_at(weather, position)
     speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # whole numbers would make whole numbers of the slip: 0
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
     theta, texture = (table[surface] for table in _surfaces(surfaces))
-    return jnp.maximum(friction(v, film_mm, theta, texture, s, tyre=constants), floor)
+    return jnp.maximum(compute_lugre_friction(v, film_mm, theta, texture, s, tyre=constants), floor)
 
 
 def _tyre(entry: Mapping[str, Any]) -> Tyre:
-    tyre: Tyre = build({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
+    tyre: Tyre = instantiate({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
     numbers = dict(vars(tyre))
     stribeck = {f"stribeck_velocity[{i}]": b for i, b in enumerate(numbers.pop("stribeck_velocity"))}
     if len(stribeck) != 4:
@@ -167,13 +169,13 @@ def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Ar
     """theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
-    rows = [build({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
+    rows = [instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
     for name, row in zip(SURFACES, rows, strict=True):
         check_numbers(vars(row), where=f"weather.grip.surfaces.{name}", above=0.0)
     return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
 
 
-def uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:
+def make_uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:
     """One condition everywhere and for ever: no patches, no rain."""
     none, nothing = jnp.zeros(0, jnp.float32), jnp.zeros(0, bool)
     patches = Patches(jnp.zeros((0, 1, 2), jnp.float32), nothing, none, jnp.zeros(0, jnp.int32), none, none, nothing)

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import CONTIGUOUS_M, heading, locate, running_length
-from scenefactory_jax.core.instantiate import ConfigError, check_range, check_share, check_type
+from scenefactory_jax.core.geometry import CONTIGUOUS_M, cumulative_length, find_point_at_distance, heading_vector
+from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_range, check_type
 from scenefactory_jax.core.types import SURFACES, Patches, Road, Scene, Weather
-from scenefactory_jax.weather.patches import join
+from scenefactory_jax.weather.patches import join_patches
 
 
 def circles(
@@ -82,7 +82,7 @@ def polygons(
     # half a sector of play keeps every angle between neighbours below pi, from three corners on
     angle = 2 * jnp.pi / corners * (jnp.arange(corners) + 0.5 * jax.random.uniform(turn, (count, corners)))
     reach = _uniform(size, radius_m, (count, corners), name="radius_m")
-    vertices = centre[:, None] + reach[..., None] * heading(angle)
+    vertices = centre[:, None] + reach[..., None] * heading_vector(angle)
     cover = {"chance": chance, "surface": surface, "film_mm": film_mm, "follows": follows}
     return _cover(rest, weather, vertices, jnp.zeros(count, jnp.float32), lanes, closed=True, **cover)
 
@@ -117,13 +117,13 @@ def strips(
     _check(count=(count, 0), points=(points, 2))
     place, far, wide, aside, rest = jax.random.split(key, 5)
     length = _uniform(far, length_m, (count,), name="length_m")
-    running = running_length(scene.lanes)
+    running = cumulative_length(scene.lanes)
     begin = jax.random.uniform(place, (count, 1)) * running[-1]
     along = length[:, None] * jnp.linspace(0.0, 1.0, points)
-    point, yaw, lane, arc = locate(scene.lanes, running, begin + along)
+    point, yaw, lane, arc = find_point_at_distance(scene.lanes, running, begin + along)
     same = (lane == lane[:, :1]) & (jnp.abs(arc - arc[:, :1] - along) < CONTIGUOUS_M)
     end = jnp.sum(jnp.cumprod(same, axis=1), axis=1, keepdims=True) - 1  # the last point before the polyline ends or breaks
-    left = heading(yaw + jnp.pi / 2)
+    left = heading_vector(yaw + jnp.pi / 2)
     middle = point + _uniform(aside, offset_m, (count, 1, 1), name="offset_m", least=None) * left
     vertices = jnp.take_along_axis(middle, jnp.minimum(jnp.arange(points), end)[..., None], axis=1)
     width = _uniform(wide, width_m, (count,), name="width_m")
@@ -144,7 +144,7 @@ def fixed(key: PRNGKeyArray, scene: Scene, weather: Weather, *, shapes: list[dic
     Raises:
         ConfigError: naming the shape and its key.
     """
-    return join([_shape(weather, shape, where=f"shapes[{i}]") for i, shape in enumerate(shapes)] or [weather.patches])
+    return join_patches([_shape(weather, shape, where=f"shapes[{i}]") for i, shape in enumerate(shapes)] or [weather.patches])
 
 
 def _shape(weather: Weather, shape: Mapping[str, Any], *, where: str) -> Patches:
@@ -181,10 +181,10 @@ def _shape(weather: Weather, shape: Mapping[str, Any], *, where: str) -> Patches
 def _centres(key: PRNGKeyArray, lanes: Road, *, count: int, scatter_m: float) -> tuple[Float[Array, "N 2"], Bool[Array, ""]]:
     """Places on or beside lanes, as likely in every metre of them, and whether there are lanes at all."""
     along, aside = jax.random.split(key)
-    running = running_length(lanes)
-    point, yaw, _, _ = locate(lanes, running, jax.random.uniform(along, (count,)) * running[-1])
+    running = cumulative_length(lanes)
+    point, yaw, _, _ = find_point_at_distance(lanes, running, jax.random.uniform(along, (count,)) * running[-1])
     scatter = jax.random.uniform(aside, (count, 1), minval=-scatter_m, maxval=scatter_m)
-    return point + scatter * heading(yaw + jnp.pi / 2), running[-1] > 0
+    return point + scatter * heading_vector(yaw + jnp.pi / 2), running[-1] > 0
 
 
 def _cover(
@@ -202,7 +202,7 @@ def _cover(
 ) -> Patches:
     """Patches of these shapes: whether each is there, and what covers it."""
     _check(chance=(chance, 0.0), follows=(follows, 0.0))
-    check_share(chance, where="chance")
+    check_fraction(chance, where="chance")
     count = vertices.shape[0]
     wet, there = jax.random.split(key)
     return Patches(

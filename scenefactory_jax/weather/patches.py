@@ -10,7 +10,7 @@ from scenefactory_jax.core.geometry import cross, dot
 from scenefactory_jax.core.types import Patches, Weather
 
 
-def inside(patches: Patches, position: Float[Array, "*shape 2"]) -> Bool[Array, "*shape N"]:
+def contains_points(patches: Patches, position: Float[Array, "*shape 2"]) -> Bool[Array, "*shape N"]:
     """Whether points lie in patches: within the radius of a patch's line or, if it is closed, in its interior by the even-odd rule.
 
     Absent patches hold nothing. Repeated vertices change nothing.
@@ -29,20 +29,20 @@ def inside(patches: Patches, position: Float[Array, "*shape 2"]) -> Bool[Array, 
     return patches.present & (jnp.any(near, axis=-1) | interior)
 
 
-def condition(weather: Weather, position: Float[Array, "*shape 2"]) -> tuple[Float[Array, "*shape"], Int[Array, "*shape"]]:
+def condition_at(weather: Weather, position: Float[Array, "*shape 2"]) -> tuple[Float[Array, "*shape"], Int[Array, "*shape"]]:
     """Water film in mm and surface (an index into SURFACES) at points: those of the last patch that holds the point, or the open road's."""
     patches, shape = weather.patches, position.shape[:-1]
     count = patches.present.shape[0]
     if count == 0:
         return jnp.broadcast_to(weather.film_mm, shape), jnp.broadcast_to(weather.surface, shape)
-    within = inside(patches, position)
+    within = contains_points(patches, position)
     last = count - 1 - jnp.argmax(within[..., ::-1], axis=-1)
     film_mm = (patches.film_mm + patches.follows * weather.film_mm)[last]
     covered = jnp.any(within, axis=-1)
     return jnp.where(covered, film_mm, weather.film_mm), jnp.where(covered, patches.surface[last], weather.surface)
 
 
-def join(parts: Sequence[Patches]) -> Patches:
+def join_patches(parts: Sequence[Patches]) -> Patches:
     """All patches of several, the later above the earlier; shorter lines of vertices repeat their last one."""
     parts = [part for part in parts if part.present.shape[0]] or list(parts[:1])
     longest = max(part.vertices.shape[1] for part in parts)

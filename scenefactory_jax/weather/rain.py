@@ -18,7 +18,7 @@ from scenefactory_jax.core.types import Rain, Weather
 SPAN = 5.0  # time constants that knots cover: 0.7 % of the change is still to come then
 
 
-def pass_time(weather: Weather, *, dt: float | Float[Array, ""]) -> Weather:
+def advance_rain(weather: Weather, *, dt: float | Float[Array, ""]) -> Weather:
     """The weather `dt` seconds later; without knots its film stays as it is."""
     rain = replace(weather.rain, now_s=weather.rain.now_s + dt)
     film_mm = jnp.interp(rain.now_s, rain.time_s, rain.film_mm) if rain.time_s.shape[0] else weather.film_mm

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_numbers
+from scenefactory_jax.core.instantiate import ConfigError, check_numbers, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Scene, Weather
-from scenefactory_jax.weather.friction import uniform
-from scenefactory_jax.weather.patches import join
-from scenefactory_jax.weather.rain import pass_time
+from scenefactory_jax.weather.friction import make_uniform
+from scenefactory_jax.weather.patches import join_patches
+from scenefactory_jax.weather.rain import advance_rain
 
 
 def make(config: Mapping[str, Any]) -> Callable[[PRNGKeyArray, Scene], Weather]:
@@ -38,13 +38,13 @@ def make(config: Mapping[str, Any]) -> Callable[[PRNGKeyArray, Scene], Weather]:
     entries, course = config.get("patches") or {}, config.get("rain")
     if not isinstance(entries, Mapping):
         raise ConfigError(f"weather.patches: {entries!r}; wanted is name -> entry")
-    road = build(config["draw"], builtins=__name__, where="weather.draw")
+    road = instantiate(config["draw"], builtins=__name__, where="weather.draw")
     builders = {
-        f"weather.patches.{name}": build(entry, builtins="scenefactory_jax.weather.patch_layouts", where=f"weather.patches.{name}")
+        f"weather.patches.{name}": instantiate(entry, builtins="scenefactory_jax.weather.patch_layouts", where=f"weather.patches.{name}")
         for name, entry in entries.items()
         if entry is not None
     }
-    rain = None if course is None else build(course, builtins="scenefactory_jax.weather.rain", where="weather.rain")
+    rain = None if course is None else instantiate(course, builtins="scenefactory_jax.weather.rain", where="weather.rain")
     if not builders and rain is None:
         return road
 
@@ -52,10 +52,10 @@ def make(config: Mapping[str, Any]) -> Callable[[PRNGKeyArray, Scene], Weather]:
         road_key, rain_key, *keys = jax.random.split(key, 2 + len(builders))
         weather = road(road_key, scene)
         built = [_named(where, make, key, scene, weather) for key, (where, make) in zip(keys, builders.items(), strict=True)]
-        weather = replace(weather, patches=join([weather.patches, *built]))
+        weather = replace(weather, patches=join_patches([weather.patches, *built]))
         if rain is None:
             return weather
-        return pass_time(replace(weather, rain=_named("weather.rain", rain, rain_key, weather)), dt=0.0)
+        return advance_rain(replace(weather, rain=_named("weather.rain", rain, rain_key, weather)), dt=0.0)
 
     return episode
 
@@ -77,7 +77,7 @@ class Case:
     weight: float
 
 
-def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Weather:
+def sample_condition(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Weather:
     """A road condition for one episode, drawn from `cases` with probability proportional to their weights.
 
     Raises:
@@ -88,7 +88,7 @@ def draw(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Wea
     index = jax.random.choice(key, len(chosen), p=weights / weights.sum())
     film = jnp.asarray([case.film_mm for case in chosen], jnp.float32)
     surface = jnp.asarray([SURFACES.index(case.surface) for case in chosen], jnp.int32)
-    return uniform(film[index], surface[index])
+    return make_uniform(film[index], surface[index])
 
 
 def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
@@ -96,7 +96,7 @@ def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
     chosen = []
     for i, numbers in enumerate(cases):
         where = f"weather.draw.cases[{i}]"
-        make = build({**numbers, "_target_": "Case"}, builtins=__name__, where=where)
+        make = instantiate({**numbers, "_target_": "Case"}, builtins=__name__, where=where)
         case = make()
         if case.surface not in SURFACES:
             raise ConfigError(f"{where}.surface: {case.surface!r}; valid: {', '.join(SURFACES)}")
@@ -107,6 +107,6 @@ def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
     return chosen
 
 
-def keep(key: PRNGKeyArray, scene: Scene) -> Weather:
+def keep_condition(key: PRNGKeyArray, scene: Scene) -> Weather:
     """The scene's own road condition, as it was packed."""
     return scene.weather

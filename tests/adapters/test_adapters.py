@@ -9,47 +9,47 @@ import numpy as np
 import pytest
 from support.adapting import ALONE, SMOKE, scenes
 
-from scenefactory_jax.adapters import bounds, episodes, flat, layout
+from scenefactory_jax.adapters import bounds, episodes, flatten_observation, layout
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.types import Rows
+from scenefactory_jax.core.types import SetObservation
 from scenefactory_jax.env import environment, observations
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
 
 def test_a_flat_observation_holds_every_group_where_its_layout_says():
-    rows = Rows(jnp.arange(2 * 3 * 2.0).reshape(2, 3, 2) + 1, jnp.array([[True, False, True], [False, False, False]]))
+    rows = SetObservation(jnp.arange(2 * 3 * 2.0).reshape(2, 3, 2) + 1, jnp.array([[True, False, True], [False, False, False]]))
     observation = {"zone": jnp.ones((2, 4)), "ego": jnp.full((2, 1), 5.0), "road": rows}
-    vector, columns = flat(observation), layout(observation)
+    vector, columns = flatten_observation(observation), layout(observation)
     assert vector.shape == (2, 1 + 6 + 3 + 4) and list(columns) == ["ego", "road", "road.mask", "zone"]
     np.testing.assert_array_equal(vector[:, columns["road"]], [[1, 2, 0, 0, 5, 6], [0] * 6])  # what is masked reads zeros
     np.testing.assert_array_equal(vector[:, columns["road.mask"]], [[1, 0, 1], [0, 0, 0]])
     np.testing.assert_array_equal(vector[:, columns["ego"]], [[5], [5]])
     many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), observation)
-    np.testing.assert_array_equal(flat(many), jnp.stack([vector] * 7))
+    np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
 
 
 @pytest.mark.parametrize("observe", ["reference", "foresight"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
-    settings = hydra_config.load("train", SMOKE, f"observe={observe}", "dynamics=bicycle", "ends=invincible", "scenes.pack.agents=4")
-    env, given = environment.make(settings), scenes(agents=4).scene
+    settings = hydra_config.load_config("train", SMOKE, f"observe={observe}", "dynamics=bicycle", "ends=invincible", "scenes.pack.agents=4")
+    env, given = environment.make_env(settings), scenes(agents=4).scene
 
     def step(given, carry, key):
         states, action = carry
         drawn = jax.random.uniform(key, action.shape, minval=-1.0)
         drawn = jnp.where(jax.random.bernoulli(key, 0.1), drawn, action)  # for a third of a second at a time
         states, outcome = jax.vmap(env.step)(given, states, drawn)
-        return (states, drawn), flat(outcome.observation)
+        return (states, drawn), flatten_observation(outcome.observation)
 
     def drive(given, key):
         states, seen = jax.vmap(env.reset)(jax.random.split(key, 4), given)
         full = jnp.tile(jnp.array([1.0, 0.05, -1.0]), (4, 4, 1))
-        return flat(seen), jax.lax.scan(functools.partial(step, given), (states, full), jax.random.split(key, 120))[1]
+        return flatten_observation(seen), jax.lax.scan(functools.partial(step, given), (states, full), jax.random.split(key, 120))[1]
 
     first, seen = jax.jit(drive)(given, jax.random.key(0))
     observation = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 4), given)[1]
-    low, high = bounds.flat_bounds(environment.parts_of(settings).groups, observation)
+    low, high = bounds.flat_bounds(environment.make_parts(settings).groups, observation)
     assert np.isfinite(low).all() and np.isfinite(high).all() and low.shape == seen.shape[-1:]
     seen = np.concatenate([np.asarray(first)[None], np.asarray(seen)])
     outside = (seen < low - 1e-5) | (seen > high + 1e-5)
@@ -58,23 +58,23 @@ def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
 
 
 def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
-    @observations.bounded(observations.SHARE, observations.ANY)
+    @observations.bound_observation(observations.SHARE, observations.ANY)
     def mine(scene, state, *, scale: float):
         return scale * jnp.array([[0.25, 30.0, -4.0]])
 
-    unbound = lambda scene, state: Rows(jnp.array([[[-20.0, 20.0], [0.0, 1.0]]]), jnp.array([[True, True]]))  # noqa: E731
+    unbound = lambda scene, state: SetObservation(jnp.array([[[-20.0, 20.0], [0.0, 1.0]]]), jnp.array([[True, True]]))  # noqa: E731
     groups = {"mine": functools.partial(mine, scale=2.0), "yours": unbound}
     seen = {name: bounds.clip(group)(None, None) for name, group in groups.items()}
     limit = bounds.LIMIT
-    np.testing.assert_array_equal(flat(seen), [[0.5, limit, -8.0, -limit, limit, 0.0, 1.0, 1.0, 1.0]])
+    np.testing.assert_array_equal(flatten_observation(seen), [[0.5, limit, -8.0, -limit, limit, 0.0, 1.0, 1.0, 1.0]])
     low, high = bounds.flat_bounds(groups, seen)
     np.testing.assert_array_equal(low, [0, -limit, -limit, *[-limit] * 4, 0, 0])
     np.testing.assert_array_equal(high, [1, limit, limit, *[limit] * 4, 1, 1])
 
 
 def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
-    pool = episodes.pool(None, ALONE, scenes(), alone=True)
-    begin = jax.jit(jax.vmap(lambda key: episodes.begin(pool.env, pool.scenes, key)))
+    pool = episodes.make_pool(None, ALONE, scenes(), alone=True)
+    begin = jax.jit(jax.vmap(lambda key: episodes.begin_episode(pool.env, pool.scenes, key)))
     keys = jax.random.split(jax.random.key(0), 64)
     episode, seen = begin(keys)
     assert set(np.asarray(episode.scene)) == {0, 1, 2, 3} and pool.steps == 60 and len(pool.names) == 4
@@ -88,15 +88,15 @@ def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
 
 
 def test_a_step_of_an_episode_is_the_environments_own():
-    settings = hydra_config.load("train", SMOKE)
-    pool = episodes.pool(settings, (), scenes(agents=4), alone=False)
-    episode, seen = jax.jit(lambda key: episodes.begin(pool.env, pool.scenes, key, 2))(jax.random.key(3))
+    settings = hydra_config.load_config("train", SMOKE)
+    pool = episodes.make_pool(settings, (), scenes(agents=4), alone=False)
+    episode, seen = jax.jit(lambda key: episodes.begin_episode(pool.env, pool.scenes, key, 2))(jax.random.key(3))
     action = jnp.full((4, 3), 0.5)
-    _, moment = jax.jit(lambda given: episodes.advance(pool.env, pool.scenes, given, action))(episode)
-    env, scene = environment.make(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
+    _, moment = jax.jit(lambda given: episodes.step_worlds(pool.env, pool.scenes, given, action))(episode)
+    env, scene = environment.make_env(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
     after, outcome = jax.jit(env.step)(scene, episode.state, action)
     assert seen.shape == (4, pool.columns)
-    np.testing.assert_allclose(moment.observation, flat(outcome.observation), atol=1e-5)
+    np.testing.assert_allclose(moment.observation, flatten_observation(outcome.observation), atol=1e-5)
     driving = np.asarray(episode.state.active)
     assert 0 < driving.sum() < 4  # scene 2 leaves slots empty
     np.testing.assert_allclose(moment.reward, np.where(driving, outcome.reward, 0), atol=1e-5)
@@ -106,11 +106,11 @@ def test_a_step_of_an_episode_is_the_environments_own():
 
 
 def test_a_step_is_all_control_steps_of_an_action():
-    held = episodes.pool(hydra_config.load("train", SMOKE), ["controls.every=3"], scenes(agents=4), alone=False)
+    held = episodes.make_pool(hydra_config.load_config("train", SMOKE), ["controls.every=3"], scenes(agents=4), alone=False)
     assert (held.steps, held.step_hz) == (20, 10.0)
-    episode = episodes.start(held.env, held.scenes, jax.random.key(3), 1)
+    episode = episodes.start_episodes(held.env, held.scenes, jax.random.key(3), 1)
     action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
-    after, moment = jax.jit(functools.partial(episodes.advance, held.env))(held.scenes, episode, action)
+    after, moment = jax.jit(functools.partial(episodes.step_worlds, held.env))(held.scenes, episode, action)
     scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
     step, paid = jax.jit(held.env.transition), 0.0
     for _ in range(3):
@@ -133,19 +133,22 @@ def test_a_step_is_all_control_steps_of_an_action():
 )
 def test_a_config_that_does_not_fit_says_what_to_set(override, message):
     with pytest.raises(ConfigError, match=message):
-        episodes.pool(None, [*ALONE, override], None, alone=True)
+        episodes.make_pool(None, [*ALONE, override], None, alone=True)
     with pytest.raises(ConfigError, match=message):  # and one from Python
-        episodes.pool(hydra_config.load("train", *ALONE, override), (), None, alone=True)
+        episodes.make_pool(hydra_config.load_config("train", *ALONE, override), (), None, alone=True)
 
 
 def test_scenes_and_options_that_do_not_fit_say_so():
     with pytest.raises(ConfigError, match=r"the scenes given: 4 slots a scene; .* set scenes\.pack\.agents=1"):
-        episodes.pool(None, [SMOKE], scenes(agents=4), alone=True)
+        episodes.make_pool(None, [SMOKE], scenes(agents=4), alone=True)
     with pytest.raises(ConfigError, match=r"options\['scene'\]: 4; valid: 0 to 3"):
-        episodes.chosen({"scene": 4}, 4)
-    assert episodes.chosen(None, 4) == episodes.ANY and episodes.chosen({"scene": 3, "other": 1}, 4) == 3
-    assert episodes.chosen({"scene": [3, -1]}, 4, 2).tolist() == [3, -1] and episodes.chosen({"scene": 1}, 4, 2).tolist() == [1, 1]
-    changed = episodes.pool(hydra_config.load("train", *ALONE), ["timing.episode_s=1"], scenes(), alone=True)
+        episodes.choose_scene({"scene": 4}, 4)
+    assert episodes.choose_scene(None, 4) == episodes.ANY and episodes.choose_scene({"scene": 3, "other": 1}, 4) == 3
+    assert episodes.choose_scene({"scene": [3, -1]}, 4, 2).tolist() == [3, -1] and episodes.choose_scene({"scene": 1}, 4, 2).tolist() == [
+        1,
+        1,
+    ]
+    changed = episodes.make_pool(hydra_config.load_config("train", *ALONE), ["timing.episode_s=1"], scenes(), alone=True)
     assert changed.steps == 30
 
 

@@ -10,7 +10,7 @@ from support.running import quick_compilation
 from scenefactory_jax.cli import benchmark as command
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import phase_timing
@@ -26,7 +26,7 @@ def made(tmp_path_factory):
     """Every scope once."""
     folder = tmp_path_factory.mktemp("bench")
     with quick_compilation():
-        return folder, command.bench({**load("bench", *SMALL, f"out={folder}"), "variants": VARIANTS})
+        return folder, command.bench({**load_config("bench", *SMALL, f"out={folder}"), "variants": VARIANTS})
 
 
 def test_every_scope_is_measured(made):
@@ -47,7 +47,7 @@ def test_phases_add_up_to_the_whole(made):
     for name in ("training", "environment"):
         parts = list(rows[name]["phases_ms"].values())  # written with six digits each; on a busy machine a part may be below zero
         assert sum(parts) == pytest.approx(rows[name]["ms_a_control_step"], abs=1e-5 * sum(map(abs, parts)))
-    assert phase_timing.parts_of_the_whole({"a": 1.0, "b": 3.0, "c": 2.5}) == {"a": 1.0, "b": 2.0, "c": -0.5}
+    assert phase_timing.time_phases({"a": 1.0, "b": 3.0, "c": 2.5}) == {"a": 1.0, "b": 2.0, "c": -0.5}
 
 
 def test_the_report_is_made_of_the_json(made, tmp_path):
@@ -61,7 +61,7 @@ def test_the_report_is_made_of_the_json(made, tmp_path):
 
 def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
     folder, before = made
-    config = {**load("bench", *SMALL, f"out={folder}", "resume=true"), "variants": VARIANTS | {"new": {"seed": 1}}}
+    config = {**load_config("bench", *SMALL, f"out={folder}", "resume=true"), "variants": VARIANTS | {"new": {"seed": 1}}}
     asked, measured = [], {key: before["rows"][0][key] for key in before["rows"][0] if key not in ("name", "changes", "settings")}
     monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: asked.append(task["seed"]) or measured | {"per_s": 7.0})
     after = command.bench(config)
@@ -73,24 +73,24 @@ def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
 
 def test_the_whole_configuration_comes_first():
     """The loops in Python are compared with the first row."""
-    config = load("bench", "experiment=published", "suite=throughput")
+    config = load_config("bench", "experiment=published", "suite=throughput")
     name, changes = next(iter(config["variants"].items()))
     assert (name, changes) == ("256 x 16", {"phases": True})
     full = config["variants"]["bicycle environment 4096 x 16, no empty slots"]
     assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawn"]["draw"]["_target_"] == "random_pairs"
-    assert next(iter(load("bench", "suite=streaming")["variants"])) == "in memory"
+    assert next(iter(load_config("bench", "suite=streaming")["variants"])) == "in memory"
 
 
 def test_there_must_be_something_to_resume(tmp_path):
     for out in ("null", str(tmp_path)):
         with pytest.raises(ConfigError, match=r"resume=true: out=.*no bench\.json to go on with"):
-            command.bench(load("bench", *SMALL, f"out={out}", "resume=true"))
+            command.bench(load_config("bench", *SMALL, f"out={out}", "resume=true"))
 
 
 def test_the_readme_shows_what_was_measured():
     result = result_file.read(ROOT / "experiments" / "throughput" / "bench.json")
     text = (ROOT / "README.md").read_text()
-    assert report.versus(result).count("\n") >= 2 and report.versus(result) in text
+    assert report.compare_with_published(result).count("\n") >= 2 and report.compare_with_published(result) in text
     shares, said = re.findall(r"[\d,]+ steps/s|[\d.]+ times", report.split(result)), " ".join(text.split())
     assert len(shares) == 3 and all(share in said for share in shares)
     devices = report.over_devices(result_file.read(ROOT / "experiments" / "devices" / "bench.json"))
@@ -102,12 +102,12 @@ def test_only_the_whole_configuration_stands_beside_published_figures():
     row["per_s_range"] = [38400.0, 38600.0]
     others = [{"changes": {"policy": {"dtype": "bfloat16"}}}, {"scope": "environment"}, {"devices": 2}, {"worlds": 255}]
     one = {**row, "worlds": 4096, "slots": 1, "changes": {"worlds": 4096, "scenes": {"pack": {"agents": 1}}, "phases": False}}
-    table = report.versus({"rows": [row, *({**row, **other} for other in others), one], "versions": {"device": "a GPU"}})
+    table = report.compare_with_published({"rows": [row, *({**row, **other} for other in others), one], "versions": {"device": "a GPU"}})
     assert table.splitlines()[2:] == [
         "| 256 x 16 | 38,500 (38,400 to 38,600) | 19,250 | 2.0 |",
         "| 4,096 x 1 | 38,500 (38,400 to 38,600) | 41,742 | 0.9 |",
     ]
-    assert report.versus({"rows": [{**row, **others[0]}], "versions": {"device": "a GPU"}}) == ""
+    assert report.compare_with_published({"rows": [{**row, **others[0]}], "versions": {"device": "a GPU"}}) == ""
 
 
 def test_the_ratio_is_split_into_plain_jax_and_kernels():
@@ -140,7 +140,7 @@ def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
         return size | numbers | {"per_s_range": [1.0, 3.0], "ms_a_control_step": task["worlds"] / 2, "phases_ms": {}, "repeats": 1}
 
     monkeypatch.setattr(command, "measure", measure)
-    config = {**load("bench", *SMALL, f"out={tmp_path}"), "variants": {str(n): {"worlds": n} for n in (1, 2, 5, 4)}}
+    config = {**load_config("bench", *SMALL, f"out={tmp_path}"), "variants": {str(n): {"worlds": n} for n in (1, 2, 5, 4)}}
     rows = command.bench(config)["rows"]
     assert [row["fits"] for row in rows] == [True, True, True, False] and rows[3]["slots"] == 4
     text = (tmp_path / "throughput.md").read_text()
@@ -152,7 +152,7 @@ def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
 
 
 def test_variants_change_values_and_replace_entries():
-    config = load("bench", "experiment=smoke")
+    config = load_config("bench", "experiment=smoke")
     changes = {"ppo": {"horizon": 5}, "dynamics": {"_target_": "mine", "mass": 1.0}, "worlds": 3}
     found = command.changed(config, changes, where="variants.mine")
     assert found["ppo"] == {**config["ppo"], "horizon": 5} and found["worlds"] == 3
@@ -164,9 +164,9 @@ def test_variants_change_values_and_replace_entries():
         command.bench({**config, "variants": {"mine": {"scope": "driving"}}})
 
 
-@pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.folder() / "suite").glob("*.yaml")))
+@pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.find_conf() / "suite").glob("*.yaml")))
 def test_every_variant_of_a_suite_is_a_config(suite):
-    config = load("bench", "experiment=published", f"suite={suite}")
+    config = load_config("bench", "experiment=published", f"suite={suite}")
     for name, changes in config["variants"].items():
         schema.check(command.changed(config, changes, where=name), schema.BENCH)
 
@@ -175,6 +175,6 @@ def test_the_loop_stands_beside_the_first_configuration():
     phases_ms = {"policy": 1.25, "physics": 2.0, "whole": 3.25}
     loop = {"agent_steps_per_s": 500.0, "agent_steps_per_s_range": [490.0, 510.0], "phase_ms_a_control_step": phases_ms, "cars": 16.0,
             "steps": 60, "repeats": 3}  # fmt: skip
-    text = report.beside({"baseline": loop, "rows": [{"name": "256 x 16", "scope": "training", "per_s": 250_000.0}]})
+    text = report.set_beside({"baseline": loop, "rows": [{"name": "256 x 16", "scope": "training", "per_s": 250_000.0}]})
     assert "500 agent steps/s (490 to 510, 3 repeats of 60 steps, 16 cars a world)" in text and "policy 1.2, physics 2.0." in text
     assert text.endswith("`256 x 16` (training) makes 500 times as many.")

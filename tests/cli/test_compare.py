@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from scenefactory_jax.cli.compare import compare
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
 
@@ -32,7 +32,7 @@ def run(folder, *, seed, dtype="float32", reached=(0.0, 0.2, 0.4, 0.6), agents=N
 
 
 def settings(*runs, **numbers):
-    config = load("compare", f"runs=[{','.join(map(str, runs))}]")
+    config = load_config("compare", f"runs=[{','.join(map(str, runs))}]")
     return config | {"metrics": list(METRICS), "window": 2, "last": 0.5, "bootstrap": 100} | numbers
 
 

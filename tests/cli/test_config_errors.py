@@ -25,7 +25,7 @@ COMMANDS = {"train": train, "bench": bench, "render": render, "scenes": scenes, 
 def refused(command, *overrides):
     """The message with which a command refuses a config; a run must not even begin a folder."""
     with pytest.raises((ConfigError, SceneError)) as caught:
-        COMMANDS[command](hydra_config.load(command, *overrides))
+        COMMANDS[command](hydra_config.load_config(command, *overrides))
     return str(caught.value)
 
 
@@ -52,11 +52,11 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
         written(folder, content, name)
     written(folder, whole, "good.json")
     written(folder, document(objects=[thing(0, speed=0)]), "goalless.json")
-    summary = convert(hydra_config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
+    summary = convert(hydra_config.load_config("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     printed = capsys.readouterr().out
     assert (summary.files, summary.scenes, len(summary.rejects)) == (8, 2, 6) and "2 scenes" in printed and "6 rejected" in printed
     assert "packing with these numbers refuses: 1 no agent left" in printed
-    account = scene_source.from_path(hydra_config.load("scenes", "scenes=womd")["scenes"], tmp_path / "bank").account
+    account = scene_source.from_path(hydra_config.load_config("scenes", "scenes=womd")["scenes"], tmp_path / "bank").account
     assert "goalless.json (street): tracks: no agent is left of 1: 1 too_short" in account and "refuses: 1 no agent left" in account
     reasons = {reject["source"]: reject["reason"] for reject in bank_reader.open(tmp_path / "bank").rejects}
     for name, (_, reason) in files.items():
@@ -67,18 +67,18 @@ def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
     far = thing(30, id=9)  # 150 m on in the one step that is left after the tenth
     far["position"] = [{"x": 30.0 + (150 if step == 11 else 0), "y": 0.0, "z": 0.0} for step in range(12)]
     path = written(tmp_path, document(objects=[thing(0, id=7, speed=40), far]))
-    summary = convert(hydra_config.load("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE))
+    summary = convert(hydra_config.load_config("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE))
     assert summary.agents_kept == 1 and summary.agents_dropped["goal_outside_box"] == 1
-    scene, report = bank_reader.packed(bank_reader.open(tmp_path / "bank"), [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = bank_reader.pack_scenes(bank_reader.open(tmp_path / "bank"), [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and scene.agents.present.sum() == 1
 
     alone = written(tmp_path, document(objects=[thing(0, kind="pedestrian"), far]), "alone.json")
     sized = [*HERE, f"source={alone}", f"out={tmp_path / 'none'}"]
-    summary = convert(hydra_config.load("convert", *sized))
+    summary = convert(hydra_config.load_config("convert", *sized))
     assert (summary.scenes, summary.agents_kept, summary.refused) == (1, 0, {"no_agent_left": 1})
     message = refused("train", "scenes=womd", f"scenes.path={tmp_path / 'none'}", f"out={tmp_path / 'run'}")
     assert "no agent is left of 2: 1 not_a_vehicle, 1 goal_outside_box" in message
-    unforced = hydra_config.load("scenes", "scenes=womd", "scenes.pack.require_agents=false")["scenes"]
+    unforced = hydra_config.load_config("scenes", "scenes=womd", "scenes.pack.require_agents=false")["scenes"]
     assert not scene_source.from_path(unforced, tmp_path / "none").scene.agents.present.any()
 
 
@@ -88,7 +88,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
     assert f"scenes.path={path}: no usable scene" in message and "1 too_short" in message and not (tmp_path / "run").exists()
     assert "scenes.path: null; give a bank, a scene file or a folder" in refused("train", "experiment=smoke", "scenes=womd")
     with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: 7 is the training seed"):
-        scene_source.heldout(hydra_config.load("train", "scenes.seed=7", "scenes.heldout.seed=7")["scenes"], path=None)
+        scene_source.load_heldout_scenes(hydra_config.load_config("train", "scenes.seed=7", "scenes.heldout.seed=7")["scenes"], path=None)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, 
 
 
 def test_a_mistake_in_the_config_is_no_scene_s_fault_in_a_stream():
-    source = batches.open(hydra_config.load("scenes", "scenes.pack.box_m=-1.0")["scenes"])
+    source = batches.open(hydra_config.load_config("scenes", "scenes.pack.box_m=-1.0")["scenes"])
     with pytest.raises(ConfigError, match=r"^scenes\.pack\.box_m: -1; wanted is a number above 0"):
         batches.measure(source, None, grid={"radius_m": None}, sample=1, headroom=1.0, given={}, seed=0)
 
@@ -118,11 +118,11 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     folder.mkdir()
     written(folder, document(name="../escaped"), "a.json")
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
-    loaded = scenes(hydra_config.load("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
+    loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
-    summary = convert(hydra_config.load("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
+    summary = convert(hydra_config.load_config("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair
     assert "b.json (\\ud800half): " in capsys.readouterr().out
 
@@ -149,12 +149,12 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
 )
 def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message):
     with pytest.raises(ConfigError, match=message):
-        hydra_config.load("train", override)
+        hydra_config.load_config("train", override)
 
 
 def test_an_unknown_config_is_named():
     with pytest.raises(ConfigError, match=r"no config 'fly'; valid: bench, compare, convert, drive, evaluate, .*train"):
-        hydra_config.load("fly")
+        hydra_config.load_config("fly")
 
 
 # ---- values that do not fit
@@ -221,16 +221,16 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
     ],
 )
 def test_a_wrong_value_of_a_part_is_named(override, message):
-    settings = hydra_config.load("train", "experiment=smoke", override)
+    settings = hydra_config.load_config("train", "experiment=smoke", override)
     with pytest.raises(ConfigError) as caught:
-        make_trainer(settings, environment.make(settings), make_policy(settings))
+        make_trainer(settings, environment.make_env(settings), make_policy(settings))
     assert message in str(caught.value)
 
 
 def test_a_config_from_python_is_checked_too(tmp_path):
-    settings = hydra_config.load("train", "experiment=smoke")
+    settings = hydra_config.load_config("train", "experiment=smoke")
     schema.check_train(settings | {"out": tmp_path})  # a path is as good as its text
     with pytest.raises(ConfigError, match="worlds: missing; the command needs name, out, resume, seed, worlds"):
         schema.check_train({name: value for name, value in settings.items() if name != "worlds"})
     with pytest.raises(ConfigError, match="group 'reward' is missing; an environment needs timing, controls"):
-        environment.make({name: value for name, value in settings.items() if name != "reward"})
+        environment.make_env({name: value for name, value in settings.items() if name != "reward"})

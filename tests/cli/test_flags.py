@@ -61,25 +61,25 @@ def test_help_says_what_a_command_is_for(called, capsys, command):
 
 
 def test_help_is_the_config_with_its_comments():
-    text = annotated_config.write("train", "weather=ice", "worlds=7")
-    assert yaml.safe_load(text) == hydra_config.load("train", "weather=ice", "worlds=7")
+    text = annotated_config.annotate("train", "weather=ice", "worlds=7")
+    assert yaml.safe_load(text) == hydra_config.load_config("train", "weather=ice", "worlds=7")
     told = {"devices: null # that share the worlds; null: all there are", "worlds: 7", "# weather=ice; or "}
     assert all(any(line.startswith(one) for line in text.splitlines()) for one in told)
     assert max(map(len, text.splitlines())) <= annotated_config.WIDTH
-    assert "run: ??? # folder that `train` or `export` wrote" in annotated_config.write("evaluate")
+    assert "run: ??? # folder that `train` or `export` wrote" in annotated_config.annotate("evaluate")
 
 
 def test_an_empty_mapping_empties_what_is_removed_first():
-    assert hydra_config.load("task", "~reward", "+reward={}")["reward"] == {}
-    assert hydra_config.load("task", "reward.idle=null")["reward"]["idle"] is None
+    assert hydra_config.load_config("task", "~reward", "+reward={}")["reward"] == {}
+    assert hydra_config.load_config("task", "reward.idle=null")["reward"]["idle"] is None
 
 
 def test_the_folder_of_a_sweeps_run_says_what_differs():
-    name = run_folder.fresh("wet", ["weather=dry", "ppo.gamma=0.97", "scenes.path=/a b/c", "+dynamics/fleet=sizes"]).name
+    name = run_folder.make_folder_name("wet", ["weather=dry", "ppo.gamma=0.97", "scenes.path=/a b/c", "+dynamics/fleet=sizes"]).name
     assert re.fullmatch(r"wet-weather_dry-gamma_0\.97-path_a_b_c-dynamics_fleet_sizes-\d{8}-\d{6}", name)
-    long = [run_folder.fresh("a", [f"scenes.path={'x' * 200}{end}"]).name for end in "12"]
+    long = [run_folder.make_folder_name("a", [f"scenes.path={'x' * 200}{end}"]).name for end in "12"]
     assert len(set(long)) == 2 and max(map(len, long)) <= len("a--20261125-010203") + run_folder.MOST
-    assert re.fullmatch(r"a-\d{8}-\d{6}", run_folder.fresh("a").name)
+    assert re.fullmatch(r"a-\d{8}-\d{6}", run_folder.make_folder_name("a").name)
 
 
 def test_the_bar_is_readable_in_80_columns():

@@ -25,7 +25,7 @@ from scenefactory_jax.visualization.report import study_report as report
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-STUDIES = sorted(path.stem for path in (hydra_config.folder() / "study").glob("*.yaml") if path.stem != "base")
+STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 TOY = {
     "base": ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observe.ego._target_=study_parts.ego"],
     "common": ["evaluation.every=1"],
@@ -49,7 +49,7 @@ ALONE |= {"figures": []}
 def toy(folder, *overrides, **changes):
     """A study of seconds, on generated scenes."""
     settings = [f"runs={folder / 'runs'}", f"out={folder / 'out'}", "seeds=[3,4]", "progress=false", "evaluation.bootstrap=20"]
-    found = hydra_config.load("study", "study=navigation", *settings, "evaluation.chunk_steps=30", *overrides)
+    found = hydra_config.load_config("study", "study=navigation", *settings, "evaluation.chunk_steps=30", *overrides)
     found["study"] = {**found["study"], **TOY, **changes}
     return found
 
@@ -218,7 +218,7 @@ def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch
 
 def test_what_another_command_trains_is_left_to_it(tmp_path, capsys):
     first, second = study_plan.make(toy(tmp_path, **ALONE)).trainings
-    with run_folder.opened({**first.config, "out": str(first.folder)}):
+    with run_folder.open_run_folder({**first.config, "out": str(first.folder)}):
         result = study(toy(tmp_path, **ALONE))
     assert "training all terms, seed 3: left to the command that trains in" in capsys.readouterr().out
     assert not command.is_trained(first) and command.is_trained(second) and result["rows"][0]["seeds"] == [4]
@@ -277,7 +277,7 @@ def test_wrong_keys_of_a_study_are_named(tmp_path, changes, message):
 
 def test_wrong_keys_of_the_command_are_named(tmp_path):
     with pytest.raises(ConfigError, match=r"Available options:.*friction.*navigation"):
-        hydra_config.load("study")
+        hydra_config.load_config("study")
     for override, message in {"only=[bicycle]": r"only: unknown 'bicycle'; valid: all terms", "seeds=[1,1]": r"seeds: \[1, 1\]"}.items():
         with pytest.raises(ConfigError, match=message):
             study(toy(tmp_path, override))
@@ -301,27 +301,27 @@ def steps_of(config):
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_is_whole(name, tmp_path):
     """Every training and judging builds, and whatever is compared or drawn is judged."""
-    entry = hydra_config.load("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
+    entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
     assert entry["study"]["protocols"] == ["invincible"] + ["strict"] * (name not in ONE_PROTOCOL)
     plan = study_plan.make(entry | {"test_scenes": "it's.bank", "study": {**entry["study"], "protocols": ["strict"]}})
     assert entry["study"]["seeds"] == [0, 1, 2] and plan.trainings and plan.judgings
     for built in {one.program: one.config for one in (*plan.trainings, *plan.judgings)}.values():
         assert built["scenes"]["path"] == "train.bank" and built["scenes"]["heldout"]["path"] == "it's.bank"
-        environment.parts_of(built | {"ends": hydra_config.load("task")["ends"]})
+        environment.make_parts(built | {"ends": hydra_config.load_config("task")["ends"]})
     assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
     assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
 
 
 def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
     """`recorded` and `strict` judge as navigation's first condition does, `paper` as its second: by name what the study spells out."""
-    entry = hydra_config.load("study", "study=navigation", f"runs={tmp_path}", "seeds=[0]")
+    entry = hydra_config.load_config("study", "study=navigation", f"runs={tmp_path}", "seeds=[0]")
     conditions = {"recorded": "original", "strict": "original", "paper": "original, from rest"}
     plan = study_plan.make(entry)
     for name, condition in conditions.items():
-        asked = hydra_config.load("evaluate", "run=x", f"protocol={name}")
+        asked = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
         rows = [one for one in plan.judgings if (one.row, one.condition) == ("rigid body", condition)]
         assert {one.protocol for one in rows} >= set(asked["protocol"]["ends"])
-        assert rows[0].config == hydra_config.amend(rows[0].training.config, asked["protocol"]["settings"])
+        assert rows[0].config == hydra_config.apply_overrides(rows[0].training.config, asked["protocol"]["settings"])
         assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
 
 
@@ -346,11 +346,11 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
     [("network", "experiment=smoke"), ("recipe", "experiment=quick,worlds=2"), ("network_laptop", "experiment=laptop,scenes.take.count=1")],
 )
 def test_networks_of_the_studies_fit_their_observations(name, base):
-    plan = study_plan.make(hydra_config.load("study", f"study={name}", "seeds=[0]", f"study.base=[{base},scenes.count=1]"))
-    scene = scene_source.training(plan.trainings[0].config["scenes"])[0]
+    plan = study_plan.make(hydra_config.load_config("study", f"study={name}", "seeds=[0]", f"study.base=[{base},scenes.count=1]"))
+    scene = scene_source.load_training_scenes(plan.trainings[0].config["scenes"])[0]
     networks = {json.dumps([one.config["observe"], one.config["policy"]]): one.config for one in plan.trainings}
     for entry in networks.values():
-        env, policy = environment.make(entry), training_loop.make_policy(entry)
+        env, policy = environment.make_env(entry), training_loop.make_policy(entry)
         seen = jax.eval_shape(env.reset, jax.random.key(0), scene)[1]
         jax.eval_shape(policy.init, jax.random.key(0), seen)
 
@@ -361,7 +361,7 @@ def test_networks_of_the_studies_fit_their_observations(name, base):
 def test_studies_share_what_they_train_alike(alike, tmp_path):
     same = set()
     for name, variant in alike.items():
-        entry = hydra_config.load("study", f"study={name}", f"runs={tmp_path}", "seeds=[1]")
+        entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "seeds=[1]")
         entry["study"]["trainings"] = {variant: entry["study"]["trainings"][variant]}
         plan = study_plan.make(entry | {"study": {**entry["study"], "compare": [], "trend": None, "floors": {}}})
         same |= {one.digest for one in plan.trainings}
@@ -369,14 +369,16 @@ def test_studies_share_what_they_train_alike(alike, tmp_path):
 
 
 def test_later_overrides_win():
-    assert study_plan.later_wins(["a=1", "b.c=2", "a=3", "~d", "+b.c=4"]) == ["a=3", "~d", "+b.c=4"]
+    assert study_plan.merge_overrides(["a=1", "b.c=2", "a=3", "~d", "+b.c=4"]) == ["a=3", "~d", "+b.c=4"]
 
 
 # ---- subsets of scenes
 
 
 def test_fewer_scenes_of_one_seed_are_a_part_of_more():
-    load = lambda *own: scene_source.training(hydra_config.load("train", "experiment=smoke", "scenes.count=4", *own)["scenes"])  # noqa: E731
+    load = lambda *own: scene_source.load_training_scenes(
+        hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]
+    )
     everything = load()
     some = [set(load("seed=5", f"scenes.take.count={count}").names) for count in (1, 2, 3)]
     assert [len(names) for names in some] == [1, 2, 3] and some[0] < some[1] < some[2] < set(everything.names)
@@ -386,4 +388,4 @@ def test_fewer_scenes_of_one_seed_are_a_part_of_more():
     assert shapes[0] == shapes[1]  # so that programs are the same
     with pytest.raises(ConfigError, match=r"scenes\.take\.count: 7, but there are 4 scenes"):
         load("scenes.take.count=7")
-    assert json.dumps(hydra_config.load("train")["scenes"]["take"]) == '{"count": null, "seed": 0}'
+    assert json.dumps(hydra_config.load_config("train")["scenes"]["take"]) == '{"count": null, "seed": 0}'

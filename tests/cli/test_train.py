@@ -28,7 +28,7 @@ from scenefactory_jax.cli.render import render
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock, result_file
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
@@ -76,8 +76,8 @@ def test_a_run_folder_holds_what_it_promises(whole):
 
 
 def test_the_untrained_policy_is_the_one_that_training_began_with(whole):
-    scenes, trainer = scene_source.training(whole.config["scenes"]), make_trainer(whole.config, whole.env, whole.policy)
-    worlds, _ = scene_source.assign(scenes, whole.config["worlds"], seed=whole.config["seed"])
+    scenes, trainer = scene_source.load_training_scenes(whole.config["scenes"]), make_trainer(whole.config, whole.env, whole.policy)
+    worlds, _ = scene_source.assign_scenes(scenes, whole.config["worlds"], seed=whole.config["seed"])
     begun = trainer.init(jax.random.key(whole.config["seed"]), worlds).parameters
     jax.tree.map(np.testing.assert_array_equal, policy_io.draw_untrained(whole.config, scenes[0]), begun)
 
@@ -112,7 +112,7 @@ def test_the_report_compares_and_its_files_are_there(whole):
 
 
 def test_the_report_shows_the_worst_of_every_kind_of_failure(whole):
-    ranked = failures.of(agent_metrics.read_csv(whole.folder / "agents-strict.csv"))
+    ranked = failures.rank_failures(agent_metrics.read_csv(whole.folder / "agents-strict.csv"))
     told = json.loads((whole.folder / "failures.json").read_text())
     assert set(told) == {"strict", "strict, untrained"}
     assert {kind: len(found) for kind, found in ranked.items()} == {k: entry["agents"] for k, entry in told["strict"]["kinds"].items()}
@@ -125,14 +125,14 @@ def test_the_report_shows_the_worst_of_every_kind_of_failure(whole):
 
 
 def test_every_spawned_agent_has_a_record(whole):
-    heldout = scene_source.heldout(whole.config["scenes"], path=None)
+    heldout = scene_source.load_heldout_scenes(whole.config["scenes"], path=None)
     present = np.asarray(heldout.scene.agents.present)
     for name in ("strict", "strict-untrained"):
         records = agent_metrics.read_csv(whole.folder / f"agents-{name}.csv")
         assert len(records["scene"]) == present.sum()
         assert list(zip(records["world"], records["agent"], strict=True)) == list(zip(*np.nonzero(present), strict=True))
         assert set(records["scene"]) == set(heldout.names)
-    seen = scene_source.training(whole.config["scenes"]).scene.agents.position
+    seen = scene_source.load_training_scenes(whole.config["scenes"]).scene.agents.position
     assert not any(np.array_equal(one, other) for one in seen for other in heldout.scene.agents.position)
 
 
@@ -178,14 +178,14 @@ def test_what_does_not_go_on_changes_nothing(whole, tmp_path):
         train(smoke(tmp_path / "run"))
     (tmp_path / "aside").rename(tmp_path / "run" / "checkpoints")
     free = ["iterations=9", "checkpoint_every=3", "loggers=[]", "evaluation.seed=3", "scenes.heldout.count=2", "scenes.workers=2", "name=b"]
-    with run_folder.opened(smoke(tmp_path / "run", "resume=true", *free)) as (_, goes_on):
+    with run_folder.open_run_folder(smoke(tmp_path / "run", "resume=true", *free)) as (_, goes_on):
         assert goes_on
 
 
 def test_one_command_at_a_time_trains_in_a_folder(tmp_path):
     settings = smoke(tmp_path / "a" / "run")
     refused = pytest.raises(folder_lock.Busy, match="another command writes there now")
-    with run_folder.opened(settings), refused, run_folder.opened(settings):
+    with run_folder.open_run_folder(settings), refused, run_folder.open_run_folder(settings):
         pass
     (tmp_path / "a" / "run").rmdir()  # no lock is left
 
@@ -193,11 +193,11 @@ def test_one_command_at_a_time_trains_in_a_folder(tmp_path):
 def test_a_training_that_cannot_begin_removes_what_it_made_and_nothing_else(tmp_path):
     (tmp_path / "mine" / "empty").mkdir(parents=True)
     for place in ("mine/empty", "mine/new/run"):
-        with pytest.raises(KeyError), run_folder.opened(smoke(tmp_path / place)):
+        with pytest.raises(KeyError), run_folder.open_run_folder(smoke(tmp_path / place)):
             raise KeyError
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["empty", "mine"]
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"out=\S+file: is a file"), run_folder.opened(smoke(tmp_path / "file")):
+    with pytest.raises(ConfigError, match=r"out=\S+file: is a file"), run_folder.open_run_folder(smoke(tmp_path / "file")):
         pass
 
 
@@ -232,7 +232,7 @@ def test_a_signal_to_stop_keeps_the_iteration_that_it_falls_into(whole, interrup
 
 def test_a_second_interrupt_ends_at_once_and_what_is_ignored_stays_so(interruptible):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under `nohup`
-    with interrupt.deferred() as asked:
+    with interrupt.defer_interrupt() as asked:
         signal.raise_signal(signal.SIGHUP)
         assert asked() is None
         signal.raise_signal(signal.SIGTERM)
@@ -258,7 +258,7 @@ def test_held_out_scenes_are_refused_before_anything_is_read(tmp_path):
 
 
 def asked(run, out, *overrides):
-    return hydra_config.load("evaluate", f"run={run.folder}", f"out={out}", "chunk_steps=30", "bootstrap=100", *overrides)
+    return hydra_config.load_config("evaluate", f"run={run.folder}", f"out={out}", "chunk_steps=30", "bootstrap=100", *overrides)
 
 
 def judged(run, out, *overrides):
@@ -268,7 +268,7 @@ def judged(run, out, *overrides):
 def told(report: Path):
     """The config of the command with which a report says that its numbers are made again."""
     [line] = re.findall(r"^python -m scenefactory_jax evaluate (.*)$", report.read_text(), re.MULTILINE)
-    return hydra_config.load("evaluate", *shlex.split(line))
+    return hydra_config.load_config("evaluate", *shlex.split(line))
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
@@ -280,7 +280,10 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
     kept = [file.name for file in sorted(first.folder.glob("agents-*.csv"))]
     result_file.begin(first.folder, {"scenes": None})  # as the next evaluation does
     assert kept == ["agents-invincible.csv", "agents-strict.csv"] and [file.name for file in first.folder.iterdir()] == ["judged.json"]
-    assert result_file.judged(second.folder)["protocols"] == ["invincible"] and result_file.judged(second.folder)["seed"] == 1000
+    assert (
+        result_file.read_evaluated(second.folder)["protocols"] == ["invincible"]
+        and result_file.read_evaluated(second.folder)["seed"] == 1000
+    )
     ended = strict["collided"] | strict["crashed"] | strict["touched_edge"]
     assert ended.any() and (invincible["time_s"] >= strict["time_s"]).all()
 
@@ -303,13 +306,13 @@ def test_other_settings_of_a_run(whole, tmp_path):
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
     with pytest.raises(ConfigError, match=r"is no run: it has no config\.yaml"):
-        evaluate(hydra_config.load("evaluate", f"run={tmp_path}"))
+        evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
 def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     """Judged alike, also by name as one of the package's own, and without a word about where scenes lay."""
     told = ["card.about='For tests.'", f"card.judged={{unseen roads: {whole.folder}}}"]
-    kept = export(hydra_config.load("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}", *told))
+    kept = export(hydra_config.load_config("export", f"run={whole.folder}", f"out={tmp_path / 'pretrained' / 'handy'}", *told))
     files = ["README.md", "checkpoints/policy.npz", "config.yaml", "versions.yaml"]
     assert sorted(str(one.relative_to(kept)) for one in kept.rglob("*.*")) == files
     card, last = (kept / "README.md").read_text(), metrics_csv.read(whole.folder)[-1]
@@ -326,16 +329,16 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     assert trained.folder == kept and trained.config["observe"] == whole.config["observe"]
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
     again = evaluate(
-        hydra_config.load("evaluate", "run=handy", "protocol.ends=[strict]", "video.enable=false", "failures.pictures.enable=false")
+        hydra_config.load_config("evaluate", "run=handy", "protocol.ends=[strict]", "video.enable=false", "failures.pictures.enable=false")
     )
     assert again.folder == Path("runs/handy/evaluation")
     assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
     with pytest.raises(ConfigError, match=r"hand is no run: .*, or one of the package's own: handy"):
         scenefactory_jax.load_policy("hand")
     with pytest.raises(ConfigError, match=r"card\.judged\.nothing: \S+ holds no records of agents; give a folder that `evaluate` wrote"):
-        export(hydra_config.load("export", "run=handy", f"out={tmp_path / 'other'}", f"card.judged={{nothing: {tmp_path}}}"))
+        export(hydra_config.load_config("export", "run=handy", f"out={tmp_path / 'other'}", f"card.judged={{nothing: {tmp_path}}}"))
     with pytest.raises(ConfigError, match="holds something already; give a new folder"):
-        export(hydra_config.load("export", "run=handy", f"out={whole.folder}"))
+        export(hydra_config.load_config("export", "run=handy", f"out={whole.folder}"))
 
 
 def test_scores_and_titles_name_other_scenes(whole, tmp_path):
@@ -345,7 +348,9 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
     assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
     assert named("unseen", whole.folder) == "unseen"
     assert evaluation_files.title("mine", asked) == "mine: evaluation on towns.bank"
-    assert evaluation_files.again(asked, hydra_config.load("evaluate", "run=mine", "protocol=recorded", "seed=7")) == (
+    assert evaluation_files.format_rerun_command(
+        asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")
+    ) == (
         "python -m scenefactory_jax evaluate run=mine protocol=recorded trust=true scenes.path=/data/towns.bank"
         " 'overrides=[\"dynamics=bicycle\"]' seed=7"
     )
@@ -355,11 +360,11 @@ def test_a_damaged_config_is_named(tmp_path):
     for content, message in {"": "holds no config of a run", "- 1": "holds no config", "a: [1": "damaged: while parsing"}.items():
         (tmp_path / "config.yaml").write_text(content)
         with pytest.raises(ConfigError, match=message):
-            evaluate(hydra_config.load("evaluate", f"run={tmp_path}"))
+            evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
 def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
-    page = replay(hydra_config.load("replay", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
+    page = replay(hydra_config.load_config("replay", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
     head = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))
     records = agent_metrics.read_csv(whole.folder / "agents-strict.csv")
     assert head["title"] == whole.folder.name and [one["name"] for one in head["worlds"]] == list(dict.fromkeys(records["scene"]))
@@ -372,7 +377,7 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
         assert all(records[event["name"]][rows[event["car"]]] for event in shown["events"])
         assert sum(event["name"] == "reached" for event in shown["events"]) == sum(records["reached"][row] for row in rows.values())
     with pytest.raises(ConfigError, match=r"dynamics: decided by the run .*; to change it: overrides='\[dynamics=\.\.\.\]'"):
-        replay(hydra_config.load("replay", f"run={whole.folder}", "dynamics=mjx_car"))
+        replay(hydra_config.load_config("replay", f"run={whole.folder}", "dynamics=mjx_car"))
 
 
 # ---- convert -> bank -> train
@@ -380,7 +385,9 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
 
 def trained_on_bank(source, folder):
     """Convert, train on the bank, and hand back the conversion's summary and the run."""
-    summary = convert(hydra_config.load("convert", f"source={source}", f"out={folder / 'bank'}", "progress=false", "scenes.pack.agents=4"))
+    summary = convert(
+        hydra_config.load_config("convert", f"source={source}", f"out={folder / 'bank'}", "progress=false", "scenes.pack.agents=4")
+    )
     run = train(smoke(folder / "run", "scenes=womd", f"scenes.path={folder / 'bank'}", *CAPACITY))
     assert len(bank_reader.open(folder / "bank")) == summary.scenes == 2
     assert len(run.metrics) == 2 and all(np.isfinite(value) for row in run.metrics for value in row.values())
@@ -431,18 +438,18 @@ def test_compiled_programs_are_kept_where_the_environment_says(monkeypatch, tmp_
 
 
 def test_scenes_lists_and_draws(tmp_path, capsys):
-    loaded = scenes(hydra_config.load("scenes", "op=sheet", "scenes.count=3", "limit=2", f"out={tmp_path}"))
+    loaded = scenes(hydra_config.load_config("scenes", "op=sheet", "scenes.count=3", "limit=2", f"out={tmp_path}"))
     printed = capsys.readouterr().out
     assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "3 generated scenes" in printed
     assert sorted(path.stem for path in tmp_path.glob("*.png")) == sorted([*loaded.names[:2], "sheet"])
     with pytest.raises(ConfigError, match="op: 'draw'; valid: check, sheet"):
-        scenes(hydra_config.load("scenes", "op=draw"))
+        scenes(hydra_config.load_config("scenes", "op=draw"))
 
 
 def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
     import mujoco
 
-    settings = hydra_config.load("render", "scenes.count=1", f"out={tmp_path}", "weather=split")
+    settings = hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", "weather=split")
     monkeypatch.setattr(rendering, "photograph", lambda model, **size: np.zeros((4, 6, 3), np.uint8))
     xml = render(settings)
     assert {str(xml), str(tmp_path / "mujoco.png")} <= set(capsys.readouterr().out.replace(": ", "\n").split("\n"))
@@ -456,7 +463,7 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
     assert render(settings) == xml and "no OpenGL through egl here" in capsys.readouterr().out
     for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: mjx_car"}.items():
         with pytest.raises(ConfigError, match=message):
-            render(hydra_config.load("render", "scenes.count=1", f"out={tmp_path}", override))
+            render(hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", override))
 
 
 # ---- command line
@@ -484,7 +491,7 @@ def test_only_our_own_command_line_counts_as_a_command(monkeypatch):
     called = {"/lib/scenefactory_jax/__main__.py train": "python -m scenefactory_jax train a=1", "/home/me/train.py": "train(config)"}
     for program, command in called.items():
         monkeypatch.setattr(sys, "argv", [program, "a=1", "out=x"])
-        assert hydra_config.command("train") == command
+        assert hydra_config.format_command("train") == command
 
 
 def test_a_wrong_key_ends_as_one_line():
@@ -527,7 +534,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
 
     def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load(config_name, *arguments[1:])))
+        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
 
     monkeypatch.setattr("hydra.main", composing)
     with pytest.raises(SystemExit) as stopped:
@@ -542,16 +549,16 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 
 def options():
     others = ("experiment", "protocol", "spread", "study", "suite", "sysid", "validation")
-    groups = [folder for folder in sorted(hydra_config.folder().iterdir()) if folder.is_dir() and folder.name not in others]
+    groups = [folder for folder in sorted(hydra_config.find_conf().iterdir()) if folder.is_dir() and folder.name not in others]
     return [f"{folder.name}={path.stem}" for folder in groups for path in sorted(folder.glob("*.yaml")) if path.stem != "base"]
 
 
 def builds(whole_config):
-    env, policy = environment.make(whole_config), make_policy(whole_config)
+    env, policy = environment.make_env(whole_config), make_policy(whole_config)
     assert make_trainer(whole_config, env, policy).iterate
-    assert {"gpudrive", "scenefactory"} <= set(scene_source.readers(whole_config["scenes"])["formats"])
+    assert {"gpudrive", "scenefactory"} <= set(scene_source.make_readers(whole_config["scenes"])["formats"])
     if scene_source.has_heldout(whole_config["scenes"]):
-        build(
+        instantiate(
             whole_config["scenes"]["generate"],
             builtins="scenefactory_jax.data.generators.procedural.procedural_scene",
             where="scenes.generate",
@@ -562,24 +569,26 @@ def builds(whole_config):
 def test_every_option_builds(option):
     lean = [] if option.startswith("dynamics=") else ["dynamics=bicycle"]
     if option == "policy=seeker":  # learns nothing: it is judged in place of a policy
-        builds(hydra_config.amend(hydra_config.load("train", *lean), [option]))
+        builds(hydra_config.apply_overrides(hydra_config.load_config("train", *lean), [option]))
     else:
-        builds(hydra_config.load("train", option, *lean))
+        builds(hydra_config.load_config("train", option, *lean))
 
 
 def names(group):
-    return sorted(path.stem for path in (hydra_config.folder() / group).glob("*.yaml"))
+    return sorted(path.stem for path in (hydra_config.find_conf() / group).glob("*.yaml"))
 
 
 @pytest.mark.parametrize("name", names("spread"))
 def test_every_way_to_spread_work_builds(name):
-    build(hydra_config.load("convert", f"spread={name}")["spread"], builtins="scenefactory_jax.core.parallel.task_map", where="spread")
+    instantiate(
+        hydra_config.load_config("convert", f"spread={name}")["spread"], builtins="scenefactory_jax.core.parallel.task_map", where="spread"
+    )
 
 
 @pytest.mark.parametrize("name", names("suite"))
 def test_what_a_suite_says_counts(name):
-    said = {key: value for key, value in OmegaConf.load(hydra_config.folder() / "suite" / f"{name}.yaml").items() if key != "defaults"}
-    found = hydra_config.load("bench", f"suite={name}")
+    said = {key: value for key, value in OmegaConf.load(hydra_config.find_conf() / "suite" / f"{name}.yaml").items() if key != "defaults"}
+    found = hydra_config.load_config("bench", f"suite={name}")
     assert said["variants"].keys() <= found["variants"].keys()
     assert {key: found[key] for key in said if key != "variants"} == {key: said[key] for key in said if key != "variants"}
 
@@ -590,10 +599,10 @@ RUNS = (["experiment=quick", "scenes=womd"], ["experiment=published", "dynamics=
 @pytest.mark.parametrize("name", names("protocol"))
 def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(name):
     """Two runs with nothing in common are judged alike; `trained` leaves each as it is."""
-    settings = hydra_config.load("evaluate", "run=x", f"protocol={name}")
+    settings = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
     schema.check_evaluate(settings)
-    runs = [hydra_config.load("train", *words) for words in RUNS]
-    judged = [hydra_config.amend(run, settings["protocol"]["settings"]) for run in runs]
+    runs = [hydra_config.load_config("train", *words) for words in RUNS]
+    judged = [hydra_config.apply_overrides(run, settings["protocol"]["settings"]) for run in runs]
     assert settings["protocol"]["name"] == name and (settings["seed"], settings["repeats"]) == (1000, 1)
     if name == "trained":
         assert judged == runs
@@ -601,14 +610,14 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     own = ("observe", "controls", "ends")  # what the policy learnt to see and to do; how agents end is `protocol.ends`
     for group in set(environment.GROUPS) - set(own):
         assert judged[0][group] == judged[1][group], group
-    assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load("train", "scenes=womd")["scenes"]["pack"]
+    assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load_config("train", "scenes=womd")["scenes"]["pack"]
     told = circumstances.describe(judged[0])
     assert told["Starts"] == ("as recorded, from rest" if name == "paper" else "as recorded, at the recorded speed")
     assert (told["Weather"], told["Background traffic"]) == ("AC 0 mm", "none") and told["Dynamics"].startswith("`mjx_car`")
 
 
 def test_episodes_are_described():
-    tell = lambda *words: circumstances.describe(hydra_config.load("train", *words))  # noqa: E731
+    tell = lambda *words: circumstances.describe(hydra_config.load_config("train", *words))  # noqa: E731
     found = tell("spawn=varied", "weather=storm", "others=replay", "dynamics=bicycle", "scenes=town")
     along = "40% somewhere on the recorded way; 40% random, start and goal along lanes"
     assert found["Starts"] == f"20% as recorded, from rest; {along}" and found["Dynamics"] == "`bicycle`"
@@ -620,5 +629,5 @@ def test_episodes_are_described():
 
 @pytest.mark.parametrize("name", names("experiment"))
 def test_every_experiment_builds(name):
-    builds(hydra_config.load("train", f"experiment={name}"))
-    assert hydra_config.load("bench", f"experiment={name}")["ppo"] == hydra_config.load("train", f"experiment={name}")["ppo"]
+    builds(hydra_config.load_config("train", f"experiment={name}"))
+    assert hydra_config.load_config("bench", f"experiment={name}")["ppo"] == hydra_config.load_config("train", f"experiment={name}")["ppo"]

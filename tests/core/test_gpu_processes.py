@@ -11,7 +11,7 @@ from scenefactory_jax.core.parallel import gpu_processes
 
 
 def work(index, pieces, folder):
-    claims = gpu_processes.Claims(folder)
+    claims = gpu_processes.TaskClaims(folder)
     return {"taken": [one for one in pieces if claims.take(one)], "sees": os.environ[gpu_processes.VISIBLE], "index": index}
 
 
@@ -44,7 +44,7 @@ def until(true, *, seconds=60.0):
 
 def leading(folder):
     try:
-        gpu_processes.run(beating, 2, folder)
+        gpu_processes.run_on_gpus(beating, 2, folder)
     finally:
         (folder / "gathered").touch()
 
@@ -52,16 +52,16 @@ def leading(folder):
 def test_each_piece_is_done_once_and_each_process_sees_a_gpu_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv(gpu_processes.VISIBLE, "4,GPU-7a")
     pieces = [f"piece-{index}" for index in range(40)]
-    answers = gpu_processes.run(work, 2, pieces, tmp_path)
+    answers = gpu_processes.run_on_gpus(work, 2, pieces, tmp_path)
     assert sorted(one for answer in answers for one in answer["taken"]) == sorted(pieces)
     assert [answer["sees"] for answer in answers] == ["4", "GPU-7a"] and os.environ[gpu_processes.VISIBLE] == "4,GPU-7a"
     monkeypatch.delenv(gpu_processes.VISIBLE)
-    assert gpu_processes.run(work, 1, [], tmp_path)[0]["sees"] == "0" and gpu_processes.VISIBLE not in os.environ
+    assert gpu_processes.run_on_gpus(work, 1, [], tmp_path)[0]["sees"] == "0" and gpu_processes.VISIBLE not in os.environ
 
 
 def test_a_failing_process_is_told_once_the_others_have_ended(tmp_path, capfd):
     with pytest.raises(RuntimeError, match="1 of 2 processes ended with an error"):
-        gpu_processes.run(failing, 2, tmp_path)
+        gpu_processes.run_on_gpus(failing, 2, tmp_path)
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
 
 
@@ -89,35 +89,35 @@ def test_nobody_computes_on_when_the_first_is_ended(how, tmp_path):
 def test_more_processes_than_gpus_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv(gpu_processes.VISIBLE, "0")
     with pytest.raises(RuntimeError, match="`processes` is at most 1"):
-        gpu_processes.run(work, 2, [], tmp_path)
+        gpu_processes.run_on_gpus(work, 2, [], tmp_path)
 
 
 def test_processes_that_share_a_gpu_share_its_memory(tmp_path, monkeypatch):
     monkeypatch.setenv(gpu_processes.VISIBLE, "4,5")
     monkeypatch.delenv(gpu_processes.MEMORY, raising=False)
-    answers = gpu_processes.run(surrounded, 3, tmp_path, per_gpu=2)
+    answers = gpu_processes.run_on_gpus(surrounded, 3, tmp_path, per_gpu=2)
     assert answers == [["4", "0.450"], ["4", "0.450"], ["5", "0.450"]] and gpu_processes.MEMORY not in os.environ
     with pytest.raises(RuntimeError, match="`processes` is at most 4"):
-        gpu_processes.run(surrounded, 5, tmp_path, per_gpu=2)
+        gpu_processes.run_on_gpus(surrounded, 5, tmp_path, per_gpu=2)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not bind processes to cores")
 def test_without_a_gpu_each_process_has_a_core(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     own = sorted(os.sched_getaffinity(0))
-    assert gpu_processes.run(cores, 3, tmp_path) == [[own[index % len(own)]] for index in range(3)]
+    assert gpu_processes.run_on_gpus(cores, 3, tmp_path) == [[own[index % len(own)]] for index in range(3)]
     assert sorted(os.sched_getaffinity(0)) == own
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
-    assert gpu_processes.run(cores, 1, tmp_path) == [own]
+    assert gpu_processes.run_on_gpus(cores, 1, tmp_path) == [own]
 
 
 def test_alone_all_is_ones_own_once():
-    claims = gpu_processes.Claims(None)
+    claims = gpu_processes.TaskClaims(None)
     assert claims.take("piece") and not claims.take("piece") and claims.take("another")
 
 
 def test_each_begins_with_groups_that_nobody_has_begun_and_helps_at_the_end(tmp_path):
     groups = {"wide": ["a", "b"], "narrow": ["c"], "deep": ["d"]}
-    first, second = (gpu_processes.Claims(tmp_path).shares(groups) for _ in range(2))
+    first, second = (gpu_processes.TaskClaims(tmp_path).shares(groups) for _ in range(2))
     assert [next(first)[0], next(second)[0], next(first)[0]] == ["wide", "narrow", "deep"]
     assert [name for name, _ in second] == list(groups) == [name for name, _ in first]

@@ -5,7 +5,7 @@ import types
 
 import pytest
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number
+from scenefactory_jax.core.instantiate import ConfigError, check_number, instantiate
 from scenefactory_jax.env import rewards
 
 
@@ -25,7 +25,7 @@ ENTRY = {"_target_": "scale", "factor": 2, "steps": 3, "names": ["a"]}
 
 
 def test_binds_numbers_and_context():
-    assert build(ENTRY, builtins=_module(), where="x", dt=0.5)(1.0) == 6.5
+    assert instantiate(ENTRY, builtins=_module(), where="x", dt=0.5)(1.0) == 6.5
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_binds_numbers_and_context():
 )
 def test_refuses_by_name(change, message):
     with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
-        build({**ENTRY, **change}, builtins=_module(), where="x")
+        instantiate({**ENTRY, **change}, builtins=_module(), where="x")
 
 
 IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env.rewards.Mapping", "event.func", ".event", ""]
@@ -51,17 +51,17 @@ IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env
 @pytest.mark.parametrize("target", IMPORTED)
 def test_a_part_is_what_a_module_defines_not_what_it_imports(target):
     with pytest.raises(ConfigError, match=r"^x\._target_: "):
-        build({"_target_": target}, builtins=rewards, where="x")
+        instantiate({"_target_": target}, builtins=rewards, where="x")
 
 
 def test_missing_key_lists_what_is_needed():
     with pytest.raises(ConfigError, match=r"x.factor: missing; scale needs dt, factor, names, steps"):
-        build({"_target_": "scale", "steps": 1, "names": []}, builtins=_module(), where="x")
+        instantiate({"_target_": "scale", "steps": 1, "names": []}, builtins=_module(), where="x")
 
 
 def test_a_context_value_is_no_key():
     with pytest.raises(ConfigError, match=r"x.dt: unknown key"):
-        build({**ENTRY, "dt": 1.0}, builtins=_module(), where="x", dt=0.5)
+        instantiate({**ENTRY, "dt": 1.0}, builtins=_module(), where="x", dt=0.5)
 
 
 @pytest.mark.parametrize(

@@ -19,13 +19,13 @@ def interrupted(seconds):
 
 
 def test_an_interrupt_is_for_the_process_that_started_them():
-    with process_pool.pool(1) as processes:
+    with process_pool.open_pool(1) as processes:
         assert processes.submit(interrupted, 0.2).result(timeout=120) == "done"
 
 
 def lead(beat):
     """Starts a worker that works on and on, and tells it by a file."""
-    with process_pool.pool(1) as processes:
+    with process_pool.open_pool(1) as processes:
         processes.submit(beats, beat).result()
 
 
@@ -59,7 +59,7 @@ def until(true, seconds=120.0):
 
 
 def test_an_error_ends_them_whatever_they_are_at():
-    with pytest.raises(KeyboardInterrupt), process_pool.mapping(2) as over:
+    with pytest.raises(KeyboardInterrupt), process_pool.map_tasks(2) as over:
         results = iter(over(interrupted, [0.0, 600.0, 600.0, 600.0]))
         assert next(results) == "done"
         begun = time.monotonic()

@@ -9,7 +9,7 @@ import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config, view
 from scenefactory_jax.cli.compare import _read
 from scenefactory_jax.cli.export import export
-from scenefactory_jax.cli.view import of_run
+from scenefactory_jax.cli.view import load_run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation.protocols import evaluate
@@ -60,10 +60,10 @@ def test_a_run_names_parts_of_the_package_alone(folder, target):
     "door",
     [
         lambda run, out: sf.load_policy(run),
-        lambda run, out: export(hydra_config.load("export", f"run={run}", f"out={out}")),
-        lambda run, out: evaluate(hydra_config.load("evaluate", f"run={run}", f"out={out}")),
-        lambda run, out: view.replay(hydra_config.load("replay", f"run={run}", f"out={out}.html")),
-        lambda run, out: of_run(hydra_config.load("drive", f"run={run}"), command="drive"),
+        lambda run, out: export(hydra_config.load_config("export", f"run={run}", f"out={out}")),
+        lambda run, out: evaluate(hydra_config.load_config("evaluate", f"run={run}", f"out={out}")),
+        lambda run, out: view.replay(hydra_config.load_config("replay", f"run={run}", f"out={out}.html")),
+        lambda run, out: load_run_config(hydra_config.load_config("drive", f"run={run}"), command="drive"),
     ],
     ids=["load_policy", "export", "evaluate", "replay", "drive"],
 )
@@ -80,24 +80,24 @@ def test_what_is_trusted_is_named_and_runs(folder, tmp_path, capsys):
     trained = sf.load_policy(folder, trust=True)
     assert (folder / "ran").exists() and trained.config["policy"]["_target_"] == "planted.make"
     assert f"{folder / 'config.yaml'}: trusted, and runs planted.make (policy._target_)\n" == capsys.readouterr().out
-    kept = export(hydra_config.load("export", f"run={folder}", f"out={tmp_path / 'mine'}", "trust=true"))
+    kept = export(hydra_config.load_config("export", f"run={folder}", f"out={tmp_path / 'mine'}", "trust=true"))
     assert "names functions outside of scenefactory_jax: `planted.make`." in (kept / "README.md").read_text()
     with pytest.raises(ConfigError, match=r"policy\._target_: 'planted\.make'"):
         sf.load_policy(kept)
 
 
 def test_a_policy_of_the_package_needs_no_trust(capsys):
-    assert trusted_targets.outside(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
+    assert trusted_targets.find_outside_targets(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
     assert policy_card._code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
 
 
 def test_whatever_a_training_can_choose_may_be_named():
-    whole = hydra_config.load("train")
-    groups = [group for group in whole if (hydra_config.folder() / group).is_dir()]
-    files = [file for group in groups for file in (hydra_config.folder() / group).rglob("*.yaml")]
+    whole = hydra_config.load_config("train")
+    groups = [group for group in whole if (hydra_config.find_conf() / group).is_dir()]
+    files = [file for group in groups for file in (hydra_config.find_conf() / group).rglob("*.yaml")]
     assert {"dynamics", "reward", "observe", "scenes", "policy", "loggers", "weather"} <= set(groups) and len(files) > 40
-    for name in [*files, hydra_config.folder() / "formats.yaml"]:
-        assert trusted_targets.outside(yaml.safe_load(name.read_text()) or {}) == {}, name
+    for name in [*files, hydra_config.find_conf() / "formats.yaml"]:
+        assert trusted_targets.find_outside_targets(yaml.safe_load(name.read_text()) or {}) == {}, name
 
 
 def test_yaml_that_names_itself_is_read_once(tmp_path):
@@ -109,17 +109,20 @@ def test_yaml_that_names_itself_is_read_once(tmp_path):
 
 def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path, capsys):
     mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
-    before = hydra_config.load("train", mine, f"out={tmp_path}")
+    before = hydra_config.load_config("train", mine, f"out={tmp_path}")
     hydra_config.write(tmp_path, before)
-    with run_folder.opened(before | {"resume": True}) as (folder, resume):  # what is built is the command's config, never the folder's
+    with run_folder.open_run_folder(before | {"resume": True}) as (
+        folder,
+        resume,
+    ):  # what is built is the command's config, never the folder's
         assert folder == tmp_path and not resume
     assert capsys.readouterr().out == f"{tmp_path} has no checkpoint to go on from: the run begins anew\n"
-    other = hydra_config.load("train", f"out={tmp_path}", "resume=true")
-    with pytest.raises(ConfigError, match=r"reward\.mine=None"), run_folder.opened(other):
+    other = hydra_config.load_config("train", f"out={tmp_path}", "resume=true")
+    with pytest.raises(ConfigError, match=r"reward\.mine=None"), run_folder.open_run_folder(other):
         pass
 
 
 def test_runs_are_compared_without_trust(tmp_path):
-    hydra_config.write(tmp_path, hydra_config.load("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
+    hydra_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
     (tmp_path / "metrics.csv").write_text("iteration\n1\n")
     assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"

@@ -63,10 +63,10 @@ def put(file, content):
 
 
 def outcome(path, wanted, file):
-    """"same" if every scene comes as it was written, "refused" if one line names the damaged file; nothing else may happen."""
+    """ "same" if every scene comes as it was written, "refused" if one line names the damaged file; nothing else may happen."""
     try:
         opened = bank_reader.open(path)
-        found = [arrow_codec.encode(raw) for raw in bank_reader.raws(opened, range(len(opened)))]
+        found = [arrow_codec.encode(raw) for raw in bank_reader.read_raws(opened, range(len(opened)))]
     except SceneError as error:
         assert file.name in str(error) and "\n" not in str(error) and len(str(error)) < 500, error
         return "refused"
@@ -121,7 +121,7 @@ def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, sc
     put(two, sizes[0])
     assert outcome(path, wanted, one) == "refused"
     with pytest.raises(SceneError, match=r"^/.*/scenes-00000\.arrow: "):
-        bank_reader.packed(bank_reader.open(path), [0], check=checker(), pack=packer(), workers=1)
+        bank_reader.pack_scenes(bank_reader.open(path), [0], check=checker(), pack=packer(), workers=1)
 
 
 def test_a_damaged_index_is_refused(tmp_path, scenes):
@@ -135,7 +135,7 @@ def test_a_damaged_index_is_refused(tmp_path, scenes):
         told = bank_reader.is_bank(path)
         assert outcome(path, wanted, file) == "refused" and told, bytes(changed)
         with pytest.raises(SceneError, match=r"bank\.json: damaged"):
-            bank_writer.require_free(path)  # it may be a bank of which something can be saved: nothing takes its place
+            bank_writer.check_free_space(path)  # it may be a bank of which something can be saved: nothing takes its place
     for place in (0, 1, len(content) // 2, len(content) - 3):
         put(file, content[:place])
         assert outcome(path, wanted, file) == "refused"
@@ -156,7 +156,9 @@ def test_an_older_bank_is_read_chosen_from_and_gone_on_with(tmp_path, scenes):
     both = bank_reader.save(bank_reader.join([bank_reader.view(old, [2, 0]), new]), tmp_path / "view", copy=False, settings={})
     copied = bank_reader.save(both, tmp_path / "copy", copy=True, settings={})
     for found in (both, copied):
-        assert [arrow_codec.encode(raw) for raw in bank_reader.raws(found, range(3))] == [arrow_codec.encode(scenes[i]) for i in (2, 0, 0)]
+        assert [arrow_codec.encode(raw) for raw in bank_reader.read_raws(found, range(3))] == [
+            arrow_codec.encode(scenes[i]) for i in (2, 0, 0)
+        ]
     assert (both.places[:, 2] == shard_files.UNKNOWN).tolist() == [True, True, False] and (copied.places[:, 2] > 0).all()
     folder, out = tmp_path / "in", tmp_path / "grown"
     folder.mkdir()
@@ -166,7 +168,7 @@ def test_an_older_bank_is_read_chosen_from_and_gone_on_with(tmp_path, scenes):
     written(folder, document(name="b"), "b.json")
     conversion.convert(folder, out, **options())
     grown = bank_reader.open(out)
-    assert grown.names == ("a", "b") and [raw.name for raw in bank_reader.raws(grown, [0, 1])] == ["a", "b"]
+    assert grown.names == ("a", "b") and [raw.name for raw in bank_reader.read_raws(grown, [0, 1])] == ["a", "b"]
 
 
 # ---- killed

@@ -52,7 +52,7 @@ from scenefactory_jax.roadgraph import lane_topology
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
-TOPOLOGY = {key: value for key, value in hydra_config.load("lanes")["lanes"]["topology"].items() if key != "_target_"}
+TOPOLOGY = {key: value for key, value in hydra_config.load_config("lanes")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_stack_pads_with_masked_rows(street):
             if name.endswith((".valid", ".present")):
                 assert whole.sum() == leaf.sum()
     assert (stacked.agents.size > 0).all()
-    again, _ = stack.stack([columns.assemble(Scene, {n: a[0] for n, a in columns.flatten(stacked).items()})], capacity=NONE)
+    again, _ = stack.stack([columns.assemble_columns(Scene, {n: a[0] for n, a in columns.flatten(stacked).items()})], capacity=NONE)
     np.testing.assert_array_equal(again.road.midpoint[0, :256], stacked.road.midpoint[0, :256])
 
 
@@ -164,10 +164,10 @@ def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
     moved = bank_reader.open(tmp_path / "elsewhere")
     assert moved.names == ("street", "straße", "third") and moved.settings == {"seed": 3} and len(opened) == 3
     for index, raw in enumerate(raws):
-        exactly(bank_reader.raw(moved, index), raw)
-    exactly(bank_reader.raw(moved, -1), raws[2])
+        exactly(bank_reader.read_raw(moved, index), raw)
+    exactly(bank_reader.read_raw(moved, -1), raws[2])
     with pytest.raises(ValueError, match="read-only"):
-        bank_reader.raw(moved, 0).tracks[0].xyz[:] = 0.0  # the file itself, not a copy
+        bank_reader.read_raw(moved, 0).tracks[0].xyz[:] = 0.0  # the file itself, not a copy
     table = moved.metadata.to_pydict()
     assert table["letters"] == [6, 6, 5] and table["sdc"] == [7, None, 7] and table["lights"] == [0, 2, 0] and table["edges"] == [1, 1, 0]
     assert table["vehicles"] == [2, 2, 2] and table["cyclists"] == [0, 1, 0] and table["max_x"] == [40.0, 40.0, 40.0]
@@ -185,7 +185,7 @@ def test_what_cannot_be_packed_is_refused_or_named(made):
     tools = TOOLS | {"pack": packer(box_m=2.0)}
     with pytest.raises(SceneError, match=r"scene 0, street: tracks: no agent is left of 2: 1 .*; leave it out, or change"):
         bank_reader.load(opened, [0], capacity=NONE, **tools)
-    found = bank_reader.packed(opened, [1, 0], **TOOLS | {"pack": packer(box_m=2.0, require_agents=False, centre="mean")})
+    found = bank_reader.pack_scenes(opened, [1, 0], **TOOLS | {"pack": packer(box_m=2.0, require_agents=False, centre="mean")})
     assert isinstance(found[0], Reject) and found[0].scene == "straße" and "no driving lane" in found[0].reason
 
 
@@ -203,11 +203,11 @@ def test_views_refer_and_copies_do_not(tmp_path, made):
     for found in (view, own, bank_reader.save(bank_reader.view(view, [4, 3]), view.path, copy=False, settings={})):
         order = wanted if len(found) == 5 else [2, 1]
         for index, place in enumerate(order):
-            exactly(bank_reader.raw(found, index), raws[place])
+            exactly(bank_reader.read_raw(found, index), raws[place])
     shutil.move(tmp_path / "bank", tmp_path / "gone")
     with pytest.raises(SceneError, match=r"bank/scenes-00000\.arrow: missing; .* a view also the banks that it refers to"):
         bank_reader.open(view.path)
-    exactly(bank_reader.raw(bank_reader.open(tmp_path / "copy"), 0), raws[2])
+    exactly(bank_reader.read_raw(bank_reader.open(tmp_path / "copy"), 0), raws[2])
     with pytest.raises(SceneError, match="a view of no scene"):
         bank_reader.view(own, [])
     with pytest.raises(SceneError, match="cannot take the place of the bank that it refers to"):
@@ -218,9 +218,9 @@ def test_a_bank_replaces_a_bank_and_nothing_else(tmp_path, made):
     raws, opened = made
     again = bank_reader.save(bank_reader.view(opened, [1]), opened.path, copy=True, settings={})  # filtered onto itself
     assert again.names == ("straße",)
-    exactly(bank_reader.raw(opened, 0), raws[0])  # what was mapped stays as it was
+    exactly(bank_reader.read_raw(opened, 0), raws[0])  # what was mapped stays as it was
     with pytest.raises(SceneError, match="cut short or changed"):
-        bank_reader.raw(replace(opened, readers={}), 0)
+        bank_reader.read_raw(replace(opened, readers={}), 0)
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("years of work")
     with pytest.raises(SceneError, match="exists and is no bank"):
@@ -269,7 +269,7 @@ def test_a_bank_that_cannot_be_read_is_named(tmp_path, made):
             bank_reader.verify(path)
         file.write_bytes(bytes(len(content)))
         with pytest.raises(SceneError, match=f"{name}: damaged"):
-            bank_reader.raw(bank_reader.open(path), 0)
+            bank_reader.read_raw(bank_reader.open(path), 0)
         file.unlink()
         with pytest.raises(SceneError, match=f"{name}: missing"):
             bank_reader.open(path)
@@ -289,9 +289,9 @@ def test_scenes_that_are_held_hold_no_file_open(made):
     _, opened = made
     descriptors = lambda: len(os.listdir("/proc/self/fd"))  # noqa: E731
     before = descriptors()
-    held = [bank_reader.raw(bank_reader.open(opened.path), 1) for _ in range(50)]
+    held = [bank_reader.read_raw(bank_reader.open(opened.path), 1) for _ in range(50)]
     assert descriptors() == before and len(held) == 50
-    exactly(bank_reader.raw(pickle.loads(pickle.dumps(opened)), 1), held[0])
+    exactly(bank_reader.read_raw(pickle.loads(pickle.dumps(opened)), 1), held[0])
 
 
 # ---- conversion
@@ -343,9 +343,9 @@ def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
     assert opened.metadata["packing"].to_pylist() == ["no_agent_left"] * 3
     found = operations.statistics(opened.metadata, by=None)["all"]["texts"]
     assert found["packing"] == {"no_agent_left": 3}
-    wide = bank_reader.packed(opened, range(3), check=checker(), pack=packer(), workers=1)
+    wide = bank_reader.pack_scenes(opened, range(3), check=checker(), pack=packer(), workers=1)
     assert [type(one).__name__ for one in wide] == ["Packed", "Packed", "Reject"] and wide[2].kind == "no_agent_left"
-    assert bank_reader.packed(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
+    assert bank_reader.pack_scenes(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
     whole = conversion.convert(folder, tmp_path / "wide", **options())
     assert bank_reader.open(tmp_path / "wide").metadata["packing"].to_pylist() == ["packed", "packed", "no_agent_left"]
     assert whole.scenes == 3 and whole.agents_kept == 4 and whole.refused == {"no_agent_left": 1}
@@ -473,7 +473,7 @@ def test_a_file_that_gave_nothing_is_read_again(tmp_path):
 
 def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
     folder = streets(tmp_path / "in", "a", "b", "c")
-    wrong = functools.partial(lane_topology.rebuild, **TOPOLOGY | {"beside_m": [5.0, 2.0]})
+    wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"beside_m": [5.0, 2.0]})
     for workers in (1, 2):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
         with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
@@ -541,7 +541,7 @@ def test_a_cluster_is_a_spread_like_any_other(tmp_path, monkeypatch):
     with pytest.raises(SceneError, match=r'Ray is not installed; `pip install "scenefactory_jax\[ray\]"`'):
         list(ray(dies_of_three, [1]))
     cluster(monkeypatch)
-    assert list(ray(dies_of_three, [1, 2, 3, 4])) == [10, 20, spreads.Lost("Ray: RayError: the worker died"), 40]
+    assert list(ray(dies_of_three, [1, 2, 3, 4])) == [10, 20, spreads.FailedTask("Ray: RayError: the worker died"), 40]
     with monkeypatch.context() as without:
         without.setattr(spreads, "_timed", missing)
         with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'scenefactory_jax'; "):
@@ -594,8 +594,8 @@ def test_real_scenes_convert_alike_in_one_process_and_in_two(tmp_path, shared_da
         for raw in reader_selection.read(path, reader_selection.make(FORMATS))
     ]
     for index, raw in enumerate(raws):
-        exactly(bank_reader.raw(one, index), raw)
-        exactly(bank_reader.raw(two, index), raw)
+        exactly(bank_reader.read_raw(one, index), raw)
+        exactly(bank_reader.read_raw(two, index), raw)
     stacked, report = bank_reader.load(one, range(3), capacity=NONE, check=checker(), pack=packer(), workers=1)
     assert not report.cuts and all(np.isfinite(leaf).all() for leaf in columns.flatten(stacked).values())
     assert np.abs(stacked.road.midpoint).max() <= 100 and np.abs(stacked.agents.goal).max() <= 100
@@ -625,7 +625,7 @@ def test_a_hundred_thousand_scenes_open_at_once(tmp_path, street):
     assert time.process_time() - start < 1.0 and [int(name[-6:]) % 22 for name in view.names] == [i % 22 for i in chosen]
     order = rng.integers(0, len(view), 2000)
     start = time.process_time()
-    raws = list(bank_reader.raws(view, order))
+    raws = list(bank_reader.read_raws(view, order))
     assert time.process_time() - start < 2.0 and [raw.name for raw in raws] == [f"scene-{chosen[i]:06d}" for i in order]
 
 
@@ -675,7 +675,7 @@ def test_others_stand_in_the_model_and_can_be_hit(street):
 
 def test_merged_segments_stay_within_the_tolerance(street):
     scene = prepared(replace(street, roads=(*street.roads, curve(2, 20, 50))), require_agents=False).scene
-    single, merged = (list(world_mjcf.chains(scene.road, tolerance)) for tolerance in (None, 0.05))
+    single, merged = (list(world_mjcf.join_segments(scene.road, tolerance)) for tolerance in (None, 0.05))
     assert [len(points) for points, _ in single] == [81, 50, 81] and [kind for _, kind in merged] == [2, 2, 15]
     assert sum(len(points) - 1 for points, _ in merged) < 20
     for (fine, _), (coarse, _) in zip(single, merged, strict=True):

@@ -99,19 +99,19 @@ def test_order_and_place_change_nothing():
 @pytest.mark.parametrize("name", ["cell_m", "height_m", "headings", "one_in"])
 def test_a_number_of_no_place_is_refused(name):
     with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: 0; wanted is a number above 0"):
-        geographic_split.streets(generated(0), **STREETS | {name: type(STREETS[name])(0)})
+        geographic_split.find_streets(generated(0), **STREETS | {name: type(STREETS[name])(0)})
 
 
 def test_streets_are_those_of_the_shared_frame():
     raw = generated(3)
     numbers = {"cell_m": 2.0, "height_m": 2.0, "headings": 16, "one_in": 1}
-    here = geographic_split.streets(raw, **numbers)
+    here = geographic_split.find_streets(raw, **numbers)
     lane_m = FEATURES(raw)["lane_m"]
     assert 0.7 * lane_m < 2 * len(here) < 1.6 * lane_m  # a place every two metres; a lane askew to the grid touches more
-    same = geographic_split.streets(moved(raw, (100.0, 0.0, 7.0), origin=(-100.0, 0.0, -7.0)), **numbers)
+    same = geographic_split.find_streets(moved(raw, (100.0, 0.0, 7.0), origin=(-100.0, 0.0, -7.0)), **numbers)
     assert len(np.intersect1d(here, same)) > 0.99 * len(here)  # floats: 0.1 + 100 - 100 is not 0.1
-    some = geographic_split.streets(raw, **numbers | {"one_in": 8})
+    some = geographic_split.find_streets(raw, **numbers | {"one_in": 8})
     assert set(some) <= set(here) and 0.5 < 8 * len(some) / len(here) < 2
-    assert not len(np.intersect1d(here, geographic_split.streets(replace(raw, metadata={"dataset": "another"}), **numbers)))
+    assert not len(np.intersect1d(here, geographic_split.find_streets(replace(raw, metadata={"dataset": "another"}), **numbers)))
     turned = replace(raw, roads=tuple(replace(line, xyz=line.xyz[::-1]) for line in raw.roads))
-    assert len(np.intersect1d(here, geographic_split.streets(turned, **numbers))) < 0.05 * len(here)  # the other way is another street
+    assert len(np.intersect1d(here, geographic_split.find_streets(turned, **numbers))) < 0.05 * len(here)  # the other way is another street

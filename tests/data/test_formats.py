@@ -25,7 +25,7 @@ from support.format_documents import (
 )
 from support.scene_documents import FORMATS, document, prepared
 
-from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, OtherFormat, SceneError
+from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, FormatMismatch, SceneError
 from scenefactory_jax.core.types import EDGES
 from scenefactory_jax.data.formats import polylines, reader_selection, safe_pickle
 
@@ -238,7 +238,7 @@ def test_a_pickle_has_limits(tmp_path):
     with pytest.raises(SceneError, match="more than 100 opcodes"):
         safe_pickle.load(path, file_limit_mb=1, opcode_limit=100)
     assert LIMITS["opcode_limit"] <= 10**6  # nine million empty lists took a minute and 1.7 GB; a scenario of 20 s has 141,000
-    with pytest.raises(OtherFormat, match="no pickle of protocol 3, 4, 5"):
+    with pytest.raises(FormatMismatch, match="no pickle of protocol 3, 4, 5"):
         safe_pickle.load(written(tmp_path, pickle.dumps([], protocol=0)), **LIMITS)
 
 

@@ -15,7 +15,7 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import duplicates, filter_expressions, geographic_split, operations
@@ -125,7 +125,7 @@ def test_groups_are_connected_by_shared_streets(block, monkeypatch):
     for least, reach in ((1, 40), (2, 60), (3, 60)):
         sets = [set(rng.integers(0, reach * 4, rng.integers(0, 9)).tolist()) for _ in range(40)]
         starts = np.cumsum([0, *map(len, sets)])
-        found = geographic_split.groups(np.array([key for one in sets for key in one], int), starts, least_shared=least)
+        found = geographic_split.find_groups(np.array([key for one in sets for key in one], int), starts, least_shared=least)
         wanted = np.unique(components(sets, least), return_inverse=True)[1]
         pairs = {(a, b) for a, b in zip(found.tolist(), wanted.tolist(), strict=True)}
         assert len(pairs) == len(set(found.tolist())) == len(set(wanted.tolist())) > 1
@@ -134,25 +134,25 @@ def test_groups_are_connected_by_shared_streets(block, monkeypatch):
 def test_groups_are_dealt_whole_and_shares_are_met():
     rng = np.random.default_rng(0)
     group = np.unique(rng.integers(0, 300, 1000), return_inverse=True)[1]
-    parts = geographic_split.deal(group, SHARES, seed=0)
+    parts = geographic_split.assign_groups(group, SHARES, seed=0)
     assert np.array_equal(np.sort(np.concatenate(list(parts.values()))), np.arange(1000))
     assert not any(set(group[a]) & set(group[b]) for a, b in itertools.combinations(parts.values(), 2))
-    assert [len(rows) for rows in parts.values()] == [600, 200, 200] and not any(geographic_split.leaks(group, parts).values())
-    again, other = geographic_split.deal(group, SHARES, seed=0), geographic_split.deal(group, SHARES, seed=1)
+    assert [len(rows) for rows in parts.values()] == [600, 200, 200] and not any(geographic_split.find_leaks(group, parts).values())
+    again, other = geographic_split.assign_groups(group, SHARES, seed=0), geographic_split.assign_groups(group, SHARES, seed=1)
     assert all(np.array_equal(parts[name], again[name]) for name in parts) and any(set(parts[name]) != set(other[name]) for name in parts)
-    by_scene = geographic_split.deal(np.arange(1000), SHARES, seed=0)
+    by_scene = geographic_split.assign_groups(np.arange(1000), SHARES, seed=0)
     apart = {name: sum(g in set().union(*(group[r] for n, r in by_scene.items() if n != name)) for g in group[rows])
              for name, rows in by_scene.items()}  # fmt: skip
-    assert geographic_split.leaks(group, by_scene) == apart and apart["test"] > 100
+    assert geographic_split.find_leaks(group, by_scene) == apart and apart["test"] > 100
     with pytest.raises(ConfigError, match=r"split.shares.val: 0.2 of 9 scenes in 1 groups"):
-        geographic_split.deal(np.zeros(9, int), SHARES, seed=0)
+        geographic_split.assign_groups(np.zeros(9, int), SHARES, seed=0)
     for wrong, message in (({"train": 1.0}, "two parts or more"), ({"a": 1, "b": 0}, "split.shares.b: 0")):
         with pytest.raises(ConfigError, match=message):
-            geographic_split.deal(group, wrong, seed=0)
+            geographic_split.assign_groups(group, wrong, seed=0)
 
 
 def test_a_split_never_divides_a_street(town):
-    table = operations.described(town, FEATURES)
+    table = operations.describe_scenes(town, FEATURES)
     groups = operations.streets(table, least_shared=2)
     assert sorted(np.bincount(groups).tolist()) == [1] * 6 + [3, 3]
     assert [set(groups[6:9]), set(groups[9:])] == [{groups[6]}, {groups[9]}]
@@ -168,14 +168,14 @@ def test_a_split_never_divides_a_street(town):
 
 
 def womd(folder, part, names=None):
-    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    formats = reader_selection.make(hydra_config.load_config("convert", "scenes=womd")["scenes"]["formats"])
     files = sorted((folder / "womd" / part).iterdir())
     return [next(reader_selection.read(file, formats)) for file in files if names is None or file.name.split(".")[0] in names]
 
 
 def shown(raws):
-    found = [geographic_split.streets(raw, **hydra_config.load("scenes")["features"]["streets"]) for raw in raws]
-    return geographic_split.groups(np.concatenate(found), np.cumsum([0, *map(len, found)]), least_shared=3)
+    found = [geographic_split.find_streets(raw, **hydra_config.load_config("scenes")["features"]["streets"]) for raw in raws]
+    return geographic_split.find_groups(np.concatenate(found), np.cumsum([0, *map(len, found)]), least_shared=3)
 
 
 def test_real_scenes_of_one_street_are_found(shared_data):
@@ -190,7 +190,9 @@ def test_the_shipped_test_scenes_share_no_street_with_the_training_scenes(shared
     groups = shown([*train, *test])
     assert not set(groups[: len(train)]) & set(groups[len(train) :])
     leaks = [
-        geographic_split.leaks(groups, geographic_split.deal(np.arange(len(groups)), {"train": 0.8, "test": 0.2}, seed=s))["test"]
+        geographic_split.find_leaks(groups, geographic_split.assign_groups(np.arange(len(groups)), {"train": 0.8, "test": 0.2}, seed=s))[
+            "test"
+        ]
         for s in range(200)
     ]
     assert len(groups) - len(set(groups)) == 1 and 0.2 < np.mean(leaks) < 0.45  # one pair in 192: a random split divides it with 0.32
@@ -206,12 +208,12 @@ def test_copies_are_found_and_different_scenes_kept(tmp_path):
     faster = replace(crossing, name="another run", tracks=tuple(replace(t, xyz=np.roll(t.xyz, 8, axis=0)) for t in crossing.tracks))
     fewer = replace(crossing, name="one car fewer", tracks=crossing.tracks[1:])
     bank = banked(tmp_path / "bank", [*raws, copy, faster, fewer])
-    made = duplicates.dedupe(bank, operations.described(bank, FEATURES), **NUMBERS)
+    made = duplicates.dedupe(bank, operations.describe_scenes(bank, FEATURES), **NUMBERS)
     assert made.account["groups"] == [[crossing.name, "a copy"]] and made.account["compared"] >= 1
     assert list(made.bank.names) == [*(raw.name for raw in raws), "another run", "one car fewer"]
-    alike = functools.partial(duplicates.same, crossing, tolerance_m=0.2, share=0.95)
+    alike = functools.partial(duplicates.is_same_scene, crossing, tolerance_m=0.2, share=0.95)
     assert alike(copy) and not alike(faster) and not alike(fewer)
-    again = duplicates.dedupe(made.bank, operations.described(made.bank, FEATURES), **NUMBERS)
+    again = duplicates.dedupe(made.bank, operations.describe_scenes(made.bank, FEATURES), **NUMBERS)
     assert again.account["groups"] == [] and len(again.bank) == len(made.bank)
 
 
@@ -219,7 +221,7 @@ def test_copies_are_found_and_different_scenes_kept(tmp_path):
 
 
 def test_samples_are_seeded_and_keep_strata(town):
-    table = operations.described(town, FEATURES)
+    table = operations.describe_scenes(town, FEATURES)
     draw = functools.partial(operations.sample, town, table)
     one, same, other = (draw(count=5, share=None, stratify=None, seed=seed).bank.names for seed in (0, 0, 1))
     assert one == same != other and len(set(one)) == 5 and [name for name in town.names if name in one] == list(one)
@@ -238,23 +240,23 @@ def test_samples_are_seeded_and_keep_strata(town):
 
 
 def test_a_merge_has_every_scene_once(town, tmp_path):
-    table = operations.described(town, FEATURES)
+    table = operations.describe_scenes(town, FEATURES)
     parts = operations.split(town, table, shares=SHARES, by="scene", least_shared=2, seed=0).banks
     whole = operations.merge(list(parts.values()), duplicates="refuse")
     assert sorted(whole.bank.names) == sorted(town.names) and whole.account["banks"] == [len(bank) for bank in parts.values()]
     for index in (0, 5, 11):
-        assert banks.raw(whole.bank, index).name == whole.bank.names[index]
+        assert banks.read_raw(whole.bank, index).name == whole.bank.names[index]
     with pytest.raises(SceneError, match=r"merge: \d scenes have the name of another: procedural-.*duplicates=first"):
         operations.merge([town, parts["test"]], duplicates="refuse")
     assert operations.merge([town, parts["test"]], duplicates="first").bank.names == town.names
     bare = banked(tmp_path / "bare", [generated(6)], described=False)
-    mixed = operations.described(operations.merge([town, bare], duplicates="refuse").bank, FEATURES)
+    mixed = operations.describe_scenes(operations.merge([town, bare], duplicates="refuse").bank, FEATURES)
     assert mixed["lane_m"].to_pylist()[-1] == FEATURES(generated(6))["lane_m"] and mixed["streets"].null_count == 0
     assert mixed.slice(0, 12).select(["lane_m", "streets"]).equals(table.select(["lane_m", "streets"]))
 
 
 def test_statistics_agree_with_numpy(town):
-    table = operations.described(town, FEATURES)
+    table = operations.describe_scenes(town, FEATURES)
     every, parts = operations.statistics(table, by=None)["all"], operations.statistics(table, by="dataset")
     lane = table["lane_m"].to_numpy()
     found = every["numbers"]["lane_m"]
@@ -273,7 +275,7 @@ def test_statistics_agree_with_numpy(town):
 
 
 def command(bank, *overrides):
-    return scenes(hydra_config.load("scenes", f"scenes.path={bank.path}", "progress=false", *overrides))
+    return scenes(hydra_config.load_config("scenes", f"scenes.path={bank.path}", "progress=false", *overrides))
 
 
 def test_commands_write_views(town, tmp_path, capsys):
@@ -302,11 +304,11 @@ def test_commands_write_views(town, tmp_path, capsys):
 def test_what_is_exported_reads_back(town, tmp_path, name, pattern):
     assert command(town, "op=export", f"export.format={name}", f"out={tmp_path}") == 12
     files = sorted(tmp_path.glob(pattern))
-    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    formats = reader_selection.make(hydra_config.load_config("convert", "scenes=womd")["scenes"]["formats"])
     found = {raw.name: raw for file in files for raw in reader_selection.read(file, formats)}
     assert len(files) == 12 and len(found) == 12
     for index in (0, 11):
-        raw = banks.raw(town, index)
+        raw = banks.read_raw(town, index)
         back = next(one for key, one in found.items() if raw.name in key)
         np.testing.assert_allclose(back.tracks[0].xyz[:, :2], raw.tracks[0].xyz[:, :2], atol=0.01)
 
@@ -323,7 +325,7 @@ def test_an_export_goes_on_past_what_is_repaired_or_cannot_be_written(tmp_path, 
     told = capsys.readouterr().out
     assert "not written: laneless: " in told and "no driving lane" in told and "two scenes need two names" in told
     assert "in 1 scenes: sizes that are not positive replaced by (4.0, 2.0, 1.0)" in told and "2 of 4 scenes in the format" in told
-    formats = reader_selection.make(hydra_config.load("convert", "scenes=womd")["scenes"]["formats"])
+    formats = reader_selection.make(hydra_config.load_config("convert", "scenes=womd")["scenes"]["formats"])
     found = [raw for file in (tmp_path / "out").glob(pattern) for raw in reader_selection.read(file, formats)]
     back = next(raw for raw in found if "sizes" in raw.name)
     assert len(found) == 2 and back.tracks[0].size == pytest.approx((4.0, 2.0, 1.0))
@@ -331,7 +333,7 @@ def test_an_export_goes_on_past_what_is_repaired_or_cannot_be_written(tmp_path, 
 
 def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
     name, spelled = "a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec", r"a\x1b[2J\x1b]0;x\x07\nerror: b\x9b1m\u202ec"
-    assert for_terminal(name) == spelled and for_terminal("straße 北 é") == "straße 北 é"
+    assert escape_for_terminal(name) == spelled and escape_for_terminal("straße 北 é") == "straße 北 é"
     evil = replace(generated(0), name=name, metadata={"dataset": name, "format": "f"})
     bank = banked(tmp_path / "bank", [evil, replace(evil, source="again")])
     command(bank, "op=info")
@@ -363,12 +365,15 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     assert json.loads(told.out) == found and f"bank {bank.path}, whose conversion was stopped" in told.err
     command(bank, "op=sample", "sample.count=1", f"out={tmp_path / 'sample'}")
     assert "whose conversion was stopped" in capsys.readouterr().err
-    assert "whose conversion was stopped" in batches.open(hydra_config.load("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+    assert (
+        "whose conversion was stopped"
+        in batches.open(hydra_config.load_config("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+    )
 
 
 def test_banks_are_judged_and_compared(town, tmp_path):
     counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
-    assert counts.keys() == hydra_config.load("scenes")["quality"]["rules"].keys()
+    assert counts.keys() == hydra_config.load_config("scenes")["quality"]["rules"].keys()
     assert "12 scenes" in (tmp_path / "quality" / "quality.md").read_text()
     others = ["compare.others=[procedural]", "compare.limit=2", f"out={tmp_path / 'compared'}"]
     text = command(town, "op=compare", *others).read_text()
@@ -408,7 +413,7 @@ def test_what_cannot_be_done_is_named(town, overrides, message):
 
 def test_scenes_are_simulated(capsys):
     small = ["scenes.count=3", "scenes.pack.agents=4", "simulate.worlds=2", "simulate.seconds=0.2", "op=simulate"]
-    found = scenes(hydra_config.load("scenes", *small))
+    found = scenes(hydra_config.load_config("scenes", *small))
     assert all(list(row) == ["cars", "faults", "overlapping", "on_edge", "off_lane", "collided", "touched_edge"] for row in found.values())
     clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
     assert clean == [True] * 3

@@ -7,14 +7,14 @@ import pytest
 from support import plain_packing
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, validation
 from scenefactory_jax.roadgraph import spatial_grid
 
-PROCEDURAL = hydra_config.load("scenes")["scenes"]
-WOMD = hydra_config.load("convert", "scenes=womd")["scenes"]
-GENERATE = build(PROCEDURAL["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="generate")
+PROCEDURAL = hydra_config.load_config("scenes")["scenes"]
+WOMD = hydra_config.load_config("convert", "scenes=womd")["scenes"]
+GENERATE = instantiate(PROCEDURAL["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="generate")
 SETTINGS = [{}, {"centre": "sdc", "box_m": 60.0, "car_size_m": None, "others": 3, "agents": 4, "log_from": "start", "start_speed": "zero"}]
 CHECK = {key: value for key, value in WOMD["check"].items() if key != "_target_"}
 NUMBERS = {key: value for key, value in WOMD["pack"].items() if key != "_target_"} | {"require_agents": False}

@@ -8,7 +8,7 @@ import shapely
 import yaml
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import EDGES, LANE_STREET
 from scenefactory_jax.data.generators import curves, speed_profile
@@ -21,7 +21,7 @@ TRAFFIC = CONFIG["traffic"]
 
 
 def generator(**changes):
-    return build(CONFIG | changes, builtins="scenefactory_jax.scenes.procedural", where="generate")
+    return instantiate(CONFIG | changes, builtins="scenefactory_jax.scenes.procedural", where="generate")
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +234,7 @@ def test_cars_meet(scenes):
 
 
 def test_nothing_is_lost_when_scenes_are_packed(scenes):
-    parts = scene_source.readers(hydra_config.load("train", "scenes=procedural")["scenes"])
+    parts = scene_source.make_readers(hydra_config.load_config("train", "scenes=procedural")["scenes"])
     for scene in scenes[: len(KINDS)]:
         packed = prepare(scene, check=parts["check"], pack=parts["pack"])
         assert packed.report.agents_kept == len(scene.tracks)
@@ -289,7 +289,7 @@ def test_a_stop_takes_the_time_that_physics_gives():
     route = speed_profile.make_route(np.stack([np.arange(0.0, 100.01, 0.25), np.zeros(401)], -1))
     limits = speed_profile.Limits(acceleration=2.0, braking=4.0, lateral=2.0)
     times = np.array([0.0, 1.0, 5.0, 11.25, 12.25, 13.75, 20.0])
-    driven = speed_profile.drive(route, speed_profile.comfortable(route, 10.0, limits), times, limits, start_speed=0.0)
+    driven = speed_profile.drive(route, speed_profile.limit_by_curvature(route, 10.0, limits), times, limits, start_speed=0.0)
     np.testing.assert_allclose(driven.place, [0.0, 1.0, 25.0, 87.5, 95.5, 100.0, 100.0], atol=1e-6)
     np.testing.assert_allclose(driven.speed, [0.0, 2.0, 10.0, 10.0, 6.0, 0.0, 0.0], atol=1e-3)
 
@@ -299,7 +299,7 @@ def test_a_car_that_waits_stands_still():
     limits = speed_profile.Limits(acceleration=2.0, braking=4.0, lateral=2.0)
     times = np.arange(0.0, 15.0, 0.01)
     driven = speed_profile.drive(
-        route, speed_profile.comfortable(route, 8.0, limits), times, limits, start_speed=8.0, stop_at=20.0, wait=3.0
+        route, speed_profile.limit_by_curvature(route, 8.0, limits), times, limits, start_speed=8.0, stop_at=20.0, wait=3.0
     )
     standing = times[(driven.speed < 1e-6) & (driven.place < 30)]
     assert standing[-1] - standing[0] == pytest.approx(3.0, abs=0.02)

@@ -8,7 +8,7 @@ from support.scene_documents import FORMATS, checker, document, prepared, writte
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.scene_quality import quality as report_quality
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import DRIVEWAY, EDGES
 from scenefactory_jax.data import conversion
@@ -17,16 +17,16 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.generators.procedural import procedural_scene
 from scenefactory_jax.roadgraph import lane_topology
 
-QUALITY = hydra_config.load("quality")["quality"]
-PROCEDURAL = hydra_config.load("scenes")["scenes"]["generate"]
+QUALITY = hydra_config.load_config("quality")["quality"]
+PROCEDURAL = hydra_config.load_config("scenes")["scenes"]["generate"]
 RULES = quality_gate.make(QUALITY["rules"])
-rebuild = build(hydra_config.load("quality")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
+rebuild = instantiate(hydra_config.load_config("quality")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
 LOG = 91
 ALONG = np.arange(0.0, 121.0)
 
 
 def judge(raw):
-    return quality_gate.judge(raw, RULES, reject=QUALITY["reject"], drop=QUALITY["drop"])
+    return quality_gate.find_defects(raw, RULES, reject=QUALITY["reject"], drop=QUALITY["drop"])
 
 
 def line(id, points, kind=2, height=0.0, **relations):
@@ -137,7 +137,7 @@ def test_every_rule_has_its_defect_here():
 
 def test_a_sound_street_and_generated_scenes_have_no_findings():
     assert judge(street()).findings == ()
-    make = build(PROCEDURAL, builtins=procedural_scene, where="scenes.generate")
+    make = instantiate(PROCEDURAL, builtins=procedural_scene, where="scenes.generate")
     for index in range(2 * len(PROCEDURAL["kinds"])):
         assert judge(make(1, index)).findings == ()
 
@@ -215,7 +215,7 @@ def test_the_gate_refuses_drops_and_counts():
 def test_a_rule_of_one_s_own_is_an_entry_and_a_rule_can_be_left_out():
     rules = quality_gate.make({"times": None, "crowded": {"_target_": f"{__name__}.crowded", "most": 1}})
     assert list(rules) == ["crowded"]
-    (finding,) = quality_gate.judge(street(), rules, reject=["crowded"], drop=[]).rejected
+    (finding,) = quality_gate.find_defects(street(), rules, reject=["crowded"], drop=[]).rejected
     assert (finding.rule, finding.value, finding.limit) == ("crowded", 2.0, 1.0)
 
 
@@ -224,11 +224,11 @@ def crowded(raw, *, most: int):
 
 
 def test_the_report_counts_and_draws(tmp_path, capsys):
-    scenes = hydra_config.load("scenes", "scenes.count=2")["scenes"]
+    scenes = hydra_config.load_config("scenes", "scenes.count=2")["scenes"]
     settings = QUALITY | {"rules": {"length": QUALITY["rules"]["length"] | {"range_m": [5.0, 20.0]}, "times": QUALITY["rules"]["times"]}}
     settings |= {"reject": [], "drop": ["length"]}
     counts = report_quality({"scenes": scenes, "quality": settings, "out": str(tmp_path)})
-    cars = sum(len(build(PROCEDURAL, builtins=procedural_scene, where="")(0, index).tracks) for index in range(2))
+    cars = sum(len(instantiate(PROCEDURAL, builtins=procedural_scene, where="")(0, index).tracks) for index in range(2))
     assert counts["length"] == (cars, 2, cars) and counts["times"] == (0, 0, 0)
     text = (tmp_path / "quality.md").read_text()
     assert f"| length | {cars} | 2 | {cars} | 100 % | drops |" in text and (tmp_path / "length.png").stat().st_size > 10_000
@@ -238,7 +238,7 @@ def test_the_report_counts_and_draws(tmp_path, capsys):
 def test_what_the_check_refuses_is_not_judged(tmp_path, capsys):
     written(tmp_path, document(), "good.json")
     written(tmp_path, document(roads=document()["roads"][:1]), "laneless.json")
-    scenes = hydra_config.load("scenes", "scenes=womd", f"scenes.path={tmp_path}")["scenes"]
+    scenes = hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={tmp_path}")["scenes"]
     counts = report_quality({"scenes": scenes, "quality": QUALITY | {"drop": []}, "out": str(tmp_path / "out")})
     assert counts["missing_map"].findings == 0 and "1 scenes judged, 0 refused, 0 objects left out, 1 not read" in capsys.readouterr().out
     assert "no driving lane" in (tmp_path / "out" / "quality.md").read_text()

@@ -28,7 +28,7 @@ from support.scene_documents import (
 import scenefactory_jax as sf
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import EDGES, POLYGONS
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
@@ -321,7 +321,7 @@ def test_a_jitter_of_the_clock_is_resampled_and_counted(street):
     steps, current = np.arange(199), 50
     times = 0.1 * steps
     times[120:] += 0.01
-    x, yaw = 8.0 * times, wrapped(np.pi - 0.05 + 0.01 * times)  # past pi
+    x, yaw = 8.0 * times, wrap_angles(np.pi - 0.05 + 0.01 * times)  # past pi
     xyz, velocity = np.stack([x, 0 * x, 0 * x], axis=1), np.tile([8.0, 0.0], (199, 1))
     car = Track(7, "vehicle", (4.0, 2.0, 1.5), xyz, yaw, velocity, np.ones(199, bool))
     brief = replace(car, id=8, valid=(steps >= 60) & (steps < 150))
@@ -334,7 +334,7 @@ def test_a_jitter_of_the_clock_is_resampled_and_counted(street):
     for track in even.tracks:
         seen = track.valid
         np.testing.assert_allclose(track.xyz[seen, 0], 8.0 * even.times[seen], atol=1e-9)
-        np.testing.assert_allclose(wrapped(track.yaw - np.pi - 0.01 * even.times)[seen], -0.05, atol=1e-9)
+        np.testing.assert_allclose(wrap_angles(track.yaw - np.pi - 0.01 * even.times)[seen], -0.05, atol=1e-9)
         assert not track.xyz[~seen].any() and (track.velocity[seen] == [8.0, 0.0]).all()
     assert even.tracks[0].valid.all() and np.flatnonzero(even.tracks[1].valid)[[0, -1]].tolist() == [60, 149]
     once = 0.1 * steps
@@ -465,7 +465,7 @@ def test_no_agent_left_is_refused_with_reasons(tmp_path, readers):
 
 def test_box_overlap_agrees_with_shapely():
     rng = np.random.default_rng(0)
-    boxes = [pack.corners(rng.uniform(-4, 4, 2), rng.uniform(-4, 4), *rng.uniform(0.5, 5, 2)) for _ in range(60)]
+    boxes = [pack.box_corners(rng.uniform(-4, 4, 2), rng.uniform(-4, 4), *rng.uniform(0.5, 5, 2)) for _ in range(60)]
     polygons = [shapely.Polygon(box) for box in boxes]
     for box, polygon in zip(boxes, polygons, strict=True):
         wanted = [polygon.intersection(other).area > 1e-9 for other in polygons]

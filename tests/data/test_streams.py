@@ -14,7 +14,7 @@ from support.streets import street
 
 from experiments.benchmarks import streaming
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import batches, samplers, stream
@@ -47,7 +47,9 @@ def same(one, other):
 
 
 def trainer_of(**numbers):
-    return train_iteration.make(probe(life=3, episode_steps=50), late_fusion.make(**SMALL), **{**NUMBERS, "episode_steps": 50, **numbers})
+    return train_iteration.make_trainer(
+        probe(life=3, episode_steps=50), late_fusion.make(**SMALL), **{**NUMBERS, "episode_steps": 50, **numbers}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +114,9 @@ def test_nothing_compiles_twice(trainer, swapped):
 
 def table(draws, episodes=None, successes=None, *, endless=False):
     zeros = np.zeros(len(draws))
-    return samplers.Table(np.asarray(draws), zeros if episodes is None else episodes, zeros if successes is None else successes, endless)
+    return samplers.SceneOutcomes(
+        np.asarray(draws), zeros if episodes is None else episodes, zeros if successes is None else successes, endless
+    )
 
 
 def sequence(sampler, known, counts):
@@ -120,12 +124,12 @@ def sequence(sampler, known, counts):
     drawn = []
     for count in counts:
         drawn.append(sampler(known, count))
-        known = samplers.drawn(known, drawn[-1])
+        known = samplers.count_draws(known, drawn[-1])
     return np.concatenate(drawn), known
 
 
 def test_shuffled_brings_every_scene_once_an_epoch():
-    draw = build({"_target_": "shuffled"}, builtins=samplers, where="stream.sampler", seed=4)
+    draw = instantiate({"_target_": "shuffled"}, builtins=samplers, where="stream.sampler", seed=4)
     whole, known = sequence(draw, samplers.empty(11), [33])
     parts, _ = sequence(draw, samplers.empty(11), [3, 7, 1, 2, 20])
     np.testing.assert_array_equal(parts, whole)
@@ -142,7 +146,7 @@ def test_failing_scenes_come_more_often_in_proportion_to_failure():
     failures = np.array([0.0, 9.5, 19.0, 38.0])[kind]
     known, counts = table(np.zeros(400, int), np.full(400, 38.0), 38.0 - failures), np.zeros(4)
     for trial in range(3000):
-        drawn = samplers.failing(known, 2, seed=trial, floor=0.5)  # one in turn, one that fails
+        drawn = samplers.prioritize_failures(known, 2, seed=trial, floor=0.5)  # one in turn, one that fails
         counts[kind[drawn[0]]] += 1
     wanted = 3000 * np.array([1.0, 10.5, 20.0, 39.0]) / 70.5
     assert ((counts - wanted) ** 2 / wanted).sum() < 16.3  # chi-square with three degrees of freedom: 0.1 %
@@ -155,24 +159,26 @@ def test_failing_starves_nobody(floor):
     episodes = np.full(scenes_, 50.0)
     known = table(np.zeros(scenes_, int), episodes, np.where(np.arange(scenes_) == 7, 0.0, episodes))  # one scene fails always
     for turn in range(1, rounds + 1):
-        drawn, known = sequence(lambda known, count: samplers.failing(known, count, seed=1, floor=floor), known, [4] * int(15 / floor))
+        drawn, known = sequence(
+            lambda known, count: samplers.prioritize_failures(known, count, seed=1, floor=floor), known, [4] * int(15 / floor)
+        )
         assert known.draws.min() >= turn and drawn.min() >= 0 and drawn.max() < scenes_
     assert known.draws[7] == rounds if floor == 1.0 else known.draws[7] > 3 * np.median(known.draws)
 
 
 def test_failing_draws_new_scenes_of_an_endless_source():
-    known = samplers.drawn(samplers.empty(None), np.arange(10))
-    known = samplers.learnt(known, np.array([2, 3, 3]), np.array([4, 1, 3]), np.array([0, 5, 3]), memory=0.5)
+    known = samplers.count_draws(samplers.empty(None), np.arange(10))
+    known = samplers.update_outcomes(known, np.array([2, 3, 3]), np.array([4, 1, 3]), np.array([0, 5, 3]), memory=0.5)
     np.testing.assert_array_equal(known.successes[:4], [0, 0, 0, 4])  # never more than lives
-    drawn = samplers.failing(known, 6, seed=0, floor=0.5)
+    drawn = samplers.prioritize_failures(known, 6, seed=0, floor=0.5)
     assert set(drawn[:2]) == {2, 3} and list(drawn[2:]) == [10, 11, 12, 13]  # only two were driven in: new ones fill up
     with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: 0\.0; .* scenes could starve"):
-        samplers.failing(known, 6, seed=0, floor=0.0)
+        samplers.prioritize_failures(known, 6, seed=0, floor=0.0)
 
 
 def test_what_was_learnt_earlier_fades():
     known = table([1, 1], np.array([8.0, 8.0]), np.array([2.0, 2.0]))
-    after = samplers.learnt(known, np.array([1, 1, 0]), np.array([3, 1, 0]), np.array([3, 1, 0]), memory=0.5)
+    after = samplers.update_outcomes(known, np.array([1, 1, 0]), np.array([3, 1, 0]), np.array([3, 1, 0]), memory=0.5)
     np.testing.assert_array_equal(after.episodes, [8.0, 8.0])  # nobody's life ended in world 0: nothing is forgotten
     np.testing.assert_array_equal(after.successes, [2.0, 5.0])
 
@@ -182,7 +188,7 @@ def test_what_was_learnt_earlier_fades():
 
 def entry(*overrides, **trouble):
     """A training config whose generator makes streets; see `streets.street`."""
-    found = hydra_config.load("train", "experiment=smoke", "stream=shuffled", *SHORT, *overrides)
+    found = hydra_config.load_config("train", "experiment=smoke", "stream=shuffled", *SHORT, *overrides)
     troubles = {"unusable": [], "broken": [], "deadly": [], "endless": []} | trouble
     found["scenes"]["generate"] = {"_target_": "support.streets.street"} | troubles
     return found
@@ -199,7 +205,7 @@ def flowing(found):
     def swap(state, held, worlds, fresh):
         return state, jax.tree.map(lambda leaf, row: put(leaf, row, worlds), held, fresh)
 
-    return stream.flowing(found, mesh=None, before=None), swap
+    return stream.open_stream(found, mesh=None, before=None), swap
 
 
 def alone(found, index, sizes):
@@ -208,7 +214,7 @@ def alone(found, index, sizes):
 
 
 def fit(found, sizes, excess="cut"):
-    return batches.Fit(sizes, found["scenes"]["cells"], excess)
+    return batches.BoxSizes(sizes, found["scenes"]["cells"], excess)
 
 
 def measured(found, source, *, sample=8, **given):
@@ -245,11 +251,12 @@ def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     same(generated.scene, loaded.scene)
     whole, _ = bank_reader.load(
         written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, workers=1,
-        check=build(found["scenes"]["check"], builtins="scenefactory_jax.data.packing.validation", where="check"),
-        pack=build(found["scenes"]["pack"], builtins="scenefactory_jax.data.packing.pack", where="pack"),
+        check=instantiate(found["scenes"]["check"], builtins="scenefactory_jax.data.packing.validation", where="check"),
+        pack=instantiate(found["scenes"]["pack"], builtins="scenefactory_jax.data.packing.pack", where="pack"),
     )  # fmt: skip
     same(
-        loaded.scene, spatial_grid.attach(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES})
+        loaded.scene,
+        spatial_grid.attach_grid(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
     )
 
 
@@ -257,7 +264,7 @@ def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
     for name in ("one", "two"):
         written(tmp_path, document(name=name, objects=[thing(0, id=7, speed=40)]), f"{name}.json")
     (tmp_path / "broken.json").write_text("{}")
-    found = hydra_config.load("train", "experiment=smoke", "scenes=womd", f"scenes.path={tmp_path}")
+    found = hydra_config.load_config("train", "experiment=smoke", "scenes=womd", f"scenes.path={tmp_path}")
     files = batches.open(found["scenes"])
     assert files.count == 3 and files.name(0).endswith("broken.json")
     sizes = measured(found, files)
@@ -287,7 +294,7 @@ def test_room_for_more_changes_no_look_up():
     seen = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "most": 400}):
         grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).cells)
-        rows, listed = map(np.asarray, spatial_grid.listed(grid, *spatial_grid.part(grid, jnp.asarray(places))))
+        rows, listed = map(np.asarray, spatial_grid.list_segments(grid, *spatial_grid.find_cell_bounds(grid, jnp.asarray(places))))
         seen.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
     assert seen[0] == seen[1] and any(seen[0])
 
@@ -307,7 +314,7 @@ def test_room_for_more_changes_no_look_up():
     ],
 )
 def test_mistakes_are_named(overrides, message):
-    with pytest.raises(ConfigError, match=message), stream.flowing(entry(*overrides), mesh=None, before=None):
+    with pytest.raises(ConfigError, match=message), stream.open_stream(entry(*overrides), mesh=None, before=None):
         pass
 
 
@@ -375,8 +382,8 @@ def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
     told = {"swapped": 4, "wait_ms": 12.34, "scenes": 4096, "cut": 3, "refused": 1}
     moving = row | {"name": "shuffled", "slots_per_s": 1900.0, "ms_a_control_step": 500.0, "stream": told}
     other = moving | {"name": "larger", "worlds": 128}
-    table = throughput_report.streamed({"rows": [row | {"devices": 2, "slots_per_s": 1.0}, row, moving, other]}).splitlines()[2:]
+    table = throughput_report.streaming_table({"rows": [row | {"devices": 2, "slots_per_s": 1.0}, row, moving, other]}).splitlines()[2:]
     assert table[0] == "| shuffled | 4 of 64 | 0.2 | 9 | 1,900 | 5.0 % of `in memory` | 12.3 | 4,096 | 3 and 1 |"
-    assert "of `in memory`" not in table[1] and throughput_report.streamed({"rows": [row]}) == ""
+    assert "of `in memory`" not in table[1] and throughput_report.streaming_table({"rows": [row]}) == ""
     with pytest.raises(ConfigError, match=r"stream: scenes are exchanged while training; scope=physics has stream=none"):
-        streaming.measure(hydra_config.load("bench", "stream=shuffled", "scope=physics"), mesh=None)
+        streaming.measure(hydra_config.load_config("bench", "stream=shuffled", "scope=physics"), mesh=None)

@@ -8,7 +8,7 @@ import shapely
 import yaml
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, SceneError
 from scenefactory_jax.core.types import DRIVABLE, EDGES, STOP_SIGN
 from scenefactory_jax.data.curation import distribution_distance
@@ -28,14 +28,14 @@ from scenefactory_jax.data.packing.pack import prepare
 
 CONFIG = yaml.safe_load((Path(__file__).resolve().parents[2] / "conf" / "scenes" / "town.yaml").read_text())["generate"]
 TRAFFIC, NETWORK = CONFIG["traffic"], CONFIG["network"]
-MANNERS = driver_model.Manners(**TRAFFIC["manners"])
+MANNERS = driver_model.DriverParameters(**TRAFFIC["manners"])
 RED = {LIGHT_STATES.index("stop"), LIGHT_STATES.index("arrow_stop")}
 MINOR = NETWORK["streets"]["minor"]
 COUNT = 18
 
 
 def generator(**changes):
-    return build(CONFIG | changes, builtins="scenefactory_jax.scenes.town", where="generate")
+    return instantiate(CONFIG | changes, builtins="scenefactory_jax.scenes.town", where="generate")
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def _on(lanes, lines, place):
 
 
 def test_nothing_is_repaired_or_lost_when_scenes_are_packed(scenes):
-    parts = scene_source.readers(hydra_config.load("train", "scenes=town")["scenes"])
+    parts = scene_source.make_readers(hydra_config.load_config("train", "scenes=town")["scenes"])
     agents = 0
     for scene in scenes[::3]:
         report = prepare(scene, check=parts["check"], pack=parts["pack"]).report
@@ -240,9 +240,9 @@ def test_nothing_is_repaired_or_lost_when_scenes_are_packed(scenes):
 
 
 def test_the_demo_runs_on_towns():
-    loaded = hydra_config.load("train", "experiment=demo", "scenes=town")["scenes"]
+    loaded = hydra_config.load_config("train", "experiment=demo", "scenes=town")["scenes"]
     assert (loaded["count"], loaded["generate"]["traffic"]["cars"]) == (32, [3, 4])
-    scenes = scene_source.training(loaded | {"count": 1})
+    scenes = scene_source.load_training_scenes(loaded | {"count": 1})
     assert len(scenes) == 1 and np.asarray(scenes.scene.agents.present).any()
 
 
@@ -271,7 +271,7 @@ def test_bad_numbers_are_refused_by_name(changes, named):
 
 
 def test_a_grid_without_its_middle_crossing_is_drawn_anew():
-    draw = build(NETWORK["plans"]["grid"], builtins=street_plan, where="grid")
+    draw = instantiate(NETWORK["plans"]["grid"], builtins=street_plan, where="grid")
     classes = [cross_sections.make_class("minor", 1, MINOR)]
     drawn = [draw(np.random.default_rng(seed), 45.0, classes) for seed in range(20)]
     assert {plan is None for plan in drawn} == {True, False} and all(plan.edges for plan in drawn if plan)
@@ -290,7 +290,7 @@ def follow(begin, speed, seconds, *, ways=None, ranks=(ON_ROAD, ON_ROAD), gate=(
     straight = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
     ways = ways or (straight, straight)
     paths = [
-        lane_paths.make_path([lane_paths.Piece(way, 15.0, rank, None, 0)], eager=1.0, lateral=2.0, braking=2.0)._replace(gates=gate)
+        lane_paths.make_path([lane_paths.PathPiece(way, 15.0, rank, None, 0)], eager=1.0, lateral=2.0, braking=2.0)._replace(gates=gate)
         for way, rank in zip(ways, ranks, strict=True)
     ]
     users = driver_model.Users(np.full(2, 4.0), np.full(2, 2.0), np.array(begin), np.array(speed), np.full(2, -np.inf))
@@ -304,7 +304,7 @@ def test_a_follower_keeps_the_gap_of_the_idm():
     """Behind a car at speed v the IDM's gap is (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     slow = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
     paths = [
-        lane_paths.make_path([lane_paths.Piece(slow, limit, ON_ROAD, None, 0)], eager=1.0, lateral=2.0, braking=2.0)
+        lane_paths.make_path([lane_paths.PathPiece(slow, limit, ON_ROAD, None, 0)], eager=1.0, lateral=2.0, braking=2.0)
         for limit in (15.0, 8.0)
     ]
     users = driver_model.Users(np.full(2, 4.0), np.full(2, 2.0), np.array([0.0, 60.0]), np.array([15.0, 8.0]), np.full(2, -np.inf))

@@ -11,7 +11,7 @@ from support import womd_records as records
 from support.scene_documents import FORMATS, checker, document, packer, written
 from support.womd_records import JUMP_M, saved, scenes
 
-from scenefactory_jax.core.raw_scene import OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import FormatMismatch, RawScene, Reject, SceneError
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.formats import reader_selection, tfrecord, womd
 
@@ -70,7 +70,7 @@ def test_a_truncated_file_gives_what_is_whole_and_names_the_rest(tmp_path, three
         found = outcome(saved(tmp_path, gzip.compress(content[:cut], 1) if packed else content[:cut]))
         whole = sum(start <= cut for start in starts[1:])
         if cut < 12:
-            assert isinstance(found, OtherFormat)
+            assert isinstance(found, FormatMismatch)
             continue
         assert [isinstance(item, RawScene) for item in found] == [True] * whole + [False] * (cut not in starts), cut
         assert all(isinstance(item, RawScene) or "truncated" in item.reason for item in found)
@@ -86,7 +86,7 @@ def test_gzip_is_read_and_its_damage_is_named(tmp_path, three):
         outcome(saved(tmp_path, bytes(bent)))
     for cut in range(0, len(packed), 97):
         found = outcome(saved(tmp_path, packed[:cut]))
-        assert isinstance(found, OtherFormat) or isinstance(found[-1], Reject)
+        assert isinstance(found, FormatMismatch) or isinstance(found[-1], Reject)
 
 
 def test_bit_flips_are_never_read_as_data(tmp_path, three):
@@ -144,7 +144,7 @@ def test_foreign_files_are_refused_and_go_to_their_readers(tmp_path):
     foreign = {"empty": b"", "short": b"abc", "noise": bytes(range(256)) * 9, "record": records.framed(b"\x0a\x03abc", b"")}
     for name, content in foreign.items():
         path = saved(tmp_path, content, name)
-        assert isinstance(outcome(path), OtherFormat)
+        assert isinstance(outcome(path), FormatMismatch)
         said = {"empty": "an empty file", "record": "womd: record 0 at byte 0: neither a Scenario"}.get(name, "it begins with b'")
         with pytest.raises(SceneError, match=said):
             list(reader_selection.read(path, readers))

@@ -58,7 +58,9 @@ def desk(tmp_path_factory):
     banked(folder / "test.bank", [generated(index) for index in range(4, 6)])
     for name, source in {"fit.bank": "train.bank", "validation.bank": "test.bank", "WOMD/test": "test.bank"}.items():
         shutil.copytree(folder / source, folder / name)
-    scenes(hydra_config.load("scenes", f"scenes.path={whole.path}", "op=export", f"out={folder / 'WOMD' / 'train'}", "progress=false"))
+    scenes(
+        hydra_config.load_config("scenes", f"scenes.path={whole.path}", "op=export", f"out={folder / 'WOMD' / 'train'}", "progress=false")
+    )
     with quick_compilation():
         train(smoke(folder / "runs" / "RUN", "evaluation.enable=false"))
     for seed, name in enumerate(("A-0", "A-1", "B", "wet-0")):

@@ -59,7 +59,7 @@ def test_commands_of_the_pages_compose(page):
         swept = ("seed=", "weather=", "ppo.gamma=")  # of a sweep, the first value
         settings = [word.split(",")[0] if word.startswith(swept) else word for word in words if word not in ("-m", "--cfg", "job")]
         launched = [word for word in settings if not word.startswith("hydra")]
-        assert hydra_config.load(command, *launched)
+        assert hydra_config.load_config(command, *launched)
 
 
 def test_results_of_the_readme_are_those_of_the_study():
@@ -133,13 +133,13 @@ def test_the_python_of_the_library_page_runs(quickly):
 
 def test_the_task_page_has_the_numbers_of_the_configs(quickly):
     page = (ROOT / "docs" / "task.md").read_text()
-    published, wary = (hydra_config.load("task", f"reward={name}")["reward"] for name in ("reference", "wary"))
+    published, wary = (hydra_config.load_config("task", f"reward={name}")["reward"] for name in ("reference", "wary"))
     for name, term in wary.items():
         shown = (f"{entry['weight']:g}" if entry else "" for entry in (published.get(name), term))
         assert f"| `{name}` | {' | '.join(shown)} |".replace("|  |", "| |") in page
     widths = []
     for experiment in ("published", "quick", "demo"):
-        settings = hydra_config.load("train", f"experiment={experiment}", "scenes=procedural", "scenes.count=1", "dynamics=bicycle")
+        settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=procedural", "scenes.count=1", "dynamics=bicycle")
         scene = sf.load_scenes(settings["scenes"])[0]
         _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
         widths.append(max(columns.stop for columns in layout(seen).values()))

@@ -41,7 +41,7 @@ def test_the_parts_of_the_page_drive_together(page):
     parts = [word for word in overrides if "my_reader" not in word]
     assert set(blocks) == {"my_terms", "my_groups", "my_controls", "my_backend", "my_reader"}
     assert all(any(name in word for word in overrides) for name in blocks)
-    env = environment.make(hydra_config.load("task", *parts, "observe=small", "~observe.road", "~observe.neighbours"))
+    env = environment.make_env(hydra_config.load_config("task", *parts, "observe=small", "~observe.road", "~observe.neighbours"))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
     state, step = env.start(jax.random.key(0), scene), jax.jit(env.step)
     actions = [[0.8, 0.0, -1.0]] * 10 + [[0.0, 0.5, -1.0]] * 10 + [[-1.0, 0.0, -1.0]] * 10
@@ -66,8 +66,8 @@ def test_the_reader_of_the_page_converts_a_table(page, tmp_path):
     (tmp_path / "in" / "street.csv").write_text("\n".join(lines))
     (tmp_path / "in" / "empty.csv").write_text("lane,0,0")
     own = [word for word in words if "my_reader" in word]
-    summary = convert(hydra_config.load("convert", f"source={tmp_path / 'in'}", f"out={tmp_path / 'bank'}", "progress=false", *own))
+    summary = convert(hydra_config.load_config("convert", f"source={tmp_path / 'in'}", f"out={tmp_path / 'bank'}", "progress=false", *own))
     assert (summary.files, summary.scenes) == (2, 1)
     opened = bank_reader.open(tmp_path / "bank")
-    scene, report = bank_reader.packed(opened, [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = bank_reader.pack_scenes(opened, [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)

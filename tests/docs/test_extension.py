@@ -150,7 +150,7 @@ def test_a_reward_term_is_one_file_and_one_entry(run):
 
 
 def test_an_observation_group_is_one_file_and_one_entry(run):
-    before, after = policy_io.draw_untrained(run.config, scene_source.training(run.config["scenes"])[0]), run.state.parameters
+    before, after = policy_io.draw_untrained(run.config, scene_source.load_training_scenes(run.config["scenes"])[0]), run.state.parameters
     towers = jax.device_get(before)["params"], jax.device_get(after)["params"]
     vectors = 7 + 4 + 2  # ego, weather, and the clock
     for tower in ("actor", "critic"):
@@ -172,14 +172,14 @@ def test_a_logger_is_one_file_and_one_entry(run):
 
 
 def test_what_an_action_means_is_one_function_and_one_entry(mine):
-    env = environment.make(hydra_config.load("task", "dynamics=bicycle", *CRUISE))
+    env = environment.make_env(hydra_config.load_config("task", "dynamics=bicycle", *CRUISE))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]])
     state, _ = jax.jit(env.transition)(scene, env.start(jax.random.key(0), scene), jnp.array([[0.8, 0.5, 0.0], [-0.6, 0.0, 0.0]]))
     np.testing.assert_allclose(state.previous_action, [[0.4, 0.5, 0.0], [-0.3, 0.0, 1.0]])  # and kept in bounds
 
 
 def test_a_dynamics_backend_is_one_file_and_one_entry(mine):
-    env = environment.make(hydra_config.load("task", *DYNAMICS, "observe=small"))
+    env = environment.make_env(hydra_config.load_config("task", *DYNAMICS, "observe=small"))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
     state = env.start(jax.random.key(0), scene)
     step = jax.jit(env.transition)
@@ -195,7 +195,7 @@ def test_a_backend_may_be_an_option_of_the_group(mine):
     (mine / "conf" / "dynamics").mkdir(parents=True)
     (mine / "conf" / "dynamics" / "points.yaml").write_text("{_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}")
     place = f"hydra.searchpath=[{mine / 'conf'}]"
-    assert hydra_config.load("task", "dynamics=points", place)["dynamics"] == hydra_config.load("task", *DYNAMICS)["dynamics"]
+    assert hydra_config.load_config("task", "dynamics=points", place)["dynamics"] == hydra_config.load_config("task", *DYNAMICS)["dynamics"]
     flags = hydra_config.parse_flags(["-m", "--cfg", "job", "dynamics=points", place, "hydra.verbose=true"])
     assert hydra_config.as_overrides(flags) == ["dynamics=points", place]
 
@@ -206,11 +206,11 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
     (tmp_path / "in" / "street.csv").write_text("\n".join(lines))
     written(tmp_path / "in", document(), "logged.json")
     overrides = [f"source={tmp_path / 'in'}", f"out={tmp_path / 'bank'}", "progress=false"]
-    summary = convert(hydra_config.load("convert", *overrides, FORMAT))
+    summary = convert(hydra_config.load_config("convert", *overrides, FORMAT))
     opened = bank_reader.open(tmp_path / "bank")
     assert (summary.files, summary.scenes, opened.names) == (2, 2, ("street", "street"))  # the GPUDrive document has this name too
     index = next(i for i, source in enumerate(opened.metadata["source"].to_pylist()) if source.endswith(".csv"))
-    scene, report = bank_reader.packed(opened, [index], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = bank_reader.pack_scenes(opened, [index], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)
     assert scene.agents.route[0] == pytest.approx(40.0) and report.segments_kept == 80
 
@@ -227,4 +227,4 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
 )
 def test_a_part_of_ones_own_is_checked_like_any_other(mine, override, message):
     with pytest.raises(ConfigError, match=message):
-        environment.make(hydra_config.load("task", override, "dynamics=bicycle"))
+        environment.make_env(hydra_config.load_config("task", override, "dynamics=bicycle"))

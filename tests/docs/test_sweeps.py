@@ -37,9 +37,9 @@ def test_joblib_runs_them_at_a_time(tmp_path):
 
 def test_runs_that_begin_in_one_second_do_not_share_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    settings = hydra_config.load("train", *TOY)
+    settings = hydra_config.load_config("train", *TOY)
     with contextlib.ExitStack() as stack:
-        folders = [stack.enter_context(run_folder.opened(settings))[0] for _ in range(4)]
+        folders = [stack.enter_context(run_folder.open_run_folder(settings))[0] for _ in range(4)]
         assert len(set(folders)) == 4 and all(folder.is_dir() for folder in folders)
 
 

@@ -52,7 +52,7 @@ def lacking(monkeypatch):
     for name in ("ray", "gymnasium"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "scenefactory_jax.adapters.gymnasium", raising=False)
-    assign = scene_source.assign
+    assign = scene_source.assign_scenes
 
     def short_of_memory(scenes, worlds, **rest):
         return assign(scenes, worlds, **rest) if worlds < 10_000 else jnp.zeros((10**15,), jnp.uint8)
@@ -78,7 +78,7 @@ def said(command, folder, monkeypatch, capsys) -> str:
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
 
     def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load(config_name, *arguments[1:])))
+        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
 
     monkeypatch.setattr("hydra.main", composing)
     try:
@@ -120,7 +120,9 @@ def test_a_car_that_breaks_does_not_end_training():
 
 
 def test_an_error_of_our_own_keeps_its_traceback():
-    assert error_messages.explain(RuntimeError("a bug"), {}) is None and error_messages.explain(AssertionError(), {}) is None
-    assert error_messages.explain(KeyError("worlds"), {"worlds": 4}) is None
-    told = error_messages.explain(MemoryError("Unable to allocate 1.53 GiB for an array with shape (400000, 1024)"), {"worlds": 400000})
+    assert error_messages.explain_error(RuntimeError("a bug"), {}) is None and error_messages.explain_error(AssertionError(), {}) is None
+    assert error_messages.explain_error(KeyError("worlds"), {"worlds": 4}) is None
+    told = error_messages.explain_error(
+        MemoryError("Unable to allocate 1.53 GiB for an array with shape (400000, 1024)"), {"worlds": 400000}
+    )
     assert told is not None and "out of memory: Unable to allocate 1.53 GiB" in told and "worlds=400000" in told

@@ -9,13 +9,13 @@ from support.running import ROOT
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.track_interpolation import nobody
+from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics import collision
 
 NUMBERS = yaml.safe_load((ROOT / "conf" / "dynamics" / "base.yaml").read_text())["contact"]
 MASS = NUMBERS["mass"]
-touch = jax.jit(jax.vmap(collision.touch))
+touch = jax.jit(jax.vmap(collision.find_box_contact))
 
 
 def with_numbers(**changes):
@@ -27,7 +27,7 @@ both = jax.jit(with_numbers())
 
 
 def forces(cars):
-    return both(cars, nobody())
+    return both(cars, make_empty_boxes())
 
 
 def boxes(position, *, z=0.75, yaw=0.0, velocity=0.0, yaw_rate=0.0, size=(4.0, 2.0), mass=MASS, present=True) -> Boxes:
@@ -114,7 +114,7 @@ def test_momentum_is_kept(seed):
 def test_friction_and_damping_never_add_energy(seed):
     """With springs away (depths tiny compared to speeds), contact power is not positive."""
     cars = crowd(seed)
-    force, torque, _ = jax.jit(with_numbers(stiffness=1e-9))(cars, nobody())
+    force, torque, _ = jax.jit(with_numbers(stiffness=1e-9))(cars, make_empty_boxes())
     assert float((force * cars.velocity).sum() + (torque * cars.yaw_rate).sum()) < 0
 
 
@@ -170,7 +170,7 @@ def test_what_does_not_touch_feels_nothing():
     for state in (two(0.01, closing=20.0), two(-1.0, z=1.01), two(-1.0, present=[True, False])):
         assert all(not np.asarray(x).any() for x in (*forces(state), *both(*split(state))))
     alone = jax.tree.map(lambda leaf: leaf[:1], two(-1.0))
-    assert all(not np.asarray(x).any() for x in with_numbers()(alone, nobody()))
+    assert all(not np.asarray(x).any() for x in with_numbers()(alone, make_empty_boxes()))
 
 
 def test_a_touch_is_felt_within_a_tenth_of_a_millimetre():
@@ -241,10 +241,10 @@ def test_neighbours_are_the_nearest_by_their_outlines():
     cars = boxes([[0.0, 0.0], [100.0, 0.0]])
     others = boxes([[9.0, 0.0], [6.0, 0.0], [101.0, 0.0], [0.0, 5.0]], size=[[18.0, 2.5], [0.8, 0.8], [4.0, 2.0], [4.0, 2.0]],
                    present=[True, True, True, False])  # fmt: skip
-    near = collision.neighbours(cars, others, nearest=2)
+    near = collision.find_neighbours(cars, others, nearest=2)
     np.testing.assert_array_equal(near.position[:, :, 0], [[9.0, 6.0], [101.0, 9.0]])  # the long one's front is nearer than the person
-    assert collision.neighbours(cars, others, nearest=9).position.shape == (2, 4, 2)
-    assert collision.neighbours(cars, nobody(), nearest=4).position.shape == (2, 0, 2)
+    assert collision.find_neighbours(cars, others, nearest=9).position.shape == (2, 4, 2)
+    assert collision.find_neighbours(cars, make_empty_boxes(), nearest=4).position.shape == (2, 0, 2)
 
 
 def collide(masses, speed, *, offset=0.0, steps=240, dt=1 / 120, driven=False):
@@ -260,7 +260,7 @@ def collide(masses, speed, *, offset=0.0, steps=240, dt=1 / 120, driven=False):
             force, torque = (jnp.concatenate([x, jnp.zeros_like(x)]) for x in (force, torque))
             largest = jnp.concatenate([largest, largest])
         else:
-            force, torque, largest = with_numbers()(state, nobody())
+            force, torque, largest = with_numbers()(state, make_empty_boxes())
         velocity = state.velocity + dt * force / state.mass[:, None]
         rate = state.yaw_rate + dt * torque / inertia
         moved = replace(state, position=state.position + dt * velocity, yaw=state.yaw + dt * rate, velocity=velocity, yaw_rate=rate)

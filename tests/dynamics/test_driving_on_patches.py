@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from support.hand_scenes import scene_of
 
-from scenefactory_jax.cli.hydra_config import load
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches
-from scenefactory_jax.weather.friction import uniform
-from scenefactory_jax.weather.patches import condition
+from scenefactory_jax.weather.friction import make_uniform
+from scenefactory_jax.weather.patches import condition_at
 
 G, CARS, CHUNK = 9.81, 8, 30
 LANES = 500.0 * np.arange(CARS)
@@ -25,10 +25,10 @@ MU = {"AC": 1.1048, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
 
 @functools.cache
 def backend():
-    config = load("task")
-    grip = build(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    config = load_config("task")
+    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
     context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
-    dynamics = build(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+    dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
     @jax.jit
     def second(scene, body, action):
@@ -54,7 +54,7 @@ def drive(shapes, *, speed, seconds, throttle=0.0, steer=0.0, brake=0.0):
     patches = Patches(jnp.asarray(vertices), jnp.zeros(CARS, bool), radius, surface, film, nothing, jnp.asarray(present))
     start = np.stack([np.zeros(CARS), LANES], 1)
     scene = scene_of(start, start, speeds=np.full(CARS, speed))
-    scene = replace(scene, weather=replace(uniform(jnp.float32(0.0), jnp.int32(0)), patches=patches))
+    scene = replace(scene, weather=replace(make_uniform(jnp.float32(0.0), jnp.int32(0)), patches=patches))
     second, init = backend()
     body, parts = init(scene), []
     action = np.stack(np.broadcast_arrays(throttle, steer, brake, np.zeros(CARS))[:3], -1).astype(np.float32)
@@ -141,4 +141,4 @@ def test_the_condition_is_asked_where_the_wheels_are():
     motion = drive({0: coin, 1: ([[1.3, -1.0]], 0.2, "ICE", 0.0), 2: ([[0.0, 0.0]], 0.5, "ICE", 0.0)}, speed=0.0, seconds=1)
     one = (3 * MU["AC"] + MU["ICE"]) / 4
     np.testing.assert_allclose(motion.grip[0, :4], [one, one, MU["AC"], MU["AC"]], atol=2e-3)
-    assert condition(uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)
+    assert condition_at(make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)

@@ -14,8 +14,8 @@ import pytest
 from omegaconf import OmegaConf
 from support.hand_scenes import scene_of
 
-from scenefactory_jax.cli.hydra_config import load
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import bounds
@@ -33,7 +33,7 @@ BACKENDS = ("mjx_car", "bicycle", "replay")
 
 @functools.cache
 def config(name):
-    return load("task", f"dynamics={name}")["dynamics"]
+    return load_config("task", f"dynamics={name}")["dynamics"]
 
 
 def numbers_of(name):
@@ -49,7 +49,7 @@ def grip(weather, position, speed):
 def make(name, **changes):
     entry = OmegaConf.to_container(OmegaConf.merge(config(name), changes))
     context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
-    return build(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+    return instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 def scene_for(position=None, yaw=None, speed=0.0):
@@ -338,13 +338,13 @@ def test_bicycle_reports_contact_and_keeps_going():
 @pytest.mark.parametrize("name", ["mjx_car", "mjx_published"])
 def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
     car, solver = numbers_of(name)
-    plain = cars.standalone(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
-    seen = cars.standalone(car, solver, physics_dt=1 / 120, visual=True, brake_rows=True)
+    plain = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    seen = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=True, brake_rows=True)
     assert (plain.nq, plain.nv, plain.npair) == (17, 16, 4) and seen.ngeom > plain.ngeom
     np.testing.assert_allclose(seen.body_mass, plain.body_mass)
     assert plain.body_mass.sum() == pytest.approx(1980.03, abs=0.01)
     np.testing.assert_allclose(seen.body_inertia, plain.body_inertia)
-    height = cars.rest(plain, car)[2]
+    height = cars.find_rest_pose(plain, car)[2]
     assert height == pytest.approx({"mjx_car": 0.755, "mjx_published": 0.57}[name], abs=0.01)
     assert name != "mjx_car" or config("bicycle")["centre_height"] == pytest.approx(height, abs=1e-3)
 
@@ -387,14 +387,14 @@ def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
     group, name = key.split(".")
     entry = {**config("mjx_car"), group: {**config("mjx_car")[group], name: bad}}
     with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted (is|are) .*{wanted}"):
-        cars.numbers(entry)
+        cars.read_parameters(entry)
 
 
 def test_every_number_of_a_car_has_its_bounds():
     numbers = {field.name for kind in (cars.CarParameters, cars.Solver) for field in dataclasses.fields(kind)}
     assert bounds.BOUNDS.keys() == numbers - {"algorithm", "integrator"}
     for name in ("mjx_car", "mjx_published"):
-        cars.numbers(config(name))
+        cars.read_parameters(config(name))
 
 
 @pytest.mark.parametrize(
@@ -420,7 +420,7 @@ def test_no_two_parts_of_a_start_share_memory(name):
 def test_refuses_a_control_step_that_is_no_multiple():
     context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 50}
     with pytest.raises(ConfigError, match="whole multiple"):
-        build(config("mjx_car"), builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+        instantiate(config("mjx_car"), builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 @pytest.mark.slow

@@ -41,19 +41,19 @@ def quick():
 @pytest.fixture(scope="module")
 def model():
     """Compiled with all that MJX's stages need."""
-    return cars.standalone(CAR, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
+    return cars.build_standalone_model(CAR, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
 
 
 @pytest.fixture(scope="module")
 def stages(model):
-    return mjx_backend.compiled(model)
+    return mjx_backend.compile_stages(model)
 
 
 @pytest.fixture(scope="module")
 def crew():
     """As many cars, no two alike."""
     several = [jax.tree.map(jnp.float32, random_car(seed)) for seed in range(COUNT)]
-    return jax.vmap(randomization.enlist)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *several))
+    return jax.vmap(randomization.derive_constants)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *several))
 
 
 @pytest.fixture(scope="module")
@@ -70,24 +70,26 @@ def cases(model):
 
 def told(own, qpos, qvel, command, friction):
     """State and load of one car."""
-    state = states.seen(own.car, qpos, qvel)
-    pushed = actuators.applied(own.car, state, command, actuators.pulling(own.car, command.drive, state.spin))
-    return state, actuators.Load(pushed, command.mu, friction, actuators.slip_damping(own.car, state))
+    state = states.from_mujoco(own.car, qpos, qvel)
+    pushed = actuators.make_step_input(own.car, state, command, actuators.compute_drive_torque(own.car, command.drive, state.spin))
+    return state, actuators.PhysicsStepInput(pushed, command.mu, friction, actuators.compute_slip_damping(own.car, state))
 
 
 def of_arrow(own, *case):
     """The problem in closed form, and the rows of which tyres count."""
     state, load = told(own, *case)
-    patch = tyres.touch(own, state)
-    return closed_form_step.problem_of(own, state, patch, load, **STEP), patch.depth > 0.0
+    patch = tyres.find_contact_patches(own, state)
+    return closed_form_step.make_contact_problem(own, state, patch, load, **STEP), patch.depth > 0.0
 
 
 def of_mjx(own, *case, stages):
     """MJX's model and data, and the reference with what `tyres.turning` adds."""
     qpos, qvel = case[:2]
     state, load = told(own, *case)
-    own_model, data = mjx_backend.smooth(stages, mjx_backend.fit(stages.model, stages.places, own), state, load, qpos, qvel)
-    away = tyres.turning(tyres.touch(own, state), equations_of_motion.drift(state))
+    own_model, data = mjx_backend.compute_smooth_dynamics(
+        stages, mjx_backend.fit_model(stages.model, stages.places, own), state, load, qpos, qvel
+    )
+    away = tyres.compute_jdot_qvel(tyres.find_contact_patches(own, state), equations_of_motion.compute_bias_acceleration(state))
     turn = jnp.stack([dot(axis, away) for axis in (state.north, -state.east)], axis=-1)
     return own_model, data, data._impl.efc_aref.at[stages.rows[:, 1:]].add(-turn), load
 
@@ -129,22 +131,25 @@ def test_the_problem_is_that_of_mjx_for_cars_that_differ(quick, crew, cases, sta
 def test_inertia_and_forces_are_the_c_engines(cases, seed):
     """In double precision, of cars that were compiled one by one."""
     car = random_car(seed)
-    model = cars.standalone(car, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
-    data, full, at = mujoco.MjData(model), np.zeros((16, 16)), columns(mjx_backend.compiled(model))
-    own = randomization.enlist(jax.tree.map(jnp.float32, car))
+    model = cars.build_standalone_model(car, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
+    data, full, at = mujoco.MjData(model), np.zeros((16, 16)), columns(mjx_backend.compile_stages(model))
+    own = randomization.derive_constants(jax.tree.map(jnp.float32, car))
     qpos, qvel = cases[:2]
 
     @jax.jit
     @jax.vmap
     def one(qpos, qvel):
-        state = states.seen(own.car, qpos, qvel)
+        state = states.from_mujoco(own.car, qpos, qvel)
         base, across, joints = (
             jnp.stack([jnp.stack([jnp.broadcast_to(number, shape) for number in row]) for row in part])
-            for part, shape in zip(equations_of_motion.inertia(own.car, state), ((), (4,), (4,)), strict=True)
+            for part, shape in zip(equations_of_motion.compute_mass_matrix(own.car, state), ((), (4,), (4,)), strict=True)
         )
-        away, held = equations_of_motion.bias(own.car, state, equations_of_motion.drift(state)), actuators.springs(own.car, state)
+        away, held = (
+            equations_of_motion.compute_bias_force(own.car, state, equations_of_motion.compute_bias_acceleration(state)),
+            actuators.compute_suspension_forces(own.car, state),
+        )
         smooth = jax.tree.map(lambda a, b: a - b, held, away)
-        pushed = states.flat([*smooth.force, *smooth.torque], [smooth.suspension, smooth.spin, smooth.steer], state)
+        pushed = states.flatten([*smooth.force, *smooth.torque], [smooth.suspension, smooth.spin, smooth.steer], state)
         rotation = jnp.stack([jnp.stack(row) for row in states.matrix(qpos[3:7])])
         return base, across, joints, pushed, rotation
 
@@ -210,24 +215,26 @@ def test_a_car_at_rest_has_a_slope_of_its_turning():
 
 def test_joints_stand_where_the_compiled_model_has_them(model, cases):
     """Numbers by joint to MuJoCo's order and axes and back."""
-    at, (qpos, qvel) = cars.places(model), cases[:2]
+    at, (qpos, qvel) = cars.find_addresses(model), cases[:2]
     one = jax.tree.map(lambda leaf: leaf[0], (qpos, qvel))
-    state = states.seen(CAR, *one)
+    state = states.from_mujoco(CAR, *one)
     for places, number in ((at.suspension_q, state.travel), (at.steer_q, state.steer[:2])):
         np.testing.assert_array_equal(one[0][places], number)
     for places, number in ((at.suspension_v, state.sinking), (at.steer_v, state.steering[:2]), (at.spin_v, state.spin)):
         np.testing.assert_array_equal(one[1][places], number)
-    np.testing.assert_allclose(states.flat(*states.unflat(one[1], state), state), one[1], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(states.flatten(*states.unflatten(one[1], state), state), one[1], rtol=1e-5, atol=1e-5)
 
 
 def test_masses_and_weights_are_the_compiled_models(model):
-    own, compiled = randomization.enlist(jax.tree.map(jnp.float32, CAR)), articulated_car.compiled(
+    own, compiled = randomization.derive_constants(jax.tree.map(jnp.float32, CAR)), articulated_car.compile_car(
         CAR, SOLVER, brakes="friction", physics_dt=DT, control_dt=4 * DT
     ).own  # fmt: skip
     np.testing.assert_allclose(own.spin_weight, compiled.spin_weight, rtol=1e-4)
     np.testing.assert_allclose(own.wheel_weight, compiled.wheel_weight, rtol=1e-4)
-    assert equations_of_motion.mass(CAR) == pytest.approx(model.body_mass.sum())
-    np.testing.assert_allclose(equations_of_motion.load(CAR), [cars.corner_load(CAR, front=front) for front in (True, True, False, False)])
+    assert equations_of_motion.total_mass(CAR) == pytest.approx(model.body_mass.sum())
+    np.testing.assert_allclose(
+        equations_of_motion.compute_loads(CAR), [cars.corner_load(CAR, front=front) for front in (True, True, False, False)]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -237,15 +244,15 @@ def moves(cases):
     both = []
     for algorithm in ("arrow", "Newton"):
         solver = dataclasses.replace(SOLVER, algorithm=algorithm, iterations=20, line_search=12, tolerance=0.0)
-        plant = articulated_car.compiled(CAR, solver, brakes="friction", physics_dt=DT, control_dt=4 * DT)
+        plant = articulated_car.compile_car(CAR, solver, brakes="friction", physics_dt=DT, control_dt=4 * DT)
         with jax.default_matmul_precision("highest"):
-            move = jax.jit(jax.vmap(functools.partial(articulated_car.move, plant, plant.own, {})))
+            move = jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.own, {})))
             both.append(lambda now, move=move: move(now, command))
     return both, plant
 
 
 def at(qpos, qvel):
-    return articulated_car.Single(qpos, qvel, jnp.zeros((COUNT, 16)), jnp.ones((COUNT, 4)))
+    return articulated_car.CarCarry(qpos, qvel, jnp.zeros((COUNT, 16)), jnp.ones((COUNT, 4)))
 
 
 def test_a_step_is_that_of_mjxs_newton(quick, moves, cases):
@@ -275,11 +282,12 @@ def test_the_solver_converges_where_it_is_compiled_with_its_problem():
     """
     count, rng = 240, np.random.default_rng(7)
     plants = [
-        articulated_car.compiled(CAR, dataclasses.replace(SOLVER, **more), brakes="friction", physics_dt=DT, control_dt=4 * DT)
+        articulated_car.compile_car(CAR, dataclasses.replace(SOLVER, **more), brakes="friction", physics_dt=DT, control_dt=4 * DT)
         for more in ({}, {"iterations": 20, "line_search": 10})
     ]
     shipped, patient = (
-        jax.jit(jax.vmap(functools.partial(articulated_car.move, plant, plant.own, {})), compiler_options=BY_DEFAULT) for plant in plants
+        jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.own, {})), compiler_options=BY_DEFAULT)
+        for plant in plants
     )
     draw = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (count, *shape)), jnp.float32)  # noqa: E731
     qpos = jnp.tile(jnp.asarray(plants[0].still, jnp.float32), (count, 1))
@@ -288,7 +296,7 @@ def test_the_solver_converges_where_it_is_compiled_with_its_problem():
     mu = jnp.broadcast_to(draw(0.05, 1.2, 1), (count, 4))
     drive, brake = CAR.drive_torque * draw(0.0, 1.0), CAR.brake_torque_front * jnp.maximum(draw(-1.0, 1.0, 1), 0.0) * jnp.ones(4)
     command = actuators.Command(CAR.steering_limit * draw(-1.0, 1.0), drive, brake, mu, jnp.zeros((count, 2)), jnp.zeros(count))
-    now = articulated_car.Single(qpos, qvel, jnp.zeros((count, 16)), jnp.ones((count, 4)))
+    now = articulated_car.CarCarry(qpos, qvel, jnp.zeros((count, 16)), jnp.ones((count, 4)))
     for _ in range(24):
         now, _ = patient(now, command)
     apart = np.abs(np.asarray(shipped(now, command)[0].qacc_warmstart - patient(now, command)[0].qacc_warmstart))[:, :6].max(1)

@@ -6,7 +6,7 @@ import pytest
 from test_dynamics import LANES, drive, random_controls, scene_for
 
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Log
+from scenefactory_jax.core.types import AgentLog
 from scenefactory_jax.dynamics import log_playback
 
 
@@ -17,7 +17,7 @@ def logged(valid):
     yaw = np.tile((3.0 + 0.5 * t + np.pi) % (2 * np.pi) - np.pi, (8, 1))
     velocity = np.tile(np.array([10.0, 0.0]), (8, len(t), 1))
     position, yaw, velocity = (jnp.asarray(x, jnp.float32) for x in (position, yaw, velocity))
-    return Log(position=position, yaw=yaw, velocity=velocity, valid=jnp.tile(jnp.asarray(valid, bool), (8, 1)), dt=jnp.float32(0.1))
+    return AgentLog(position=position, yaw=yaw, velocity=velocity, valid=jnp.tile(jnp.asarray(valid, bool), (8, 1)), dt=jnp.float32(0.1))
 
 
 def test_replay_follows_the_log_whatever_the_action():

@@ -14,8 +14,8 @@ from mujoco import mjx
 from support.hand_scenes import scene_of
 from test_dynamics import CHUNK, EVERYONE, KEY, LANES, MU, G, compile_, constant, make, numbers_of, random_controls, scene_for
 
-from scenefactory_jax.cli.hydra_config import amend, load
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import pack, validation
@@ -41,7 +41,7 @@ def random_car(seed):
 
 def changed(**factors):
     """The reference car with some numbers multiplied, as plain numbers."""
-    return randomization.scaled(CAR, factors)
+    return randomization.scale_parameters(CAR, factors)
 
 
 CARS = [
@@ -78,8 +78,8 @@ def several():
 def started(scene, cars_of):
     """Bodies at their start, of other cars than `CARS`: what `init` does, without its trace."""
     body = several()[2](scene)
-    crew = jax.vmap(randomization.enlist)(stacked(cars_of))
-    height, travel = jax.vmap(functools.partial(randomization.standing, physics_dt=1 / 120))(crew)
+    crew = jax.vmap(randomization.derive_constants)(stacked(cars_of))
+    height, travel = jax.vmap(functools.partial(randomization.place_at_rest, physics_dt=1 / 120))(crew)
     qpos = body.qpos.at[:, 2].set(height).at[:, [7, 10, 13, 15]].set(travel)
     spin = scene.agents.speed / crew.car.wheel_radius
     return replace(body, fleet=crew, qpos=qpos, qvel=body.qvel.at[:, [8, 11, 13, 15]].set(spin[:, None]))
@@ -95,7 +95,7 @@ def drive(scene, action, body=None):
 
 
 def test_columns_are_those_that_started_relies_on():
-    at = cars.places(cars.standalone(CAR, SOLVER, **COMPILED))
+    at = cars.find_addresses(cars.build_standalone_model(CAR, SOLVER, **COMPILED))
     assert at.suspension_q.tolist() == [7, 10, 13, 15] and at.spin_v.tolist() == [8, 11, 13, 15]
     assert at.wheel.tolist() == WHEEL_BODIES and at.chassis == CHASSIS
 
@@ -104,21 +104,21 @@ def test_columns_are_those_that_started_relies_on():
 def test_a_fitted_model_is_the_compiled_one(seed):
     """Every number that MJX's step reads, to 1e-4."""
     other = random_car(seed)
-    model = cars.standalone(CAR, SOLVER, **COMPILED)
-    own = randomization.enlist(jax.tree.map(jnp.float32, other))
+    model = cars.build_standalone_model(CAR, SOLVER, **COMPILED)
+    own = randomization.derive_constants(jax.tree.map(jnp.float32, other))
     put = functools.partial(mjx.put_model, impl="jax")
-    fitted = put(model).replace(**mjx_backend.fit(put(model), cars.places(model), own))
+    fitted = put(model).replace(**mjx_backend.fit_model(put(model), cars.find_addresses(model), own))
     # where a free body starts, its box, what only other solvers, engines or sensors read: no step looks at it
     unread = {"stat", "qpos0", "dof_M0", "geom_aabb", "geom_rbound"}
     partly = {"body_invweight0", "dof_invweight0", "qpos_spring", "geom_size", "body_pos"}  # below
-    wanted = put(cars.standalone(other, SOLVER, **COMPILED))
+    wanted = put(cars.build_standalone_model(other, SOLVER, **COMPILED))
     compared = 0
     for (path, right), left in zip(jax.tree_util.tree_leaves_with_path(wanted), jax.tree.leaves(fitted), strict=True):
         if path[0].name not in unread | partly:
             np.testing.assert_allclose(np.asarray(left), np.asarray(right), rtol=1e-4, atol=1e-7, err_msg=jax.tree_util.keystr(path))
             compared += 1
     assert compared > 100
-    spin, spring = cars.places(model).spin_v, cars.places(model).suspension_q
+    spin, spring = cars.find_addresses(model).spin_v, cars.find_addresses(model).suspension_q
     np.testing.assert_allclose(fitted.dof_invweight0[spin], wanted.dof_invweight0[spin], rtol=1e-4)
     np.testing.assert_allclose(fitted.body_invweight0[WHEEL_BODIES, 0], wanted.body_invweight0[WHEEL_BODIES, 0], rtol=1e-4)
     np.testing.assert_allclose(fitted.qpos_spring[spring], wanted.qpos_spring[spring], rtol=1e-4, atol=1e-6)
@@ -130,8 +130,8 @@ def test_a_fitted_model_is_the_compiled_one(seed):
 def test_standing_height_is_where_the_c_engine_settles(seed):
     """Of level cars: the centre of mass amidships. A car that leans is 'level' at its axles' mean."""
     for other in (dataclasses.replace(random_car(seed), mass_forward=0.0, wheel_damping=0.5), changed(mass=2.5, suspension_stiffness=0.5)):
-        settled = cars.rest(cars.standalone(other, SOLVER, **COMPILED), other)
-        height, travel = randomization.standing(randomization.enlist(jax.tree.map(jnp.float32, other)), physics_dt=1 / 120)
+        settled = cars.find_rest_pose(cars.build_standalone_model(other, SOLVER, **COMPILED), other)
+        height, travel = randomization.place_at_rest(randomization.derive_constants(jax.tree.map(jnp.float32, other)), physics_dt=1 / 120)
         assert float(height) == pytest.approx(settled[2], abs=2e-3)
         np.testing.assert_allclose(travel, settled[[7, 10, 13, 15]], atol=2e-3)
 
@@ -186,7 +186,7 @@ def test_axles_carry_what_statics_say():
 def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
     sizes = jnp.array([[4.0, 2.0], [4.0, 2.0], [12.0, 2.5], [2.5, 1.2], [5.0, 2.0], [4.0, 1.6], [3.2, 1.6], [6.0, 2.4]])
     reference = jax.tree.map(lambda leaf: jnp.full((8,), leaf, jnp.float32), CAR)
-    resized = randomization.resize(reference, sizes)
+    resized = randomization.resize_car(reference, sizes)
     crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in jax.tree.leaves(resized)]) for i in range(8)]
     assert crew[2].mass == pytest.approx(1800 * 3.75) and crew[2].wheelbase == pytest.approx(7.8)
     for one in crew:
@@ -227,12 +227,12 @@ def test_mass_reaches_the_contact():
 
 
 def spread(**changes):
-    return load("task", "dynamics/fleet=spread")["dynamics"]["fleet"] | changes
+    return load_config("task", "dynamics/fleet=spread")["dynamics"]["fleet"] | changes
 
 
 def sampler(**changes):
     numbers = {key: value for key, value in spread(**changes).items() if key != "_target_"}
-    return randomization.drawn(car=CAR, physics_dt=1 / 120, **numbers)
+    return randomization.draw_cars(car=CAR, physics_dt=1 / 120, **numbers)
 
 
 def test_draws_are_pure_in_the_key_and_within_their_ranges():
@@ -283,27 +283,30 @@ def test_a_spread_that_cannot_be_is_refused_at_build(changes, named):
 
 
 def test_the_reference_numbers_leave_room_for_the_shipped_spread():
-    worst = randomization.worst(CAR, {name: tuple(span) for name, span in spread()["scale"].items()})
+    worst = randomization.find_worst(CAR, {name: tuple(span) for name, span in spread()["scale"].items()})
     assert worst.suspension_damping > CAR.suspension_damping and worst.mass < CAR.mass and worst.inertia[0] < CAR.inertia[0]
     cars.stable_limits(worst, physics_dt=1 / 120, where="")
 
 
 def test_a_run_can_be_amended_with_a_fleet():
-    config = load("task")
+    config = load_config("task")
     assert config["dynamics"]["fleet"] is None
-    amended = amend(config, ["dynamics/fleet=sizes"])
+    amended = apply_overrides(config, ["dynamics/fleet=sizes"])
     assert amended["dynamics"]["fleet"]["size"] == "logged" and amended["dynamics"]["car"] == config["dynamics"]["car"]
     assert config["dynamics"]["fleet"] is None
 
 
 def test_sizes_of_real_scenes_build_and_step(shared_data):
     """Cars as large as the recording says, from its scenes to a second of driving."""
-    scenes = load("convert", "scenes=womd", "scenes.pack.car_size_m=null")["scenes"]
+    scenes = load_config("convert", "scenes=womd", "scenes.pack.car_size_m=null")["scenes"]
     formats = reader_selection.make(scenes["formats"])
-    check, packing = build(scenes["check"], builtins=validation, where="check"), build(scenes["pack"], builtins=pack, where="pack")
+    check, packing = (
+        instantiate(scenes["check"], builtins=validation, where="check"),
+        instantiate(scenes["pack"], builtins=pack, where="pack"),
+    )
     path = sorted((shared_data / "womd" / "train").iterdir())[0]
     scene = jax.tree.map(jnp.asarray, pack.prepare(next(iter(reader_selection.read(path, formats))), check=check, pack=packing).scene)
-    entry = load("task", "dynamics/fleet=sizes")["dynamics"]["fleet"]
+    entry = load_config("task", "dynamics/fleet=sizes")["dynamics"]["fleet"]
     dynamics = make("mjx_car", fleet=entry)
     present = scene.agents.present
     body = jax.jit(dynamics.init)(KEY, scene)

@@ -115,7 +115,7 @@ def test_a_lateral_force_needs_the_same_slip_angle_at_every_speed():
     slow, fast, middle, old_slow, old_fast = slip[grips]
     assert slow == pytest.approx(fast, rel=0.1) and middle == pytest.approx(fast, rel=0.1)
     assert old_slow > 2.5 * old_fast  # slip velocity: three times the angle at a third of the speed
-    weight = randomization.enlist(jax.tree.map(jnp.float32, law)).wheel_weight[2]
+    weight = randomization.derive_constants(jax.tree.map(jnp.float32, law)).wheel_weight[2]
     d = law.tyre_impedance
     yields = float(weight) * (1 - d) / d / SOLVER.friction_ratio
     assert fast == pytest.approx(motion_laws.mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
@@ -127,7 +127,7 @@ def test_below_the_slip_speed_nothing_changes():
     law = dataclasses.replace(FREE, tyre_slip_speed=2.5, tyre_slip_damping=20.0)
 
     def damping(of, velocity):
-        return actuators.slip_damping(of, states.seen(of, jnp.zeros(17).at[3].set(1.0), velocity))
+        return actuators.compute_slip_damping(of, states.from_mujoco(of, jnp.zeros(17).at[3].set(1.0), velocity))
 
     found = jax.vmap(functools.partial(damping, law))(qvel)
     np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 10.0, 2.0], rtol=1e-6)
@@ -139,9 +139,9 @@ def test_gradients_are_finite_at_rest():
 
     def load(qvel):
         command = actuators.Command(*[jnp.zeros(())] * 2, jnp.zeros(4), jnp.ones(4), jnp.zeros(2), jnp.zeros(()))
-        state = states.seen(law, jnp.zeros(17).at[3].set(1.0), qvel)
-        pushed = actuators.applied(law, state, command, jnp.zeros(4))
-        return sum(jnp.sum(part) for part in jax.tree.leaves(pushed)) + actuators.slip_damping(law, state)
+        state = states.from_mujoco(law, jnp.zeros(17).at[3].set(1.0), qvel)
+        pushed = actuators.make_step_input(law, state, command, jnp.zeros(4))
+        return sum(jnp.sum(part) for part in jax.tree.leaves(pushed)) + actuators.compute_slip_damping(law, state)
 
     slope = jax.jit(jax.grad(load))
     for speed in (0.0, 3.0, 10.0):
@@ -172,7 +172,7 @@ def test_each_car_has_its_own_and_drives_as_in_the_c_engine():
 
 
 def test_resistance_grows_with_the_footprint():
-    larger = randomization.resize(dataclasses.replace(CAR, **ON), np.array([8.0, 3.0]))
+    larger = randomization.resize_car(dataclasses.replace(CAR, **ON), np.array([8.0, 3.0]))
     assert larger.rolling_torque == pytest.approx(3 * 40.0) and larger.air_drag == pytest.approx(3 * 1.5)
     assert larger.tyre_slip_speed == 3.0
 

@@ -12,12 +12,12 @@ import scenefactory_jax
 from scenefactory_jax.core import geometry
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.track_interpolation import nobody
-from scenefactory_jax.core.types import Dynamics, Motion, Step
+from scenefactory_jax.core.track_interpolation import make_empty_boxes
+from scenefactory_jax.core.types import Dynamics, Motion, RewardInput
 from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, surrogate_safety, termination, traffic
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.roadgraph import queries
-from scenefactory_jax.weather.road_condition import keep
+from scenefactory_jax.weather.road_condition import keep_condition
 
 CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
 
@@ -32,13 +32,13 @@ def glide() -> Dynamics:
     def advance(scene, body, action, active):
         v = jnp.where(active, body["v"] + action[:, 0], body["v"])
         v = jnp.where(action[:, 0] > 0.99, jnp.nan, v)
-        p = body["p"] + jnp.where(active, v / 30, 0.0)[:, None] * geometry.heading(body["yaw"])
+        p = body["p"] + jnp.where(active, v / 30, 0.0)[:, None] * geometry.heading_vector(body["yaw"])
         return {**body, "p": p, "v": v, "force": jnp.where(action[:, 2] > 0.5, 100.0, 0.0)}
 
     def read(body):
         zero = jnp.zeros_like(body["v"])
         flat = lambda xy, z: jnp.concatenate([xy, z[:, None]], axis=1)  # noqa: E731
-        velocity = body["v"][:, None] * geometry.heading(body["yaw"])
+        velocity = body["v"][:, None] * geometry.heading_vector(body["yaw"])
         place, speed = flat(body["p"], zero + 0.6), flat(velocity, zero)
         return Motion(place, speed, body["yaw"], zero, zero + 1, zero, body["force"], zero + 1, zero, zero)
 
@@ -50,16 +50,16 @@ def config():
     return scenefactory_jax.load("task")
 
 
-def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.ignore, hold=1):
-    parts = environment.Parts(
+def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.no_traffic, hold=1):
+    parts = environment.EnvParts(
         dynamics=glide(),
-        command=actions.pedals,
+        command=actions.separate_pedals,
         hold=hold,
         draw_agents=draw,
-        draw_weather=keep,
+        draw_weather=keep_condition,
         others=beside,
-        measure=functools.partial(step_metrics.measure, **config["facts"]),
-        judge=functools.partial(termination.judge, ending=ending or config["ends"]["ending"]),
+        measure=functools.partial(step_metrics.compute, **config["facts"]),
+        judge=functools.partial(termination.evaluate, ending=ending or config["ends"]["ending"]),
         terms=rewards.make(config["reward"]),
         groups=observations.make({**config["observe"], "road": {**config["observe"]["road"], "count": 40}}),
         episode_steps=steps,
@@ -82,11 +82,11 @@ def test_angles_wrap_and_frames_invert():
 
 
 def test_norm_has_a_gradient_at_rest():
-    assert jnp.all(jnp.isfinite(jax.grad(lambda v: geometry.norm(v).sum())(jnp.zeros((2, 2)))))
+    assert jnp.all(jnp.isfinite(jax.grad(lambda v: geometry.safe_norm(v).sum())(jnp.zeros((2, 2)))))
 
 
 def test_car_circles_are_the_published_ones():
-    centres, radius = geometry.car_circles(jnp.zeros((1, 2)), jnp.zeros(1), jnp.array([[4.0, 2.0]]), **CIRCLES)
+    centres, radius = geometry.cover_with_circles(jnp.zeros((1, 2)), jnp.zeros(1), jnp.array([[4.0, 2.0]]), **CIRCLES)
     np.testing.assert_allclose(radius, [1.1], rtol=1e-6)
     np.testing.assert_allclose(centres[0, :, 0], [1.12, 0, -1.12], atol=1e-6)
 
@@ -113,9 +113,9 @@ def test_ttc_equals_a_simulated_one():
     position, yaw = rng.uniform(-12, 12, (5, 2)), rng.uniform(-3, 3, 5)
     velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
     sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
-    centres, radius = geometry.car_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
+    centres, radius = geometry.cover_with_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
     moving = (jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32))
-    ttc, drac, *_ = surrogate_safety.pairwise(centres, radius, *moving, drac_gap_floor_m=1.0)
+    ttc, drac, *_ = surrogate_safety.compare_pairs(centres, radius, *moving, drac_gap_floor_m=1.0)
     ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
     expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
     assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
@@ -125,9 +125,9 @@ def test_ttc_equals_a_simulated_one():
 
 def test_head_on_ttc_and_drac_by_hand():
     yaw, size = jnp.array([0.0, jnp.pi]), jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
-    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
+    centres, radius = geometry.cover_with_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
     velocity = jnp.array([[5.0, 0], [-5.0, 0]])
-    ttc, drac, away, ahead = surrogate_safety.pairwise(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    ttc, drac, away, ahead = surrogate_safety.compare_pairs(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
     gap = 20 - 2 * 1.12 - 2 * 1.1
     for distances in (away, ahead):
         np.testing.assert_allclose(distances, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
@@ -137,8 +137,8 @@ def test_head_on_ttc_and_drac_by_hand():
 
 def test_parting_cars_never_meet():
     size = jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
-    centres, radius = geometry.car_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
-    ttc, *_ = surrogate_safety.pairwise(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
+    centres, radius = geometry.cover_with_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
+    ttc, *_ = surrogate_safety.compare_pairs(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
     assert jnp.isinf(ttc).all()
 
 
@@ -146,8 +146,8 @@ def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
     """Followers 10 m behind, 1.5 m to the side; the third car is 2.3 m beside the first, just out of its way."""
     size = jnp.tile(jnp.array([4.0, 2.0]), (3, 1))
     place = jnp.array([[0.0, 0], [10.0, 1.5], [10.0, -2.3]])
-    centres, radius = geometry.car_circles(place, jnp.zeros(3), size, **CIRCLES)
-    ahead = surrogate_safety.pairwise(centres, radius, jnp.zeros((3, 2)), jnp.zeros(3), drac_gap_floor_m=1.0).ahead
+    centres, radius = geometry.cover_with_circles(place, jnp.zeros(3), size, **CIRCLES)
+    ahead = surrogate_safety.compare_pairs(centres, radius, jnp.zeros((3, 2)), jnp.zeros(3), drac_gap_floor_m=1.0).ahead
     free = 10 - 2 * 1.12 - np.sqrt(2.2**2 - 1.5**2)
     np.testing.assert_allclose(ahead, [[np.inf, free, np.inf], [np.inf] * 3, [np.inf] * 3], rtol=1e-5)
 
@@ -155,7 +155,7 @@ def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
 def test_first_hits_keeps_storage_order():
     rng = np.random.default_rng(1)
     hits = rng.random((7, 90)) < 0.2
-    index, mask = queries.first_hits(jnp.asarray(hits), count=12)
+    index, mask = queries.first_edge_hits(jnp.asarray(hits), count=12)
     for row in range(7):
         expected = np.flatnonzero(hits[row])[:12]
         assert list(np.asarray(index[row])[np.asarray(mask[row])]) == list(expected)
@@ -207,7 +207,7 @@ def test_encounters_by_hand_and_from_any_frame(env):
         scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
         state, _ = env.reset(jax.random.key(0), scene)
         state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.1, 0.3, 0.0])))
-        return jax.tree.map(np.asarray, observations.encounters(scene, state, **numbers))
+        return jax.tree.map(np.asarray, observations.closest_approach(scene, state, **numbers))
 
     rows = seen(0.0, [0.0, 0.0])
     squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
@@ -225,7 +225,7 @@ def test_one_pedal_brakes_below_zero():
     asked = jnp.array([[0.6, -0.2, -1.0], [-0.3, 0.1, -1.0], [-0.3, 0.0, 0.7], [0.5, 1.0, 0.4], [-1.0, 0.0, 0.0]])
     wanted = [[0.6, -0.2, -0.6], [0.0, 0.1, 0.3], [0.0, 0.0, 0.7], [0.5, 1.0, 0.4], [0.0, 0.0, 1.0]]
     np.testing.assert_allclose(actions.one_pedal(asked), wanted, rtol=1e-6)
-    np.testing.assert_array_equal(actions.pedals(asked), asked)
+    np.testing.assert_array_equal(actions.separate_pedals(asked), asked)
 
 
 def test_controls_are_what_dynamics_and_rewards_are_given(config):
@@ -234,12 +234,12 @@ def test_controls_are_what_dynamics_and_rewards_are_given(config):
     scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]], speeds=[10.0])
 
     def speed_after(entry):
-        env = environment.make({**own, "controls": {"command": entry, "every": 1}})
+        env = environment.make_env({**own, "controls": {"command": entry, "every": 1}})
         state, _ = env.reset(jax.random.key(0), scene)
         state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
-        return float(geometry.norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
+        return float(geometry.safe_norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
 
-    rolled, braked = speed_after({"_target_": "pedals"}), speed_after({"_target_": "one_pedal"})
+    rolled, braked = speed_after({"_target_": "separate_pedals"}), speed_after({"_target_": "one_pedal"})
     assert rolled[0] == pytest.approx(10.0, abs=0.01) and braked[0] < 9.95
     np.testing.assert_allclose(braked[1], [0, 0, 0.5])
 
@@ -256,7 +256,7 @@ def test_an_action_stands_until_the_next_is_read(config):
     np.testing.assert_allclose(taken, [0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
     for every, message in ((7, "controls.every: 7; wanted is a divisor of the 1500 control steps"), (0, "controls.every: 0; wanted")):
         with pytest.raises(ConfigError, match=message):
-            environment.make({**config, "controls": {**config["controls"], "every": every}})
+            environment.make_env({**config, "controls": {**config["controls"], "every": every}})
 
 
 def test_a_step_is_an_action_with_all_its_control_steps(config):
@@ -297,7 +297,7 @@ def test_a_car_knows_how_it_turns(env):
     scene = scene_of([[0.0, 0], [0, 9]], [[50.0, 0]] * 2)
     state, _ = env.reset(jax.random.key(0), scene)
     state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.4, -1.0]), steer=jnp.array([-0.1, 0.2])))
-    seen = observations.turning(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
+    seen = observations.yaw_rate_and_steer(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
     np.testing.assert_allclose(seen, [[0.2, -0.2], [-0.5, 0.4]], rtol=1e-6)
 
 
@@ -327,7 +327,7 @@ def test_without_road_edges_every_observation_is_finite():
     numbers = scenefactory_jax.load("task", "observe=foresight", "dynamics=bicycle")
     scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
     scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
-    _, seen = environment.make(numbers).reset(jax.random.key(0), scene)
+    _, seen = environment.make_env(numbers).reset(jax.random.key(0), scene)
     assert set(seen) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
     np.testing.assert_allclose(seen["lane"][:, 3:5], [[1.0, 0.0]] * 2)
     slope = jax.grad(lambda length: observations._squashed(length, 2.0).sum())(jnp.array([jnp.inf, 1.0]))
@@ -336,7 +336,7 @@ def test_without_road_edges_every_observation_is_finite():
 
 def test_an_episode_may_begin_at_a_later_moment(config):
     """Starts are drawn beside the others as they are then, and it has rained until then."""
-    one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), nobody())
+    one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), make_empty_boxes())
     moving = lambda scene, step: replace(one, position=jnp.array([[1.0, 0.0]]) * step)  # noqa: E731
     beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.boxes.position[:1], scene.agents.goal.shape))  # noqa: E731
     env, scene = build_env(config, draw=beside, beside=moving), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
@@ -387,7 +387,7 @@ def test_terms_beyond_the_published_ones_by_hand(env):
     scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], goals, yaws=[np.pi, 0.0, 0.0, 0.0], speeds=[0.0, 0, 3, 3])
     state, (outcome,) = drive(env, scene, jnp.zeros((4, 3)), 1)
     facts = outcome.facts
-    step = Step(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, facts=facts, events=outcome.events)
+    step = RewardInput(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, facts=facts, events=outcome.events)
     beside, behind = 7.5 - 2.2, 6.0 - 2.24 - 2.2
     np.testing.assert_allclose(facts.gap, [beside, beside, behind, behind], rtol=1e-4)
     np.testing.assert_allclose(facts.lane_heading, [-1, 1, 1, 1], atol=1e-5)
@@ -395,7 +395,7 @@ def test_terms_beyond_the_published_ones_by_hand(env):
     np.testing.assert_allclose(facts.stopping_margin, [np.inf, np.inf, behind - stop, np.inf], rtol=1e-4)
     edge = np.asarray(facts.edge_gap)
     np.testing.assert_allclose(edge[:2], [6 - 0.05 - 3.5 - 1.1, 6 - 0.05 - 4.0 - 1.1], atol=0.02)
-    np.testing.assert_allclose(rewards.clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)
+    np.testing.assert_allclose(rewards.low_clearance(step, limit_m=2.0), [0, 0, 1 - behind / 2, 1 - behind / 2], atol=1e-4)
     np.testing.assert_allclose(rewards.edge_clearance(step, limit_m=1.0), np.clip(1 - edge, 0, 1), atol=1e-5)
     np.testing.assert_allclose(rewards.wrong_way(step), [1, 0, 0, 0], atol=1e-5)
     late = replace(step, facts=replace(facts, stopping_margin=jnp.array([jnp.inf, 2.0, -1.0, -9.0])))
@@ -421,7 +421,7 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     broken = lambda parameters, observation: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
     episode = episodes.begin(env, jax.random.key(0), two_cars)
     far = episode.tally.goal_distance
-    tally = episodes.play(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
+    tally = episodes.run_episode_chunk(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
     assert tally.happened.fault.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
     assert float(tally.goal_distance[0]) == float(far[0]) and not tally.speed_sum.any()
     motion = replace(episode.state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
@@ -557,7 +557,7 @@ def test_cars_underway_start_on_their_recorded_ways():
     log = replace(scene.log, **tracks, valid=jnp.asarray(valid))
     numbers = scenefactory_jax.load("task", "spawn=underway", "spawn.draw.start_gap_m=4.0")["spawn"]["draw"]
     del numbers["_target_"]
-    draw = jax.jit(jax.vmap(lambda key: spawning.underway(key, replace(scene, log=log), **numbers)))
+    draw = jax.jit(jax.vmap(lambda key: spawning.along_log(key, replace(scene, log=log), **numbers)))
     agents = jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(4), 200)))
     assert agents.present[:, :3].mean() > 0.95 and not agents.present[:, 3].any()
     for car, whole in ((0, 40.0), (1, 40.0), (2, 6.0)):
@@ -621,7 +621,7 @@ def test_mistakes_in_a_mixture_are_named(change, message):
 )
 def test_numbers_that_cannot_work_are_refused_by_name(override, message):
     with pytest.raises(ConfigError, match=message):
-        environment.make(scenefactory_jax.load("task", "spawn=random_pairs", "dynamics=bicycle", override))
+        environment.make_env(scenefactory_jax.load("task", "spawn=random_pairs", "dynamics=bicycle", override))
 
 
 def test_respawn_starts_finished_cars_again(config):

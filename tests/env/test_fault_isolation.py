@@ -9,7 +9,7 @@ import pytest
 from support.hand_scenes import scene_of
 
 from experiments.validation import fault_isolation
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
@@ -18,7 +18,7 @@ NUMBERS = dict(seed=3, steps=12, fault_step=5, world=0, agent=1, iterations=2)
 
 
 def config(*overrides):
-    return load("task", "observe=small", "ends=invincible", *overrides)
+    return load_config("task", "observe=small", "ends=invincible", *overrides)
 
 
 def worlds():
@@ -31,7 +31,7 @@ def worlds():
 
 @pytest.fixture(scope="module")
 def env():
-    return environment.make(config())
+    return environment.make_env(config())
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def report(env):
 def test_addresses(env):
     model_config = config()["dynamics"]
     car, solver = cars.CarParameters(**model_config["car"]), cars.Solver(**model_config["solver"])
-    model = cars.standalone(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
-    np.testing.assert_array_equal(cars.places(model).steer_q, fault_isolation.STEERING)
+    model = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    np.testing.assert_array_equal(cars.find_addresses(model).steer_q, fault_isolation.STEERING)
 
 
 @pytest.mark.parametrize("name", fault_isolation.BREAKS)
@@ -60,8 +60,8 @@ def test_the_same_seed_drives_the_same(report):
 
 def test_the_same_seed_learns_the_same():
     """Two PPO iterations at toy size, twice."""
-    settings = load("train", "experiment=smoke")
-    trainer = make_trainer(settings, environment.make(settings), make_policy(settings))
+    settings = load_config("train", "experiment=smoke")
+    trainer = make_trainer(settings, environment.make_env(settings), make_policy(settings))
     one, again = (fault_isolation.learn(trainer, worlds(), seed, 2) for seed in (5, 5))
     found = fault_isolation.same(one, again)
     assert len(found) > 50 and all(found.values())

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from support.hand_scenes import scene_of
 
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import geometry
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import ROAD_USERS, Tracks
+from scenefactory_jax.core.types import ROAD_USERS, TrafficLog
 from scenefactory_jax.env import environment
 from scenefactory_jax.roadgraph import spatial_grid
 from scenefactory_jax.weather import friction
@@ -44,7 +44,7 @@ def street():
     """Three cars in a row, 5 m apart so that each sees the others, and a parked vehicle ahead of them."""
     starts = np.array([[0.0, 0.0], [5.0, 0.5], [10.0, 0.0]])
     scene = scene_of(starts, starts + np.array([40.0, 0.0]), speeds=[6.0, 5.0, 4.0])
-    parked = Tracks(
+    parked = TrafficLog(
         position=jnp.full((1, 3, 2), jnp.array([20.0, 2.0])),
         yaw=jnp.zeros((1, 3)),
         velocity=jnp.zeros((1, 3, 2)),
@@ -57,7 +57,7 @@ def street():
 
 @pytest.fixture(scope="module")
 def env():
-    return environment.make(load("task", "dynamics=bicycle", "observe=small", "others=replay"))
+    return environment.make_env(load_config("task", "dynamics=bicycle", "observe=small", "others=replay"))
 
 
 @pytest.fixture(scope="module")
@@ -119,15 +119,15 @@ def test_what_stands_beside_the_road_with_unusable_numbers_is_absent(drive, fiel
 
 def test_an_unknown_distance_is_not_short():
     vectors = jnp.array([[jnp.nan, 0.0], [0.0, 0.0], [3.0, 4.0], [jnp.inf, 0.0]])
-    np.testing.assert_array_equal(geometry.norm(vectors), [np.nan, 0, 5, np.inf])
+    np.testing.assert_array_equal(geometry.safe_norm(vectors), [np.nan, 0, 5, np.inf])
 
 
 @pytest.mark.usefixtures("unchecked_annotations")
 @pytest.mark.parametrize("mode", ["static", "speed"])
 def test_whole_numbers_are_numbers_to_friction(mode):
-    entry = load("task")["weather"]["grip"] | {"mode": mode}
-    grip = build(entry, builtins=friction, where="weather.grip")
-    road = lambda film: friction.uniform(film, jnp.int32(0))  # noqa: E731
+    entry = load_config("task")["weather"]["grip"] | {"mode": mode}
+    grip = instantiate(entry, builtins=friction, where="weather.grip")
+    road = lambda film: friction.make_uniform(film, jnp.int32(0))  # noqa: E731
     whole = grip(road(jnp.int32(0)), jnp.zeros((2, 2), int), jnp.array([10, 20]))
     np.testing.assert_array_equal(whole, grip(road(jnp.float32(0)), jnp.zeros((2, 2)), jnp.array([10.0, 20.0])))
     assert whole.dtype == jnp.float32 and (whole > 0.9).all()
@@ -202,7 +202,7 @@ def test_a_state_of_other_agents_is_refused_and_whole_numbers_are_an_action(env,
 def test_scenes_may_be_closed_over(env, given, drive):
     """numpy's and JAX's arrays, with cells and without, whatever is mapped over."""
     plain = jax.tree.map(np.asarray, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), street()))
-    gridded, key = spatial_grid.attach(plain, radius_m=10.0, size_m=10.0), jax.random.key(0)
+    gridded, key = spatial_grid.attach_grid(plain, radius_m=10.0, size_m=10.0), jax.random.key(0)
     one, one_gridded = (jax.tree.map(lambda leaf: leaf[0], scenes) for scenes in (plain, gridded))
     jax.jit(lambda state, action: env.step(one, state, action)).lower(*given[1:])
     jax.jit(jax.vmap(lambda key: env.reset(key, one_gridded))).lower(jnp.stack([key, key]))

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from support.hand_scenes import scene_of
 
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Events, Motion, State, Step
+from scenefactory_jax.core.types import Events, Motion, RewardInput, State
 from scenefactory_jax.env import environment, rewards, termination
 
 FAR = [[50.0, 0.0]]  # a goal that is ahead and not reached
@@ -25,7 +25,7 @@ EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")  # in the o
 
 @pytest.fixture(scope="module")
 def parts():
-    return environment.parts_of(load("task", "dynamics=bicycle"))
+    return environment.make_parts(load_config("task", "dynamics=bicycle"))
 
 
 def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright=1.0, force=0.0, age=100):
@@ -52,7 +52,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         agents=scene.agents,
         weather=scene.weather,
         active=scene.agents.present,
-        happened=termination.none(count),
+        happened=termination.make_empty_events(count),
         age=jnp.full(count, age, jnp.int32),
         previous_action=jnp.zeros((count, 3)),
         step=jnp.int32(age),
@@ -64,14 +64,14 @@ def judged(parts, before, after, scene):
     """The step as the environment makes it of two moments."""
     facts = parts.measure(scene, before, after)
     events, _ = parts.judge(facts, before.happened, before.active)
-    return Step(scene, before, after.previous_action, after, facts, events)
+    return RewardInput(scene, before, after.previous_action, after, facts, events)
 
 
 def paid(parts, start, end, *, goal=FAR, present=None, **motion):
     """What the first car is paid for a step between two places, term by term."""
     scene = scene_of(start, np.broadcast_to(goal, (len(start), 2)), present=present)
     step = judged(parts, moment(scene, start, **motion), moment(scene, end, **motion), scene)
-    total, terms = rewards.weigh(step, parts.terms)
+    total, terms = rewards.sum_terms(step, parts.terms)
     assert float(total[0]) == pytest.approx(sum(float(term[0]) for term in terms.values()), abs=1e-5)
     return {name: float(term[0]) for name, term in terms.items()}
 
@@ -122,7 +122,7 @@ def test_a_car_100_m_from_where_it_started_costs_10(parts, x, costs):
     """With a way of 50 m to its goal; the box of the scene ends at 100 m, too."""
     scene = scene_of([[0.0, 0.0]], FAR)
     step = judged(parts, moment(scene, [[x - 0.2, 0.0]]), moment(scene, [[x, 0.0]]), scene)
-    assert float(rewards.weigh(step, parts.terms)[1]["crash"][0]) == costs
+    assert float(rewards.sum_terms(step, parts.terms)[1]["crash"][0]) == costs
 
 
 @pytest.mark.parametrize(("y", "costs"), [(4.84, 0.0), (4.86, -20.0)])
@@ -211,7 +211,7 @@ def test_an_edge_ahead_costs_7_hundredths_over_the_time_until_it_is_met(parts, s
 def test_who_did_not_drive_is_paid_nothing(parts):
     cars = [[0.0, 0.0], [20.0, 0.0]]
     scene = scene_of(cars, np.array(cars) + 1.0, present=[True, False])
-    total, terms = rewards.weigh(judged(parts, moment(scene, cars), moment(scene, cars), scene), parts.terms)
+    total, terms = rewards.sum_terms(judged(parts, moment(scene, cars), moment(scene, cars), scene), parts.terms)
     assert float(total[0]) > 40.0 and all(float(term[1]) == 0.0 for term in (total, *terms.values()))
 
 

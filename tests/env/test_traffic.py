@@ -13,11 +13,11 @@ from test_dynamics import LANES, constant, make, scene_for
 from test_environment import CIRCLES, build_env, drive
 
 import scenefactory_jax
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import track_interpolation
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import ROAD_USERS, Boxes, Tracks
+from scenefactory_jax.core.types import ROAD_USERS, Boxes, TrafficLog
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, stack, validation
@@ -28,7 +28,7 @@ KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 
 
 def numbers_of(name, **changes):
-    return {key: value for key, value in load("task", f"others={name}")["others"].items() if key != "_target_"} | changes
+    return {key: value for key, value in load_config("task", f"others={name}")["others"].items() if key != "_target_"} | changes
 
 
 def bound(name, *, control_dt=CONTROL, **changes):
@@ -46,10 +46,10 @@ def track(start, velocity=(0.0, 0.0), *, kind="vehicle", valid=None, size=(4.5, 
     return hide(place), hide(yaw), hide(np.tile(np.asarray(velocity, float), (steps, 1))), valid, np.asarray(size, float), KINDS[kind]
 
 
-def tracks_of(*rows) -> Tracks:
+def tracks_of(*rows) -> TrafficLog:
     position, yaw, velocity, valid, size, kind = (np.stack([row[i] for row in rows]) for i in range(6))
     f = jnp.float32
-    return Tracks(jnp.asarray(position, f), jnp.asarray(yaw, f), jnp.asarray(velocity, f), jnp.asarray(valid), jnp.asarray(size, f),
+    return TrafficLog(jnp.asarray(position, f), jnp.asarray(yaw, f), jnp.asarray(velocity, f), jnp.asarray(valid), jnp.asarray(size, f),
                   jnp.asarray(kind, jnp.int32))  # fmt: skip
 
 
@@ -131,7 +131,7 @@ def test_kinds_rows_and_masses_are_the_configs(street):
     with pytest.raises(ConfigError, match=r"mass_kg\.vehicle: 0.0"):
         at(street, "replay", 0, mass_kg={**heavy, "vehicle": 0.0})
     with pytest.raises(ConfigError, match=r"others\.kinds.*horse"):
-        environment.make(load("task", "dynamics=bicycle", "others=replay", "others.kinds=[horse]"))
+        environment.make_env(load_config("task", "dynamics=bicycle", "others=replay", "others.kinds=[horse]"))
 
 
 def test_static_keeps_the_parked_where_they_stood():
@@ -190,7 +190,7 @@ def test_neighbours_and_ttc_know_the_others(street, config):
 
 
 def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, config):
-    bare = replace(street, others=track_interpolation.unrecorded(21))
+    bare = replace(street, others=track_interpolation.make_empty_log(21))
     ignored = build_env(config)
     for a, b in zip(jax.tree.leaves(drive(ignored, bare, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(ignored, street, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
@@ -207,7 +207,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
     scene = scene_of(np.zeros((6, 2)), np.ones((6, 2)))
     scene = with_tracks(replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))])), *(track([p, 1.0]) for p in (-30.0, 0.0, 25.0)))
     scene = replace(scene, boxes=at(scene, "static", 0))
-    numbers = load("task", "spawn=random_pairs")["spawn"]["draw"] | {"travel_max_m": 20.0}
+    numbers = load_config("task", "spawn=random_pairs")["spawn"]["draw"] | {"travel_max_m": 20.0}
     del numbers["_target_"]
     agents = jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers))(jax.random.split(jax.random.key(3), 20))
     starts = np.asarray(agents.position)[np.asarray(agents.present)]
@@ -222,7 +222,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
 
 
 def test_a_car_that_drives_into_a_parked_one_has_collided():
-    env = environment.make(load("task", "dynamics=bicycle", "others=static", "observe=small"))
+    env = environment.make_env(load_config("task", "dynamics=bicycle", "others=static", "observe=small"))
     scene = with_tracks(scene_of([[0, 0], [0, 4]], [[50, 0], [50, 4]], speeds=[10.0, 10.0], half_width=9.0), track([14.0, 0.3]))
     state, step = env.start(jax.random.key(0), scene), jax.jit(env.transition)
     when = None
@@ -281,7 +281,7 @@ def logged(tmp_path):
         thing(41, y=1, id=7, speed=0),  # within the agent's box
         thing(-60, y=3, id=8, speed=0, kind="other"),
     ]
-    return parsed(tmp_path, document(objects=objects), reader_selection.make(load("convert", "scenes=womd")["scenes"]["formats"]))
+    return parsed(tmp_path, document(objects=objects), reader_selection.make(load_config("convert", "scenes=womd")["scenes"]["formats"]))
 
 
 def test_everybody_is_kept_or_counted(logged):
@@ -306,7 +306,7 @@ def test_banks_and_stacks_carry_others(tmp_path, logged):
     full, less = prepared(logged), prepared(logged, others=1, agents=3)
     tools = {"check": checker(), "pack": packer(), "workers": 1}
     for name, leaf in columns.flatten(full.scene).items():
-        np.testing.assert_array_equal(columns.flatten(bank_reader.packed(opened, [0], **tools)[0].scene)[name], leaf)
+        np.testing.assert_array_equal(columns.flatten(bank_reader.pack_scenes(opened, [0], **tools)[0].scene)[name], leaf)
     stacked, report = bank_reader.load(opened, [1, 0, 1], capacity={}, **tools)
     assert report.capacity["others"] == 4 and stacked.others.valid.any(-1).sum(1).tolist() == [1, 4, 1]
     assert stacked.boxes.present.shape == (3, 0)
@@ -317,9 +317,9 @@ def test_banks_and_stacks_carry_others(tmp_path, logged):
 
 
 def real(shared_data, count=None):
-    scenes = load("convert", "scenes=womd")["scenes"]
+    scenes = load_config("convert", "scenes=womd")["scenes"]
     formats, check, packing = reader_selection.make(scenes["formats"]), scenes["check"], scenes["pack"]
-    tools = build(check, builtins=validation, where="check"), build(packing, builtins=pack, where="pack")
+    tools = instantiate(check, builtins=validation, where="check"), instantiate(packing, builtins=pack, where="pack")
     paths = [path for part in ("train", "test") for path in sorted((shared_data / "womd" / part).iterdir())[:count]]
     return [pack.prepare(raw, check=tools[0], pack=tools[1]) for path in paths for raw in reader_selection.read(path, formats)]
 

@@ -14,7 +14,7 @@ from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Log, Tracks
+from scenefactory_jax.core.types import AgentLog, TrafficLog
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import agent_metrics, episode_records, failure_signals, failures
@@ -83,7 +83,7 @@ def scripted(first, goal, second):
     velocity = np.gradient(position, DT, axis=1)
     # goals of the second car are out of reach: what it does is judged by what happens to it
     scene = scene_of(position[:, 0], [goal, FAR], yaws=yaw[:, 0], half_width=28.0, length=80.0, steps=len(TIME))
-    log = Log(
+    log = AgentLog(
         position=jnp.asarray(position, jnp.float32),
         yaw=jnp.asarray(yaw, jnp.float32),
         velocity=jnp.asarray(velocity, jnp.float32),
@@ -92,13 +92,13 @@ def scripted(first, goal, second):
     )
     place = jnp.tile(jnp.array([[[30.0, 8.0]]]), (1, len(TIME), 1))
     zero = jnp.zeros((1, len(TIME)))
-    box = Tracks(place, zero, jnp.zeros_like(place), jnp.ones(zero.shape, bool), jnp.array([[4.5, 2.0]]), jnp.zeros(1, jnp.int32))
+    box = TrafficLog(place, zero, jnp.zeros_like(place), jnp.ones(zero.shape, bool), jnp.array([[4.5, 2.0]]), jnp.zeros(1, jnp.int32))
     return replace(scene, log=log, others=box)
 
 
 @pytest.fixture(scope="module")
 def settings():
-    return configs.load("evaluate", "run=x", f"chunk_steps={round(SECONDS * 30)}", "failures.pictures.panels=2")
+    return configs.load_config("evaluate", "run=x", f"chunk_steps={round(SECONDS * 30)}", "failures.pictures.panels=2")
 
 
 @pytest.fixture(scope="module")
@@ -107,12 +107,14 @@ def played(tmp_path_factory, settings):
     where = tmp_path_factory.mktemp("x")
     config = smoke(where, "dynamics=replay", "others=static", f"timing.episode_s={SECONDS}", "weather.patches=null")
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(scripted(*drive) for drive in DRIVES.values()))
-    scenes = scene_source.Scenes(scene_source.with_cells(stacked, config["scenes"]), tuple(NAMES), "")
+    scenes = scene_source.Scenes(scene_source.attach_grids(stacked, config["scenes"]), tuple(NAMES), "")
     with quick_compilation():
-        env = environment.make(config)
+        env = environment.make_env(config)
         observation = jax.jit(env.reset)(jax.random.key(0), scenes[0])[1]
         parameters = make_policy(config).init(jax.random.key(1), observation)
-        return episode_records.make_player(config, scenes, protocol="strict", settings=settings, worlds=None, steps=None)(parameters)
+        return episode_records.make_episode_runner(config, scenes, protocol="strict", settings=settings, worlds=None, steps=None)(
+            parameters
+        )
 
 
 def row_of(records, name, agent=0) -> int:
@@ -141,7 +143,7 @@ def test_every_failure_has_one_kind_and_no_other_agent_has(played):
     records, _ = played
     assert set(records["failure"]) == {*failures.KINDS, failures.NONE}
     np.testing.assert_array_equal(records["failure"] == failures.NONE, records["clean"])
-    found = failures.of(records)
+    found = failures.rank_failures(records)
     rows = [failure.row for ranked in found.values() for failure in ranked]
     assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == list(failures.KINDS)
 
@@ -174,7 +176,7 @@ def test_weaving_shows_as_yaw_acceleration(played):
 
 def test_flags_tell_what_else_is_true(played):
     records, _ = played
-    found = {(failure.scene, failure.agent): failure for ranked in failures.of(records).values() for failure in ranked}
+    found = {(failure.scene, failure.agent): failure for ranked in failures.rank_failures(records).values() for failure in ranked}
     assert found["wrong_way_into", 0].flags == ("wrong_way",)
     assert found["overshoot_then_stands", 0].flags == ("stuck",) and found["overshoot", 0].flags == ()
     assert found["rear_end", 0].flags == (), "the kind says already that it is at fault"
@@ -182,11 +184,11 @@ def test_flags_tell_what_else_is_true(played):
 
 def test_the_worst_come_first(played):
     records, _ = played
-    found = failures.of(records)
+    found = failures.rank_failures(records)
     for ranked in found.values():
         assert [failure.severity for failure in ranked] == sorted((failure.severity for failure in ranked), reverse=True)
     assert failures.scenes(found["at_fault"])[0] == ("head_on_off_lane", 2), "most of a kind"
-    chosen = failures.worst(found["at_fault"], 3)
+    chosen = failures.find_worst_failures(found["at_fault"], 3)
     assert len({failure.scene for failure in chosen}) == 3 and chosen[0].scene == "head_on_off_lane"
 
 
@@ -194,15 +196,17 @@ def test_records_keep_their_kinds_in_a_file(played, tmp_path):
     records, _ = played
     agent_metrics.write_csv(tmp_path / "agents.csv", records)
     again = agent_metrics.read_csv(tmp_path / "agents.csv")
-    assert failures.of(again) == failures.of(records)
+    assert failures.rank_failures(again) == failures.rank_failures(records)
     told = json.loads(failure_pictures.write(tmp_path, {"strict": records}, {}).read_text())["strict"]["kinds"]
-    assert {kind: entry["agents"] for kind, entry in told.items()} == {kind: len(ranked) for kind, ranked in failures.of(records).items()}
+    assert {kind: entry["agents"] for kind, entry in told.items()} == {
+        kind: len(ranked) for kind, ranked in failures.rank_failures(records).items()
+    }
     with pytest.raises(agent_metrics.RecordsError, match=r"records\.severity: column missing; kinds of failures need"):
-        failures.of({name: column for name, column in records.items() if name != "severity"})
+        failures.rank_failures({name: column for name, column in records.items() if name != "severity"})
 
 
 def test_definitions_name_the_numbers(played, settings):
-    text = failures.definitions(played[0], failures.numbers(settings["failures"]))
+    text = failures.list_definitions(played[0], failures.list_thresholds(settings["failures"]))
     assert "`" not in text and "a stretch of 15 m" in text and "at least 33 % of the closing speed" in text
 
 
@@ -210,7 +214,7 @@ def test_pictures_show_the_place(played, settings, tmp_path):
     """Two worst of each kind beside each other; the failed car's red is where the failure was, in the middle of the lower picture."""
     records, recording = played
     paths = failure_pictures.draw(tmp_path, "strict", records, recording, settings)
-    assert set(paths) == set(failures.of(records))
+    assert set(paths) == set(failures.rank_failures(records))
     picture = np.asarray(Image.open(paths["wrong_way"]).convert("RGB")).astype(int)
     red = (np.abs(picture - (208, 28, 40)).sum(-1) < 30).nonzero()
     tall, wide = picture.shape[:2]
@@ -235,14 +239,14 @@ def test_lanes_that_cross_are_not_driven_against():
     road = road_of([(2, along), (2, across)])
     place = jnp.array([[-20.0, 0.5], [-20.0, 0.5], [0.5, 1.0], [-20.0, 9.0]])
     velocity = jnp.array([[5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0]])
-    found = failure_signals.alignment(place, velocity, road, within_m=2.0)
+    found = failure_signals.heading_alignment(place, velocity, road, within_m=2.0)
     np.testing.assert_allclose(found, [1, -1, 0, 1], atol=1e-6)
 
 
 def test_settings_are_checked_at_the_door():
-    config = configs.load("evaluate", "run=x")
+    config = configs.load_config("evaluate", "run=x")
     del config["failures"]["notes"]["near_m"]
     with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
         schema.check_evaluate(config)
     with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: 0; wanted is at least 1"):
-        schema.check_train(configs.load("train", "evaluation.failures.pictures.panels=0"))
+        schema.check_train(configs.load_config("train", "evaluation.failures.pictures.panels=0"))

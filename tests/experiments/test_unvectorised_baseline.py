@@ -12,7 +12,7 @@ from experiments.unvectorised_baseline import baseline_agent as one
 from experiments.unvectorised_baseline import baseline_environment
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import Events, Motion, Rows, Step
+from scenefactory_jax.core.types import Events, Motion, RewardInput, SetObservation
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.termination import EVENTS
 from scenefactory_jax.learning.training_loop import make_policy
@@ -24,7 +24,7 @@ MOMENTS, SECONDS = 16, 1.0
 
 @pytest.fixture(scope="module")
 def config():
-    return sf.load("bench", *SMALL, *NETWORK)
+    return sf.load_config("bench", *SMALL, *NETWORK)
 
 
 @pytest.fixture(scope="module")
@@ -40,12 +40,12 @@ def task(config):
 @pytest.fixture(scope="module")
 def reference(config):
     """The device's start, observation, and facts with events and rewards, each compiled once."""
-    parts, env = environment.parts_of(config), sf.make(config)
+    parts, env = environment.make_parts(config), sf.make(config)
 
     def judged(scene, before, after):
         facts = parts.measure(scene, before, after)
         events, done = parts.judge(facts, before.happened, before.active)
-        step = Step(scene, before, after.previous_action, after, facts, events)
+        step = RewardInput(scene, before, after.previous_action, after, facts, events)
         return facts, events, done, {name: weight * term(step) for name, (weight, term) in parts.terms.items()}
 
     return jax.jit(env.start), jax.jit(env.observe), jax.jit(judged)
@@ -132,7 +132,7 @@ def test_every_agent_sees_what_it_sees_on_the_device(task, scene, reference, mom
             for name, group in wanted.items():
                 if seen is None:
                     assert not any(leaf[slot].any() for leaf in jax.tree.leaves(group))
-                elif isinstance(group, Rows):
+                elif isinstance(group, SetObservation):
                     count = len(seen[name])
                     assert group.mask[slot].sum() == count and group.mask[slot, :count].all()
                     np.testing.assert_allclose(seen[name], group.features[slot, :count], atol=1e-5)
@@ -183,7 +183,7 @@ def test_numpy_network_is_the_policy(task, scene, reference, moments, parameters
 
 
 def test_the_c_engine_drives_nearly_as_the_device_does(task, scene, reference, config):
-    dynamics, state = environment.parts_of(config).dynamics, reference[0](jax.random.key(3), scene)
+    dynamics, state = environment.make_parts(config).dynamics, reference[0](jax.random.key(3), scene)
     steps = round(SECONDS * config["timing"]["control_hz"])
     rng = np.random.default_rng(1)
     command = jnp.asarray(rng.uniform([0.3, -0.3, -1.0], [1.0, 0.3, 0.3], (len(state.active), 3)), jnp.float32)
@@ -245,7 +245,7 @@ def test_measure_gives_positive_numbers(config, scene, parameters):
 @pytest.mark.parametrize("override", ["dynamics=bicycle", "others=static", "weather=storm", "+reward.own={_target_: my.term, weight: 1.0}"])
 def test_what_only_the_device_has_is_named(override):
     with pytest.raises(ConfigError, match="baseline has"):
-        baseline_environment.make(sf.load("bench", override))
+        baseline_environment.make(sf.load_config("bench", override))
 
 
 def test_another_policy_is_named(config, scene):

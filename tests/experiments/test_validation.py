@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from experiments.validation import encounters, engines, equivalence, impacts, random_drives
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
-SETTINGS = load("validate")["validation"]  # what `validate` runs, at toy size
+SETTINGS = load_config("validate")["validation"]  # what `validate` runs, at toy size
 DRIVES = {**SETTINGS["drives"]["draw"], "control_hz": 30.0, "seconds": 2.0}
 MEETINGS = {**SETTINGS["encounters"]["draw"], "control_hz": 30.0}
 del DRIVES["count"], MEETINGS["count"]
 TIMING = dict(physics_hz=120.0, control_hz=30.0)
 ROAD = SETTINGS["road"]
 CONVERGED = dict(**SETTINGS["reference"], nudge=0.0)
-WHEEL = dict(wheel_radius=load("task")["dynamics"]["car"]["wheel_radius"])
+WHEEL = dict(wheel_radius=load_config("task")["dynamics"]["car"]["wheel_radius"])
 BOUND = dict(**SETTINGS["bound"], **WHEEL, control_hz=30.0, bins=40)
 COLLISION = dict(**SETTINGS["encounters"]["collision"], control_hz=30.0)
 # With a line search of 4 this drive never leaves its first step's forces: engine and brakes nearly cancel, and no step is accepted
@@ -31,7 +31,7 @@ STUCK = random_drives.Sequences(
 @pytest.fixture(scope="module")
 def entry():
     """The shipped car, with the shipped solver."""
-    return load("task", "dynamics=mjx_car")["dynamics"]
+    return load_config("task", "dynamics=mjx_car")["dynamics"]
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_a_contact_of_another_stiffness_shows(entry, met, meetings):
 
 
 def head_on(entry, impedance, *, position, speed=(10.0, 0.0), yaw=(0.0, 0.0), friction=0.5):
-    car, solver = cars.numbers(entry)
+    car, solver = cars.read_parameters(entry)
     contact = engines.touch(entry, impedance=impedance)
     options = dict(physics_dt=1 / 1920, substeps=64, iterations=100, line_search=50)
     arrays = {"position": np.array(position, float), "speed": np.array(speed, float), "yaw": np.array(yaw, float)}
@@ -176,8 +176,8 @@ def test_near_misses_and_hits_are_told_apart(entry):
 
 
 def test_mechanics_are_those_of_rigid_bodies(entry):
-    car, solver = cars.numbers(entry)
-    rig = mujoco_c.meeting(car, solver, engines.touch(entry, impedance=0.5), physics_dt=1 / 120, iterations=1, line_search=1)
+    car, solver = cars.read_parameters(entry)
+    rig = mujoco_c.make_encounter(car, solver, engines.touch(entry, impedance=0.5), physics_dt=1 / 120, iterations=1, line_search=1)
     mujoco_c.place(rig, rig.model.qpos0[:17], np.array([[0.0, 3.0], [0.0, -2.0]]), np.zeros(2), np.array([10.0, 4.0]))
     found = mujoco_c.mechanics(rig, rig.qpos.copy(), rig.qvel.copy())
     mass = rig.model.body_subtreemass[0] / 2
@@ -188,11 +188,11 @@ def test_mechanics_are_those_of_rigid_bodies(entry):
 
 
 def test_places_of_the_wheels_rates():
-    dynamics = load("task", "dynamics=mjx_car")["dynamics"]
+    dynamics = load_config("task", "dynamics=mjx_car")["dynamics"]
     car, solver = cars.CarParameters(**dynamics["car"]), cars.Solver(**dynamics["solver"])
-    model = cars.standalone(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    model = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
     assert isinstance(model, mujoco.MjModel)
-    np.testing.assert_array_equal(cars.places(model).spin_v, equivalence.SPIN)
+    np.testing.assert_array_equal(cars.find_addresses(model).spin_v, equivalence.SPIN)
 
 
 def test_drives_are_seeded_and_cover_their_ranges():

@@ -10,9 +10,9 @@ from experiments.validation import engines, friction_patches, motion_laws, rando
 from experiments.validation import run as command
 from experiments.validation import validation_report as report
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.parallel.process_pool import spreading
+from scenefactory_jax.core.parallel.process_pool import make_task_map
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 G = 9.81
@@ -23,7 +23,7 @@ STANDING = dict(frictions=MU, speed_max=2.0, brake_s=1.0, settle_s=4.0, hold_s=2
 
 
 def entry_of(name, **car):
-    entry = load("task", f"dynamics={name}")["dynamics"]
+    entry = load_config("task", f"dynamics={name}")["dynamics"]
     return {**entry, "car": {**entry["car"], **car}} if car else entry
 
 
@@ -34,7 +34,7 @@ def entry():
 
 @pytest.fixture(scope="module")
 def car(entry):
-    return cars.numbers(entry)[0]
+    return cars.read_parameters(entry)[0]
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_the_car_rides_on_its_springs(drive, car):
 def test_the_published_car_rides_on_its_stops():
     published = entry_of("mjx_published")
     hard = motion_laws.driver(published, slippery=1.0, width=4, **RATES)
-    lying = motion_laws.ride(hard, cars.numbers(published)[0], friction=0.9, seconds=2.0, **CLOCK)
+    lying = motion_laws.ride(hard, cars.read_parameters(published)[0], friction=0.9, seconds=2.0, **CLOCK)
     assert 0.03 < lying["on_springs"] < 0.06 and lying["travel_m"].min() > lying["room_m"]
     assert lying["load_sum"] == pytest.approx(1.0, abs=5e-3)
 
@@ -168,7 +168,7 @@ def test_pieces_do_not_matter(drive, entry):
 
 @pytest.mark.slow
 def test_ice_pushes_wide_and_splits(entry):
-    grip = load("task")["weather"]["grip"]
+    grip = load_config("task")["weather"]["grip"]
     options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
     found = friction_patches.patches(entry, grip, **RATES, **options)
     wide = np.array(found["bend"]["wide_m"])
@@ -187,7 +187,7 @@ TOY = (  # as many cases, as long, as in test_validation: these programs are com
 
 
 def toy(out, *overrides):
-    return command.validate(load("validate", f"out={out}", *TOY, *overrides))
+    return command.validate(load_config("validate", f"out={out}", *TOY, *overrides))
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
 
 def test_verdicts_can_fail(measured):
     _, results = measured
-    targets = load("validate")["validation"]["targets"]
+    targets = load_config("validate")["validation"]["targets"]
     worse = json.loads(json.dumps(results))
     worse["drives"]["result"]["within"] = 0.5
     rows = worse["encounters"]["result"]["contacts"]["spring"]["rows"]
@@ -258,10 +258,10 @@ def test_verdicts_can_fail(measured):
 
 def test_the_committed_report_is_made_of_its_results(tmp_path):
     """No number in it was typed in."""
-    committed = configs.folder().parent / "experiments" / "validation"
+    committed = configs.find_conf().parent / "experiments" / "validation"
     results = command.read(committed)
     assert list(results) == list(command.PARTS)
-    written = report.write(tmp_path, results, load("validate")["validation"]["targets"])
+    written = report.write(tmp_path, results, load_config("validate")["validation"]["targets"])
     assert written.read_text() == (committed / "validation.md").read_text()
     assert {path.name for path in tmp_path.glob("*.png")} == {path.name for path in committed.glob("*.png")}
 
@@ -273,13 +273,13 @@ def square(cases):
 
 def test_cases_spread_over_processes_come_back_in_order():
     cases = motion_laws.held([0.1] * 5, np.arange(5.0), motion_laws.COAST, steps=1)
-    with spreading(1) as here, spreading(2) as there:
+    with make_task_map(1) as here, make_task_map(2) as there:
         np.testing.assert_array_equal(here(square, cases).qpos, there(square, cases).qpos)
 
 
 @pytest.mark.parametrize("size", ["reduced", "full"])
 def test_sizes_compose(size):
-    config = load("validate", f"validation={size}")
+    config = load_config("validate", f"validation={size}")
     assert config["validation"]["drives"]["draw"]["count"] >= 48 and config["validation"]["settings"]["trials"]
     assert {"mjx_car", "latched", "published", "bicycle"} == set(config["backends"])
 

@@ -22,7 +22,7 @@ def fresh():
     env = probe(life=3, episode_steps=20)
     numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 20}
     numbers["average"] = 0.5
-    return train_iteration.make(env, late_fusion.make(**SMALL), **numbers)
+    return train_iteration.make_trainer(env, late_fusion.make(**SMALL), **numbers)
 
 
 def begin(trainer):
@@ -231,7 +231,7 @@ def test_a_stripped_checkpoint_drives_but_does_not_go_on(saved, trainer, tmp_pat
     folder = saved[0]
     shutil.copytree(folder, tmp_path / "run")
     whole, before = checkpoint.restore_parameters(folder), sum(file.stat().st_size for file in (tmp_path / "run").rglob("*"))
-    checkpoint.strip(tmp_path / "run")
+    checkpoint.drop_training_state(tmp_path / "run")
     assert checkpoint.latest(tmp_path / "run") == checkpoint.latest(folder)
     assert sum(file.stat().st_size for file in (tmp_path / "run").rglob("*")) < 0.5 * before
     assert_same(checkpoint.restore_parameters(tmp_path / "run"), whole)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core.instantiate import ConfigError, build
-from scenefactory_jax.core.types import Rows
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.types import SetObservation
 from scenefactory_jax.learning.networks import late_fusion
 
 TINY = dict(
@@ -32,7 +32,7 @@ def observe(key, *, rows=K, batch=(W, A)):
     return {
         "ego": jax.random.normal(keys[0], (*batch, 7)),
         "weather": jax.random.normal(keys[1], (*batch, 4)),
-        "road": Rows(jax.random.normal(keys[2], (*batch, rows, 5)), mask),
+        "road": SetObservation(jax.random.normal(keys[2], (*batch, rows, 5)), mask),
     }
 
 
@@ -63,8 +63,8 @@ def test_widths_of_none_are_widths_that_nobody_named(tiny):
 def test_hidden_rows_and_their_order_change_nothing(tiny):
     policy, parameters, observation = tiny
     road, order = observation["road"], jnp.array([3, 1, 4, 0, 2])
-    poisoned = {**observation, "road": Rows(jnp.where(road.mask[..., None], road.features, 1e6), road.mask)}
-    shuffled = {**observation, "road": Rows(road.features[..., order, :], road.mask[..., order])}
+    poisoned = {**observation, "road": SetObservation(jnp.where(road.mask[..., None], road.features, 1e6), road.mask)}
+    shuffled = {**observation, "road": SetObservation(road.features[..., order, :], road.mask[..., order])}
     longer = {**observation, "road": jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x)], axis=2), road)}
     wanted = policy.apply(parameters, observation)
     for other in (poisoned, shuffled, longer):
@@ -74,7 +74,7 @@ def test_hidden_rows_and_their_order_change_nothing(tiny):
 
 def test_empty_sets_read_zero_and_all_gradients_stay_finite(tiny):
     policy, parameters, observation = tiny
-    nothing = {**observation, "road": Rows(observation["road"].features, jnp.zeros((W, A, K), bool))}
+    nothing = {**observation, "road": SetObservation(observation["road"].features, jnp.zeros((W, A, K), bool))}
 
     def loss(parameters, observation):
         mean, log_std, value = policy.apply(parameters, observation)
@@ -123,7 +123,7 @@ def test_pooling_before_the_activation_is_pooling_after_it():
 
 def test_new_groups_need_no_code(tiny):
     policy, _, observation = tiny
-    extra = {**observation, "memory": jnp.ones((W, A, 2)), "lights": Rows(jnp.ones((W, A, 2, 9)), jnp.ones((W, A, 2), bool))}
+    extra = {**observation, "memory": jnp.ones((W, A, 2)), "lights": SetObservation(jnp.ones((W, A, 2, 9)), jnp.ones((W, A, 2), bool))}
     actor = jax.eval_shape(policy.init, jax.random.key(0), extra)["params"]["actor"]
     assert actor["vector"]["layer_0"]["kernel"].shape == (7 + 4 + 2, 8)
     assert actor["lights_rows"]["layer_0"]["kernel"].shape == (9, 4)
@@ -131,8 +131,8 @@ def test_new_groups_need_no_code(tiny):
 
 
 def test_published_network_has_the_published_size():
-    policy = build(configs.load("train")["policy"], builtins=late_fusion, where="policy")()
-    observation = {**observe(jax.random.key(0)), "neighbours": Rows(jnp.ones((W, A, 2, 7)), jnp.ones((W, A, 2), bool))}
+    policy = instantiate(configs.load_config("train")["policy"], builtins=late_fusion, where="policy")()
+    observation = {**observe(jax.random.key(0)), "neighbours": SetObservation(jnp.ones((W, A, 2, 7)), jnp.ones((W, A, 2), bool))}
     parameters = jax.eval_shape(policy.init, jax.random.key(1), observation)
     assert sum(leaf.size for leaf in jax.tree.leaves(parameters)) == 132_359  # the paper's, without LayerNorm
 
@@ -155,4 +155,4 @@ def test_mistakes_are_named(tiny):
     with pytest.raises(ConfigError, match=r"policy\.rows\.roads: .* valid: road"):
         late_fusion.make(**{**TINY, "rows": {"roads": [8]}}).init(jax.random.key(0), tiny[2])
     with pytest.raises(ConfigError, match=r"policy\.activation: 'gelu'"):
-        build({"_target_": "make", **TINY, "activation": "gelu"}, builtins=late_fusion, where="policy")
+        instantiate({"_target_": "make", **TINY, "activation": "gelu"}, builtins=late_fusion, where="policy")

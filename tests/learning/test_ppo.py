@@ -11,7 +11,7 @@ from jax.scipy.stats import norm
 from support.probes import NUMBERS, PRESENT, SMALL, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Env
 from scenefactory_jax.learning.networks import late_fusion
@@ -27,7 +27,7 @@ def test_advantages_equal_a_plain_loop():
     bootstrap = jax.random.normal(keys[2], (W, A))
     active, done = jax.random.bernoulli(keys[3], 0.8, (T, W, A)), jax.random.bernoulli(keys[4], 0.2, (T, W, A))
     truncated = jax.random.bernoulli(keys[5], 0.2, (T, W, A))
-    estimate = jax.jit(functools.partial(gae.estimate, gamma=0.9, gae_lambda=0.8))
+    estimate = jax.jit(functools.partial(gae.compute_gae, gamma=0.9, gae_lambda=0.8))
     advantage, returns = estimate(reward, value, bootstrap, active, done, truncated)
 
     reward, value, bootstrap, active, done, truncated = map(np.asarray, (reward, value, bootstrap, active, done, truncated))
@@ -56,9 +56,9 @@ def test_gaussians_agree_with_their_definitions():
     draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
     own = loss.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
     difference = own - loss.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
-    np.testing.assert_allclose(loss.kl(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
+    np.testing.assert_allclose(loss.kl_divergence(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
     np.testing.assert_allclose(loss.gaussian_entropy(log_std_old), -own.mean(), rtol=0.01)
-    assert float(jnp.abs(loss.kl(mean, log_std, mean, log_std)).max()) == 0.0
+    assert float(jnp.abs(loss.kl_divergence(mean, log_std, mean, log_std)).max()) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def batch():
 def test_loss_equals_its_definition(batch):
     policy, parameters, samples, log_std_old = batch
     numbers = dict(clip=0.2, value_clip=0.2, entropy=0.01, value=0.5)
-    total, facts = loss.ppo(parameters, samples, log_std_old, policy=policy, **numbers)
+    total, facts = loss.compute_loss(parameters, samples, log_std_old, policy=policy, **numbers)
     mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
     surrogates, values = [], []
     for i in np.flatnonzero(np.asarray(samples.weight)):
@@ -110,12 +110,14 @@ def test_samples_without_weight_change_nothing(batch):
         advantage=jnp.where(empty, jnp.nan, samples.advantage),
         returns=jnp.where(empty, 1e6, samples.returns),
     )
-    gradient = jax.jit(jax.grad(lambda p, b: loss.ppo(p, b, log_std, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)[0]))
+    gradient = jax.jit(
+        jax.grad(lambda p, b: loss.compute_loss(p, b, log_std, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)[0])
+    )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
-    normal, weight = loss.normalise(garbage.advantage, samples.weight), samples.weight
+    normal, weight = loss.normalize_advantages(garbage.advantage, samples.weight), samples.weight
     np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
     assert float(loss.weighted_mean(garbage.returns, jnp.zeros(24))) == 0.0
-    assert not loss.normalise(garbage.returns, jnp.zeros(24)).any()
+    assert not loss.normalize_advantages(garbage.returns, jnp.zeros(24)).any()
 
 
 def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
@@ -132,22 +134,22 @@ def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
 
 def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
-    whole = update.split(jax.random.key(5), weight, minibatches=4, size=24)
+    whole = update.split_minibatches(jax.random.key(5), weight, minibatches=4, size=24)
     assert sorted(whole.reshape(-1).tolist()) == list(range(96))
     assert np.ptp(np.asarray(weight[whole].sum(1))) <= 1
-    part = update.split(jax.random.key(5), weight, minibatches=4, size=12)
+    part = update.split_minibatches(jax.random.key(5), weight, minibatches=4, size=12)
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
 def test_what_is_left_out_is_counted_group_by_group(batch):
     """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
     policy, parameters, samples, log_std = batch
-    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
-    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
+    adam = update.make_optimizer(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.compute_loss, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
     numbers = dict(loss=objective, optimiser=adam, rate=update.AdaptiveRate(None, 1e-5, 1e-2, None), epochs=1, minibatches=2, size=6)
     samples = dataclasses.replace(samples, weight=(jnp.arange(24) < 14).astype(jnp.float32))
     given = (parameters, adam.init(parameters), samples, log_std, jax.random.key(0), jnp.int32(0))
-    *_, facts = update.learn(*given, **numbers, permute_each_epoch=False, groups=2)
+    *_, facts = update.update_epochs(*given, **numbers, permute_each_epoch=False, groups=2)
     assert float(facts["left_out"]) == pytest.approx(6 / 14)
 
 
@@ -155,13 +157,13 @@ def test_what_is_left_out_is_counted_group_by_group(batch):
 def learn(batch):
     """Two minibatches of 12: (samples, numbers of the rate, iteration) -> (parameters, optimiser state, facts)."""
     policy, parameters, _, log_std = batch
-    adam = update.optimiser(learning_rate=1e-3, max_grad_norm=1.0)
-    objective = functools.partial(loss.ppo, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
+    adam = update.make_optimizer(learning_rate=1e-3, max_grad_norm=1.0)
+    objective = functools.partial(loss.compute_loss, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
     numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
 
     @jax.jit
     def run(samples, rate, iteration):
-        return update.learn(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), iteration, rate=rate, **numbers)
+        return update.update_epochs(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), iteration, rate=rate, **numbers)
 
     return lambda samples, *rate, iteration=0: run(samples, update.AdaptiveRate(*rate), iteration)
 
@@ -215,7 +217,7 @@ def counted(env: Env):
 def course():
     """Agents who would live 5 steps in worlds of 4: all run out of time."""
     env, traces = counted(probe(life=5, episode_steps=4))
-    return train_iteration.make(
+    return train_iteration.make_trainer(
         env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 4}
     ), traces
 
@@ -262,8 +264,10 @@ def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length
     worlds = jax.vmap(env.start)(jax.random.split(jax.random.key(0), 2), stage)
     seen = jax.vmap(env.observe)(stage, worlds)
     parameters = policy.init(jax.random.key(1), seen)
-    begin = (stage, worlds, seen, rollout.no_lives(worlds), jax.random.key(2))
-    after, _, lives, samples, tally, record = jax.jit(functools.partial(rollout.collect, env, policy, horizon=4))(parameters, *begin)
+    begin = (stage, worlds, seen, rollout.make_empty_episode_stats(worlds), jax.random.key(2))
+    after, _, lives, samples, tally, record = jax.jit(functools.partial(rollout.collect_rollout, env, policy, horizon=4))(
+        parameters, *begin
+    )
     lived = min(life, length)
     held = samples.active[..., :2]
     assert held.all() and not samples.active[..., 2].any()
@@ -279,7 +283,7 @@ def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length
 
 def test_worlds_begin_where_an_action_is_read():
     env = probe(life=5, episode_steps=12)._replace(hold=3)
-    trainer = train_iteration.make(env, late_fusion.make(**SMALL), **{**NUMBERS, "initial_phase": True, "episode_steps": 12})
+    trainer = train_iteration.make_trainer(env, late_fusion.make(**SMALL), **{**NUMBERS, "initial_phase": True, "episode_steps": 12})
     steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
     assert set(steps.tolist()) == {0, 3, 6, 9}
 
@@ -297,21 +301,21 @@ def test_restart_keeps_what_was_learnt(course):
 def test_mistakes_are_named():
     env, policy = probe(), late_fusion.make(**SMALL)
     with pytest.raises(ConfigError, match=r"16 x 8 worlds x 3 agents = 384 samples .* 7 minibatches"):
-        train_iteration.make(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
+        train_iteration.make_trainer(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
     with pytest.raises(ConfigError, match=r"ppo\.gamma: 1\.5"):
-        train_iteration.make(env, policy, **{**NUMBERS, "gamma": 1.5})
+        train_iteration.make_trainer(env, policy, **{**NUMBERS, "gamma": 1.5})
     with pytest.raises(ConfigError, match=r"ppo\.learning_rate: 1\.0 is outside"):
-        train_iteration.make(env, policy, **{**NUMBERS, "learning_rate": 1.0})
+        train_iteration.make_trainer(env, policy, **{**NUMBERS, "learning_rate": 1.0})
     wrong = {"desired_kl": -0.01, "value_clip": 0.0, "entropy": float("nan"), "value": -1.0, "max_grad_norm": 0.0}
     for name, value in wrong.items():
         with pytest.raises(ConfigError, match=rf"ppo\.{name}: {value:g}; wanted is a .*number"):
-            train_iteration.make(env, policy, **{**NUMBERS, name: value})
+            train_iteration.make_trainer(env, policy, **{**NUMBERS, name: value})
 
 
 @pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])
 def test_configs_build(name):
-    entry = {"_target_": "make", **configs.load("train", f"ppo={name}")["ppo"]}
-    trainer = build(entry, builtins=train_iteration, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
+    entry = {"_target_": "make", **configs.load_config("train", f"ppo={name}")["ppo"]}
+    trainer = instantiate(entry, builtins=train_iteration, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
     assert trainer.iterate
 
 
@@ -319,7 +323,7 @@ def test_configs_build(name):
 def probes():
     """One compiled trainer for all probes: task -> (action mean and value for cues, metrics of every iteration)."""
     policy = late_fusion.make(**SMALL)
-    trainer = train_iteration.make(probe(), policy, **{**NUMBERS, "sample_share": 0.75})  # two of three slots are spawned
+    trainer = train_iteration.make_trainer(probe(), policy, **{**NUMBERS, "sample_share": 0.75})  # two of three slots are spawned
     apply = jax.jit(policy.apply)
 
     def train_on(task, iterations):

@@ -82,8 +82,8 @@ def test_other_groups_learn_something_else(found):
 def test_mistakes_are_named():
     env, policy = probe(), late_fusion.make(**SMALL)
     with pytest.raises(ConfigError, match=r"ppo\.shards: 0"):
-        train_iteration.make(env, policy, **{**NUMBERS, "shards": 0})
+        train_iteration.make_trainer(env, policy, **{**NUMBERS, "shards": 0})
     with pytest.raises(ConfigError, match=r"worlds: 8 do not divide into 3 shards"):
-        train_iteration.make(env, policy, **{**NUMBERS, "shards": 3}).init(jax.random.key(0), scenes(8))
+        train_iteration.make_trainer(env, policy, **{**NUMBERS, "shards": 3}).init(jax.random.key(0), scenes(8))
     with pytest.raises(ConfigError, match=r"devices: 99; there are \d+"):
-        sharding.mesh(99)
+        sharding.make_mesh(99)

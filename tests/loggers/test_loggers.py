@@ -16,8 +16,8 @@ ROWS = [{"iteration": i, "reward": 0.5 * i, "events/reached": 0.1 * i, "loss/kl"
 
 def told(folder, rows, *overrides, after=0):
     """What a training does with its rows; the config it ran with."""
-    whole = hydra_config.load("train", *overrides)
-    with loggers.opened(loggers.make(whole["loggers"]), folder, whole, after=after) as note:
+    whole = hydra_config.load_config("train", *overrides)
+    with loggers.open_loggers(loggers.make(whole["loggers"]), folder, whole, after=after) as note:
         for row in rows:
             note(row)
     return whole
@@ -97,7 +97,7 @@ def test_mlflow(tmp_path, monkeypatch):
 
     with (
         pytest.raises(KeyboardInterrupt),
-        loggers.opened(loggers.make(hydra_config.load("train", *overrides)["loggers"]), tmp_path, {}, after=4),
+        loggers.open_loggers(loggers.make(hydra_config.load_config("train", *overrides)["loggers"]), tmp_path, {}, after=4),
     ):
         raise KeyboardInterrupt
     assert client.get_run(run.info.run_id).info.status == "FAILED"
@@ -113,4 +113,4 @@ def test_a_missing_package_is_refused_before_anything_is_written(tmp_path, monke
 
 def test_a_key_of_a_logger_is_checked():
     with pytest.raises(ConfigError, match=r"loggers\.wandb\.colour: unknown key.*valid: entity, group, mode, project"):
-        loggers.make({"wandb": hydra_config.load("train", "loggers=[wandb]")["loggers"]["wandb"] | {"colour": "blue"}})
+        loggers.make({"wandb": hydra_config.load_config("train", "loggers=[wandb]")["loggers"]["wandb"] | {"colour": "blue"}})

@@ -8,33 +8,33 @@ import pytest
 from support.scene_documents import FORMATS
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
 from scenefactory_jax.core.types import DRIVABLE
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.generators.procedural import procedural_scene
 from scenefactory_jax.roadgraph import lane_graph, lane_topology, routes
 
-NUMBERS = hydra_config.load("quality")["lanes"]
-PROCEDURAL = hydra_config.load("scenes")["scenes"]["generate"]
+NUMBERS = hydra_config.load_config("quality")["lanes"]
+PROCEDURAL = hydra_config.load_config("scenes")["scenes"]["generate"]
 KINDS = len(PROCEDURAL["kinds"])
 
 
 def rebuild(raw, **numbers):
-    return build(NUMBERS["topology"] | numbers, builtins=lane_topology, where="lanes.topology")(raw)
+    return instantiate(NUMBERS["topology"] | numbers, builtins=lane_topology, where="lanes.topology")(raw)
 
 
 def network(roads, **numbers):
-    return build(NUMBERS["network"] | numbers, builtins=routes, where="lanes.network")(lane_graph.make(roads))
+    return instantiate(NUMBERS["network"] | numbers, builtins=routes, where="lanes.network")(lane_graph.make(roads))
 
 
 def search(net, start, yaw, goal, goal_yaw=None, **numbers):
     places = (np.array([*start, 0.0]), yaw, np.array([*goal, 0.0]), goal_yaw)
-    return build(NUMBERS["search"] | numbers, builtins=routes, where="lanes.search")(net, *places)
+    return instantiate(NUMBERS["search"] | numbers, builtins=routes, where="lanes.search")(net, *places)
 
 
 def procedural(index):
-    return build(PROCEDURAL, builtins=procedural_scene, where="scenes.generate")(0, index)
+    return instantiate(PROCEDURAL, builtins=procedural_scene, where="scenes.generate")(0, index)
 
 
 def bare(raw):
@@ -176,10 +176,10 @@ def test_places_on_lanes_are_those_of_a_search_through_all_segments():
         mine = places.lane == row
         np.testing.assert_array_equal(np.sort(places.point[mine]), np.flatnonzero(distance <= 5.0))
         np.testing.assert_allclose(places.distance[mine], distance[places.point[mine]], atol=1e-9)
-    again, direction = lane_graph.at(graph, places.lane, places.arc)
+    again, direction = lane_graph.point_at(graph, places.lane, places.arc)
     np.testing.assert_allclose(again, places.xyz)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0)
-    ends, _ = lane_graph.at(graph, np.arange(len(graph.id)), graph.length)
+    ends, _ = lane_graph.point_at(graph, np.arange(len(graph.id)), graph.length)
     np.testing.assert_allclose(ends, graph.xyz[graph.first[1:] - 1])
 
 
@@ -260,7 +260,7 @@ def test_logged_cars_have_routes_of_the_length_that_they_drove(shared_data):
                 continue
             cars += 1
             places = track.xyz[steps]
-            find = build(NUMBERS["search"] | {"count": 1}, builtins=routes, where="lanes.search")
+            find = instantiate(NUMBERS["search"] | {"count": 1}, builtins=routes, where="lanes.search")
             if found := find(net, places[0], float(track.yaw[steps[0]]), places[-1], float(track.yaw[steps[-1]])):
                 ratios.append(found[0].length / np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).sum())
     assert cars > 20 and len(ratios) / cars > 0.9 and np.median(ratios) == pytest.approx(1.0, abs=0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_set_kernel import imagined_gpu
 
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import geometry
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.data.loading import scene_source
@@ -20,8 +20,8 @@ ROWS = {"radius_m": 10.0, "kind_scale": 20.0}
 @pytest.fixture(scope="module")
 def scenes():
     """Two worlds with more segments than a program takes at once, the second with gaps in its tables."""
-    loaded = scene_source.training(load("train", "scenes.count=2")["scenes"]).scene
-    loaded = spatial_grid.attach(jax.tree.map(np.asarray, replace(loaded, cells=None)), radius_m=10.0, size_m=5.0)
+    loaded = scene_source.load_training_scenes(load_config("train", "scenes.count=2")["scenes"]).scene
+    loaded = spatial_grid.attach_grid(jax.tree.map(np.asarray, replace(loaded, cells=None)), radius_m=10.0, size_m=5.0)
     assert min(loaded.lanes.valid.shape[1], loaded.edges.valid.shape[1]) >= road_kernels.LOOK
     gaps = {name: np.array(getattr(loaded, name).valid) for name in ("lanes", "edges")}
     for valid in gaps.values():
@@ -41,7 +41,7 @@ def cars(scenes):
     yaw = rng.uniform(-3.0, 3.0, (worlds, CARS)).astype(np.float32)
     size = np.broadcast_to(np.array([4.0, 2.0], np.float32), position.shape)
     shape = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
-    circles, radius = jax.vmap(lambda *at: geometry.car_circles(*at, **shape))(position, yaw, size)
+    circles, radius = jax.vmap(lambda *at: geometry.cover_with_circles(*at, **shape))(position, yaw, size)
     velocity = rng.normal(0.0, 6.0, position.shape).astype(np.float32)
     velocity[:, 2] = 0.0
     active = np.broadcast_to(np.arange(CARS) % 3 > 0, (worlds, CARS))
@@ -64,11 +64,13 @@ def looked(scenes, cars, find):
 
 def test_looking_is_what_plain_jax_finds(scenes, cars):
     def kernel(scene, circles, radius, velocity, yaw, position, active):
-        ahead = geometry.heading(yaw)
-        return road_kernels.look(scene.lanes, scene.edges, circles, radius, velocity, ahead, position, active, **EDGES, interpret=True)
+        ahead = geometry.heading_vector(yaw)
+        return road_kernels.query_road_blocks(
+            scene.lanes, scene.edges, circles, radius, velocity, ahead, position, active, **EDGES, interpret=True
+        )
 
     row, squared, rate = looked(scenes, cars, kernel)
-    wanted = looked(scenes, cars, lambda scene, *car: queries.look(scene, *car, **EDGES, kernels=False))
+    wanted = looked(scenes, cars, lambda scene, *car: queries.query_road(scene, *car, **EDGES, kernels=False))
     np.testing.assert_array_equal(row, wanted[0])
     np.testing.assert_allclose(np.sqrt(squared), wanted[1], rtol=1e-5, atol=1e-5)
     with np.errstate(divide="ignore"):
@@ -79,7 +81,9 @@ def test_looking_is_what_plain_jax_finds(scenes, cars):
 def test_a_world_without_a_road_has_nothing_to_find(scenes, cars):
     def find(scene, circles, radius, velocity, yaw, position, active):
         lanes, edges = (replace(table, valid=table.valid & False) for table in (scene.lanes, scene.edges))
-        return road_kernels.look(lanes, edges, circles, radius, velocity, geometry.heading(yaw), position, active, **EDGES, interpret=True)
+        return road_kernels.query_road_blocks(
+            lanes, edges, circles, radius, velocity, geometry.heading_vector(yaw), position, active, **EDGES, interpret=True
+        )
 
     row, squared, rate = jax.vmap(find)(scenes, *cars)
     assert not row.any() and np.isinf(squared).all() and not rate.any()
@@ -90,13 +94,13 @@ def test_gathering_is_what_plain_jax_finds(scenes, cars, count):
     *_, yaw, position, active = cars
 
     def kernel(scene, position, yaw, active):
-        first, last = spatial_grid.part(scene.cells, position)
-        turn = geometry.heading(-yaw)
+        first, last = spatial_grid.find_cell_bounds(scene.cells, position)
+        turn = geometry.heading_vector(-yaw)
         last = jnp.where(active, last, first)
-        return road_kernels.gather(scene.road, scene.cells, first, last, position, turn, count=count, **ROWS, interpret=True)
+        return road_kernels.gather_segment_blocks(scene.road, scene.cells, first, last, position, turn, count=count, **ROWS, interpret=True)
 
     features, mask = jax.vmap(kernel)(scenes, position, yaw, active)
-    wanted = jax.vmap(lambda *given: queries.around(*given, count=count, **ROWS, kernels=False))(scenes, position, yaw, active)
+    wanted = jax.vmap(lambda *given: queries.gather_segments(*given, count=count, **ROWS, kernels=False))(scenes, position, yaw, active)
     np.testing.assert_array_equal(mask, wanted.mask)
     np.testing.assert_allclose(features, wanted.features, atol=1e-5)
     assert mask.all(axis=-1).any() == (count == 20) and mask.any() and not mask[~np.asarray(active)].any()
@@ -109,10 +113,10 @@ def test_derivatives_are_those_of_plain_jax(scenes, cars):
 
     def told(kernels):
         def total(shift, turn):
-            beside = queries.look(
+            beside = queries.query_road(
                 scene, circles + shift, radius, velocity, yaw + turn, position + shift, active, **EDGES, kernels=kernels
             )  # fmt: skip
-            seen = queries.around(scene, position + shift, yaw + turn, active, count=20, **ROWS, kernels=kernels)
+            seen = queries.gather_segments(scene, position + shift, yaw + turn, active, count=20, **ROWS, kernels=kernels)
             edges = jnp.where(active & jnp.isfinite(beside.edge), beside.edge, 0.0).sum()
             times = jnp.where(active & jnp.isfinite(beside.edge_ttc), jnp.minimum(beside.edge_ttc, 10.0), 0.0).sum()
             return edges + times + (seen.features**3).sum()
@@ -129,8 +133,8 @@ def test_derivatives_are_those_of_plain_jax(scenes, cars):
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(scenes, cars):
     def text(kernels, platform):
         def both(scene, circles, radius, velocity, yaw, position, active):
-            seen = queries.around(scene, position, yaw, active, count=20, **ROWS, kernels=kernels)
-            return seen, queries.look(scene, circles, radius, velocity, yaw, position, active, **EDGES, kernels=kernels)
+            seen = queries.gather_segments(scene, position, yaw, active, count=20, **ROWS, kernels=kernels)
+            return seen, queries.query_road(scene, circles, radius, velocity, yaw, position, active, **EDGES, kernels=kernels)
 
         with imagined_gpu():
             return jax.jit(jax.vmap(both)).trace(scenes, *cars).lower(lowering_platforms=(platform,)).as_text()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.running import SHARED
 
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.types import Motion
 from scenefactory_jax.data.loading import scene_source
@@ -27,7 +27,7 @@ def scenes(request):
             pytest.skip(f"no data at {WOMD}")
         first = sorted(WOMD.iterdir())[0]
         overrides = ["scenes=womd", f"scenes.path={first}", "scenes.cells.radius_m=null"]
-    return scene_source.training(load("train", *overrides)["scenes"]).scene
+    return scene_source.load_training_scenes(load_config("train", *overrides)["scenes"]).scene
 
 
 def places(scene, seed):
@@ -58,7 +58,7 @@ def look(count):
 
 @pytest.mark.parametrize(("size_m", "count"), [(5.0, 350), (3.0, 20), (25.0, 64)])
 def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
-    quick, find = spatial_grid.attach(scenes, radius_m=10.0, size_m=size_m), look(count)
+    quick, find = spatial_grid.attach_grid(scenes, radius_m=10.0, size_m=size_m), look(count)
     for world in range(len(scenes.log.dt)):
         one = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), quick)  # noqa: B023
         position = places(one, world)
@@ -69,7 +69,7 @@ def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
 
 
 def test_a_larger_radius_looks_through_all(scenes):
-    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), spatial_grid.attach(scenes, radius_m=4.0, size_m=5.0))
+    narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), spatial_grid.attach_grid(scenes, radius_m=4.0, size_m=5.0))
     find, position = look(350), places(narrow, 0)
     jax.tree.map(np.testing.assert_array_equal, find(narrow, position), find(replace(narrow, cells=None), position))
 
@@ -77,14 +77,14 @@ def test_a_larger_radius_looks_through_all(scenes):
 def test_a_world_without_a_road_has_empty_lists(scenes):
     road = scenes.road
     bare = unchecked(type(scenes), **(vars(scenes) | {"road": unchecked(type(road), **(vars(road) | {"valid": road.valid & False}))}))
-    made = spatial_grid.attach(bare, radius_m=10.0, size_m=5.0).cells
+    made = spatial_grid.attach_grid(bare, radius_m=10.0, size_m=5.0).cells
     assert not made.first.any() and made.most == 1
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made)
-    _, listed = spatial_grid.listed(one, *spatial_grid.part(one, jnp.zeros((3, 2))))
+    _, listed = spatial_grid.list_segments(one, *spatial_grid.find_cell_bounds(one, jnp.zeros((3, 2))))
     assert not listed.any()
 
 
 def test_configs_look_as_far_as_their_observation():
-    assert load("train", "experiment=published")["scenes"]["cells"]["radius_m"] == 10.0
-    assert load("train", "observe.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
-    assert load("convert")["scenes"]["cells"]["radius_m"] is None
+    assert load_config("train", "experiment=published")["scenes"]["cells"]["radius_m"] == 10.0
+    assert load_config("train", "observe.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
+    assert load_config("convert")["scenes"]["cells"]["radius_m"] is None

@@ -14,7 +14,7 @@ ALONE = [SMOKE, "scenes.pack.agents=1"]
 @functools.cache
 def scenes(*, agents: int = 1) -> scene_source.Scenes:
     """The four scenes of the smallest config."""
-    return scene_source.training(hydra_config.load("train", SMOKE, f"scenes.pack.agents={agents}")["scenes"])
+    return scene_source.load_training_scenes(hydra_config.load_config("train", SMOKE, f"scenes.pack.agents={agents}")["scenes"])
 
 
 def actions(steps, worlds, *, seed=0):

@@ -31,7 +31,7 @@ import numpy as np
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli.convert import convert
-from scenefactory_jax.evaluation.episode_records import make_player
+from scenefactory_jax.evaluation.episode_records import make_episode_runner
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from support.format_documents import argoverse2_files, dumped, encoded, pufferdrive_map, scenarionet_document
 from support.scene_documents import document, scenefactory_document
@@ -110,12 +110,12 @@ def is_same(name: str, found: dict[str, Any]) -> bool:
 
 @functools.cache
 def scenes() -> Any:
-    return sf.load_scenes(sf.load("train", *SMALL)["scenes"])
+    return sf.load_scenes(sf.load_config("train", *SMALL)["scenes"])
 
 
 def environment(*overrides: str) -> Any:
     """200 control steps of 4 worlds with random actions: all that reset and the steps give, and where the cars are after each."""
-    env = sf.make(sf.load("train", *SMALL, "timing.episode_s=20", *overrides))
+    env = sf.make(sf.load_config("train", *SMALL, "timing.episode_s=20", *overrides))
     worlds = scenes().scene
     actions = jax.random.uniform(jax.random.key(1), (STEPS, WORLDS, AGENTS, 3), minval=-0.6, maxval=1.0)
 
@@ -133,7 +133,7 @@ def environment(*overrides: str) -> Any:
 
 def training(*overrides: str) -> Any:
     """Three iterations: their metrics, and the parameters after them."""
-    config = sf.load("train", *overrides)
+    config = sf.load_config("train", *overrides)
     trainer, worlds = make_trainer(config, sf.make(config), make_policy(config)), scenes().scene
     state, rows = trainer.init(jax.random.key(0), worlds), []
     for _ in range(3):
@@ -144,8 +144,8 @@ def training(*overrides: str) -> Any:
 
 def evaluation() -> Any:
     """The per-agent table of an untrained policy."""
-    config, settings = sf.load("train", *SMALL, "timing.episode_s=4"), sf.load("evaluate", "run=none")
-    play = make_player(config, scenes(), protocol="invincible", settings=settings, worlds=0, steps=0)
+    config, settings = sf.load_config("train", *SMALL, "timing.episode_s=4"), sf.load_config("evaluate", "run=none")
+    play = make_episode_runner(config, scenes(), protocol="invincible", settings=settings, worlds=0, steps=0)
     env = sf.make(config)
     observation = env.reset(jax.random.key(0), scenes()[0])[1]
     return play(make_policy(config).init(jax.random.key(0), observation))[0]
@@ -171,7 +171,7 @@ def packed(*names: str) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             (Path(folder) / name).write_bytes(documents()[name])
-        return list(sf.read(folder)), sf.load_scenes(sf.load("train", *FILES, f"scenes.path={folder}")["scenes"]).scene
+        return list(sf.read(folder)), sf.load_scenes(sf.load_config("train", *FILES, f"scenes.path={folder}")["scenes"]).scene
 
 
 def bank() -> Any:
@@ -181,13 +181,13 @@ def bank() -> Any:
         files.mkdir()
         for name in ("gpudrive.json", "scenario.tfrecord"):
             (files / name).write_bytes(documents()[name])
-        convert(sf.load("convert", f"source={files}", f"out={out}", "progress=false", *FILES[1:]))
-        return list(sf.read(out)), sf.load_scenes(sf.load("train", *FILES, f"scenes.path={out}")["scenes"]).scene
+        convert(sf.load_config("convert", f"source={files}", f"out={out}", "progress=false", *FILES[1:]))
+        return list(sf.read(out)), sf.load_scenes(sf.load_config("train", *FILES, f"scenes.path={out}")["scenes"]).scene
 
 
 def towns() -> Any:
     """Eight generated towns, packed."""
-    return sf.load_scenes(sf.load("train", "scenes=town", f"scenes.count={TOWNS}")["scenes"]).scene
+    return sf.load_scenes(sf.load_config("train", "scenes=town", f"scenes.count={TOWNS}")["scenes"]).scene
 
 
 CASES: dict[str, Callable[[], Any]] = {

@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 
-from scenefactory_jax.core.raw_scene import Companion, OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import Companion, FormatMismatch, RawScene, Reject, SceneError
 
 FLIPS = 40  # files with flipped bits
 CUTS = 15  # files cut short
@@ -38,9 +38,9 @@ def attempt(read, path):
         scenes = list(read(path))
         assert all(isinstance(scene, (RawScene, Reject)) for scene in scenes)
         verdict = "read"
-    except (Companion, OtherFormat, SceneError) as error:
+    except (Companion, FormatMismatch, SceneError) as error:
         assert str(path) in str(error), f"no file in: {error}"
-        verdict = OtherFormat.__name__ if isinstance(error, OtherFormat) else type(error).__name__
+        verdict = FormatMismatch.__name__ if isinstance(error, FormatMismatch) else type(error).__name__
     return verdict
 
 

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from scenefactory_jax.core.track_interpolation import nobody, unrecorded
-from scenefactory_jax.core.types import Agents, Log, Road, Scene
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
+from scenefactory_jax.core.types import AgentLog, Agents, Road, Scene
+from scenefactory_jax.weather.friction import make_uniform
 
 
 def road_of(lines, capacity=None) -> Road:
@@ -55,7 +55,7 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
         route=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
         present=jnp.ones(count, bool) if present is None else jnp.asarray(present, bool),
     )
-    log = Log(
+    log = AgentLog(
         position=jnp.tile(agents.position[:, None], (1, steps, 1)),
         yaw=jnp.tile(agents.yaw[:, None], (1, steps)),
         velocity=jnp.zeros((count, steps, 2), jnp.float32),
@@ -64,5 +64,5 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     )
     return Scene(
         road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
-        weather=uniform(jnp.float32(0.0), jnp.int32(0)), others=unrecorded(steps), boxes=nobody(),
+        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)), others=make_empty_log(steps), boxes=make_empty_boxes(),
     )

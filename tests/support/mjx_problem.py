@@ -51,15 +51,15 @@ def newton(*arrays, stages: Stages, friction_ratio, iterations, line_search):
     """`solve.newton` from rest on MuJoCo's arrays; acceleration [16] and contact forces [4, 3] in MuJoCo's order."""
     problem = taken_apart(*arrays, stages=stages, friction_ratio=friction_ratio)
     zero = contact_solver.Acceleration([jnp.zeros(())] * contact_solver.BASE, [jnp.zeros(4)] * contact_solver.OWN)
-    found, force = contact_solver.newton(problem, zero, iterations=iterations, line_search=line_search)
+    found, force = contact_solver.solve_contacts(problem, zero, iterations=iterations, line_search=line_search)
     flat = jnp.zeros(17).at[columns(stages)].set(jnp.stack(found.own, axis=-1)).at[: contact_solver.BASE].set(jnp.stack(found.base))
     return flat[:16], jnp.stack(force, axis=-1)
 
 
 def random_states(model, car, *, count, seed):
     """Cars at rest's height and far from it: dived, rolled, upside down, in the air, on their rims; steered, spinning, driving, falling."""
-    at, rng = cars.places(model), np.random.default_rng(seed)
-    qpos, qvel = np.tile(cars.rest(model, car), (count, 1)), rng.normal(0, 1, (count, 16))
+    at, rng = cars.find_addresses(model), np.random.default_rng(seed)
+    qpos, qvel = np.tile(cars.find_rest_pose(model, car), (count, 1)), rng.normal(0, 1, (count, 16))
     third = count // 3  # on the road; leaning; anyhow
     lean = np.concatenate([np.full(third, 0.02), np.full(third, 0.4), np.full(count - 2 * third, 3.0)])
     axis = rng.normal(0, 1, (count, 3)) * lean[:, None] + np.array([0.0, 0.0, 1.0]) * rng.uniform(-3, 3, (count, 1))

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
 from scenefactory_jax.data.packing import columns
 from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS, PackReport, _centre, overlaps
@@ -114,7 +114,7 @@ def pack(
         relief_m=relief,
         metadata=dict(raw.metadata),
     )
-    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
 
 
 def _segments(raw, origin, half, gap_m, outline_m):
@@ -222,7 +222,7 @@ def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
         path = track.xyz[raw.current :][track.valid[raw.current :], :2] - origin[:2]
         yaw = track.yaw[raw.current]
         along = float(track.velocity[raw.current] @ np.array([np.cos(yaw), np.sin(yaw)]))
-        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrapped(yaw)
+        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         rows["route"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
@@ -246,7 +246,7 @@ def _recording(tracks, raw, origin, slots, first):
         valid = track.valid[first:]
         rows["valid"][slot] = valid
         rows["position"][slot][valid] = track.xyz[first:][valid, :2] - origin[:2]
-        rows["yaw"][slot][valid] = wrapped(track.yaw[first:][valid])
+        rows["yaw"][slot][valid] = wrap_angles(track.yaw[first:][valid])
         rows["velocity"][slot][valid] = track.velocity[first:][valid]
     return rows
 

@@ -9,8 +9,8 @@ import types
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.core.types import Env, Events, Facts, Motion, Outcome, Scene, State
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.core.types import Env, Events, Motion, Scene, State, StepMetrics, StepResult
+from scenefactory_jax.weather.friction import make_uniform
 
 AGENTS = 3
 SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0}
@@ -72,7 +72,7 @@ def blank(cls, **known):
 
 def scenes(worlds: int, task: int = 5) -> Scene:
     """Scenes that hold nothing but the number of a probe."""
-    scene = blank(Scene, weather=uniform(jnp.float32(0.0), jnp.int32(task)))
+    scene = blank(Scene, weather=make_uniform(jnp.float32(0.0), jnp.int32(task)))
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), scene)
 
 
@@ -120,8 +120,8 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
         truncated = after.step >= episode_steps
         over = truncated | ~jnp.any(after.active)
         events = blank(Events, reached=done)
-        facts = blank(Facts, speed=jnp.where(state.active, 2.0, POISON))
-        return after, Outcome(None, paid, {"paid": paid}, events, done, truncated, over, facts)
+        facts = blank(StepMetrics, speed=jnp.where(state.active, 2.0, POISON))
+        return after, StepResult(None, paid, {"paid": paid}, events, done, truncated, over, facts)
 
     def observe(scene, state):
         return {"cue": jnp.where(state.active, see(scene.weather.surface, state.body, state.age), 0.0)[:, None]}

@@ -10,23 +10,23 @@ from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics.articulated.tyres import Tyres
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import Recording, record
-from scenefactory_jax.visualization.web.replay_data import Light, Posts
+from scenefactory_jax.visualization.web.replay_data import Light, RoadPosts
 from support.hand_scenes import scene_of
 
 STEPS, HZ = 90, 30
 NAMES = ("first </script> world", "second")
-POSTS = (Posts((Light((10.0, 0.0), 0.0, [(0.0, "stop"), (1.0, "go")]),), ((12.0, 5.0),)), Posts())
+POSTS = (RoadPosts((Light((10.0, 0.0), 0.0, [(0.0, "stop"), (1.0, "go")]),), ((12.0, 5.0),)), RoadPosts())
 
 
 def made() -> Recording:
     """Car 0 reaches its goal, car 1 steers off the road, car 2 drives on; the second world is the first one mirrored in its order."""
-    settings = hydra_config.load("train", "experiment=smoke", "ends=invincible", "timing.episode_s=10")
+    settings = hydra_config.load_config("train", "experiment=smoke", "ends=invincible", "timing.episode_s=10")
     starts, goals = np.array([[-20.0, 0.0], [-40.0, 0.0], [-50.0, -3.0]]), np.array([[-8.0, 0.0], [50.0, 0.0], [55.0, -3.0]])
     scenes = [scene_of(starts, goals, speeds=[8.0, 12.0, 5.0]), scene_of(starts[::-1], goals[::-1], speeds=[5.0, 12.0, 8.0])]
     scene = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
     turn = jnp.array([[0.3, 0.0, 0.0], [0.6, 0.35, -0.2], [0.1, 0.0, 0.0]])
     act = lambda parameters, observation, key: turn + 0.02 * jax.random.normal(key, (3, 3))  # noqa: E731
-    return _dressed(jax.device_get(record(environment.make(settings), act, None, scene, jax.random.key(3), steps=STEPS)))
+    return _dressed(jax.device_get(record(environment.make_env(settings), act, None, scene, jax.random.key(3), steps=STEPS)))
 
 
 def _dressed(recording: Recording) -> Recording:

@@ -26,7 +26,7 @@ def quick_compilation():
 
 def smoke(out, *overrides):
     """A training config of seconds."""
-    return hydra_config.load("train", "experiment=smoke", "progress=false", f"out={out}", *overrides)
+    return hydra_config.load_config("train", "experiment=smoke", "progress=false", f"out={out}", *overrides)
 
 
 def shell(folder, *words, timeout=None, **environment):

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import features
 
-PROCEDURAL = hydra_config.load("convert", "scenes=procedural")["scenes"]
-FEATURES = build(hydra_config.load("scenes")["features"], builtins=features, where="features")
+PROCEDURAL = hydra_config.load_config("convert", "scenes=procedural")["scenes"]
+FEATURES = instantiate(hydra_config.load_config("scenes")["features"], builtins=features, where="features")
 
 
 @functools.cache
 def generated(index, seed=3):
     """A procedural scene; the kinds take turns: straight, curve, T, crossing, roundabout, merge."""
     builtins = "scenefactory_jax.data.generators.procedural.procedural_scene"
-    return build(PROCEDURAL["generate"], builtins=builtins, where="scenes.generate")(seed, index)
+    return instantiate(PROCEDURAL["generate"], builtins=builtins, where="scenes.generate")(seed, index)
 
 
 def banked(folder, raws, *, described=True):

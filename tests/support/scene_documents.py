@@ -5,22 +5,22 @@ import json
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Polyline
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import pack, validation
 
-WOMD = hydra_config.load("convert", "scenes=womd")["scenes"]
+WOMD = hydra_config.load_config("convert", "scenes=womd")["scenes"]
 FORMATS = WOMD["formats"]
 STEPS = 12
 
 
 def checker(**numbers):
-    return build(WOMD["check"] | numbers, builtins=validation, where="scenes.check")
+    return instantiate(WOMD["check"] | numbers, builtins=validation, where="scenes.check")
 
 
 def packer(**numbers):
-    return build(WOMD["pack"] | {"log_from": "start"} | numbers, builtins=pack, where="scenes.pack")
+    return instantiate(WOMD["pack"] | {"log_from": "start"} | numbers, builtins=pack, where="scenes.pack")
 
 
 def prepared(raw, **numbers):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.sysid import heldout_manoeuvres, manoeuvres, multibody_model
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Manoeuvre, on_one_surface
@@ -52,7 +52,7 @@ def car():
 
 @pytest.fixture(scope="module")
 def teacher(car):
-    return build(conf("sysid/teacher"), builtins=multibody_model, where="sysid.teacher")(car)
+    return instantiate(conf("sysid/teacher"), builtins=multibody_model, where="sysid.teacher")(car)
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_left_is_positive_and_the_outer_wheels_are_the_right_ones(left_turn):
 
 
 def test_mirrored_commands_give_the_mirrored_path(teacher, left_turn):
-    r = record(manoeuvres.mirrored(left_turn.manoeuvre), teacher=teacher)
+    r = record(manoeuvres.mirror(left_turn.manoeuvre), teacher=teacher)
     assert r.position * [1, -1] == pytest.approx(left_turn.position, abs=1e-3)
     assert -r.yaw == pytest.approx(left_turn.yaw, abs=1e-4)
     assert r.wheel_spin[:, [1, 0, 3, 2]] == pytest.approx(left_turn.wheel_spin, abs=1e-2)
@@ -247,7 +247,7 @@ def test_the_teacher_takes_from_the_car_what_its_recordings_are_known_by(car, te
 
 def test_wrong_settings_are_named(monkeypatch, car, teacher, entries):
     with pytest.raises(ConfigError, match="steering_lag_s: 0"):
-        build({**conf("sysid/teacher"), "steering_lag_s": 0.0}, builtins=multibody_model, where="sysid.teacher")(car)
+        instantiate({**conf("sysid/teacher"), "steering_lag_s": 0.0}, builtins=multibody_model, where="sysid.teacher")(car)
     twice = {"a": entries["training"]["straight_accel"], "b": entries["training"]["straight_accel"]}
     with pytest.raises(ConfigError, match="straight_accel_0"):
         manoeuvres.training(twice)

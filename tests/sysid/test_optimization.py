@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from scenefactory_jax.cli import sysid as command
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.sysid import candidate_simulation, error_metrics, optimization, parameter_space
 from scenefactory_jax.sysid.candidate_simulation import TERMS
-from scenefactory_jax.sysid.manoeuvres import Manoeuvre, Recording
+from scenefactory_jax.sysid.manoeuvres import Manoeuvre, ManoeuvreRecording
 
 WEIGHTS = {name: 1.0 for name in TERMS}
 SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, tell=lambda line: None)
@@ -133,7 +133,7 @@ def manoeuvre(name, steer, frames=24):
 
 @pytest.fixture(scope="module")
 def config():
-    return load("sysid")
+    return load_config("sysid")
 
 
 @pytest.fixture(scope="module")
@@ -143,14 +143,14 @@ def lesson(config):
     replay = candidate_simulation.make(config["dynamics"], where, [1.0, 0.7, 0.5], physics_hz=120.0)
     begin = where.start
     plans = [manoeuvre("left", 0.3), manoeuvre("straight", 0.0, frames=18)]
-    empty = [Recording(m, *(np.zeros((len(m.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ()))) for m in plans]
+    empty = [ManoeuvreRecording(m, *(np.zeros((len(m.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ()))) for m in plans]
     path = traced(replay, begin, candidate_simulation.suite(empty))
     own = []
     for index, plan in enumerate(plans):
         frames = len(plan.controls)
         cut = jax.tree.map(lambda leaf, i=index, n=frames: leaf[i, :n], path)
         flat = np.zeros(frames)
-        own.append(Recording(plan, cut.position, cut.yaw, cut.pace, cut.yaw_rate, cut.wheel_spin, cut.steer.mean(-1), flat, flat))
+        own.append(ManoeuvreRecording(plan, cut.position, cut.yaw, cut.pace, cut.yaw_rate, cut.wheel_spin, cut.steer.mean(-1), flat, flat))
     return replay, begin, own
 
 
@@ -163,7 +163,7 @@ def traced(replay, row, plan):
 def test_a_car_that_replays_itself_makes_no_error_and_another_does(lesson, config):
     replay, begin, own = lesson
     weights = config["sysid"]["weights"]
-    score = candidate_simulation.scorer(replay, candidate_simulation.suite(own), width=3)
+    score = candidate_simulation.make_scorer(replay, candidate_simulation.suite(own), width=3)
     rows = np.stack([begin, begin + np.array([100.0, 0.0]), begin + np.array([0.0, -0.65])])
     losses = optimization.losses(score(rows, [0, 1]), weights)
     assert losses[0] < 1e-6 and (losses[1:] > 1e-3).all()
@@ -178,7 +178,7 @@ def test_residuals_square_to_the_loss(lesson, config):
     path = traced(replay, row, plan)
     square = (candidate_simulation.residuals(path, plan, [0, 1], optimization.weight_row(weights)) ** 2).sum()
     assert square == pytest.approx(
-        optimization.losses(candidate_simulation.scorer(replay, plan, width=3)(row[None], [0, 1]), weights)[0], rel=1e-3
+        optimization.losses(candidate_simulation.make_scorer(replay, plan, width=3)(row[None], [0, 1]), weights)[0], rel=1e-3
     )
 
 
@@ -201,12 +201,12 @@ def stand_ins():
     """Manoeuvres that nobody drives, one a family."""
     plans = [manoeuvre(family, 0.0)._replace(family=family) for family in FAMILIES]
     zeros = lambda plan: [np.zeros((len(plan.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ())]  # noqa: E731
-    return [Recording(plan, *zeros(plan)) for plan in plans]
+    return [ManoeuvreRecording(plan, *zeros(plan)) for plan in plans]
 
 
 def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
     budget = {name: [4, 2] for name in ("longitudinal", "steering", "surface", "refinement", "brake_preservation")}
-    config = load("sysid", f"sysid.budget={budget}".replace("'", ""), "resume=true")
+    config = load_config("sysid", f"sysid.budget={budget}".replace("'", ""), "resume=true")
     where, asked = parameter_space.make(config["sysid"]["space"]), []
     target = where.low + 0.4 * (where.high - where.low)
 
@@ -246,7 +246,7 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
     ],
 )
 def test_stages_that_cannot_be_are_refused(tmp_path, override, message):
-    config = load("sysid", override, "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1]}")
+    config = load_config("sysid", override, "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1]}")
     where = parameter_space.make(config["sysid"]["space"])
     (tmp_path / "stages").mkdir()
     with pytest.raises(ConfigError, match=message):
@@ -256,14 +256,14 @@ def test_stages_that_cannot_be_are_refused(tmp_path, override, message):
 @pytest.mark.slow
 def test_the_whole_command(tmp_path):
     budget = "{longitudinal: [2,1], steering: [2,1], surface: [2,1], refinement: [2,1], brake_preservation: [2,1]}"
-    config = load("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
+    config = load_config("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
     found = command.sysid(config)
     written = {path.name for path in tmp_path.iterdir()}
     figures = {"search.png", "slices.png", "heldout.png", "paths.png"}
     assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
     assert found["refined"]["loss"] <= found["refined"]["start_loss"] and set(found["cars"]) == {"fitted", "default", "published"}
     car = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["car"]
-    fitted = load("train", *(f"dynamics.car.{name}={value}" for name, value in car.items()))["dynamics"]["car"]
+    fitted = load_config("train", *(f"dynamics.car.{name}={value}" for name, value in car.items()))["dynamics"]["car"]
     assert all(fitted[name] == value for name, value in car.items()), "what was fitted is a car"
     text = (tmp_path / "sysid.md").read_text()
     assert "steering_limit" in text and "steady_circle" in text
@@ -280,11 +280,11 @@ def test_measures_of_a_car_that_is_one_metre_off():
     x = np.cumsum(speed) / 60.0
     zero, turn = np.zeros(frames), 0.1 * np.sin(np.arange(frames))
     plan = Manoeuvre("stop", "some", 6.0, controls, np.zeros(0), np.array([0]), np.array([0]))
-    teacher = Recording(plan, np.stack([x, zero], 1), zero, speed, turn, np.zeros((frames, 4)), zero, zero, zero)
+    teacher = ManoeuvreRecording(plan, np.stack([x, zero], 1), zero, speed, turn, np.zeros((frames, 4)), zero, zero, zero)
     places = np.stack([x, zero + 1.0], 1)[None]
-    off = candidate_simulation.Path(places, zero[None], 1.1 * speed[None], 1.1 * turn[None], np.zeros((1, frames, 4)),
+    off = candidate_simulation.CandidatePath(places, zero[None], 1.1 * speed[None], 1.1 * turn[None], np.zeros((1, frames, 4)),
                        np.zeros((1, frames, 2)), np.zeros((1, frames, 4)), np.zeros((1, frames, 4)))  # fmt: skip
-    found = error_metrics.measure(off, [teacher])
+    found = error_metrics.compute_errors(off, [teacher])
     assert found.end_m[0] == pytest.approx(1.0) and found.way_m[0] == pytest.approx(8.95, abs=0.1)
     assert found.yaw_rate_nrmse[0] == pytest.approx(0.1 / np.sqrt(2.0), rel=0.02) and found.stop_share[0] == pytest.approx(0.0, abs=0.02)
     assert np.isnan(error_metrics.stopping_m(np.zeros((frames, 3)), teacher.position, speed))

@@ -5,11 +5,11 @@ import pytest
 import yaml
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.visualization.report import sysid_report as report
 
-COMMITTED = configs.folder().parent / "experiments" / "sysid"
+COMMITTED = configs.find_conf().parent / "experiments" / "sysid"
 TARGETS = {"end_share": 0.05, "yaw_rate_nrmse": 0.15, "stop_share": 0.05, "minutes": 15.0}
 NAN = float("nan")
 
@@ -76,7 +76,7 @@ def test_families_that_miss_a_target_are_named_with_their_medians(tmp_path, resu
 
 def test_the_committed_report_is_made_of_its_results(tmp_path):
     result = result_file.read(COMMITTED / "result.json")
-    written = report.write(tmp_path, result, load("sysid", "sysid=full")["sysid"]["targets"])
+    written = report.write(tmp_path, result, load_config("sysid", "sysid=full")["sysid"]["targets"])
     assert written.read_text() == (COMMITTED / "sysid.md").read_text()
     assert {path.name for path in tmp_path.glob("*.png")} == {path.name for path in COMMITTED.glob("*.png")}
 
@@ -85,7 +85,9 @@ def test_the_shipped_car_is_the_one_that_was_fitted():
     result = result_file.read(COMMITTED / "result.json")
     found = dict(zip(result["space"]["names"], result["refined"]["best"], strict=True))
     written = yaml.safe_load((COMMITTED / "fitted.yaml").read_text())
-    car = load("sysid")["dynamics"]["car"]
-    assert set(written["car"]) == {name for name in load("sysid", "sysid=full")["sysid"]["space"] if not name.startswith("friction_")}
+    car = load_config("sysid")["dynamics"]["car"]
+    assert set(written["car"]) == {
+        name for name in load_config("sysid", "sysid=full")["sysid"]["space"] if not name.startswith("friction_")
+    }
     for name, value in written["car"].items():
         assert car[name] == value == pytest.approx(found[name], rel=1e-4)

@@ -15,11 +15,11 @@ from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mp4_writer import VideoError
 from scenefactory_jax.visualization.mujoco import actors, film, ground_meshes, offscreen_renderer, scene_model
-from scenefactory_jax.visualization.mujoco.film import Look
+from scenefactory_jax.visualization.mujoco.film import FilmSettings
 from scenefactory_jax.visualization.mujoco.offscreen_renderer import OpenGLError
 
-CAR = cars.numbers(hydra_config.load("task")["dynamics"])[0]
-LOOK = Look(**hydra_config.load("replay")["film"], goal_radius_m=3.0)._replace(width=320, height=180)
+CAR = cars.read_parameters(hydra_config.load_config("task")["dynamics"])[0]
+LOOK = FilmSettings(**hydra_config.load_config("replay")["film"], goal_radius_m=3.0)._replace(width=320, height=180)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_prisms_enclose_area_times_height(shape):
 
 
 def test_a_road_has_asphalt_kerbs_and_paint():
-    found = {surface.name: surface for surface in ground_meshes.surfaces(scene_of(np.zeros((1, 2)), np.ones((1, 2))))}
+    found = {surface.name: surface for surface in ground_meshes.find_surfaces(scene_of(np.zeros((1, 2)), np.ones((1, 2))))}
     assert set(found) == {"asphalt", "kerb"}
     low, high = found["asphalt"].vertices.min(axis=0), found["asphalt"].vertices.max(axis=0)
     assert high[1] == pytest.approx(ground_meshes.LANE_M, abs=0.05) and low[0] == pytest.approx(-60 - ground_meshes.LANE_M, abs=0.1)
@@ -61,8 +61,8 @@ def test_cars_stand_and_steer_as_they_are_put():
     built = scene_model.build(scene, CAR)
     data = mujoco.MjData(built.model)
     yaw, steer = np.array([0.5, -2.0]), np.array([0.3, 0.0])
-    joints = scene_model.posture(CAR, np.array([[1.0, 2.0], [30.0, -4.0]]), yaw, steer, np.array([0.7, 0.0]))
-    scene_model.put(built, data, joints, np.array([1.0, 0.0]))
+    joints = scene_model.set_posture(CAR, np.array([[1.0, 2.0], [30.0, -4.0]]), yaw, steer, np.array([0.7, 0.0]))
+    scene_model.place_actor(built, data, joints, np.array([1.0, 0.0]))
     for slot in range(2):
         ahead = data.body(f"agent{slot}/chassis").xmat.reshape(3, 3)[:, 0]
         np.testing.assert_allclose(ahead, [np.cos(yaw[slot]), np.sin(yaw[slot]), 0.0], atol=1e-9)
@@ -81,7 +81,7 @@ def test_cars_stand_and_steer_as_they_are_put():
 
 def test_recorded_joints_are_shown_as_they_are(recording):
     joints = np.random.default_rng(1).normal(size=(*recording.shots.yaw.shape, scene_model.JOINTS))
-    whole = actors.cast(changed(recording, joints=joints), 0, CAR)
+    whole = actors.make_actors(changed(recording, joints=joints), 0, CAR)
     last = np.flatnonzero(whole.active[:, 0])[-1]
     assert last < len(whole.yaw) - 1  # it reached its goal
     np.testing.assert_array_equal(whole.joints[: last + 1, 0], joints[0, : last + 1, 0])
@@ -90,7 +90,7 @@ def test_recorded_joints_are_shown_as_they_are(recording):
 
 
 def test_wheels_without_joints_turn_as_fast_as_the_road_passes(recording):
-    whole = actors.cast(recording, 0, CAR)
+    whole = actors.make_actors(recording, 0, CAR)
     spin = whole.joints[:, 2, scene_model.SPIN[0]]
     way = np.linalg.norm(np.diff(whole.joints[:, 2, :2], axis=0), axis=1)
     np.testing.assert_allclose(np.diff(spin) * CAR.wheel_radius, way, rtol=0.02)
@@ -105,7 +105,7 @@ def hue(colour):
 
 
 def test_from_above_every_car_is_seen_where_it_is(opened, recording):
-    whole, look = actors.cast(recording, 0, CAR), LOOK._replace(view="bird", width=960, height=540)
+    whole, look = actors.make_actors(recording, 0, CAR), LOOK._replace(view="bird", width=960, height=540)
     [picture] = film.frames(whole, [20], car=CAR, look=look)
     camera = film._above(whole, aspect=look.width / look.height)
     scale = look.height / (2 * camera.distance * np.tan(np.radians(film.FOVY / 2)))
@@ -118,7 +118,7 @@ def test_from_above_every_car_is_seen_where_it_is(opened, recording):
 
 
 def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
-    whole = actors.cast(recording, 0, CAR)
+    whole = actors.make_actors(recording, 0, CAR)
     for slot in (0, 2):
         [picture] = film.frames(whole, [20], car=CAR, look=LOOK._replace(car=slot, trail_s=0.0))
         middle = picture[90:135, 130:190].reshape(-1, 3)
@@ -130,7 +130,7 @@ def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path
     look = LOOK._replace(width=128, height=72, stride=15, view="both")
     for slot in (0, 2):
         out = film.write(tmp_path / f"{slot}.gif", recording, car=CAR, look=look._replace(car=slot))
-        whole = actors.cast(recording, 0, CAR)
+        whole = actors.make_actors(recording, 0, CAR)
         end = min(np.flatnonzero(whole.active[:, slot])[-1] + 1 + 30, STEPS)
         with Image.open(out) as image:
             assert image.n_frames == len(range(0, end, 15)) and image.size == (256, 72)
@@ -171,7 +171,7 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(offscreen_renderer, "import_module", missing)
     monkeypatch.setattr(offscreen_renderer.sys, "platform", "linux")
     with pytest.raises(OpenGLError) as caught:
-        replay(hydra_config.load("replay", f"out={tmp_path / 'a.gif'}"))
+        replay(hydra_config.load_config("replay", f"out={tmp_path / 'a.gif'}"))
     text = str(caught.value)
     assert text.startswith("no OpenGL through osmesa here (no library for mujoco.osmesa); on Debian") and "libegl1" in text
     assert "\n" not in text
@@ -186,7 +186,7 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
 ])  # fmt: skip
 def test_a_wrong_setting_is_named(override, message):
     with pytest.raises(ValueError) as caught:
-        replay(hydra_config.load("replay", override))
+        replay(hydra_config.load_config("replay", override))
     assert message in str(caught.value)
 
 
@@ -194,7 +194,7 @@ def test_replay_writes_a_picture(opened, tmp_path):
     path = written(tmp_path, document())
     small = ["film.width=128", "film.height=72", "film.at_s=0.2"]
     out = replay(
-        hydra_config.load("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'one.png'}", *small)
+        hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'one.png'}", *small)
     )
     with Image.open(out) as image:
         assert image.size == (128, 72) and len(image.getcolors(10_000)) > 30

@@ -11,11 +11,11 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.env import environment
 from scenefactory_jax.visualization.mujoco import keyboard_control
-from scenefactory_jax.visualization.mujoco.keyboard_control import Feel, Wheel
+from scenefactory_jax.visualization.mujoco.keyboard_control import KeyboardResponse, Wheel
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-FEEL = Feel(rise_s=0.4, fall_s=0.2, turn_s=0.5, centre_s=0.25, calm_mps=12.0, tap_s=0.2)
+FEEL = KeyboardResponse(rise_s=0.4, fall_s=0.2, turn_s=0.5, centre_s=0.25, calm_mps=12.0, tap_s=0.2)
 DT, NONE = 1 / 30, frozenset()
 
 
@@ -23,7 +23,7 @@ def after(seconds, held=NONE, *, pressed=NONE, wheel=None, speed=0.0):
     """Pedals and wheel some seconds later, with keys held all the time and others pressed at its beginning."""
     wheel = wheel or Wheel()
     for step in range(round(seconds / DT)):
-        wheel = keyboard_control.turned(wheel, pressed if step == 0 else NONE, held, speed=speed, feel=FEEL, dt=DT)
+        wheel = keyboard_control.turn_wheel(wheel, pressed if step == 0 else NONE, held, speed=speed, feel=FEEL, dt=DT)
     return wheel
 
 
@@ -65,10 +65,10 @@ def test_stop_brakes_at_once_whatever_else_is_held():
 @pytest.fixture(scope="module")
 def built():
     """Two bicycles; yours is the one in slot 1, and its goal would lie right before it."""
-    settings = hydra_config.load("drive", "dynamics=bicycle", "others=ignore", "observe=small")
+    settings = hydra_config.load_config("drive", "dynamics=bicycle", "others=ignore", "observe=small")
     scene = scene_of([[-20.0, 0.0], [-50.0, -3.0]], [[60.0, 0.0], [-44.0, -3.0]], speeds=[5.0, 5.0])
     act = lambda parameters, observation, key: jnp.full((2, 3), 0.0)  # noqa: E731
-    return keyboard_control.world(environment.make(settings), scene, act, None, car=1, dt=DT, off_map_m=30.0)
+    return keyboard_control.world(environment.make_env(settings), scene, act, None, car=1, dt=DT, off_map_m=30.0)
 
 
 def driven(built, script, drive=None):
@@ -149,7 +149,7 @@ def test_the_dashboard_reads_the_car(built):
 
 
 def test_the_viewers_keys_become_commands(monkeypatch):
-    _, _, codes = window._check(hydra_config.load("drive"))
+    _, _, codes = window._check(hydra_config.load_config("drive"))
     keyboard = window.Keyboard(codes)
     monkeypatch.setattr(window.glfw, "get_current_context", lambda: "window")
     down = {window.CODES["up"]}
@@ -174,7 +174,7 @@ def test_the_viewers_keys_become_commands(monkeypatch):
 )
 def test_a_wrong_setting_is_named(override, message):
     with pytest.raises(ConfigError) as caught:
-        window.drive(hydra_config.load("drive", override))
+        window.drive(hydra_config.load_config("drive", override))
     assert message in str(caught.value)
 
 
@@ -183,4 +183,4 @@ def test_without_a_display_one_line_says_what_to_do(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ConfigError, match=r"drive: no display \(DISPLAY and WAYLAND_DISPLAY are not set\); .* replay out=drive\.gif"):
-        window.drive(hydra_config.load("drive"))
+        window.drive(hydra_config.load_config("drive"))

@@ -143,7 +143,7 @@ def test_lights_stand_where_cars_stop_and_change_with_the_log():
     unseen = np.array([True, True, True, True, False])
     lights = (Light(7, states, unseen), Light(7, states, unseen, stop=np.array([10.0, 8.0, 0.0])), Light(99, states, unseen))
     raw = RawScene("s", "s", (lane,), (), 0.5 * np.arange(5), 1, lights=lights)
-    first, second = replay_data.posts(raw, (10.0, 0.0, 0.0)).lights  # the third one's lane is on no map
+    first, second = replay_data.find_posts(raw, (10.0, 0.0, 0.0)).lights  # the third one's lane is on no map
     assert first.place == (0.0, 5.0) and second.place == (0.0, 8.0) and np.isclose(first.yaw, np.pi / 2)
     assert first.shown == [(0.0, "go"), (0.5, "caution"), (1.0, "stop"), (1.5, "unknown")]
 
@@ -162,7 +162,9 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
     signed = scene_document()
     signed["roads"].append({"geometry": [{"x": 5.0, "y": 4.0, "z": 0.0}], "type": "stop_sign", "map_element_id": 17, "id": 90})
     path = written(tmp_path, signed)
-    out = replay(hydra_config.load("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'page.html'}"))
+    out = replay(
+        hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'page.html'}")
+    )
     [world] = unpacked(out.read_text())
     assert len(world["cars"]) == 2 and [-31.0, 4.0] in world["signs"] and out.stat().st_size < 200_000  # around the car that logged
 
@@ -181,11 +183,11 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
 )
 def test_a_wrong_setting_is_named(overrides, message):
     with pytest.raises(ValueError) as caught:
-        replay(hydra_config.load("replay", *overrides))
+        replay(hydra_config.load_config("replay", *overrides))
     assert message in str(caught.value)
 
 
 def test_skipping_all_scenes_says_how_many_there_are(tmp_path):
     path = written(tmp_path, scene_document())
     with pytest.raises(ValueError, match="skip: 3; valid: 0 to 0, for 1 scenes can be used"):
-        replay(hydra_config.load("replay", "scenes=womd", f"scenes.path={path}", "skip=3"))
+        replay(hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "skip=3"))

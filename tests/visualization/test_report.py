@@ -11,8 +11,8 @@ from PIL import Image
 from support.hand_scenes import road_of, scene_of
 
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.track_interpolation import nobody, unrecorded
-from scenefactory_jax.core.types import Agents, Log, Scene
+from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
+from scenefactory_jax.core.types import AgentLog, Agents, Scene
 from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization import gif_writer
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, video
@@ -20,7 +20,7 @@ from scenefactory_jax.visualization.birds_eye import figures as birds_eye_figure
 from scenefactory_jax.visualization.birds_eye import traffic_shapes as shapes
 from scenefactory_jax.visualization.report import evaluation_report, plots
 from scenefactory_jax.weather import patch_layouts
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.weather.friction import make_uniform
 
 BOOTSTRAP = {"bootstrap": 400, "seed": 0}
 FILM = {"fps": 10.0, "stride": 3, "columns": 2, "panel": 160, "trail_s": 2.0}
@@ -70,8 +70,10 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
     size = jnp.tile(jnp.array([4.5, 2.0], f), (agents, 1))
     cars = Agents(jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool))
     row = jnp.zeros((agents, 1), f)
-    log = Log(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
-    scene = jax.tree.map(np.asarray, Scene(road, road, road, cars, log, uniform(f(0.5), jnp.int32(1)), unrecorded(1), nobody()))
+    log = AgentLog(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
+    scene = jax.tree.map(
+        np.asarray, Scene(road, road, road, cars, log, make_uniform(f(0.5), jnp.int32(1)), make_empty_log(1), make_empty_boxes())
+    )
     still = np.zeros((steps, agents), np.float32)
     return drawing.Trajectory(
         scene, position, still, still + 8, active, events, np.asarray(size), goal, np.ones(agents, bool), 30.0, title, "SMA, 0.5 mm"
@@ -103,7 +105,7 @@ def test_others_are_drawn_where_they_are(trajectory):
     for shape, (x, y), kind in zip(drawn, ((-30, 3), (-50, -2), (-20, -3)), ("hollow", "lens", "disc"), strict=True):
         np.testing.assert_allclose((shape.points.min(0) + shape.points.max(0)) / 2, [x, y], atol=0.2)
         assert (shape.fill == shapes.MOVING) == (kind != "hollow") and (len(shape.points) > 6) == (kind == "disc")
-    assert shapes.parked(beside(trajectory).others).tolist() == [True, False, True]
+    assert shapes.shapes_at_rest(beside(trajectory).others).tolist() == [True, False, True]
     birds_eye_figures.trajectory_figure(beside(trajectory))
     wrong = beside(trajectory)
     with pytest.raises(drawing.TrajectoryError, match=r"others\.yaw: shape \(61, 2\)"):
@@ -269,7 +271,7 @@ def test_world_to_pixels():
 
 
 def test_view_holds_every_way_and_goal(trajectory):
-    left, bottom, side = drawing.around(drawing.places(trajectory), margin=5.0, smallest=10.0)
+    left, bottom, side = drawing.fit_view(drawing.places(trajectory), margin=5.0, smallest=10.0)
     shown = np.concatenate([trajectory.position[trajectory.active], trajectory.goal])
     assert (shown >= [left + 5 - 1e-3, bottom + 5 - 1e-3]).all() and (shown <= [left + side - 5 + 1e-3, bottom + side - 5 + 1e-3]).all()
 
@@ -295,7 +297,7 @@ def test_a_car_is_drawn_where_it_is(trajectory):
     """Law of the pixels: the box of agent 2's colour sits at its place, and moves as the car does."""
     panel, centres = 640, []
     settings = {**FILM, "columns": 1, "panel": panel, "trail_s": 0.0}
-    view = drawing.View(*drawing.around(drawing.places(trajectory), margin=9.0, smallest=50.0), panel)
+    view = drawing.View(*drawing.fit_view(drawing.places(trajectory), margin=9.0, smallest=50.0), panel)
     shown = video.shown_steps(len(trajectory.active), 30)
     for step, picture in zip(shown, video.frames([trajectory], **{**settings, "stride": 30}), strict=True):
         body = picture[video._GAP + video._bar(panel) :][:panel, video._GAP : video._GAP + panel].astype(int)
@@ -380,7 +382,7 @@ def test_bad_videos_are_refused_by_name(tmp_path, trajectory, monkeypatch):
 def test_a_fault_leaves_the_car_where_it_was(trajectory):
     position = trajectory.position.copy()
     position[50:, 2] = np.nan
-    settled = drawing.settle(trajectory._replace(position=position))
+    settled = drawing.sanitize_trajectory(trajectory._replace(position=position))
     np.testing.assert_array_equal(settled.position[60, 2], position[49, 2])
     assert not settled.active[50:, 2].any() and settled.active[:50, 2].all()
     assert len(list(video.frames([trajectory._replace(position=position)], **FILM))) == 21
@@ -389,7 +391,7 @@ def test_a_fault_leaves_the_car_where_it_was(trajectory):
 def test_a_respawn_draws_no_line_across_the_map(trajectory):
     position = trajectory.position.copy()
     position[30:, 2] += 50.0
-    driven = drawing.moves(trajectory._replace(position=position))
+    driven = drawing.is_moving(trajectory._replace(position=position))
     assert not driven[30, 2] and driven[29, 2] and driven[31, 2]
 
 
@@ -474,7 +476,7 @@ def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
     assert [area.label for area in patch_overlay.areas(shown.weather)] == ["water", "ice", "gravel"] and not patch_overlay.areas(
         none.weather
     )
-    assert patch_overlay.look("AC", 0.8)[0][0] < patch_overlay.look("AC", 0.1)[0][0], "deeper water is bluer"
+    assert patch_overlay.colour_area("AC", 0.8)[0][0] < patch_overlay.colour_area("AC", 0.1)[0][0], "deeper water is bluer"
     view = drawing.View(-60.0, -40.0, 100.0, 500)
     lines = drawing.strokes(shown.road)
     with_them = np.array(video.road_image(lines, view, patches=patch_overlay.areas(shown.weather)))

@@ -86,5 +86,5 @@ def test_rewards_are_the_sum_of_their_terms_and_what_is_not_there_is_nan(recordi
 def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setattr(rerun_file.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RerunError, match=r"writing \.rrd needs rerun; `pip install scenefactory_jax\[rerun\]`, or choose out=NAME\.html"):
-        replay(hydra_config.load("replay", f"out={tmp_path / 'a.rrd'}"))
+        replay(hydra_config.load_config("replay", f"out={tmp_path / 'a.rrd'}"))
     assert not list(tmp_path.iterdir())

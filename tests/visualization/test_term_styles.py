@@ -28,7 +28,7 @@ def lab(colour, seen=NORMAL):
 
 def test_the_terms_of_every_reward_are_told_apart():
     for reward in ("reference", "careful", "wary"):
-        names = list(hydra_config.load("task", f"reward={reward}")["reward"])
+        names = list(hydra_config.load_config("task", f"reward={reward}")["reward"])
         assert TERMS.keys() >= set(names) and len(set(term_looks(names).values())) == len(names)
     assert len(names) == 14
     for (_, one), (_, other) in itertools.combinations(TERMS.items(), 2):

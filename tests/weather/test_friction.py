@@ -11,12 +11,12 @@ from support.hand_scenes import scene_of
 from support.running import ROOT, SHARED
 
 from scenefactory_jax.cli import physics as command
-from scenefactory_jax.cli.hydra_config import load
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import result_file
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import SURFACES
 from scenefactory_jax.weather import friction, road_condition
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.weather.friction import make_uniform
 
 CONF = ROOT / "conf" / "weather"
 BASE = yaml.safe_load((CONF / "base.yaml").read_text())
@@ -28,11 +28,11 @@ PUBLISHED = {"AC": (1.105, 0.959, 0.859, 0, 0), "SMA": (1.204, 1.046, 0.937, 0, 
 
 @jax.jit
 def mu_of(speed, film, theta, texture, slip):
-    return friction.friction(speed, film, theta, texture, slip, tyre=TYRE)
+    return friction.compute_lugre_friction(speed, film, theta, texture, slip, tyre=TYRE)
 
 
 def grip_of(**numbers):
-    return build({**BASE["grip"], **numbers}, builtins=friction, where="weather.grip")
+    return instantiate({**BASE["grip"], **numbers}, builtins=friction, where="weather.grip")
 
 
 @pytest.mark.parametrize(("column", "slip"), [("mu_static_ss", 0.15), ("mu_dynamic_ss", 0.80)])
@@ -61,8 +61,8 @@ def test_closed_form_is_where_the_bristle_comes_to_rest(film, slip):
     speed, dt, z = 13.89, 1e-4, 0.0
     theta, texture = SURFACE["SMA"]["theta"], SURFACE["SMA"]["texture_mm"]
     args = (jnp.float32(speed), jnp.float32(film))
-    y_r = float(friction.spacing(*args, jnp.float32(texture), tyre=TYRE))
-    contact = theta * y_r - float(friction.lift(*args, tyre=TYRE))
+    y_r = float(friction.asperity_spacing(*args, jnp.float32(texture), tyre=TYRE))
+    contact = theta * y_r - float(friction.hydrodynamic_lift(*args, tyre=TYRE))
     b1, b2, b3, b4 = TYRE.stribeck_velocity
     stribeck = b1 * np.exp(b2 * film + b3) + b4
     g = TYRE.coulomb + (TYRE.static - TYRE.coulomb) * np.exp(-np.sqrt(slip * speed / stribeck))
@@ -93,7 +93,7 @@ def test_gradients_are_finite_at_rest_on_dry_roads_and_beyond_the_cliff():
 
 @pytest.mark.parametrize("mode", ["static", "dynamic", "speed"])
 def test_grip_modes(mode):
-    condition = uniform(jnp.float32(0.3), jnp.int32(1))
+    condition = make_uniform(jnp.float32(0.3), jnp.int32(1))
     speed = jnp.array([[0.0, 5.0, 13.89, 30.0]] * 2)
     mu = jax.jit(grip_of(mode=mode))(condition, jnp.zeros((2, 4, 2)), speed)
     assert mu.shape == (2, 4) and mu.dtype == jnp.float32
@@ -105,7 +105,7 @@ def test_grip_modes(mode):
 
 
 def test_the_floor_holds_where_the_tyre_floats():
-    mu = grip_of()(uniform(jnp.float32(2.0), jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
+    mu = grip_of()(make_uniform(jnp.float32(2.0), jnp.int32(0)), jnp.zeros((3, 2)), jnp.full(3, 20.0))
     np.testing.assert_allclose(mu, 1e-3)
 
 
@@ -116,11 +116,11 @@ def test_draw_follows_the_weights_and_keep_keeps():
         {"surface": "SMA", "film_mm": 9.0, "weight": 0.0},
     ]
     scene = scene_of([[0, 0]], [[1, 0]])
-    drawn = jax.vmap(lambda key: road_condition.draw(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
+    drawn = jax.vmap(lambda key: road_condition.sample_condition(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
     assert set(np.unique(drawn.surface)) == {0, 2}
     assert float((drawn.surface == 0).mean()) == pytest.approx(0.75, abs=0.03)
     np.testing.assert_array_equal(drawn.film_mm == 0.5, drawn.surface == 2)
-    assert road_condition.keep(jax.random.key(0), scene) is scene.weather
+    assert road_condition.keep_condition(jax.random.key(0), scene) is scene.weather
 
 
 @pytest.mark.parametrize(
@@ -158,13 +158,13 @@ def test_grip_refuses_by_name(change, named):
 )
 def test_draw_refuses_by_name(case, named):
     with pytest.raises(ConfigError, match=named):
-        road_condition.draw(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
+        road_condition.sample_condition(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
 
 
 @pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
 def test_every_shipped_weather_draws_a_drivable_road(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    draw = build({**BASE["draw"], **config["draw"]}, builtins=road_condition, where="weather.draw")
+    draw = instantiate({**BASE["draw"], **config["draw"]}, builtins=road_condition, where="weather.draw")
     scene = scene_of([[0, 0]], [[1, 0]])
     drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
     mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
@@ -175,7 +175,7 @@ def test_every_shipped_weather_draws_a_drivable_road(name):
 def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
     text = (CONF / f"{name}.yaml").read_text()
     cases = yaml.safe_load(text)["draw"]["cases"]
-    roads = [uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
+    roads = [make_uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
     mu = [float(grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0]) for road in roads]
     assert (min(mu), max(mu)) == pytest.approx((float(least), 1.10), abs=0.006)
     assert f"friction 1.10 down to {least}" in text.splitlines()[0]
@@ -183,7 +183,7 @@ def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
 
 
 def test_the_command_tells_what_the_model_says(tmp_path):
-    found = command.weather(load("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
+    found = command.weather(load_config("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
     for name, row in PUBLISHED.items():
         wanted = [mu for film, mu in zip(FILMS, row, strict=True) if film in (0.0, 0.3, 1.0)]
         np.testing.assert_allclose(found["table"][name]["static"], wanted, atol=1e-3)
@@ -191,12 +191,12 @@ def test_the_command_tells_what_the_model_says(tmp_path):
     text = (tmp_path / "weather.md").read_text()
     assert "| AC | 1.105 (1.144) | 0.959 (0.830) | 0.000 (0.000) |" in text and "| SMA | 1.204 / 1.204 | 1.046 / 1.046 |" in text
     with pytest.raises(ConfigError, match=r"slips: \[0.5, 0.1\]; wanted is \[least, most\]"):
-        command.weather(load("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
+        command.weather(load_config("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
 
 
 def test_what_is_committed_is_what_the_model_says(tmp_path):
     committed = result_file.read(ROOT / "experiments" / "weather" / "weather.json")
-    found = command.weather(load("weather", f"out={tmp_path}"))
+    found = command.weather(load_config("weather", f"out={tmp_path}"))
     for name, row in committed["table"].items():
         for kind in row:
             np.testing.assert_allclose(found["table"][name][kind], row[kind], atol=1e-4)

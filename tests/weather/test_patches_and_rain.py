@@ -20,15 +20,15 @@ from scenefactory_jax.evaluation.episode_records import _describe
 from scenefactory_jax.visualization.birds_eye import patch_overlay
 from scenefactory_jax.weather import friction as friction_model
 from scenefactory_jax.weather import patch_layouts, patches, rain, road_condition
-from scenefactory_jax.weather.friction import uniform
+from scenefactory_jax.weather.friction import make_uniform
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
 ICE, SNOW = SURFACES.index("ICE"), SURFACES.index("SNOW")
 OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml") if path.stem != "base")
-DRY = uniform(jnp.float32(0.0), jnp.int32(0))
+DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
-inside = jax.jit(patches.inside)
+inside = jax.jit(patches.contains_points)
 COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "follows": 0.5}
 LAYOUTS = {
     "circles": {"count": 40, "radius_m": [0.5, 3.0], "scatter_m": 1.5, **COVER},
@@ -45,8 +45,8 @@ def patch(vertices, *, radius=0.0, closed=False, surface=ICE, film=0.0, follows=
 
 
 def on(*parts: Patches, film=0.0, surface=0):
-    road = uniform(jnp.float32(film), jnp.int32(surface))
-    return replace(road, patches=patches.join([road.patches, *parts]))
+    road = make_uniform(jnp.float32(film), jnp.int32(surface))
+    return replace(road, patches=patches.join_patches([road.patches, *parts]))
 
 
 def blob(rng, corners):
@@ -87,7 +87,7 @@ def test_inside_agrees_with_shapely(kind):
 
 def test_inside_turns_with_the_plane():
     rng = np.random.default_rng(1)
-    several = patches.join([patch(blob(rng, 7), closed=True), patch(blob(rng, 4), radius=1.5), patch(blob(rng, 1), radius=3.0)])
+    several = patches.join_patches([patch(blob(rng, 7), closed=True), patch(blob(rng, 4), radius=1.5), patch(blob(rng, 1), radius=3.0)])
     points = jnp.asarray(rng.uniform(-10, 10, (20, 20, 2)), jnp.float32)
     move = lambda p: geometry.rotate(p, jnp.float32(0.7)) + jnp.array([11.0, -5.0])  # noqa: E731
     turned = inside(replace(several, vertices=move(several.vertices)), move(points))
@@ -101,12 +101,12 @@ def test_repeated_vertices_and_absent_patches_change_nothing():
     shapes = [patch(blob(rng, n), radius=r, closed=c) for n, r, c in ((6, 0.0, True), (3, 1.0, False), (1, 2.0, False))]
     points = jnp.asarray(rng.uniform(-12, 12, (400, 2)), jnp.float32)
     alone = jnp.concatenate([inside(shape, points) for shape in shapes], axis=1)
-    np.testing.assert_array_equal(inside(patches.join(shapes), points), alone)
+    np.testing.assert_array_equal(inside(patches.join_patches(shapes), points), alone)
     doubled = [replace(shape, vertices=jnp.repeat(shape.vertices, 2, axis=1)) for shape in shapes]
-    np.testing.assert_array_equal(inside(patches.join(doubled), points), alone)
+    np.testing.assert_array_equal(inside(patches.join_patches(doubled), points), alone)
     hidden = patch([[0.0, 0.0]], radius=50.0, surface=SNOW, film=9.0, present=False)
     for with_hidden in (on(*shapes, hidden), on(hidden, *shapes)):
-        for got, wanted in zip(patches.condition(with_hidden, points), patches.condition(on(*shapes), points), strict=True):
+        for got, wanted in zip(patches.condition_at(with_hidden, points), patches.condition_at(on(*shapes), points), strict=True):
             np.testing.assert_array_equal(got, wanted)
 
 
@@ -114,18 +114,18 @@ def test_the_last_patch_counts_and_films_follow_the_open_road():
     low = patch([[0, 0]], radius=2.0, surface=ICE, film=0.1)
     high = patch([[2, 0]], radius=2.0, surface=SNOW, film=0.2, follows=0.5)
     points = jnp.array([[-1.0, 0.0], [1.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
-    film, surface = patches.condition(on(low, high, film=0.4, surface=1), points)
+    film, surface = patches.condition_at(on(low, high, film=0.4, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.4, 0.4, 0.4], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, SNOW, SNOW, 1])
-    film, surface = patches.condition(on(high, low, film=0.8, surface=1), points)
+    film, surface = patches.condition_at(on(high, low, film=0.8, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.1, 0.6, 0.8], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, ICE, SNOW, 1])
 
 
 def test_no_patches_cost_nothing():
-    operations = jax.make_jaxpr(functools.partial(patches.condition, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
+    operations = jax.make_jaxpr(functools.partial(patches.condition_at, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
     assert {operation.primitive.name for operation in operations} <= {"broadcast_in_dim", "jit", "pjit"}
-    assert patches.join([DRY.patches, patch([[0, 0]])]).vertices.shape == (1, 1, 2)
+    assert patches.join_patches([DRY.patches, patch([[0, 0]])]).vertices.shape == (1, 1, 2)
 
 
 def test_drawn_areas_are_the_patches():
@@ -142,7 +142,7 @@ def test_drawn_areas_are_the_patches():
 
 
 def test_dry_surfaces_have_their_textbook_friction():
-    grip = instantiate.build(scenefactory_jax.load("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(scenefactory_jax.load("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
     wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
     spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
@@ -154,7 +154,7 @@ def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
     condition = on(patch([[0, 5]], radius=5.0, surface=0, film=0.5), film=0.3)
     wheels = jnp.array([[[1.3, 1.0], [1.3, -1.0], [-1.3, 1.0], [-1.3, -1.0]]])
     for mode, wet, damp in (("static", 0.8595, 0.9594), ("dynamic", 0.6770, 0.8302), ("speed", 0.8595, 0.9594)):
-        grip = instantiate.build({**entry, "mode": mode}, builtins=friction_model, where="weather.grip")
+        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.grip")
         np.testing.assert_allclose(grip(condition, wheels, jnp.full((1, 4), 13.89)), [[wet, damp, wet, damp]], atol=1e-4)
 
 
@@ -165,10 +165,10 @@ def test_time_passes_and_films_are_linear_between_knots():
     course = rain.schedule(KEY, DRY, time_s=[1.0, 2.0, 4.0], film_mm=[0.2, 0.6, 0.0])
     now, films = replace(DRY, rain=course), []
     for _ in range(50):
-        now = rain.pass_time(now, dt=0.1)
+        now = rain.advance_rain(now, dt=0.1)
         films.append(float(now.film_mm))
     np.testing.assert_allclose(films, np.interp(np.arange(1, 51) / 10, [1, 2, 4], [0.2, 0.6, 0.0]), atol=1e-5)
-    still = rain.pass_time(uniform(jnp.float32(0.3), jnp.int32(0)), dt=7.0)
+    still = rain.advance_rain(make_uniform(jnp.float32(0.3), jnp.int32(0)), dt=7.0)
     assert float(still.film_mm) == pytest.approx(0.3) and float(still.rain.now_s) == 7.0
 
 
@@ -188,7 +188,7 @@ ONSET = {"start_s": [3.0, 3.0], "rain_mm_h": [8.0, 8.0], "film_per_rain": 0.05, 
 
 @pytest.mark.parametrize(("drawn", "change", "balance"), [(0.0, {}, 0.4), (0.2, {"film_max_mm": 0.3}, 0.3), (0.5, {"knots": 40}, 0.4)])
 def test_onset_solves_its_equation(drawn, change, balance):
-    course = rain.onset(KEY, uniform(jnp.float32(drawn), jnp.int32(0)), **(ONSET | change))
+    course = rain.onset(KEY, make_uniform(jnp.float32(drawn), jnp.int32(0)), **(ONSET | change))
     times = np.linspace(0.0, 28.0, 30)
     wanted = integrated(drawn, balance, 6.0, times)
     got = np.interp(times + 3.0, course.time_s, course.film_mm)
@@ -198,7 +198,7 @@ def test_onset_solves_its_equation(drawn, change, balance):
 
 
 def test_drying_solves_its_equation():
-    course = rain.drying(KEY, uniform(jnp.float32(0.8), jnp.int32(0)), tau_s=[20.0, 20.0], knots=16)
+    course = rain.drying(KEY, make_uniform(jnp.float32(0.8), jnp.int32(0)), tau_s=[20.0, 20.0], knots=16)
     times = np.linspace(0.0, 90.0, 30)
     got = np.interp(times, course.time_s, course.film_mm)
     np.testing.assert_allclose(got, integrated(0.8, 0.0, 20.0, times), atol=0.004 * 0.8)
@@ -222,7 +222,7 @@ def test_courses_stay_within_their_ranges():
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     scene = lanes_scene()
-    road = uniform(jnp.float32(0.2), jnp.int32(1))
+    road = make_uniform(jnp.float32(0.2), jnp.int32(1))
     draw = jax.jit(lambda key: getattr(patch_layouts, name)(key, scene, road, **LAYOUTS[name]))
     laid, again, other = draw(KEY), draw(KEY), draw(jax.random.key(1))
     for a, b in zip(jax.tree.leaves(laid), jax.tree.leaves(again), strict=True):
@@ -263,7 +263,7 @@ def test_places_are_as_likely_in_every_metre_of_lane():
 
 def test_chance_and_the_open_roads_surface():
     numbers = LAYOUTS["circles"] | {"count": 2000, "chance": 0.3, "surface": None}
-    laid = jax.jit(lambda key: patch_layouts.circles(key, lanes_scene(), uniform(jnp.float32(0.0), jnp.int32(2)), **numbers))(KEY)
+    laid = jax.jit(lambda key: patch_layouts.circles(key, lanes_scene(), make_uniform(jnp.float32(0.0), jnp.int32(2)), **numbers))(KEY)
     assert laid.present.mean() == pytest.approx(0.3, abs=0.04) and (laid.surface == 2).all()
     bare = replace(lanes_scene(), lanes=road_of([], capacity=4))
     for laid in jax.jit(lambda key: [getattr(patch_layouts, name)(key, bare, DRY, **LAYOUTS[name]) for name in LAYOUTS])(KEY):
@@ -278,7 +278,7 @@ SHAPES = [
 
 
 def test_given_shapes_lie_where_they_are_given():
-    laid = patch_layouts.fixed(KEY, lanes_scene(), uniform(jnp.float32(0.1), jnp.int32(1)), shapes=SHAPES)
+    laid = patch_layouts.fixed(KEY, lanes_scene(), make_uniform(jnp.float32(0.1), jnp.int32(1)), shapes=SHAPES)
     points = jnp.array([[1.0, 4.9], [1.0, 5.1], [3.0, 0.5], [3.0, 3.0], [25.0, 0.9], [25.0, 1.1]])
     expected = [[1, 0, 0], [0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 0]]
     np.testing.assert_array_equal(inside(laid, points), np.array(expected, bool))
@@ -312,7 +312,7 @@ def test_every_option_resets_steps_and_traces_once(option):
     assert len(traces) == 1 and seen["weather"].shape == (6, 2, 4)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.facts.grip, outcome.observation, states.weather)))
     np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
-    later = jax.vmap(functools.partial(rain.pass_time, dt=20.0))(states.weather)
+    later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(states.weather)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
     assert {"drying": (moved < 0).all(), "onset": (moved > 0).all(), "storm": (moved != 0).any()}.get(option, not moved.any())
     assert count == {"ice": 6, "puddles": 10, "split": 8, "storm": 10}.get(option, 0)
@@ -345,7 +345,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     assert tokens[-1, 0, 0] == pytest.approx(0.4, abs=1e-5)
     assert (np.diff(friction[:, 1]) < 0).all() and friction[0, 0] != friction[0, 1] and friction[-1, 0] == pytest.approx(friction[-1, 1])
     # the weather moves on before the dynamics read it: the step to 1 s drives on the film of 1 s
-    grip = instantiate.build(config_of()["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(config_of()["weather"]["grip"], builtins=friction_model, where="weather.grip")
     assert friction[-1, 1] == pytest.approx(float(grip(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
 
 
@@ -419,7 +419,7 @@ def test_refuses_by_name(override, message):
     ],
 )
 def test_given_shapes_are_refused_by_name(shape, message):
-    entry = {"draw": {"_target_": "keep"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
+    entry = {"draw": {"_target_": "keep_condition"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
     with pytest.raises(ConfigError, match=r"weather\.patches\.mine\." + message):
         road_condition.make(entry)(KEY, lanes_scene())
 
@@ -430,4 +430,4 @@ def test_every_number_of_a_shipped_entry_is_a_builders():
         for path in sorted((ROOT / "conf" / "weather" / folder).glob("*.yaml")):
             entry = yaml.safe_load(path.read_text())
             if "defaults" not in entry:
-                instantiate.build(entry, builtins=module, where=path.stem)
+                instantiate.instantiate(entry, builtins=module, where=path.stem)

@@ -17,7 +17,7 @@ VISIBLE, MEMORY = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_MEM_FRACTION"
 USED = 0.9  # of a GPU's memory, by all processes that share it
 
 
-class Claims:
+class TaskClaims:
     """Which pieces of a common work are this process's: each belongs to whoever asks first. Without a folder nobody else asks."""
 
     def __init__(self, folder: Path | None):
@@ -41,7 +41,7 @@ class Claims:
         yield from groups.items()
 
 
-def run(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int = 1) -> list[Any]:
+def run_on_gpus(work: Callable[..., Any], processes: int, *arguments: Any, per_gpu: int = 1) -> list[Any]:
     """What `work(index, *arguments)` returned in each process, as plain values; `arguments[-1]` is a folder that all of them share.
 
     Args:

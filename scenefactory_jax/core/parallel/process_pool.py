@@ -18,7 +18,7 @@ from scenefactory_jax.learning.interrupt import STOPPING
 
 
 @contextlib.contextmanager
-def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+def open_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that leave the accelerator, and Ctrl-C, to this one. An error here ends them at once, whatever they are at."""
     others = set(multiprocessing.active_children())
     processes = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin)
@@ -33,22 +33,22 @@ def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextlib.contextmanager
-def mapping(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
+def map_tasks(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """`map`, in this process if `workers` is 1, else over so many of their own."""
     if workers == 1:
         yield map
         return
-    with pool(workers) as processes:
+    with open_pool(workers) as processes:
         yield processes.map
 
 
 @contextlib.contextmanager
-def spreading(workers: int) -> Iterator[Spread]:
+def make_task_map(workers: int) -> Iterator[Spread]:
     """A function that runs others over pieces of their cases: in this process if `workers` is 1, else in so many of their own."""
     if workers == 1:
         yield lambda function, cases: function(cases)
         return
-    with pool(workers) as processes:
+    with open_pool(workers) as processes:
 
         def spread(function: Callable[[Any], Any], cases: Any) -> Any:
             count = len(cases[0])

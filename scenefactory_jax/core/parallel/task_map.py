@@ -31,7 +31,7 @@ Busy = dict[Connection, tuple[subprocess.Popen[bytes], Task | None]]  # processe
 Spread = Callable[[Work, Sequence[Any]], Iterable[Any]]
 
 
-class Lost(NamedTuple):
+class FailedTask(NamedTuple):
     """What comes in place of a result."""
 
     reason: str
@@ -99,7 +99,7 @@ def _answer(
         process.wait()
         if given is None:
             raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {HERE}") from None
-        done[given[0]] = Lost(_death(process, timeout_s))
+        done[given[0]] = FailedTask(_death(process, timeout_s))
         if waiting:
             busy.update([_start()])
         return
@@ -156,7 +156,7 @@ def _timed(packed: bytes, timeout_s: float | None, item: Any) -> Any:
     except ConfigError as error:
         return error
     except Exception as error:
-        return Lost(f"{type(error).__name__}: {error}")
+        return FailedTask(f"{type(error).__name__}: {error}")
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
@@ -220,5 +220,5 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
         except cluster.exceptions.RayTaskError as error:  # `_timed` raises nothing: it could not be loaded, and the last line says why
             result = Unloadable(str(error).strip().splitlines()[-1])
         except cluster.exceptions.RayError as error:
-            result = Lost(f"Ray: {type(error).__name__}: {str(error).strip().splitlines()[0]}")
+            result = FailedTask(f"Ray: {type(error).__name__}: {str(error).strip().splitlines()[0]}")
         yield _passed(result)

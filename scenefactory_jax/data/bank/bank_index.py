@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import differing
+from scenefactory_jax.core.instantiate import find_differences
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats.reader_selection import BANK_INDEX as INDEX
 
@@ -56,7 +56,7 @@ def is_bank(path: Path | str) -> bool:
         return True
 
 
-def require_replaceable(path: Path) -> None:
+def check_replaceable(path: Path) -> None:
     """Refuse a folder that is not surely a bank.
 
     Raises:
@@ -158,7 +158,7 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def require_whole(path: Path, shard: Shard) -> None:
+def check_complete(path: Path, shard: Shard) -> None:
     """Refuse a shard that is missing or of another size than it was, by name."""
     size = path.stat().st_size if path.is_file() else None
     if size is None:
@@ -169,7 +169,7 @@ def require_whole(path: Path, shard: Shard) -> None:
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
     """Keys in which two settings differ, with both values."""
-    return [f"{name}: {theirs!r} there, {ours!r} here" for name, (theirs, ours) in differing(there, here).items()]
+    return [f"{name}: {theirs!r} there, {ours!r} here" for name, (theirs, ours) in find_differences(there, here).items()]
 
 
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:

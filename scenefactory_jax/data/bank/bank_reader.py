@@ -80,7 +80,7 @@ def open(path: Path | str) -> Bank:
     index = bank_index.read(path)
     shards = tuple(replace(shard, file=os.path.normpath(path / shard.file)) for shard in index.shards)
     for shard in shards:
-        bank_index.require_whole(Path(shard.file), shard)
+        bank_index.check_complete(Path(shard.file), shard)
     if not shards or not index.metadata:
         raise SceneError(f"{path / INDEX}: damaged: it names no shards; {bank_index.REMEDY}")
     table = _concatenated([shard_files.table(path / part.file, part) for part in index.metadata], str(path))
@@ -106,16 +106,16 @@ def verify(path: Path | str) -> None:
     open(path)
 
 
-def raw(bank: Bank, index: int) -> RawScene:
+def read_raw(bank: Bank, index: int) -> RawScene:
     """One scene as its reader gave it. Its arrays are views of the file, read-only.
 
     Raises:
         SceneError: no such scene, or its shard has changed or vanished.
     """
-    return next(raws(bank, [index]))
+    return next(read_raws(bank, [index]))
 
 
-def raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawScene]:
+def read_raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawScene]:
     """Scenes one after another.
 
     Raises:
@@ -169,13 +169,13 @@ def save(bank: Bank, path: Path | str, *, copy: bool, settings: Mapping[str, Any
     path = Path(path).resolve()
     if not copy and any(Path(shard.file).parent == path for shard in bank.shards):
         raise SceneError(f"{path}: a view cannot take the place of the bank that it refers to; give another path, or copy=true")
-    with bank_writer.replacing(path) as folder:
+    with bank_writer.replace_bank(path) as folder:
         if copy:
             parts = [slice(start, start + SHARD) for start in range(0, len(bank), SHARD)]
             shards = ((_batches(bank.shards, bank.places[part], bank.readers), bank.metadata[part]) for part in parts)
             bank_writer.fill(folder, shards, settings=settings, compression=None, complete=bank.index.complete)
         else:
-            bank_writer.refer(folder, path, bank.shards, bank.places, bank.metadata, settings=settings, complete=bank.index.complete)
+            bank_writer.write_view(folder, path, bank.shards, bank.places, bank.metadata, settings=settings, complete=bank.index.complete)
     return open(path)
 
 
@@ -200,14 +200,16 @@ def write(
         SceneError: the path exists and is no bank, there are no scenes, or one that no bank can hold.
     """
     path, scenes = Path(path).resolve(), iter(scenes)
-    with bank_writer.replacing(path) as folder:
+    with bank_writer.replace_bank(path) as folder:
         parts = iter(lambda: list(itertools.islice(scenes, SHARD)), [])
-        shards = ((map(arrow_codec.encode, part), catalogue.table([catalogue.extended(raw, features) for raw in part])) for part in parts)
+        shards = (
+            (map(arrow_codec.encode, part), catalogue.table([catalogue.extend_table(raw, features) for raw in part])) for part in parts
+        )
         bank_writer.fill(folder, shards, settings=settings, compression=compression)
     return open(path)
 
 
-def packed(
+def pack_scenes(
     bank: Bank, indices: Sequence[int] | np.ndarray, *, check: Callable[..., Any], pack: Callable[..., Any], workers: int
 ) -> list[Packed | Reject]:
     """Scenes checked and packed, in the order of the indices; a scene that cannot be is a `Reject` in its place.
@@ -225,7 +227,7 @@ def packed(
     work = functools.partial(_packed, shards=bank.shards, check=check, pack=pack)
     found: list[Packed | Reject] = []
     for piece in task_map.local(work, pieces, workers=workers if len(pieces) > 1 else 1, timeout_s=None):
-        if isinstance(piece, task_map.Lost):
+        if isinstance(piece, task_map.FailedTask):
             raise SceneError(f"{bank.path}: scenes could not be packed: {piece.reason}; try fewer workers")
         if isinstance(piece, SceneError):
             raise piece
@@ -250,7 +252,7 @@ def load(
     rows = _rows(bank, indices)
     distinct, world = np.unique(rows, return_inverse=True)
     scenes = []
-    for row, one in zip(distinct, packed(bank, distinct, check=check, pack=pack, workers=workers), strict=True):
+    for row, one in zip(distinct, pack_scenes(bank, distinct, check=check, pack=pack, workers=workers), strict=True):
         if isinstance(one, Reject):
             raise SceneError(f"{bank.path}: scene {row}, {one.scene}: {one.reason}; leave it out, or change scenes.check or scenes.pack")
         scenes.append(one.scene)
@@ -259,7 +261,7 @@ def load(
         return stacked, report
     leaves = {name: leaf[world] for name, leaf in columns.flatten(stacked).items()}
     cuts = tuple(replace(cut, world=int(place)) for cut in report.cuts for place in np.flatnonzero(world == cut.world))
-    return columns.assemble(Scene, leaves), CutReport(len(rows), report.capacity, cuts)
+    return columns.assemble_columns(Scene, leaves), CutReport(len(rows), report.capacity, cuts)
 
 
 def _packed(

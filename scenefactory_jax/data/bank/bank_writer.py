@@ -28,7 +28,7 @@ OWN = re.compile(rf"\.?(part|scenes|metadata)-\d+(-\w+)?\.arrow|\.bank\.json|{re
 
 
 @dataclass(frozen=True)
-class Piece:
+class SourceFileResult:
     """What one source file came to."""
 
     file: str  # relative to the source
@@ -39,7 +39,7 @@ class Piece:
     account: dict[str, Any] = field(default_factory=dict)
 
 
-def grow(folder: Path, pieces: Iterable[Piece], *, index: Index, shard_scenes: int, compression: Compression) -> Index:
+def append_files(folder: Path, pieces: Iterable[SourceFileResult], *, index: Index, shard_scenes: int, compression: Compression) -> Index:
     """Add source files to a bank, shard by shard. Killed at any time, the folder holds the bank up to the last finished shard.
 
     Args:
@@ -70,9 +70,9 @@ def _in_order(index: Index) -> Index:
     return replace(index, files=files, rejects=by_source(index.rejects), companions=by_source(index.companions))
 
 
-def _grow_by_shard(folder: Path, pieces: Iterator[Piece], index: Index, shard_scenes: int, compression: Compression) -> Index:
+def _grow_by_shard(folder: Path, pieces: Iterator[SourceFileResult], index: Index, shard_scenes: int, compression: Compression) -> Index:
     """One more shard, with its part of the catalogue, and the index that names both."""
-    taken: list[Piece] = []
+    taken: list[SourceFileResult] = []
 
     def batches() -> Iterator[pa.RecordBatch]:
         rows = 0
@@ -105,20 +105,20 @@ def _with_shard(folder: Path, index: Index, name: str, metadata: pa.Table) -> In
     return replace(index, shards=(*index.shards, shard), metadata=(*index.metadata, written))
 
 
-def _counted(index: Index, pieces: Sequence[Piece]) -> Index:
+def _counted(index: Index, pieces: Sequence[SourceFileResult]) -> Index:
     return replace(
         index,
         files=(*index.files, *(piece.file for piece in pieces)),
         rejects=(*index.rejects, *(reject for piece in pieces for reject in piece.rejects)),
         companions=(*index.companions, *(companion for piece in pieces for companion in piece.companions)),
-        account=functools.reduce(added, (piece.account for piece in pieces), index.account),
+        account=functools.reduce(add_shards, (piece.account for piece in pieces), index.account),
     )
 
 
-def added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+def add_shards(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     """The sum of two accounts: numbers by name, or accounts by name."""
     both = {name: (one.get(name), other.get(name)) for name in {**one, **other}}
-    total = lambda a, b: added(a or {}, b or {}) if isinstance(a or b, Mapping) else (a or 0) + (b or 0)  # noqa: E731
+    total = lambda a, b: add_shards(a or {}, b or {}) if isinstance(a or b, Mapping) else (a or 0) + (b or 0)  # noqa: E731
     return {name: total(a, b) for name, (a, b) in both.items()}
 
 
@@ -156,7 +156,7 @@ def fill(
     bank_index.write(folder, index)
 
 
-def refer(
+def write_view(
     folder: Path,
     path: Path,
     shards: Sequence[Shard],
@@ -175,7 +175,7 @@ def refer(
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replace_bank(path: Path) -> Iterator[Path]:
     """A new folder beside `path` that takes its place at the end; what an error leaves of it vanishes.
 
     No other command writes to `path` meanwhile.
@@ -184,8 +184,8 @@ def replacing(path: Path) -> Iterator[Path]:
         SceneError: the path exists and is no bank.
         folders.Busy: another command writes there.
     """
-    require_free(path)
-    with folder_lock.alone(path):
+    check_free_space(path)
+    with folder_lock.lock_folder(path):
         workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
             made = workshop / "new"
@@ -197,11 +197,11 @@ def replacing(path: Path) -> Iterator[Path]:
             shutil.rmtree(workshop, ignore_errors=True)
 
 
-def require_free(path: Path) -> None:
+def check_free_space(path: Path) -> None:
     """Refuse a path where something else than a bank is."""
     ours = path.is_dir() and all(OWN.fullmatch(file.name) for file in path.iterdir())
     if path.exists() and not ours:
-        bank_index.require_replaceable(path)
+        bank_index.check_replaceable(path)
 
 
 @contextlib.contextmanager

@@ -55,7 +55,7 @@ def row(raw: RawScene) -> dict[str, Any]:
     }
 
 
-def extended(raw: RawScene, features: Features | None) -> dict[str, Any]:
+def extend_table(raw: RawScene, features: Features | None) -> dict[str, Any]:
     """The row with the columns of one's own.
 
     Raises:

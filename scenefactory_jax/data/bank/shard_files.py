@@ -32,7 +32,7 @@ class Reader:
     """
 
     def __init__(self, shard: Shard):
-        bank_index.require_whole(Path(shard.file), shard)
+        bank_index.check_complete(Path(shard.file), shard)
         self._shard, self._content = shard, _mapped(Path(shard.file))
 
     def batch(self, place: Sequence[int]) -> pa.RecordBatch:
@@ -131,7 +131,7 @@ def _mapped(path: Path) -> pa.Buffer:
 def _require_same(shard: Shard) -> None:
     """Refuse a file that is not what was written; a process reads it once, and again after it was changed."""
     path = Path(shard.file)
-    bank_index.require_whole(path, shard)
+    bank_index.check_complete(path, shard)
     state = path.stat()
     if _digest(path, state.st_ino, state.st_mtime_ns) != shard.sha256:
         raise SceneError(f"{path}: damaged: its checksum is another; {bank_index.REMEDY}")

@@ -16,12 +16,12 @@ from scenefactory_jax.core.types import DRIVABLE
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import geographic_split
-from scenefactory_jax.data.curation.operations import Made
+from scenefactory_jax.data.curation.operations import BankResult
 
 SPACING_M = 0.5  # of the lanes' points that are compared
 
 
-def dedupe(bank: Bank, table: pa.Table, *, tolerance_m: float, share: float, slack: float) -> Made:
+def dedupe(bank: Bank, table: pa.Table, *, tolerance_m: float, share: float, slack: float) -> BankResult:
     """The first scene of every content.
 
     Args:
@@ -33,8 +33,11 @@ def dedupe(bank: Bank, table: pa.Table, *, tolerance_m: float, share: float, sla
     Returns:
         The bank without the others, and an account with all groups by name, the kept scene first.
     """
-    pairs = candidates(table, tolerance_m=tolerance_m, slack=slack)
-    equal = [same(banks.raw(bank, one), banks.raw(bank, other), tolerance_m=tolerance_m, share=share) for one, other in pairs.tolist()]
+    pairs = find_candidates(table, tolerance_m=tolerance_m, slack=slack)
+    equal = [
+        is_same_scene(banks.read_raw(bank, one), banks.read_raw(bank, other), tolerance_m=tolerance_m, share=share)
+        for one, other in pairs.tolist()
+    ]
     one, other = pairs[np.array(equal, bool)].T
     links = coo_matrix((np.ones(len(one), bool), (one, other)), shape=(len(table), len(table)))
     _, group = connected_components(links, directed=False)
@@ -42,10 +45,10 @@ def dedupe(bank: Bank, table: pa.Table, *, tolerance_m: float, share: float, sla
     names = np.array(bank.names)
     found = [names[group == number].tolist() for number in np.flatnonzero(size > 1)]
     account = {"scenes": len(table), "compared": len(pairs), "kept": len(first), "groups": found}
-    return Made(banks.view(bank, np.sort(first)), account)
+    return BankResult(banks.view(bank, np.sort(first)), account)
 
 
-def candidates(table: pa.Table, *, tolerance_m: float, slack: float) -> Int[np.ndarray, "N 2"]:
+def find_candidates(table: pa.Table, *, tolerance_m: float, slack: float) -> Int[np.ndarray, "N 2"]:
     """Pairs of rows whose steps, extents, lane length and travelled distance agree: whoever is the same scene agrees in them."""
     measure = {name: table.column(name).to_numpy().astype(float) for name in ("steps", "extent_x_m", "extent_y_m", "lane_m", "distance_m")}
     place = [measure["steps"] * 2, *(measure[name] / (2 * tolerance_m) for name in ("extent_x_m", "extent_y_m"))]
@@ -53,10 +56,10 @@ def candidates(table: pa.Table, *, tolerance_m: float, slack: float) -> Int[np.n
     return KDTree(np.stack(place, axis=1)).query_pairs(1.0, p=np.inf, output_type="ndarray").astype(int)
 
 
-def same(one: RawScene, other: RawScene, *, tolerance_m: float, share: float) -> bool:
+def is_same_scene(one: RawScene, other: RawScene, *, tolerance_m: float, share: float) -> bool:
     """Whether two scenes hold the same lanes and the same motion, one shifted against the other or not, whatever their names and order."""
     roads = [
-        geographic_split.along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=SPACING_M).xyz[:, :2]
+        geographic_split.sample_along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=SPACING_M).xyz[:, :2]
         for raw in (one, other)
     ]
     if not (len(roads[0]) and len(roads[1])):

@@ -15,10 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP
 from scenefactory_jax.data.curation import geographic_split
-from scenefactory_jax.data.packing.pack import corners, overlaps
+from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
 STOREY_M = 3.0  # lanes that are farther apart in height do not meet: one is on a bridge
 CROSSING_M = 2.0  # side of the cells on which crossings are looked for: narrower than a lane, so that neighbours do not share one
@@ -114,7 +114,7 @@ def features(
     lanes = [line for line in raw.roads if line.kind in DRIVABLE]
     found |= _bends(lanes, chord_m, curve_radius_m)
     found["intersections"] = _intersections(lanes, crossing_deg, junction_m)
-    found["streets"] = geographic_split.streets(raw, **streets).tolist()
+    found["streets"] = geographic_split.find_streets(raw, **streets).tolist()
     return {name: found[name] for name in COLUMNS}
 
 
@@ -169,7 +169,7 @@ def _overlaps(tracks: Sequence[Track], step: int) -> int:
     near = apart < np.hypot(*size.T)[pairs].sum(axis=1) / 2
     level = np.abs(place[pairs[:, 0], 2] - place[pairs[:, 1], 2]) < STOREY_M
     pairs = pairs[near & level]
-    boxes = {i: corners(place[i, :2], float(tracks[i].yaw[step]), *size[i]) for i in np.unique(pairs).tolist()}
+    boxes = {i: box_corners(place[i, :2], float(tracks[i].yaw[step]), *size[i]) for i in np.unique(pairs).tolist()}
     others = {i: pairs[pairs[:, 0] == i, 1].tolist() for i in np.unique(pairs[:, 0]).tolist()}
     return sum(int(overlaps(boxes[i], np.stack([boxes[j] for j in beside])).sum()) for i, beside in others.items())
 
@@ -190,10 +190,10 @@ def _map(roads: Sequence[Polyline]) -> dict[str, Any]:
 
 def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> dict[str, float]:
     """How much driving lanes bend, from chord to chord; a lane's ends, where there is none before or after, count as the rest of it."""
-    samples = geographic_split.along(lanes, spacing_m=chord_m, least=4)
+    samples = geographic_split.sample_along(lanes, spacing_m=chord_m, least=4)
     way = samples.xyz[1:, :2] - samples.xyz[:-1, :2]
     heading = np.arctan2(way[:, 1], way[:, 0])
-    turn = np.abs(wrapped(heading[1:] - heading[:-1]))
+    turn = np.abs(wrap_angles(heading[1:] - heading[:-1]))
     line, step = samples.line[1:-1], samples.step[1:-1]
     bends = (samples.line[2:] == line) & (samples.line[:-2] == line) & (step > chord_m / 4)  # shorter lanes are shorter than a chord
     turn, line, step = turn[bends], line[bends], step[bends]
@@ -209,7 +209,7 @@ def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> 
 
 def _intersections(lanes: Sequence[Polyline], crossing_deg: float, junction_m: float) -> int:
     """Groups of places where two driving lanes cross, found on a grid."""
-    samples = geographic_split.along(lanes, spacing_m=CROSSING_M / 2)
+    samples = geographic_split.sample_along(lanes, spacing_m=CROSSING_M / 2)
     if not len(samples.xyz):
         return 0
     cell = np.floor(samples.xyz / np.array([CROSSING_M, CROSSING_M, STOREY_M])).astype(np.int64)

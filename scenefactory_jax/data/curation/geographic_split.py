@@ -62,7 +62,7 @@ def _arcs(lines: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, " P"], Int[np.
     return np.concatenate([[0.0], np.cumsum(length)]), first
 
 
-def along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1) -> Samples:
+def sample_along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1) -> Samples:
     """Points in the middle of equal steps of about `spacing_m`, `least` a line or more, whatever the spacing of the source.
 
     Lines without length give none.
@@ -90,7 +90,7 @@ def along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1) -> Sam
     return Samples(points, line, step, np.arctan2(chord[:, 1], chord[:, 0]))
 
 
-def streets(raw: RawScene, *, cell_m: float, height_m: float, headings: int, one_in: int) -> Int[np.ndarray, " K"]:
+def find_streets(raw: RawScene, *, cell_m: float, height_m: float, headings: int, one_in: int) -> Int[np.ndarray, " K"]:
     """The places of a scene's driving lanes, as ascending hashes of 32 bits: the same place has the same one in every scene.
 
     Args:
@@ -104,7 +104,7 @@ def streets(raw: RawScene, *, cell_m: float, height_m: float, headings: int, one
     """
     for name, value in {"cell_m": cell_m, "height_m": height_m, "headings": headings, "one_in": one_in}.items():
         check_number(value, where=f"features.streets.{name}", above=0)
-    samples = along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=cell_m / 2)  # no place is jumped over
+    samples = sample_along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=cell_m / 2)  # no place is jumped over
     # places are centred on round numbers: made-up roads lie on these, and should not fall between two places
     cells = np.rint((samples.xyz + np.asarray(raw.origin)) / np.array([cell_m, cell_m, height_m])).astype(np.int64)
     towards = np.rint(samples.heading / (2 * np.pi) * headings).astype(np.int64) % headings
@@ -123,7 +123,7 @@ def _scrambled(value: np.ndarray) -> np.ndarray:
     return value ^ (value >> np.uint64(31))
 
 
-def groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *, least_shared: int) -> Int[np.ndarray, " N"]:
+def find_groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *, least_shared: int) -> Int[np.ndarray, " N"]:
     """The group of every scene: scenes that share streets, directly or through others, are in one.
 
     Args:
@@ -149,7 +149,7 @@ def groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *, lea
     return np.unique(first, return_inverse=True)[1].ravel()
 
 
-def deal(group: Int[np.ndarray, " N"], shares: Mapping[str, float | int], *, seed: int) -> dict[str, Int[np.ndarray, " M"]]:
+def assign_groups(group: Int[np.ndarray, " N"], shares: Mapping[str, float | int], *, seed: int) -> dict[str, Int[np.ndarray, " M"]]:
     """Whole groups to parts: the largest first, each to the part that lacks most of its share; groups of one size in a random order.
 
     Args:
@@ -196,7 +196,7 @@ def check_shares(shares: Mapping[str, float | int]) -> Float[np.ndarray, " P"]:
     return weights / weights.sum()
 
 
-def leaks(group: Int[np.ndarray, " N"], parts: Mapping[str, Int[np.ndarray, " M"]]) -> dict[str, int]:
+def find_leaks(group: Int[np.ndarray, " N"], parts: Mapping[str, Int[np.ndarray, " M"]]) -> dict[str, int]:
     """Scenes of each part whose streets are on another part as well: what a split should not have."""
     home = np.full(len(group), -1)
     for index, rows in enumerate(parts.values()):

@@ -23,28 +23,28 @@ NAMED = 5  # how many scenes a message names
 Account = dict[str, Any]
 
 
-class Made(NamedTuple):
+class BankResult(NamedTuple):
     """A bank, and how it came to be."""
 
     bank: Bank
     account: Account
 
 
-class Parts(NamedTuple):
+class BankParts(NamedTuple):
     """Banks by name, and how they came to be."""
 
     banks: dict[str, Bank]
     account: Account
 
 
-def undescribed(bank: Bank) -> Int[np.ndarray, " N"]:
+def find_missing_columns(bank: Bank) -> Int[np.ndarray, " N"]:
     """The scenes whose features nobody has counted."""
     if "streets" not in bank.metadata.schema.names:  # never null where features were counted
         return np.arange(len(bank))
     return np.flatnonzero(~bank.metadata.column("streets").is_valid().to_numpy(zero_copy_only=False))
 
 
-def described(
+def describe_scenes(
     bank: Bank, features: Callable[[RawScene], Mapping[str, Any]], *, on_scene: Callable[[int, int], None] | None = None
 ) -> pa.Table:
     """The bank's metadata with all columns of `features`; scenes that were converted without them are read and counted.
@@ -53,12 +53,12 @@ def described(
         features: `features.features` bound to its numbers.
         on_scene: called with (scenes done, scenes to do) after each that had to be read.
     """
-    table, missing = bank.metadata, undescribed(bank)
+    table, missing = bank.metadata, find_missing_columns(bank)
     if not len(missing):
         return table
     counted: dict[int, Mapping[str, Any]] = {}
     for done, index in enumerate(missing.tolist(), start=1):
-        counted[index] = features(banks.raw(bank, index))
+        counted[index] = features(banks.read_raw(bank, index))
         if on_scene is not None:
             on_scene(done, len(missing))
     for name in COLUMNS:
@@ -114,7 +114,7 @@ def _summary(table: pa.Table) -> dict[str, Any]:
     return {"scenes": len(table), "numbers": numbers, "texts": texts}
 
 
-def filter(bank: Bank, table: pa.Table, expression: str) -> Made:
+def filter(bank: Bank, table: pa.Table, expression: str) -> BankResult:
     """The scenes for which a condition on their metadata is true (see `expressions`).
 
     Raises:
@@ -123,10 +123,10 @@ def filter(bank: Bank, table: pa.Table, expression: str) -> Made:
     rows = filter_expressions.rows(table, expression, where="filter")
     if not len(rows):
         raise ConfigError(f"filter: {expression!r}: none of {len(table)} scenes meets it; `op=info` shows the columns' ranges")
-    return Made(banks.view(bank, rows), {"filter": expression, "scenes": len(table), "kept": len(rows)})
+    return BankResult(banks.view(bank, rows), {"filter": expression, "scenes": len(table), "kept": len(rows)})
 
 
-def sample(bank: Bank, table: pa.Table, *, count: int | None, share: float | None, stratify: str | None, seed: int) -> Made:
+def sample(bank: Bank, table: pa.Table, *, count: int | None, share: float | None, stratify: str | None, seed: int) -> BankResult:
     """Some scenes at random, each at most once, in the bank's order.
 
     Args:
@@ -152,7 +152,7 @@ def sample(bank: Bank, table: pa.Table, *, count: int | None, share: float | Non
     chosen = [rng.choice(np.flatnonzero(stratum == index), quota, replace=False) for index, quota in enumerate(quotas.tolist())]
     rows = np.sort(np.concatenate(chosen))
     account = {"seed": seed, "stratify": stratify, "scenes": total, "kept": len(rows)}
-    return Made(banks.view(bank, rows), account)
+    return BankResult(banks.view(bank, rows), account)
 
 
 def _quotas(sizes: Int[np.ndarray, " S"], wanted: int) -> Int[np.ndarray, " S"]:
@@ -165,7 +165,7 @@ def _quotas(sizes: Int[np.ndarray, " S"], wanted: int) -> Int[np.ndarray, " S"]:
 
 def split(
     bank: Bank, table: pa.Table, *, shares: Mapping[str, float | int], by: Literal["scene", "streets"], least_shared: int, seed: int
-) -> Parts:
+) -> BankParts:
     """Parts of which every scene is in one.
 
     Args:
@@ -183,7 +183,7 @@ def split(
     """
     groups = streets(table, least_shared=least_shared)
     sizes = np.bincount(groups)
-    rows = geographic_split.deal(groups if by == "streets" else np.arange(len(table)), shares, seed=seed)
+    rows = geographic_split.assign_groups(groups if by == "streets" else np.arange(len(table)), shares, seed=seed)
     account = {
         "by": by,
         "seed": seed,
@@ -191,20 +191,20 @@ def split(
         "parts": {name: {"scenes": len(found), "share": len(found) / len(table)} for name, found in rows.items()},
         "groups": len(sizes),
         "groups_by_size": {str(size): int(number) for size, number in enumerate(np.bincount(sizes)) if number},
-        "leaks": geographic_split.leaks(groups, rows),
+        "leaks": geographic_split.find_leaks(groups, rows),
     }
-    return Parts({name: banks.view(bank, found) for name, found in rows.items()}, account)
+    return BankParts({name: banks.view(bank, found) for name, found in rows.items()}, account)
 
 
 def streets(table: pa.Table, *, least_shared: int) -> Int[np.ndarray, " N"]:
     """The group of every scene: those that share streets are in one (see `places.groups`)."""
     column = _column(table, "streets", "split").combine_chunks()
-    return geographic_split.groups(
+    return geographic_split.find_groups(
         column.flatten().to_numpy(), np.cumsum([0, *column.value_lengths().to_pylist()]), least_shared=least_shared
     )
 
 
-def merge(several: Sequence[Bank], *, duplicates: Literal["refuse", "first"]) -> Made:
+def merge(several: Sequence[Bank], *, duplicates: Literal["refuse", "first"]) -> BankResult:
     """All scenes of several banks, one bank after the other.
 
     Args:
@@ -221,12 +221,12 @@ def merge(several: Sequence[Bank], *, duplicates: Literal["refuse", "first"]) ->
     _, first = np.unique(names, return_index=True)
     account: Account = {"banks": [len(one) for one in several], "scenes": len(names), "kept": len(first)}
     if len(first) == len(names):
-        return Made(whole, account)
+        return BankResult(whole, account)
     again = np.setdiff1d(np.arange(len(names)), first)
     if duplicates == "refuse":
         some = ", ".join(sorted(set(names[again].tolist()))[:NAMED])
         raise SceneError(f"merge: {len(again)} scenes have the name of another: {some}; merge.duplicates=first keeps the first of each")
-    return Made(banks.view(whole, np.sort(first)), account)
+    return BankResult(banks.view(whole, np.sort(first)), account)
 
 
 def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 
 Point = tuple[float, float, float]
 
 
-def point(place: Float[np.ndarray, "3"]) -> Point:
+def describe_point(place: Float[np.ndarray, "3"]) -> Point:
     """A place as a finding holds it."""
     return float(place[0]), float(place[1]), float(place[2])
 
@@ -53,7 +53,9 @@ def make(rules: Mapping[str, Any]) -> dict[str, Rule]:
     Raises:
         ConfigError: an entry that cannot be built, by name.
     """
-    return {name: build(entry, builtins=__name__, where=f"quality.rules.{name}") for name, entry in rules.items() if entry is not None}
+    return {
+        name: instantiate(entry, builtins=__name__, where=f"quality.rules.{name}") for name, entry in rules.items() if entry is not None
+    }
 
 
 def check_names(rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> None:
@@ -67,7 +69,7 @@ def check_names(rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Seque
             raise ConfigError(f"quality.{key}: {unknown[0]!r} is no rule; valid: {', '.join(rules)}")
 
 
-def judge(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> Verdict:
+def find_defects(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], drop: Sequence[str]) -> Verdict:
     """What the rules find.
 
     Args:
@@ -85,9 +87,7 @@ def judge(raw: RawScene, rules: Mapping[str, Rule], *, reject: Sequence[str], dr
     return Verdict(findings, tuple(finding for finding in findings if finding.rule in reject), tuple(dropped))
 
 
-def gate(
-    raw: RawScene, rules: Mapping[str, Rule], *, check: Callable[..., Any], reject: Sequence[str], drop: Sequence[str]
-) -> RawScene:
+def gate(raw: RawScene, rules: Mapping[str, Rule], *, check: Callable[..., Any], reject: Sequence[str], drop: Sequence[str]) -> RawScene:
     """The scene without the objects that rules drop, and the counts of all findings in `metadata["quality"]`.
 
     Args:
@@ -97,16 +97,16 @@ def gate(
         SceneError: the check, or a rule, refuses the scene, the latter with the first of its findings.
         ConfigError: see `judge`.
     """
-    verdict = judge(check(raw)[0], rules, reject=reject, drop=drop)
+    verdict = find_defects(check(raw)[0], rules, reject=reject, drop=drop)
     if verdict.rejected:
         first = verdict.rejected[0]
         more = f" (and {len(verdict.rejected) - 1} more)" if len(verdict.rejected) > 1 else ""
         raise SceneError(f"{raw.source}: {first.rule}: {first.message}{more}")
     counts = {name: number for name, number in sorted(Counter(finding.rule for finding in verdict.findings).items())}
-    return replace(without(raw, verdict.dropped), metadata=raw.metadata | {"quality": counts})
+    return replace(drop_findings(raw, verdict.dropped), metadata=raw.metadata | {"quality": counts})
 
 
-def without(raw: RawScene, objects: Sequence[int]) -> RawScene:
+def drop_findings(raw: RawScene, objects: Sequence[int]) -> RawScene:
     """The scene without the tracks of these ids."""
     kept = [index for index, track in enumerate(raw.tracks) if track.id not in objects]
     sdc = kept.index(raw.sdc) if raw.sdc in kept else None

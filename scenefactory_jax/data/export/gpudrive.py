@@ -26,10 +26,10 @@ def write(raw: RawScene, path: Path | str) -> None:
     Raises:
         SceneError: a map element that the format does not know, a number that is not finite, or a file that cannot be written.
     """
-    files.write(path, encoded(raw))
+    files.write(path, encode_json(raw))
 
 
-def encoded(raw: RawScene) -> bytes:
+def encode_json(raw: RawScene) -> bytes:
     """The content of a scene's file.
 
     Raises:

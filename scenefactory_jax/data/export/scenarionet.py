@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.safe_names import for_file
+from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.core.types import LINES, POLYGONS, STOP_SIGN
 from scenefactory_jax.data.export import files
 from scenefactory_jax.data.formats.scenarionet import DATASETS, ELEMENTS, KEPT, LANES, MAPPING, SUMMARY, UNITS
@@ -70,7 +70,7 @@ def write_all(scenes: Iterable[RawScene], folder: Path | str, refused: list[str]
 
 def file_name(raw: RawScene) -> str:
     """The name that ScenarioNet gives a scenario's file: `sd_DATASET_SCENARIO.pkl`."""
-    return for_file(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl")
+    return to_file_name(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl")
 
 
 def scenario(raw: RawScene) -> dict[str, Any]:

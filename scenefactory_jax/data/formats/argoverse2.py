@@ -15,8 +15,8 @@ import pyarrow.parquet
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from scenefactory_jax.core.raw_scene import Companion, OtherContent, OtherFormat, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.raw_scene import Companion, FormatMismatch, OtherContent, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.formats import argoverse2_map, integer_ids, json_documents
 
@@ -72,7 +72,7 @@ def read(
     beside = _map_beside(path, scenario)
     roads, groups = argoverse2_map.roads(beside, point_spacing_m=point_spacing_m, cut_m=cut_m, file_limit_mb=file_limit_mb)
     names, owner = np.unique(columns["track_id"], return_inverse=True)
-    ids = integer_ids.number(names)
+    ids = integer_ids.assign_ids(names)
     ground = _ground(roads)
     tracks = tuple(
         _track({key: columns[key][owner == place] for key in COLUMNS}, ids[str(name)], steps, ground, sizes_m, f"{where}track {name}")
@@ -89,18 +89,18 @@ def read(
         current=int(step[columns["observed"]].max()),
         sdc=list(names).index(SDC) if SDC in names else None,
         metadata={"dataset": "argoverse2", "format": "argoverse2", "scenario_id": scenario, "city": city, "focal_track": ids.get(focal)}
-        | {"tracks_to_predict": [ids[str(name)] for name in scored], "tokens": {"tracks": integer_ids.tokens(ids)}}
+        | {"tracks_to_predict": [ids[str(name)] for name in scored], "tokens": {"tracks": integer_ids.list_tokens(ids)}}
         | groups,
     )
 
 
 def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int, file_limit_mb: int) -> Columns:
     """The parquet file's columns as arrays."""
-    start = json_documents.head(path)
+    start = json_documents.read_head(path)
     if start.lstrip()[:1] == b"{" and argoverse2_map.is_map(json_documents.load(path, file_limit_mb=file_limit_mb)):
         raise Companion(f"{path}: the map of an Argoverse 2 scenario")
     if not start.startswith(MAGIC):
-        raise OtherFormat(f"{path}: no parquet file and no map of Argoverse 2; it begins with {start[:16]!r}")
+        raise FormatMismatch(f"{path}: no parquet file and no map of Argoverse 2; it begins with {start[:16]!r}")
     content = json_documents.unpack(path, file_limit_mb=file_limit_mb)
     if "other" not in sizes_m or any(len(size) != 3 for size in sizes_m.values()):
         raise SceneError(f"formats.argoverse2.sizes_m: {sizes_m!r} is no mapping of types, with `other`, to [length, width, height]")
@@ -122,7 +122,7 @@ def _columns(path: Path, sizes_m: Mapping[str, list[float]], row_limit: int, fil
             raise
         raise SceneError(f"{path}: no valid parquet file, damaged or cut short: {error}") from error
     for name in (*MOTION, "start_timestamp", "end_timestamp"):
-        json_documents.require_finite(columns[name], f"{path}: {name}")
+        json_documents.check_finite(columns[name], f"{path}: {name}")
     return columns
 
 
@@ -163,7 +163,7 @@ def _track(
     tree, heights = ground
     xyz, yaw, velocity, valid = np.zeros((steps, 3)), np.zeros(steps), np.zeros((steps, 2)), np.zeros(steps, bool)
     xyz[step] = np.column_stack([plane, heights[tree.query(plane)[1]] + height / 2])
-    yaw[step] = wrapped(rows["heading"])
+    yaw[step] = wrap_angles(rows["heading"])
     velocity[step] = np.stack([rows["velocity_x"], rows["velocity_y"]], axis=1)
     valid[step] = True
     return Track(id=identity, kind=KINDS.get(name, "other"), size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)

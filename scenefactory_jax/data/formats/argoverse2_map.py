@@ -62,7 +62,7 @@ def roads(
     lane_ids = [_id(record, where) for record, where in segments]
     centres = {lane: centre(border["left"], border["right"], point_spacing_m) for lane, border in zip(lane_ids, borders, strict=True)}
     for lane, (_, where) in zip(lane_ids, segments, strict=True):
-        json_documents.require_finite(centres[lane], f"{where}: centre")
+        json_documents.check_finite(centres[lane], f"{where}: centre")
     lanes = [_lane(record, centres, where) for record, where in segments]
     crossings = [_crossing(json_documents.expect(record, dict, where), where) for record, where in places["pedestrian_crossings"]]
     areas = [_line(json_documents.expect(record, dict, where), "area_boundary", where) for record, where in places["drivable_areas"]]
@@ -85,7 +85,7 @@ def _id(record: Mapping[str, Any], where: str) -> int:
 def _line(record: dict[str, Any], key: str, where: str) -> Points:
     """A list of points."""
     xyz = json_documents.points(json_documents.get(record, key, list, where), AXES, f"{where}.{key}")
-    json_documents.require_finite(xyz, f"{where}.{key}", keys=AXES)
+    json_documents.check_finite(xyz, f"{where}.{key}", keys=AXES)
     if not len(xyz):
         raise SceneError(f"{where}.{key}: no points")
     return xyz

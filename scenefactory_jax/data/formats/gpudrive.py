@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, OtherContent, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import FULL_TURN, wrapped
+from scenefactory_jax.core.scene_arrays import FULL_TURN, wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS
 from scenefactory_jax.data.formats import integer_ids, json_documents
 
@@ -100,7 +100,7 @@ def _track(record: dict[str, Any], index: int, steps: int, where: str, degrees: 
     velocity = json_documents.points(json_documents.get(record, "velocity", list, where), ("x", "y"), f"{where}.velocity", length=steps)
     heading = json_documents.numbers(json_documents.get(record, "heading", list, where), f"{where}.heading", length=steps)
     for name, table, keys in (("position", xyz, axes), ("velocity", velocity, axes), ("heading", heading, ())):
-        json_documents.require_finite(table, f"{where}.{name}", rows=valid, keys=keys)
+        json_documents.check_finite(table, f"{where}.{name}", rows=valid, keys=keys)
     if not degrees and valid.any() and np.abs(heading[valid]).max() > FULL_TURN:
         place = int(np.argmax(np.where(valid, np.abs(heading), 0.0)))
         raise SceneError(f"{where}.heading[{place}]: {heading[place]} is no angle in radians; for degrees set formats.gpudrive.headings")
@@ -112,7 +112,7 @@ def _track(record: dict[str, Any], index: int, steps: int, where: str, degrees: 
         kind=kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=_size(record, where, height_m),
         xyz=np.where(mask, np.pad(xyz, ((0, 0), (0, 1))) if flat else xyz, 0.0),
-        yaw=np.where(valid, wrapped(yaw), 0.0),
+        yaw=np.where(valid, wrap_angles(yaw), 0.0),
         velocity=np.where(mask, velocity, 0.0),
         valid=valid,
     )
@@ -131,7 +131,7 @@ def _polyline(record: dict[str, Any], index: int, where: str) -> Polyline:
     flat = bool(rows) and isinstance(rows[0], dict) and "z" not in rows[0]
     axes = ("x", "y") if flat else ("x", "y", "z")
     xyz = json_documents.points(rows, axes, f"{where}.geometry")
-    json_documents.require_finite(xyz, f"{where}.geometry", keys=axes)
+    json_documents.check_finite(xyz, f"{where}.geometry", keys=axes)
     if "map_element_id" in record:
         kind = json_documents.get(record, "map_element_id", int, where)
     else:
@@ -175,7 +175,7 @@ def _stop(record: dict[str, Any], entries: int, where: str) -> Float[np.ndarray,
         for axis in ("x", "y", "z")
     ]
     points = np.stack(table, axis=1)
-    json_documents.require_finite(points, where, keys=("x", "y", "z"))
+    json_documents.check_finite(points, where, keys=("x", "y", "z"))
     return points[-1]
 
 

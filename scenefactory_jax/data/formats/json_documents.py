@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from scenefactory_jax.core.raw_scene import OtherFormat, SceneError
+from scenefactory_jax.core.raw_scene import FormatMismatch, SceneError
 
 MAGIC = {b"\x1f\x8b": ("gzip", gzip.open), b"\xfd7zXZ\x00": ("xz", lzma.open)}
 DAMAGE = (OSError, EOFError, lzma.LZMAError, zlib.error)  # what unpacking says of a damaged file
@@ -46,9 +46,9 @@ def load(path: Path, *, file_limit_mb: int) -> dict[str, Any]:
         SceneError: unreadable, damaged or truncated, or larger than the limit.
         OtherFormat: no JSON object at all.
     """
-    start = head(path)
+    start = read_head(path)
     if not start.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        raise OtherFormat(f"{path}: no JSON object (plain, gzip or xz); it begins with {start[:16]!r}")
+        raise FormatMismatch(f"{path}: no JSON object (plain, gzip or xz); it begins with {start[:16]!r}")
     text = unpack(path, file_limit_mb=file_limit_mb)
     try:
         return json.loads(text)
@@ -56,7 +56,7 @@ def load(path: Path, *, file_limit_mb: int) -> dict[str, Any]:
         raise SceneError(f"{path}: no valid JSON, damaged or cut short after {len(text)} bytes: {error}") from error
 
 
-def head(path: Path) -> bytes:
+def read_head(path: Path) -> bytes:
     """The first HEAD bytes of what a file holds, without its compression.
 
     Raises:
@@ -91,7 +91,7 @@ def _read(path: Path, count: int) -> bytes:
         with open(path, "rb") as stream:
             name, opener = _packing(stream)
             with opener(stream) as unpacked:
-                return take(unpacked, count)
+                return take_key(unpacked, count)
     except DAMAGE as error:
         unread = f"cannot be read: {getattr(error, 'strerror', None) or error}"
         damaged = f"begins as {name} but cannot be unpacked, damaged or cut short: {error}"
@@ -105,7 +105,7 @@ def _packing(stream: BufferedReader) -> tuple[str | None, Callable[[Any], Any]]:
     return next(found, (None, contextlib.nullcontext))
 
 
-def take(stream: BufferedIOBase, count: int) -> bytes:
+def take_key(stream: BufferedIOBase, count: int) -> bytes:
     """The next `count` bytes of a stream, or as many as there are."""
     parts = []
     while count > 0 and (part := stream.read(min(count, CHUNK))):
@@ -178,7 +178,7 @@ def points(rows: Any, keys: Sequence[str], where: str, *, length: int | None = N
     return np.array([[get(row, key, float, place) for key in keys] for row, place in places], np.float64)
 
 
-def require_finite(
+def check_finite(
     table: Float[np.ndarray, "N ..."], where: str, *, rows: Bool[np.ndarray, " N"] | None = None, keys: Sequence[str] = ()
 ) -> None:
     """Refuse NaN and infinity in the given rows.

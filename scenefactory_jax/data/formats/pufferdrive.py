@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefactory_jax.core.raw_scene import OtherContent, OtherFormat, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import FULL_TURN, wrapped
+from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.scene_arrays import FULL_TURN, wrap_angles
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, LANE_STREET, LINES, SPEED_BUMP, STOP_SIGN, RoadUser
 from scenefactory_jax.data.formats import json_documents, polylines
 
@@ -75,10 +75,10 @@ def read(
 
 def _require_start(path: Path) -> None:
     """Refuse what cannot be such a map by its first numbers, before the whole file is read."""
-    start = json_documents.head(path)[: WORD * (HEAD + 1)]
+    start = json_documents.read_head(path)[: WORD * (HEAD + 1)]
     numbers = np.frombuffer(start, "<i4", len(start) // WORD).tolist()
     if len(numbers) <= HEAD or numbers[0] < 1 or numbers[1] < 0 or numbers[HEAD] not in OBJECTS:
-        raise OtherFormat(f"{path}: no PufferDrive map: it begins with the numbers {numbers}")
+        raise FormatMismatch(f"{path}: no PufferDrive map: it begins with the numbers {numbers}")
 
 
 def _layout(words: np.ndarray, size: int, path: Path) -> tuple[list[_Entity], list[_Entity]]:
@@ -86,7 +86,7 @@ def _layout(words: np.ndarray, size: int, path: Path) -> tuple[list[_Entity], li
     counts = [int(count) for count in words[:HEAD]]
     least = counts[0] * (HEAD + TAIL + OBJECT_COLUMNS) + counts[1] * (HEAD + TAIL) if len(counts) == HEAD else 0
     if size % WORD or len(counts) < HEAD or counts[0] < 1 or counts[1] < 0 or HEAD + least > len(words):
-        raise OtherFormat(f"{path}: no PufferDrive map: {size} bytes that begin with the numbers {counts}")
+        raise FormatMismatch(f"{path}: no PufferDrive map: {size} bytes that begin with the numbers {counts}")
     entities: list[_Entity] = []
     place = HEAD
     for index in range(sum(counts)):
@@ -114,7 +114,7 @@ def _track(entity: _Entity, index: int, words: np.ndarray, values: np.ndarray, w
     valid = flags == 1
     xyz, velocity = np.stack([x, y, z], axis=1), np.stack([vx, vy], axis=1)
     for name, table in (("position", xyz), ("velocity", velocity), ("heading", heading)):
-        json_documents.require_finite(table, f"{where}.{name}", rows=valid)
+        json_documents.check_finite(table, f"{where}.{name}", rows=valid)
     if np.any(np.abs(heading[valid]) > FULL_TURN):
         raise SceneError(f"{where}.heading: {np.abs(heading[valid]).max()} is no angle in radians")
     width, length, height = (float(value) for value in values[span.stop : span.stop + 3])
@@ -124,7 +124,7 @@ def _track(entity: _Entity, index: int, words: np.ndarray, values: np.ndarray, w
         kind=OBJECTS[entity.type],
         size=(length, width, height),
         xyz=np.where(mask, xyz, 0.0),
-        yaw=np.where(valid, wrapped(heading), 0.0),
+        yaw=np.where(valid, wrap_angles(heading), 0.0),
         velocity=np.where(mask, velocity, 0.0),
         valid=valid,
     )
@@ -134,5 +134,5 @@ def _polyline(entity: _Entity, index: int, values: np.ndarray, spacing_m: float,
     """One road feature."""
     columns = values[entity.start : entity.start + ROAD_COLUMNS * entity.count].reshape(ROAD_COLUMNS, entity.count)
     xyz = columns.T.astype(np.float64)
-    json_documents.require_finite(xyz, f"{where}.geometry", keys=("x", "y", "z"))
+    json_documents.check_finite(xyz, f"{where}.geometry", keys=("x", "y", "z"))
     return Polyline(kind=ROADS[entity.type], xyz=polylines.densify(xyz, spacing_m) if entity.type in THINNED else xyz, id=index)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.core.instantiate import build
-from scenefactory_jax.core.raw_scene import OtherContent, OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawScene, Reject, SceneError
 from scenefactory_jax.data.formats import foreign, json_documents
 
 REASON = 80  # characters of what one reader says of a file that is not its own
@@ -22,7 +22,7 @@ def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
     Raises:
         ConfigError: an entry that cannot be built, by name.
     """
-    return {name: build(entry, builtins=__name__, where=f"formats.{name}") for name, entry in formats.items() if entry is not None}
+    return {name: instantiate(entry, builtins=__name__, where=f"formats.{name}") for name, entry in formats.items() if entry is not None}
 
 
 def find(path: Path | str) -> list[Path]:
@@ -85,7 +85,7 @@ def _begin(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject
         except OtherContent as refusal:
             near.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", REASON))
             continue
-        except OtherFormat:
+        except FormatMismatch:
             continue
         if first is None:
             raise SceneError(f"{path}: no scene in it, says the reader {name!r}")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.raw_scene import OtherFormat, SceneError
+from scenefactory_jax.core.raw_scene import FormatMismatch, SceneError
 from scenefactory_jax.data.formats.json_documents import is_number
 
 PROTOCOLS = (3, 4, 5)
@@ -125,7 +125,7 @@ def _content(path: Path, file_limit_mb: int) -> bytes:
         with open(path, "rb") as file:
             start = file.read(2)
             if len(start) < 2 or start[0] != 0x80 or start[1] not in PROTOCOLS:
-                raise OtherFormat(f"{path}: no pickle of protocol {', '.join(map(str, PROTOCOLS))}; it begins with {start!r}")
+                raise FormatMismatch(f"{path}: no pickle of protocol {', '.join(map(str, PROTOCOLS))}; it begins with {start!r}")
             if (size_mb := Path(path).stat().st_size / 1e6) > file_limit_mb:
                 raise SceneError(f"{path}: a pickle of {size_mb:.0f} MB; file_limit_mb is {file_limit_mb}")
             return start + file.read()

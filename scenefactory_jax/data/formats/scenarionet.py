@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, Light, OtherContent, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import (
     CROSSWALK,
     DRIVEWAY,
@@ -88,9 +88,9 @@ def read(
     if "tracks" not in document or not {"map_features", "map"} & set(document):
         raise OtherContent(f"{path}: no ScenarioNet pickle: no 'tracks' and map, but {', '.join(map(str, document)) or 'nothing'}")
     where = f"{path}: "
-    document = scenarionet_legacy.today(document, where)
+    document = scenarionet_legacy.convert_legacy(document, where)
     metadata, features = document["metadata"], document["map_features"]
-    ids = {"tracks": integer_ids.number(document["tracks"]), "features": integer_ids.number(features)}
+    ids = {"tracks": integer_ids.assign_ids(document["tracks"]), "features": integer_ids.assign_ids(features)}
     times = _times(metadata, where)
     current = json_documents.get({"current_time_index": current} | metadata, "current_time_index", int, f"{where}metadata")
     if not 0 <= current < len(times):
@@ -139,7 +139,7 @@ def _find_rims(roads: list[Polyline], features: Mapping[Any, Any], where: str) -
     shaped = {key: record["polygon"] for key, record in features.items() if "polygon" in record and str(record["type"]).startswith("LANE_")}
     lanes = [_points(polygon, f"{where}[{key!r}].polygon") for key, polygon in shaped.items()]
     for lane in lanes:
-        json_documents.require_finite(lane, f"{where}: polygon")
+        json_documents.check_finite(lane, f"{where}: polygon")
     solid = [place for place, line in enumerate(roads) if line.kind in SOLID and len(line.xyz) > 1]
     rims = metadrive_map.find_rims([roads[place].xyz for place in solid], [lane[:, :2] for lane in lanes])
     return [place for place, rim in zip(solid, rims, strict=True) if rim]
@@ -150,7 +150,7 @@ def _times(metadata: Mapping[str, Any], where: str) -> Float[np.ndarray, " L"]:
     times = safe_pickle.numeric(_value(metadata, "ts", f"{where}metadata"), f"{where}metadata.ts")
     if times.ndim != 1 or not len(times):
         raise SceneError(f"{where}metadata.ts: an array of the shape {times.shape}; there must be a time for each step")
-    json_documents.require_finite(times, f"{where}metadata.ts")
+    json_documents.check_finite(times, f"{where}metadata.ts")
     return times
 
 
@@ -183,7 +183,7 @@ def _point(value: Any, where: str) -> Float[np.ndarray, "3"]:
     points = _points([value], where)
     if len(points) != 1:
         raise SceneError(f"{where}: no point; valid: two or three numbers")
-    json_documents.require_finite(points, where)
+    json_documents.check_finite(points, where)
     return points[0]
 
 
@@ -196,7 +196,7 @@ def _track(track: Mapping[str, Any], identity: int, steps: int, where: str) -> T
     for name, table in (("position", xyz), ("velocity", velocity), ("heading", yaw)):
         if len(table) != steps:
             raise SceneError(f"{where}.state.{name}: {len(table)} rows; there must be {steps}, one for each step")
-        json_documents.require_finite(table, f"{where}.state.{name}", rows=valid)
+        json_documents.check_finite(table, f"{where}.state.{name}", rows=valid)
     last = np.flatnonzero(valid)[-1] if valid.any() else -1
     length, width, height = (float(column(key)[last]) for key in ("length", "width", "height"))
     kind = json_documents.get(track, "type", str, where).lower()  # pyright: ignore[reportArgumentType]
@@ -206,7 +206,7 @@ def _track(track: Mapping[str, Any], identity: int, steps: int, where: str) -> T
         kind=kind if kind in ROAD_USERS else "other",  # pyright: ignore[reportArgumentType]
         size=(length, width, height),
         xyz=np.where(mask, xyz, 0.0),
-        yaw=np.where(valid, wrapped(yaw), 0.0),
+        yaw=np.where(valid, wrap_angles(yaw), 0.0),
         velocity=np.where(mask, velocity[:, :2], 0.0),
         valid=valid,
     )
@@ -234,7 +234,7 @@ def _polyline(feature: Mapping[str, Any], identity: int, kind: int, ids: Mapping
     shape = next((key for key in ("polyline", "polygon", "position") if key in feature), "polyline")
     table = _value(feature, shape, where)
     xyz = _point(table, f"{where}.{shape}")[None] if shape == "position" else _points(table, f"{where}.{shape}")
-    json_documents.require_finite(xyz, f"{where}.{shape}")
+    json_documents.check_finite(xyz, f"{where}.{shape}")
     if kind not in LANES:
         return Polyline(kind=kind, xyz=xyz, id=identity)
     lanes = lambda key: _lanes(feature.get(key), ids, f"{where}.{key}")  # noqa: E731
@@ -256,7 +256,7 @@ def _lanes(entries: Any, ids: Mapping[str, int], where: str) -> tuple[int, ...]:
     keys = [
         _value(entry, "feature_id", where) if isinstance(entry, dict) else entry for entry in json_documents.expect(entries, list, where)
     ]
-    found = (integer_ids.resolve(key, ids) for key in keys)
+    found = (integer_ids.look_up_id(key, ids) for key in keys)
     return tuple(dict.fromkeys(lane for lane in found if lane is not None))
 
 
@@ -279,7 +279,7 @@ def _lights(records: Mapping[Any, Any], ids: Mapping[str, int], steps: int, wher
         if not isinstance(states, (list, tuple)) or len(states) != steps:
             raise SceneError(f"{place}.state.object_state: {type(states).__name__}; there must be a list of {steps}, one for each step")
         codes = np.array([_code(state, f"{place}.state.object_state[{step}]") for step, state in enumerate(states)])
-        lane = integer_ids.resolve(key if record.get("lane") is None else record["lane"], ids)
+        lane = integer_ids.look_up_id(key if record.get("lane") is None else record["lane"], ids)
         stop = record.get("stop_point")
         stop = None if stop is None else _point(stop, f"{place}.stop_point")
         lights.append(None if lane is None else Light(lane=lane, state=np.maximum(codes, 0), valid=codes >= 0, stop=stop))
@@ -310,5 +310,5 @@ def _metadata(document: Mapping[str, Any], ids: Mapping[str, Mapping[str, int]],
     if signs:
         lanes = {key: _lanes(record.get("lane"), ids["features"], f"{where}map_features[{key!r}].lane") for key, record in signs.items()}
         found["stop_sign_lanes"] = {str(ids["features"][str(key)]): list(chosen) for key, chosen in lanes.items() if chosen}
-    tokens = {part: integer_ids.tokens(table) for part, table in ids.items()}
+    tokens = {part: integer_ids.list_tokens(table) for part, table in ids.items()}
     return found | ({"tokens": tokens} if any(tokens.values()) else {})

@@ -20,7 +20,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats import json_documents, safe_pickle
 
 
-def today(document: Mapping[Any, Any], where: str) -> dict[Any, Any]:
+def convert_legacy(document: Mapping[Any, Any], where: str) -> dict[Any, Any]:
     """A scenario in today's layout; one that is in it already comes back as it is, but for the sections that it lacks.
 
     Raises:

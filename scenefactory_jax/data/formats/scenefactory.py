@@ -82,7 +82,7 @@ def _polyline(record: Any, index: int, where: str) -> Polyline:
         if len(values) not in (2, 3):
             raise SceneError(f"{where}.xyz[{place}]: {row!r} is no point; valid: [x, y] or [x, y, z]")
         xyz[place, : len(values)] = values
-    json_documents.require_finite(xyz, f"{where}.xyz")
+    json_documents.check_finite(xyz, f"{where}.xyz")
     identity = json_documents.expect(record.get("id", index), int, f"{where}.id")
     return Polyline(kind=json_documents.get(record, "type", int, where), xyz=xyz, id=identity)
 
@@ -91,7 +91,7 @@ def _pose(record: dict[str, Any], where: str) -> Float[np.ndarray, "4"]:
     """x, y, z, yaw; z and yaw may be missing."""
     known = {"z": 0.0, "yaw": 0.0} | record
     pose = np.array([json_documents.get(known, key, float, where) for key in ("x", "y", "z", "yaw")], np.float64)
-    json_documents.require_finite(pose, where)
+    json_documents.check_finite(pose, where)
     return pose
 
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import google_crc32c
 
-from scenefactory_jax.core.raw_scene import OtherFormat, Reject, SceneError
-from scenefactory_jax.data.formats.json_documents import take
+from scenefactory_jax.core.raw_scene import FormatMismatch, Reject, SceneError
+from scenefactory_jax.data.formats.json_documents import take_key
 
 HEADER = struct.Struct("<QI")  # length of the data, masked checksum of the length
 FOOTER = struct.Struct("<I")  # masked checksum of the data
@@ -70,7 +70,7 @@ def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
             except (OSError, EOFError, zlib.error) as error:
                 frame = _Frame(fault=f"damaged or cut short: {error}", known=number > 0, last=True)
             if number == 0 and (frame is None or not frame.known):
-                raise OtherFormat(f"{path}: no TFRecord: {'it is empty' if frame is None else frame.fault}")
+                raise FormatMismatch(f"{path}: no TFRecord: {'it is empty' if frame is None else frame.fault}")
             if frame is None:
                 return
             yield Reject(None, f"{place}: {frame.fault}") if frame.fault else Record(number, offset, frame.data)
@@ -98,7 +98,7 @@ def _open(path: Path) -> tuple[BufferedIOBase, int | None]:
 
 def _read_frame(stream: BufferedIOBase, left: int | None, limit_mb: int) -> _Frame | None:
     """The next frame of a file of which `left` bytes are left, if that is known; none at its end."""
-    header = take(stream, HEADER.size)
+    header = take_key(stream, HEADER.size)
     if not header:
         return None
     if len(header) < HEADER.size:
@@ -112,8 +112,8 @@ def _read_frame(stream: BufferedIOBase, left: int | None, limit_mb: int) -> _Fra
     if length > limit_mb * 10**6:
         fault = f"it declares {length} bytes of data; formats.womd.record_limit_mb is {limit_mb}"
         return _Frame(fault=fault if sound else lost, known=sound, last=True)
-    data = take(stream, length)
-    footer = take(stream, FOOTER.size)
+    data = take_key(stream, length)
+    footer = take_key(stream, FOOTER.size)
     if len(data) + len(footer) < length + FOOTER.size:
         fault = f"truncated: it declares {length} bytes of data, and there are {len(data)}"
         return _Frame(fault=fault if sound else lost, known=sound, last=True)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from scenefactory_jax.core.raw_scene import OtherContent, OtherFormat, RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawScene, Reject, SceneError
 from scenefactory_jax.data.formats import tfrecord, womd_example, womd_scenario
 
 
@@ -36,7 +36,7 @@ def read(path: Path, *, jump_m: float, record_limit_mb: int = 64) -> Iterator[Ra
                 raise OtherContent(f"{path}: {record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset")
             else:
                 yield Reject(None, f"{record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset")
-        except OtherFormat:
+        except FormatMismatch:
             raise
         except SceneError as error:
             yield Reject(name, str(error))

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.raw_scene import SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, RoadUser
 from scenefactory_jax.data.formats import json_documents
 
@@ -14,7 +14,7 @@ OBJECT_TYPES: tuple[RoadUser, ...] = ("other", *ROAD_USERS)  # Track.ObjectType:
 STATE = ("x", "y", "z", "yaw", "velocity_x", "velocity_y", "length", "width", "height")  # columns of a table of states
 
 
-def require_times(times: Float[np.ndarray, " L"], where: str) -> None:
+def check_times(times: Float[np.ndarray, " L"], where: str) -> None:
     """Refuse a log without steps, and times that are not finite or do not rise.
 
     Raises:
@@ -22,13 +22,13 @@ def require_times(times: Float[np.ndarray, " L"], where: str) -> None:
     """
     if not len(times):
         raise SceneError(f"{where}: none; a log needs at least one step")
-    json_documents.require_finite(times, where)
+    json_documents.check_finite(times, where)
     if (falls := np.flatnonzero(np.diff(times) <= 0)).size:
         step = int(falls[0]) + 1
         raise SceneError(f"{where}[{step}]: {times[step]} s does not come after {times[step - 1]} s")
 
 
-def require_among(value: int, names: Sequence[object], what: str, where: str) -> int:
+def check_member(value: int, names: Sequence[object], what: str, where: str) -> int:
     """`value`, if it is an index into `names`.
 
     Raises:
@@ -52,7 +52,7 @@ def make_tracks(
         current: the step at which a simulation takes over.
     """
     numbers = np.where(valid[..., None], numbers, 0.0)
-    yaw = np.where(valid, wrapped(numbers[..., 3]), 0.0)
+    yaw = np.where(valid, wrap_angles(numbers[..., 3]), 0.0)
     measured = np.where(valid[:, current], current, np.argmax(valid, axis=1))
     sizes = numbers[np.arange(len(numbers)), measured, 6:9].tolist()
     return tuple(

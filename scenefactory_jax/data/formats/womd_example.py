@@ -16,7 +16,7 @@ from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawSc
 from scenefactory_jax.core.types import STOP_SIGN
 from scenefactory_jax.data.formats import json_documents, womd_common, womd_schema
 from scenefactory_jax.data.formats.tfrecord import Record
-from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, make_tracks, require_times
+from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, check_times, make_tracks
 
 Features = Mapping[str, Any]  # key -> tf.train.Feature
 
@@ -118,7 +118,7 @@ def _integers(features: Features, key: str, where: str, *, length: int | None = 
     found = _numbers(features, key, where, length=length)
     if found.dtype == np.int64:
         return found
-    json_documents.require_finite(found, f"{where}{key}")
+    json_documents.check_finite(found, f"{where}{key}")
     whole = np.clip(found, -(2**53), 2**53).astype(np.int64)  # beyond, not every integer is a float
     _require(whole == found, found, f"{where}{key}", "no whole number")
     return whole
@@ -169,7 +169,7 @@ def _states(features: Features, objects: int, where: str) -> _States:
         periods.append((period, table, valid, np.where(valid, stamps, np.iinfo(np.int64).min).max(axis=0)))
     current = sum(table.shape[1] for period, table, _, _ in periods if period == "past")
     times = np.concatenate([stamps for *_, stamps in periods]) / MICROSECONDS
-    require_times(times, f"{where}state/{{past,current,future}}/timestamp_micros")
+    check_times(times, f"{where}state/{{past,current,future}}/timestamp_micros")
     numbers, valid = (np.concatenate([entry[column] for entry in periods], axis=1) for column in (1, 2))
     return _States(numbers, valid, times, current)
 
@@ -210,7 +210,7 @@ def _signals(features: Features, period: str, where: str) -> _Signals | None:
     _require(known | ~valid, state, f"{where}{prefix}state", f"no state of a light; valid: 0 to {len(LIGHT_STATES) - 1}")
     axes = {axis: _floats(features, f"{prefix}{axis}", where, length=len(lanes)) for axis in "xyz"}
     for axis, column in axes.items():
-        json_documents.require_finite(column, f"{where}{prefix}{axis}", rows=valid)
+        json_documents.check_finite(column, f"{where}{prefix}{axis}", rows=valid)
     times = np.where(stamps < 0, np.inf, stamps / MICROSECONDS)
     lanes, state, valid = (column.reshape(len(stamps), -1) for column in (lanes, state, valid))
     return _Signals(times, lanes, state, valid, np.stack(list(axes.values()), axis=-1).reshape(*valid.shape, 3))
@@ -260,7 +260,7 @@ def _roads(features: Features, jump_m: float, where: str) -> tuple[tuple[Polylin
     kinds = _integers(features, f"{prefix}type", where, length=len(ids))
     valid = _flags(features, f"{prefix}valid", where, len(ids))
     xyz = _floats(features, f"{prefix}xyz", where, length=3 * len(ids)).reshape(-1, 3)
-    json_documents.require_finite(xyz, f"{where}{prefix}xyz", rows=valid, keys=("x", "y", "z"))
+    json_documents.check_finite(xyz, f"{where}{prefix}xyz", rows=valid, keys=("x", "y", "z"))
     _require(np.isin(kinds, ELEMENTS) | ~valid, kinds, f"{where}{prefix}type", "no map element; valid: 0 to 20 without 4")
     rows = np.flatnonzero(valid)
     if not len(rows):

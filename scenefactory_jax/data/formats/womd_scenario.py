@@ -18,7 +18,7 @@ from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawSc
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, SPEED_BUMP, STOP_SIGN
 from scenefactory_jax.data.formats import womd_schema
 from scenefactory_jax.data.formats.tfrecord import Record
-from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, make_tracks, require_among, require_times
+from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, check_member, check_times, make_tracks
 
 Message = Any  # protobuf's classes are made at run time: type checkers know none of their fields
 
@@ -59,14 +59,14 @@ def make(message: Message, *, path: Path, record: Record) -> RawScene:
     """
     where = f"{record.place}: "
     times = np.array(message.timestamps_seconds, np.float64)
-    require_times(times, f"{where}timestamps_seconds")
+    check_times(times, f"{where}timestamps_seconds")
     if not message.HasField("current_time_index"):
         raise SceneError(f"{where}current_time_index: missing")
-    current = require_among(message.current_time_index, range(len(times)), "step of the log", f"{where}current_time_index")
+    current = check_member(message.current_time_index, range(len(times)), "step of the log", f"{where}current_time_index")
     tracks = _tracks(message.tracks, len(times), current, where)
     sdc = message.sdc_track_index if message.HasField("sdc_track_index") else None
     if sdc is not None:
-        require_among(sdc, tracks, "track", f"{where}sdc_track_index")
+        check_member(sdc, tracks, "track", f"{where}sdc_track_index")
     roads = [_polyline(feature, f"{where}map_features[{i}]") for i, feature in enumerate(message.map_features)]
     return RawScene(
         name=find_name(message),
@@ -105,7 +105,7 @@ def _tracks(messages: Sequence[Message], steps: int, current: int, where: str) -
             raise SceneError(f"{where}tracks[{place}].states: {found}")
         if not message.HasField("id"):
             raise SceneError(f"{where}tracks[{place}].id: missing")
-        require_among(message.object_type, OBJECT_TYPES, "type of object", f"{where}tracks[{place}].object_type")
+        check_member(message.object_type, OBJECT_TYPES, "type of object", f"{where}tracks[{place}].object_type")
     states = enumerate(chain.from_iterable(message.states for message in messages))
     seen = {row: state for row, state in states if state.valid}
     rows = list(seen)
@@ -134,7 +134,7 @@ def _polyline(message: Message, where: str) -> Polyline | None:
             raise SceneError(f"{where}.position: missing")
         return Polyline(kind=STOP_SIGN, xyz=_table([feature.position], POINT, lambda _: f"{where}.position"), id=message.id)
     elements, points = FEATURES[sort]
-    kind = elements[require_among(getattr(feature, "type", 0), elements, f"type of {sort}", f"{where}.type")]
+    kind = elements[check_member(getattr(feature, "type", 0), elements, f"type of {sort}", f"{where}.type")]
     xyz = _table(getattr(feature, points), POINT, lambda row: f"{where}.{points}[{row}]")
     line = Polyline(kind=kind, xyz=xyz, id=message.id)
     return line if sort != "lane" else _with_graph(line, feature, where)
@@ -167,7 +167,7 @@ def _lights(moments: Sequence[Message], steps: int, where: str) -> tuple[Light, 
             place = f"{where}dynamic_map_states[{step}].lane_states[{i}]"
             if not signal.HasField("lane"):
                 raise SceneError(f"{place}.lane: missing")
-            state = require_among(signal.state, LIGHT_STATES, "state of a light", f"{place}.state")
+            state = check_member(signal.state, LIGHT_STATES, "state of a light", f"{place}.state")
             light = lights.get(signal.lane)
             if light is None:
                 light = lights[signal.lane] = Light(signal.lane, np.zeros(steps, np.int64), np.zeros(steps, bool), _stop(signal, place))
@@ -184,7 +184,7 @@ def _metadata(message: Message, tracks: Sequence[Track], where: str) -> dict[str
     """What the source says of tracks, by their ids (an index would not survive dropped tracks), and the lanes of stop signs."""
     chosen = message.tracks_to_predict
     for place, entry in enumerate(chosen):
-        require_among(entry.track_index, tracks, "track", f"{where}tracks_to_predict[{place}].track_index")
+        check_member(entry.track_index, tracks, "track", f"{where}tracks_to_predict[{place}].track_index")
     signs = [feature for feature in message.map_features if feature.WhichOneof(womd_schema.CHOICE) == "stop_sign"]
     return {
         "objects_of_interest": list(message.objects_of_interest),

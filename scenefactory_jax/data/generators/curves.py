@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 
 FINE_M = 0.25  # spacing of the points that everything is computed on; what a scene holds is coarser
 Points = Float[np.ndarray, "_ 2"]
@@ -17,7 +17,7 @@ def heading(yaw: float | Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 2"]:
 
 def wrap_angle(angle: float) -> float:
     """The same angle in [-pi, pi)."""
-    return float(wrapped(angle))
+    return float(wrap_angles(angle))
 
 
 def arc_length(points: Points) -> Float[np.ndarray, " N"]:

@@ -39,7 +39,7 @@ def make_route(points: Points) -> Route:
     return Route(points, arc_length(points), tangents(points), np.abs(curvature(points)))
 
 
-def comfortable(route: Route, limit: float, limits: Limits) -> Float[np.ndarray, " N"]:
+def limit_by_curvature(route: Route, limit: float, limits: Limits) -> Float[np.ndarray, " N"]:
     """Highest squared speed at every point from which all that lies ahead, the stop at the end included, can be met."""
     cap = np.minimum(limit**2, limits.lateral / np.maximum(route.bend, 1e-6))
     cap[-1] = 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
@@ -39,7 +39,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Fit:
+class BoxSizes:
     """How scenes become worlds that share a compiled program."""
 
     sizes: Mapping[str, int]  # of every axis of a stack, and of the cells
@@ -75,11 +75,11 @@ def open(config: Mapping[str, Any]) -> Source:
     if (config.get("take") or {}).get("count") is not None:
         count = config["take"]["count"]
         raise ConfigError(f"scenes.take.count: {count}; a stream draws from all scenes: `scenes op=sample` makes a smaller bank")
-    parts = scene_source.readers(config)
+    parts = scene_source.make_readers(config)
     ready = functools.partial(prepare, check=parts["check"], pack=parts["pack"])
     path = config["path"]
     if path is None:
-        generate = scene_source.generator(config)
+        generate = scene_source.make_generator(config)
         make = functools.partial(_generated, generate, ready, config["seed"])
         job = lambda index: functools.partial(make, index)  # noqa: E731
         return Source(None, job, lambda index: f"generated scene {index}", "scenes from the generator")
@@ -87,10 +87,10 @@ def open(config: Mapping[str, Any]) -> Source:
         opened = bank_reader.open(path)
         names, line = opened.metadata["name"], f"{len(opened)} scenes of the bank {path}{opened.unfinished}"
         job = lambda index: functools.partial(_banked, _alone(opened, index), ready)  # noqa: E731
-        return Source(len(opened), job, lambda index: for_terminal(str(names[index])), line)
+        return Source(len(opened), job, lambda index: escape_for_terminal(str(names[index])), line)
     files = reader_selection.find(path)
     job = lambda index: functools.partial(_filed, files[index], ready, parts["formats"])  # noqa: E731
-    return Source(len(files), job, lambda index: for_terminal(str(files[index])), f"{len(files)} files of {path}")
+    return Source(len(files), job, lambda index: escape_for_terminal(str(files[index])), f"{len(files)} files of {path}")
 
 
 def _generated(generate: Callable[[int, int], RawScene], ready: Callable[[RawScene], Packed], seed: int, index: int) -> Packed:
@@ -105,7 +105,7 @@ def _alone(opened: bank_reader.Bank, index: int) -> bank_reader.Bank:
 
 
 def _banked(one: bank_reader.Bank, ready: Callable[[RawScene], Packed]) -> Packed:
-    return ready(bank_reader.raw(one, 0))
+    return ready(bank_reader.read_raw(one, 0))
 
 
 def _filed(path: Path, ready: Callable[[RawScene], Packed], formats: Mapping[str, reader_selection.Reader]) -> Packed:
@@ -175,7 +175,7 @@ def _needed(job: Callable[[], Packed], *, grid: Mapping[str, Any]) -> dict[str, 
     own = {name: int(getattr(scene, name).valid.sum()) for name in columns.ROADS}  # the stack has rounded them up
     if grid["radius_m"] is None:
         return report.capacity | own
-    made = spatial_grid.attach(scene, **grid).cells
+    made = spatial_grid.attach_grid(scene, **grid).cells
     assert made is not None
     return report.capacity | own | {"side": made.side, "rows": made.rows.shape[-1], "most": made.most}
 
@@ -204,7 +204,7 @@ def require_memory(sizes: Mapping[str, int], worlds: int, *, gib: float) -> None
 # ---- batches
 
 
-def load(source: Source, pool: Executor | None, indices: Sequence[int] | np.ndarray, fit: Fit) -> Batch:
+def load(source: Source, pool: Executor | None, indices: Sequence[int] | np.ndarray, fit: BoxSizes) -> Batch:
     """Scenes at fixed sizes. One that cannot be used is named with its reason, and another of the batch stands in its row.
 
     Args:
@@ -227,14 +227,14 @@ def load(source: Source, pool: Executor | None, indices: Sequence[int] | np.ndar
     return Batch(scene, np.asarray(indices)[held], sum(rows[number].cuts > 0 for number in held), refused)
 
 
-def _row(job: Callable[[], Packed], *, fit: Fit) -> Row:
+def _row(job: Callable[[], Packed], *, fit: BoxSizes) -> Row:
     """One scene, read and fitted; what is wrong with a scene is a reason, what is wrong with the program an exception."""
     try:
         scene, report = stack([job().scene], capacity={axis: fit.sizes[axis] for axis in AXES})
         if report.cuts and fit.excess == "skip":
             return Row(None, len(report.cuts), "; ".join(describe(report)[1:]))
         if fit.grid["radius_m"] is not None:
-            scene = spatial_grid.attach(scene, **fit.grid, capacity={name: fit.sizes[name] for name in spatial_grid.SIZES})
+            scene = spatial_grid.attach_grid(scene, **fit.grid, capacity={name: fit.sizes[name] for name in spatial_grid.SIZES})
     except (SceneError, ConfigError) as error:
         return Row(None, 0, str(error))
     return Row(scene, len(report.cuts), "")

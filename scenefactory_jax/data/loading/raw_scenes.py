@@ -27,7 +27,7 @@ def scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[R
     if config["path"] is not None:
         found = _of_bank(config) if bank_reader.is_bank(config["path"]) else _of_files(config)
         return itertools.islice(found, limit)
-    generate = scene_source.generator(config)
+    generate = scene_source.make_generator(config)
     return (generate(config["seed"], index) for index in range(config["count"] if limit is None else limit))
 
 
@@ -43,12 +43,12 @@ def read(path: Path | str) -> Iterator[RawScene | str]:
     Raises:
         SceneError: no such path.
     """
-    return scenes(configs.load("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
+    return scenes(configs.load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
 
 
 def _of_bank(config: Mapping[str, Any]) -> Iterator[RawScene]:
     opened = bank_reader.open(config["path"])
-    yield from bank_reader.raws(opened, range(len(opened)))
+    yield from bank_reader.read_raws(opened, range(len(opened)))
 
 
 def _of_files(config: Mapping[str, Any]) -> Iterator[RawScene | str]:

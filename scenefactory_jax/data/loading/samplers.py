@@ -16,7 +16,7 @@ Draws = Int[np.ndarray, " count"]
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class SceneOutcomes:
     """What is known of every scene; scene by scene."""
 
     draws: Int[np.ndarray, " N"]  # times that it was drawn
@@ -25,16 +25,16 @@ class Table:
     endless: bool  # there are scenes beyond the table, and it grows as they are drawn
 
 
-Sampler = Callable[[Table, int], Draws]
+Sampler = Callable[[SceneOutcomes, int], Draws]
 
 
-def empty(scenes: int | None) -> Table:
+def empty(scenes: int | None) -> SceneOutcomes:
     """Nothing is known yet of so many scenes; None: of endlessly many."""
     count = scenes or 0
-    return Table(np.zeros(count, int), np.zeros(count), np.zeros(count), endless=scenes is None)
+    return SceneOutcomes(np.zeros(count, int), np.zeros(count), np.zeros(count), endless=scenes is None)
 
 
-def drawn(table: Table, indices: Draws) -> Table:
+def count_draws(table: SceneOutcomes, indices: Draws) -> SceneOutcomes:
     """The table after these draws; an endless one has grown by those beyond it."""
     if table.endless:
         more = max(0, int(indices.max(initial=-1)) + 1 - len(table.draws))
@@ -45,7 +45,7 @@ def drawn(table: Table, indices: Draws) -> Table:
     return replace(table, draws=draws)
 
 
-def learnt(table: Table, scenes: Draws, episodes: Draws, successes: Draws, *, memory: float) -> Table:
+def update_outcomes(table: SceneOutcomes, scenes: Draws, episodes: Draws, successes: Draws, *, memory: float) -> SceneOutcomes:
     """The table after what happened in worlds of these scenes, where what was known before counts `memory` times as much."""
     driven = episodes > 0
     rows, place = np.unique(scenes[driven], return_inverse=True)
@@ -57,7 +57,7 @@ def learnt(table: Table, scenes: Draws, episodes: Draws, successes: Draws, *, me
     return replace(table, **found)
 
 
-def shuffled(table: Table, count: int, *, seed: int) -> Draws:
+def shuffled(table: SceneOutcomes, count: int, *, seed: int) -> Draws:
     """Every scene once an epoch, in a new order each; endlessly many one after another."""
     before, scenes = int(table.draws.sum()), len(table.draws)
     if table.endless:
@@ -67,7 +67,7 @@ def shuffled(table: Table, count: int, *, seed: int) -> Draws:
     return order[before % scenes :][:count]
 
 
-def failing(table: Table, count: int, *, seed: int, floor: float) -> Draws:
+def prioritize_failures(table: SceneOutcomes, count: int, *, seed: int, floor: float) -> Draws:
     """Scenes in which agents fail come more often, and all scenes come again and again.
 
     A share `floor` of the draws are the scenes drawn least often so far (of endlessly many: new ones), in random order: nobody starves. The
@@ -92,5 +92,5 @@ def failing(table: Table, count: int, *, seed: int, floor: float) -> Draws:
     if table.endless:
         return np.concatenate([chosen, np.arange(len(table.draws), len(table.draws) + rest)])
     order = rng.permutation(len(table.draws))
-    order = order[np.argsort(drawn(table, chosen).draws[order], kind="stable")]
+    order = order[np.argsort(count_draws(table, chosen).draws[order], kind="stable")]
     return np.concatenate([chosen, np.resize(order, rest)])

@@ -13,9 +13,9 @@ from jax.sharding import Mesh
 
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, Reject
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import bank_reader
@@ -42,7 +42,7 @@ class Scenes:
         return jax.tree.map(lambda leaf: leaf[index], self.scene)
 
 
-def training(config: Mapping[str, Any]) -> Scenes:
+def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
     """The scenes to train on: `scenes.path`, or the generator's; of these, what `scenes.take` leaves.
 
     Raises:
@@ -50,17 +50,17 @@ def training(config: Mapping[str, Any]) -> Scenes:
         SceneError: nothing usable at the path, with the reasons.
     """
     schema.check_scenes(config)
-    return taken(everything(config), config)
+    return take_scenes(load_all_scenes(config), config)
 
 
-def everything(config: Mapping[str, Any]) -> Scenes:
+def load_all_scenes(config: Mapping[str, Any]) -> Scenes:
     """The scenes that `scenes.take` takes from."""
     if config["path"] is not None:
         return from_path(config, config["path"])
-    return generated(config, seed=config["seed"], count=config["count"])
+    return generate_scenes(config, seed=config["seed"], count=config["count"])
 
 
-def taken(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
+def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     """`scenes.take.count` scenes at random, in the order in which they lie: of one seed, fewer are always a part of more.
 
     Raises:
@@ -79,7 +79,7 @@ def taken(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     return Scenes(scene, tuple(scenes.names[index] for index in chosen), account)
 
 
-def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
+def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scenes:
     """Scenes that training never saw: those at `path`, or what the config's `scenes.heldout` names.
 
     Raises:
@@ -93,7 +93,7 @@ def heldout(config: Mapping[str, Any], *, path: str | None) -> Scenes:
     if config["path"] is not None or not _has_generator(config):
         raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
     check_heldout(config)
-    return generated(config, seed=config["heldout"]["seed"], count=config["heldout"]["count"])
+    return generate_scenes(config, seed=config["heldout"]["seed"], count=config["heldout"]["count"])
 
 
 def check_heldout(config: Mapping[str, Any]) -> None:
@@ -138,8 +138,8 @@ def from_path(config: Mapping[str, Any], path: str | Path) -> Scenes:
 def _from_bank(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[Packed], conversion.Summary]:
     """Everything of a bank that can be packed, and the account of that."""
     opened = bank_reader.open(path)
-    parts = {name: part for name, part in readers(config).items() if name != "formats"}
-    found = bank_reader.packed(opened, range(len(opened)), **parts, workers=config["workers"])
+    parts = {name: part for name, part in make_readers(config).items() if name != "formats"}
+    found = bank_reader.pack_scenes(opened, range(len(opened)), **parts, workers=config["workers"])
     sources = opened.metadata["source"].to_pylist()
     refused = [one._asdict() | {"source": place} for one, place in zip(found, sources, strict=True) if isinstance(one, Reject)]
     packed = [one for one in found if isinstance(one, Packed)]
@@ -149,20 +149,20 @@ def _from_bank(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[P
 
 def _from_files(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[Packed], conversion.Summary]:
     """Everything in a file or folder that can be packed, and the account of that."""
-    packed, summary = conversion.read(path, **readers(config), workers=config["workers"])
+    packed, summary = conversion.read(path, **make_readers(config), workers=config["workers"])
     return f"scenes {path}", packed, summary
 
 
-def generated(config: Mapping[str, Any], *, seed: int, count: int) -> Scenes:
+def generate_scenes(config: Mapping[str, Any], *, seed: int, count: int) -> Scenes:
     """Scenes from the generator, checked and packed like any others."""
-    generate = generator(config)
-    parts = readers(config)
+    generate = make_generator(config)
+    parts = make_readers(config)
     packed = [prepare(generate(seed, index), check=parts["check"], pack=parts["pack"]) for index in range(count)]
     agents = sum(scene.report.agents_kept for scene in packed)
     return _stacked(packed, config, [f"{count} generated scenes with {agents} agents, seed {seed}"])
 
 
-def generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
+def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
     """The generator of a scenes config, bound to its numbers: (seed, index) -> scene.
 
     Raises:
@@ -170,19 +170,19 @@ def generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
     """
     if not _has_generator(config):
         raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
-    return build(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
+    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
 
 
-def readers(config: Mapping[str, Any]) -> dict[str, Any]:
+def make_readers(config: Mapping[str, Any]) -> dict[str, Any]:
     """Formats, check and pack of a scenes config, bound to their numbers."""
     return {
         "formats": reader_selection.make(config["formats"]),
-        "check": build(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check"),
-        "pack": build(config["pack"], builtins="scenefactory_jax.data.packing.pack", where="scenes.pack"),
+        "check": instantiate(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check"),
+        "pack": instantiate(config["pack"], builtins="scenefactory_jax.data.packing.pack", where="scenes.pack"),
     }
 
 
-def assign(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
+def assign_scenes(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
     """One scene for each world: the whole list shuffled, again and again (SceneFactory's); on the device, or shared out on several.
 
     Returns:
@@ -200,7 +200,7 @@ def assign(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) 
     spawned = int(np.asarray(scenes.scene.agents.present)[chosen].sum())
     unused = f"; {np.sum(counts == 0)} scenes are not used: raise worlds" if (counts == 0).any() else ""
     text = f"{worlds} worlds of {len(scenes)} scenes, {counts.min()} to {counts.max()} worlds a scene, {spawned} logged agents{unused}"
-    return sharding.place(jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene), mesh), text
+    return sharding.place_on_devices(jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene), mesh), text
 
 
 def use_compilation_cache() -> None:
@@ -213,10 +213,12 @@ def use_compilation_cache() -> None:
 
 def _stacked(packed: Sequence[Packed], config: Mapping[str, Any], lines: list[str]) -> Scenes:
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
-    return Scenes(with_cells(scene, config), tuple(for_terminal(one.report.name) for one in packed), "\n".join([*lines, *describe(cuts)]))
+    return Scenes(
+        attach_grids(scene, config), tuple(escape_for_terminal(one.report.name) for one in packed), "\n".join([*lines, *describe(cuts)])
+    )
 
 
-def with_cells(scene: Scene, config: Mapping[str, Any]) -> Scene:
+def attach_grids(scene: Scene, config: Mapping[str, Any]) -> Scene:
     """Stacked scenes with cells for the radius of the road observation, if a config has one."""
     numbers = config["cells"]
-    return scene if numbers["radius_m"] is None else spatial_grid.attach(scene, **numbers)
+    return scene if numbers["radius_m"] is None else spatial_grid.attach_grid(scene, **numbers)

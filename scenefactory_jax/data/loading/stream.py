@@ -27,9 +27,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number, check_share
+from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, instantiate
 from scenefactory_jax.core.parallel import process_pool
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
 from scenefactory_jax.data.loading.batches import Batch
@@ -37,7 +37,7 @@ from scenefactory_jax.data.loading.batches import Batch
 SHOWN = 10  # scenes left out that are told by name
 
 
-class Numbers(NamedTuple):
+class StreamSettings(NamedTuple):
     """A `stream` entry of a config, checked; see conf/stream/base.yaml."""
 
     sampler: samplers.Sampler
@@ -53,7 +53,7 @@ class Numbers(NamedTuple):
     capacity: Mapping[str, int | None]
 
 
-def numbers(
+def make_settings(
     *,
     sampler: dict,
     share: float,
@@ -69,7 +69,7 @@ def numbers(
     seed: int,
     worlds: int,
     devices: int,
-) -> Numbers:
+) -> StreamSettings:
     """Check a `stream` entry.
 
     Raises:
@@ -80,30 +80,30 @@ def numbers(
         if value < bound:
             raise ConfigError(f"stream.{name}: {value}; wanted is at least {bound}")
     for name, value in {"share": share, "memory": memory}.items():
-        check_share(value, where=f"stream.{name}")
+        check_fraction(value, where=f"stream.{name}")
     for name, value in {"wait_s": wait_s, "memory_gib": memory_gib}.items():
         check_number(value, where=f"stream.{name}", above=0)
     if worlds % devices:
         raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
     swapped = min(worlds, int(np.ceil(share * worlds / devices)) * devices)  # every device takes an equal part of the rows
-    draw = build(sampler, builtins=samplers, where="stream.sampler", seed=seed)
-    return Numbers(draw, swapped, ahead, workers, wait_s, memory, excess, sample, headroom, memory_gib, capacity)
+    draw = instantiate(sampler, builtins=samplers, where="stream.sampler", seed=seed)
+    return StreamSettings(draw, swapped, ahead, workers, wait_s, memory, excess, sample, headroom, memory_gib, capacity)
 
 
-class Placed(NamedTuple):
+class PlacedScenes(NamedTuple):
     """A batch on its way to the devices."""
 
     batch: Batch
     scenes: Scene
 
 
-class Flow:
+class SceneStream:
     """Scenes on their way into worlds, and what is known of them. Made by `flowing`."""
 
-    def __init__(self, source: batches.Source, entry: Numbers, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
+    def __init__(self, source: batches.Source, entry: StreamSettings, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
         """`held` is what `state` told, or `_new`."""
         self._source, self._entry, self._load = source, entry, load
-        self._table = samplers.Table(
+        self._table = samplers.SceneOutcomes(
             np.asarray(held["draws"], int), np.asarray(held["episodes"], float), np.asarray(held["successes"], float), source.count is None
         )
         self._sizes, self._exchanges, self._counts = dict(held["sizes"]), held["exchanges"], dict(held["counts"])
@@ -136,7 +136,7 @@ class Flow:
         _, future = self._waiting[0]
         taken = self._take(future)
         self._waiting.popleft()
-        self._table = samplers.learnt(self._table, self._placed[worlds], *self._record[:, worlds], memory=self._entry.memory)
+        self._table = samplers.update_outcomes(self._table, self._placed[worlds], *self._record[:, worlds], memory=self._entry.memory)
         self._placed[worlds], self._record[:, worlds] = taken.batch.indices, 0
         self._exchanges += 1
         return swap(state, scenes, worlds, taken.scenes)
@@ -169,20 +169,20 @@ class Flow:
 
     def _drawn(self, count: int) -> np.ndarray:
         """The sampler's next scenes; it sees the worlds that are running, too."""
-        table = samplers.learnt(self._table, self._placed, *self._record, memory=self._entry.memory)
+        table = samplers.update_outcomes(self._table, self._placed, *self._record, memory=self._entry.memory)
         indices = np.asarray(self._entry.sampler(table, count))
         last = None if self._source.count is None else self._source.count - 1
         wrong = indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any()
         if wrong or (last is not None and (indices > last).any()):
             raise ConfigError(f"stream.sampler: it drew {indices!r}; wanted are {count} whole numbers from 0 to {last or 'anywhere'}")
-        self._table = samplers.drawn(self._table, indices)
+        self._table = samplers.count_draws(self._table, indices)
         return indices
 
-    def _take(self, future: Future) -> Placed:
+    def _take(self, future: Future) -> PlacedScenes:
         """What was loaded, and the account of it."""
         begun = time.monotonic()
         try:
-            taken: Placed = future.result(timeout=self._entry.wait_s)
+            taken: PlacedScenes = future.result(timeout=self._entry.wait_s)
         except Late:
             wait = f"stream.wait_s: no scenes after {self._entry.wait_s:g} s"
             raise RuntimeError(f"{wait} from {self._source.line}; raise it, or stream.workers") from None
@@ -192,7 +192,7 @@ class Flow:
         for name, reason in taken.batch.refused.items():
             if name not in self._told and len(self._told) < SHOWN:
                 self._told.add(name)
-                print(for_terminal(f"left out {name}: {reason}"), flush=True)
+                print(escape_for_terminal(f"left out {name}: {reason}"), flush=True)
         return taken
 
 
@@ -212,7 +212,7 @@ def _new(source: batches.Source, sizes: Mapping[str, int], worlds: int) -> dict[
 
 
 @contextlib.contextmanager
-def flowing(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[Flow]:
+def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[SceneStream]:
     """The stream of a config, from its beginning or from a `state` of before; its threads and processes end with the context.
 
     Raises:
@@ -222,28 +222,28 @@ def flowing(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str
     source = batches.open(config["scenes"])
     devices = 1 if mesh is None else mesh.size
     context = {"seed": config["seed"], "worlds": config["worlds"], "devices": devices}
-    entry: Numbers = build({"_target_": "numbers", **config["stream"]}, builtins=__name__, where="stream", **context)()
+    entry: StreamSettings = instantiate({"_target_": "make_settings", **config["stream"]}, builtins=__name__, where="stream", **context)()
     if before is not None and before["source"] != source.count:
         raise ConfigError(f"resume=true: the run streamed {before['source']} scenes; there are {source.line} now")
     grid = config["scenes"]["cells"]
     with contextlib.ExitStack() as stack:
         thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
         stack.callback(thread.shutdown, wait=True, cancel_futures=True)
-        pool = stack.enter_context(process_pool.pool(entry.processes)) if entry.processes else None
+        pool = stack.enter_context(process_pool.open_pool(entry.processes)) if entry.processes else None
         if before is None:
             asked = {"sample": entry.sample, "headroom": entry.headroom, "given": entry.capacity, "seed": config["seed"]}
             sizes = batches.measure(source, pool, grid=grid, **asked)
         else:
             sizes = before["sizes"]
         batches.require_memory(sizes, config["worlds"] + entry.ahead * entry.swapped, gib=entry.memory_gib)
-        read = functools.partial(batches.load, source, pool, fit=batches.Fit(sizes, grid, entry.excess))
+        read = functools.partial(batches.load, source, pool, fit=batches.BoxSizes(sizes, grid, entry.excess))
 
-        def placed(indices: np.ndarray) -> Placed:
+        def placed(indices: np.ndarray) -> PlacedScenes:
             batch = read(indices)
-            return Placed(batch, jax.block_until_ready(sharding.place(batch.scene, mesh)))
+            return PlacedScenes(batch, jax.block_until_ready(sharding.place_on_devices(batch.scene, mesh)))
 
         held = _new(source, sizes, config["worlds"]) if before is None else before
-        flow = Flow(source, entry, lambda indices: thread.submit(placed, indices), held)
+        flow = SceneStream(source, entry, lambda indices: thread.submit(placed, indices), held)
         what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
         print(f"stream of {source.line}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}", flush=True)
         yield flow

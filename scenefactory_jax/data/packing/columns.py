@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Cells, Patches, Rain, Road, Scene
+from scenefactory_jax.core.types import DRIVABLE, EDGES, Boxes, Patches, Rain, Road, Scene, SpatialGrid
 
 T = TypeVar("T")
 
 ROADS = ("road", "lanes", "edges")
 DRAWN = (Patches, Rain, Boxes)  # parts of a scene that resets make: no file holds them, packed scenes have none of them
-DERIVED = Cells | None  # made of the other columns where it is wanted
+DERIVED = SpatialGrid | None  # made of the other columns where it is wanted
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 
 
@@ -50,7 +50,7 @@ def _dtype(annotation: Any) -> np.dtype:
 COLUMNS: dict[str, Column] = _describe(Scene)
 
 
-def assemble(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> T:
+def assemble_columns(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "") -> T:
     """The struct whose leaves have these dotted names; they stay numpy's until a program asks for them."""
     found: dict[str, Any] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
@@ -60,7 +60,7 @@ def assemble(kind: type[T], columns: Mapping[str, np.ndarray], prefix: str = "")
         elif entry.type in DRAWN:
             leaf = _nothing(entry.type, columns["log.dt"].shape)
         elif dataclasses.is_dataclass(entry.type):
-            leaf = assemble(entry.type, columns, f"{name}.")  # pyright: ignore[reportArgumentType]
+            leaf = assemble_columns(entry.type, columns, f"{name}.")  # pyright: ignore[reportArgumentType]
         else:
             leaf = columns[name]
         found[entry.name] = leaf

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.instantiate import ConfigError, check_number
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Unpackable
-from scenefactory_jax.core.scene_arrays import Logs, joined, lengths, stacked, wrapped
+from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths, stack_tracks, wrap_angles
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns
@@ -106,7 +106,7 @@ def pack(
     (origin, centred_on), half = _centre(raw, centre), box_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
-    logs = _around(stacked(raw.tracks, len(raw.times)), origin)
+    logs = _around(stack_tracks(raw.tracks, len(raw.times)), origin)
     chosen, dropped = _choose(raw, logs, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
         raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped)}")
@@ -136,7 +136,7 @@ def pack(
 
 def _scene(leaves: dict[str, np.ndarray]) -> Scene:
     """The struct of these columns, in their types."""
-    return columns.assemble(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
+    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
 
 
 def _check(box_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:
@@ -180,7 +180,7 @@ def _segments(
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
-    xyz, bounds = joined([_outlined(raw.roads[i], outline_m) for i in order])
+    xyz, bounds = join_lines([_outlined(raw.roads[i], outline_m) for i in order])
     kind = np.array([raw.roads[i].kind for i in order], int)
     x, y = xyz[:, 0] - origin[0], xyz[:, 1] - origin[1]
     along_x, along_y = np.diff(x), np.diff(y)
@@ -249,7 +249,7 @@ def _choose(
     rows = np.flatnonzero(candidates)
     rows = rows[np.argsort(np.hypot(*start[rows].T), kind="stable")]
     size = np.tile(car_size_m, (len(rows), 1)) if car_size_m else logs.size[rows, :2]
-    boxes = corners(start[rows], logs.yaw[rows, current], size[:, 0], size[:, 1])
+    boxes = box_corners(start[rows], logs.yaw[rows, current], size[:, 0], size[:, 1])
     near = _near(start[rows], size, start[rows], size)
     kept: list[int] = []
     for candidate in range(len(rows)):
@@ -267,11 +267,11 @@ def _near(
     one: Float[np.ndarray, "N 2"], size: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], others_size: Float[np.ndarray, "M 2"]
 ) -> Bool[np.ndarray, "N M"]:
     """Whether the circles around boxes touch: boxes apart from that need no test."""
-    reach = lengths(size)[:, None] / 2 + lengths(others_size) / 2
-    return lengths(one[:, None] - other) <= reach + DEGENERATE_M
+    reach = segment_lengths(size)[:, None] / 2 + segment_lengths(others_size) / 2
+    return segment_lengths(one[:, None] - other) <= reach + DEGENERATE_M
 
 
-def corners(
+def box_corners(
     centre: Float[np.ndarray, "*N 2"],
     yaw: float | Float[np.ndarray, "*N"],
     length: float | Float[np.ndarray, "*N"],
@@ -307,9 +307,9 @@ def _agents(
         path = logs.xyz[index, current:][logs.valid[index, current:], :2]
         yaw = logs.yaw[index, current]
         along = float(logs.velocity[index, current] @ np.array([np.cos(yaw), np.sin(yaw)]))
-        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrapped(yaw)
+        rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
-        rows["route"][slot] = max(lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
+        rows["route"][slot] = max(segment_lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(chosen)
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 
@@ -326,7 +326,7 @@ def _recording(chosen: list[int], logs: Logs, first: int, slots: int) -> dict[st
     rows = {
         "position": np.where(valid[..., None], logs.xyz[chosen, first:, :2], 0.0),
         "velocity": np.where(valid[..., None], logs.velocity[chosen, first:], 0.0),
-        "yaw": np.where(valid, wrapped(logs.yaw[chosen, first:]), 0.0),
+        "yaw": np.where(valid, wrap_angles(logs.yaw[chosen, first:]), 0.0),
         "valid": valid,
     }
     return {name: np.concatenate([leaf, np.zeros((slots - len(chosen), *leaf.shape[1:]), leaf.dtype)]) for name, leaf in rows.items()}
@@ -340,7 +340,7 @@ def _choose_others(
     Whose box overlaps an agent's at the start is left out: the two would burst apart.
     """
     place, yaw, size = (leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size"))
-    boxes, starts = corners(place, yaw, size[:, 0], size[:, 1]), place if len(place) else np.zeros((1, 2))
+    boxes, starts = box_corners(place, yaw, size[:, 0], size[:, 1]), place if len(place) else np.zeros((1, 2))
     rest = np.setdiff1d(np.arange(len(logs.valid)), agents)
     now, path = logs.valid[rest, current:], logs.xyz[rest, current:, :2]
     inside = now & (np.abs(path) <= half).all(axis=2)
@@ -349,7 +349,7 @@ def _choose_others(
     touching = np.zeros(len(rest), bool)
     near = _near(path[:, 0], own, place, size) & (now[:, 0] & ~outside)[:, None]
     for row in np.flatnonzero(near.any(axis=1)).tolist():
-        box = corners(path[row, 0], logs.yaw[rest[row], current], own[row, 0], own[row, 1])
+        box = box_corners(path[row, 0], logs.yaw[rest[row], current], own[row, 0], own[row, 1])
         touching[row] = overlaps(box, boxes[near[row]]).any()
     kept = np.flatnonzero(~outside & ~touching)
     aside, ahead = (path[kept, :, axis, None] - starts[:, axis] for axis in (0, 1))

@@ -17,7 +17,7 @@ Leaves = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Cut:
+class CutCounts:
     """What one world lost to a capacity."""
 
     world: int
@@ -33,7 +33,7 @@ class CutReport:
 
     worlds: int
     capacity: dict[str, int]
-    cuts: tuple[Cut, ...]
+    cuts: tuple[CutCounts, ...]
 
 
 def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tuple[Scene, CutReport]:
@@ -55,10 +55,10 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
         raise SceneError("no scenes to stack; give at least one")
     worlds = [_compact(columns.flatten(scene)) for scene in scenes]
     sizes = _resolve(worlds, capacity)
-    cuts: list[Cut] = []
+    cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
     stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}
-    return columns.assemble(Scene, stacked), CutReport(len(scenes), sizes, tuple(cuts))
+    return columns.assemble_columns(Scene, stacked), CutReport(len(scenes), sizes, tuple(cuts))
 
 
 def describe(report: CutReport) -> list[str]:
@@ -110,39 +110,39 @@ def _resolve(worlds: Sequence[Leaves], capacity: Mapping[str, int | None]) -> di
     return sizes
 
 
-def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[Cut]) -> Leaves:
+def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCounts]) -> Leaves:
     """One world with exactly these rows."""
     world = _fit_agents(world, sizes["agents"], index, cuts)
     world = _fit_steps(world, sizes["steps"], index, cuts)
     if (had := _count(world, "others")) > sizes["others"]:
-        cuts.append(Cut(index, "others", had, sizes["others"], None))
+        cuts.append(CutCounts(index, "others", had, sizes["others"], None))
         world = _rows(world, "others", np.arange(sizes["others"]))
     for part in columns.ROADS:
         had = _count(world, part)
         if had > sizes[part]:
             kept, nearest = _nearest(world, part, sizes[part])
-            cuts.append(Cut(index, part, had, sizes[part], nearest))
+            cuts.append(CutCounts(index, part, had, sizes[part], nearest))
             world = world | {name: leaf[kept] for name, leaf in world.items() if name.startswith(f"{part}.")}
     return {name: _pad(name, leaf, sizes) for name, leaf in world.items()}
 
 
-def _fit_agents(world: Leaves, slots: int, index: int, cuts: list[Cut]) -> Leaves:
+def _fit_agents(world: Leaves, slots: int, index: int, cuts: list[CutCounts]) -> Leaves:
     """Cut slots: absent agents first, then the last present ones."""
     present = world["agents.present"]
     if len(present) <= slots:
         return world
     kept = np.sort(np.argsort(~present, kind="stable")[:slots])
     if present.sum() > slots:
-        cuts.append(Cut(index, "agents", int(present.sum()), slots, None))
+        cuts.append(CutCounts(index, "agents", int(present.sum()), slots, None))
     return _rows(world, "agents", kept)
 
 
-def _fit_steps(world: Leaves, steps: int, index: int, cuts: list[Cut]) -> Leaves:
+def _fit_steps(world: Leaves, steps: int, index: int, cuts: list[CutCounts]) -> Leaves:
     """Cut the last steps of the log."""
     had = _count(world, "steps")
     if had <= steps:
         return world
-    cuts.append(Cut(index, "steps", had, steps, None))
+    cuts.append(CutCounts(index, "steps", had, steps, None))
     return world | {name: world[name][:, :steps] for name, column in columns.COLUMNS.items() if column.axes[1:2] == ("steps",)}
 
 

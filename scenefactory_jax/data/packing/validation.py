@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import Logs, Points, grid, joined, lengths, sampled, stacked
+from scenefactory_jax.core.scene_arrays import Logs, Points, grid, join_lines, sample_tracks, segment_lengths, stack_tracks
 from scenefactory_jax.core.types import DRIVABLE, STOP_SIGN
 
 DUPLICATE_M = 1e-6  # points closer than this in the plane give no segment
@@ -52,7 +52,7 @@ def check(
         SceneError: steps that disagree, no driving lane, or a number that is not finite or beyond a bound, naming the file and the element.
     """
     _require_steps(raw, steps_most, step_s)
-    points, logs = joined(raw.roads), stacked(raw.tracks, len(raw.times))
+    points, logs = join_lines(raw.roads), stack_tracks(raw.tracks, len(raw.times))
     _require_map(raw, points, most_m)
     _require_lengths(raw, points, segment_most_m, lanes_most_m)
     _require_tracks(raw, logs, {"xyz": (most_m, "most_m"), "yaw": (most_m, "most_m"), "velocity": (speed_most_m_s, "speed_most_m_s")})
@@ -162,7 +162,7 @@ def _even_steps(raw: RawScene, logs: Logs, share: Sequence[float], lines: list[s
     if not share[0] < off.max(initial=0.0) <= share[1]:
         return raw, logs
     times, current = grid(raw.times, raw.current, step_s=usual, near=share[0])
-    even = sampled(logs, raw.times, times, near=share[0])
+    even = sample_tracks(logs, raw.times, times, near=share[0])
     tracks = tuple(
         replace(track, xyz=even.xyz[row], yaw=even.yaw[row], velocity=even.velocity[row], valid=even.valid[row])
         for row, track in enumerate(raw.tracks)
@@ -186,7 +186,7 @@ def _repair_roads(roads: tuple[Polyline, ...], points: Points, lines: list[str])
     """Without duplicate points, and without lines of fewer than two points, stop signs excepted."""
     bounds = points.bounds
     different = np.ones(len(points.xyz), bool)
-    different[1:] = lengths(np.diff(points.xyz[:, :2], axis=0)) > DUPLICATE_M
+    different[1:] = segment_lengths(np.diff(points.xyz[:, :2], axis=0)) > DUPLICATE_M
     different[bounds[:-1][np.diff(bounds) > 0]] = True  # each line's first point
     running = np.concatenate([[0], np.cumsum(different)])
     counts = np.diff(running[bounds])
@@ -236,7 +236,7 @@ def _report_jumps(raw: RawScene, logs: Logs, limit_m_s: float, lines: list[str])
     """Tracks whose positions imply more than the limit between two neighbouring valid steps."""
     pairs = logs.valid[:, 1:] & logs.valid[:, :-1]
     with np.errstate(invalid="ignore", over="ignore"):  # of values at invalid steps
-        speed = lengths(np.diff(logs.xyz[..., :2], axis=1)) / np.diff(raw.times)
+        speed = segment_lengths(np.diff(logs.xyz[..., :2], axis=1)) / np.diff(raw.times)
     jumps = (pairs & (speed > limit_m_s)).sum(axis=1)
     if jumps.any():
         ids = [raw.tracks[index].id for index in np.flatnonzero(jumps)]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.dynamics.articulated import equations_of_motion
 from scenefactory_jax.dynamics.articulated.equations_of_motion import FRONT, Forces
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FADES, LATENT_FRICTION, LEFT, ROLLS_BACK, CarParameters
-from scenefactory_jax.dynamics.articulated.state import State
+from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, length, wheels
 
 
@@ -26,7 +26,7 @@ class Command(NamedTuple):
     torque: Float[Array, ""]  # of it, about the box's centre
 
 
-class Load(NamedTuple):
+class PhysicsStepInput(NamedTuple):
     """What a physics step is told of one car besides its state."""
 
     force: Forces
@@ -35,7 +35,7 @@ class Load(NamedTuple):
     slip_damping: Number
 
 
-def wanted(car: CarParameters, action: Float[Array, "A 3"]) -> tuple[Float[Array, " A"], Float[Array, " A"], Float[Array, "A 4"]]:
+def decode_action(car: CarParameters, action: Float[Array, "A 3"]) -> tuple[Float[Array, " A"], Float[Array, " A"], Float[Array, "A 4"]]:
     """Throttle, steer and brake in [-1, 1] as steering angle, torque of a driven wheel, and largest torque of each brake."""
     throttle, steer, brake = jnp.clip(action, -1.0, 1.0).T
     brake = jnp.maximum(brake, 0.0)
@@ -43,7 +43,7 @@ def wanted(car: CarParameters, action: Float[Array, "A 3"]) -> tuple[Float[Array
     return car.steering_limit * steer, car.drive_torque * jnp.maximum(throttle, 0.0), jnp.stack([front, front, rear, rear], axis=-1)
 
 
-def applied(car: CarParameters, state: State, command: Command, wheel_torque: Float[Array, "4"]) -> Forces:
+def make_step_input(car: CarParameters, state: CarState, command: Command, wheel_torque: Float[Array, "4"]) -> Forces:
     """All forces on one car that MuJoCo's model of it does not know.
 
     Args:
@@ -59,16 +59,20 @@ def applied(car: CarParameters, state: State, command: Command, wheel_torque: Fl
     others = state.east * command.force[0] + state.north * command.force[1]
     # the chassis' joint is at the box's centre. What slows the car acts at the centre of mass; others push at its height, and where along
     # the box is in their torque already
-    torque = state.up * command.torque + cross(Vector(0.0, 0.0, car.mass_height), others) + cross(equations_of_motion.centre(car), slowing)
+    torque = (
+        state.up * command.torque
+        + cross(Vector(0.0, 0.0, car.mass_height), others)
+        + cross(equations_of_motion.centre_of_mass(car), slowing)
+    )
     torque = torque + Vector(0.0, 0.0, -car.yaw_damping * state.rate.z)
-    ground, ground_torque = scrape(car, state)
+    ground, ground_torque = compute_body_ground_force(car, state)
     return Forces(slowing + others + ground, torque + ground_torque, suspension=stop, spin=wheel_torque, steer=FRONT * servo)
 
 
-def springs(car: CarParameters, state: State) -> Forces:
+def compute_suspension_forces(car: CarParameters, state: CarState) -> Forces:
     """Springs and dampers of the joints, which MuJoCo's model has of its own."""
     none = Vector(0.0, 0.0, 0.0)
-    carried = equations_of_motion.load(car) * car.suspension_preload  # at mid travel
+    carried = equations_of_motion.compute_loads(car) * car.suspension_preload  # at mid travel
     return Forces(
         none,
         none,
@@ -78,13 +82,15 @@ def springs(car: CarParameters, state: State) -> Forces:
     )
 
 
-def pulling(car: CarParameters, drive: Float[Array, ""], spin: Float[Array, "4"]) -> Float[Array, "4"]:
+def compute_drive_torque(car: CarParameters, drive: Float[Array, ""], spin: Float[Array, "4"]) -> Float[Array, "4"]:
     """Torque of the engine on each wheel, N m: on the front ones, less from 0.9 of `spin_limit` on. So a wheel in the air stays finite."""
     left = jnp.clip((car.spin_limit - spin) / (FADES * car.spin_limit), 0.0, 1.0)
     return drive * left * FRONT
 
 
-def held(engine: Float[Array, "4"], friction: Float[Array, "4"], spin: Float[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+def compute_net_wheel_torque(
+    engine: Float[Array, "4"], friction: Float[Array, "4"], spin: Float[Array, "4"]
+) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
     """Torque and dry friction of each wheel, N m, with what one takes of the other taken off.
 
     A wheel that turns forward moves by engine - friction: the same whichever way it is written. But MuJoCo's dry friction is soft: a joint
@@ -95,7 +101,7 @@ def held(engine: Float[Array, "4"], friction: Float[Array, "4"], spin: Float[Arr
     return engine - taken, jnp.maximum(friction - taken, LATENT_FRICTION)
 
 
-def scrape(car: CarParameters, state: State) -> tuple[Vector, Vector]:
+def compute_body_ground_force(car: CarParameters, state: CarState) -> tuple[Vector, Vector]:
     """Force and torque about the box's centre of the ground on the chassis' corners.
 
     A car on its wheels never touches; one that rolls over comes to lie on springs and dampers instead of sinking through the road.
@@ -116,7 +122,7 @@ def scrape(car: CarParameters, state: State) -> tuple[Vector, Vector]:
     return total, turn
 
 
-def slip_damping(car: CarParameters, state: State) -> Number:
+def compute_slip_damping(car: CarParameters, state: CarState) -> Number:
     """Damping of the tyres' friction reference at the car's speed, 1/s: `tyre_slip_damping` up to `tyre_slip_speed`, then as 1/speed.
 
     MuJoCo's friction below the cone obeys R f = b u - a: u the slip velocity, b = damping / impedance, R the contact's regularisation and

@@ -12,23 +12,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import heading, norm
-from scenefactory_jax.core.instantiate import ConfigError, build
-from scenefactory_jax.core.pytree import choose, replace, struct
+from scenefactory_jax.core.geometry import heading_vector, safe_norm
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated import closed_form_step, equations_of_motion, mjx_backend
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated import randomization as fleets
 from scenefactory_jax.dynamics.articulated import state as states
-from scenefactory_jax.dynamics.articulated.actuators import Command, Load, applied, held, pulling, slip_damping, wanted
-from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, Places, Solver
-from scenefactory_jax.dynamics.articulated.randomization import Fleet, enlist, standing
+from scenefactory_jax.dynamics.articulated.actuators import (
+    Command,
+    PhysicsStepInput,
+    compute_drive_torque,
+    compute_net_wheel_torque,
+    compute_slip_damping,
+    decode_action,
+    make_step_input,
+)
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, ModelAddresses, Solver
+from scenefactory_jax.dynamics.articulated.randomization import CarConstants, derive_constants, place_at_rest
 from scenefactory_jax.dynamics.articulated.tyres import Tyres
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
-from scenefactory_jax.dynamics.collision import Contact, boxes_of, later
+from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
 
 
-@struct
+@pytree_dataclass
 class Body:
     """Cars of one world; every leaf has the agent axis first."""
 
@@ -38,16 +46,16 @@ class Body:
     spin_sign: Float[Array, "A 4"]  # last direction of each wheel; only latched brakes read it
     contact_force: Float[Array, " A"]
     tyres: Tyres
-    fleet: Fleet | None  # cars that differ
+    fleet: CarConstants | None  # cars that differ
 
 
-class Plant(NamedTuple):
+class CompiledCar(NamedTuple):
     """The compiled car and all that is constant about it."""
 
-    own: Fleet  # of one: the reference car
+    own: CarConstants  # of one: the reference car
     vary: Callable[..., CarParameters] | None  # (key, scene) -> the cars of an episode
     stages: mjx_backend.Stages | None  # of MJX, where its solvers are asked for
-    places: Places
+    places: ModelAddresses
     latched: bool
     solver: Solver
     still: np.ndarray  # qpos of the reference car at rest
@@ -55,7 +63,7 @@ class Plant(NamedTuple):
     substeps: int
 
 
-class Single(NamedTuple):
+class CarCarry(NamedTuple):
     """What is carried of one car from step to step, in MuJoCo's order."""
 
     qpos: Float[Array, "17"]
@@ -91,18 +99,18 @@ def make(
     Raises:
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
-    parameters, settings = cars.numbers({"car": car, "solver": solver})
-    plant = compiled(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
+    parameters, settings = cars.read_parameters({"car": car, "solver": solver})
+    plant = compile_car(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
     entry, numbers = {**contact, "_target_": "make"}, {"height": parameters.height, "physics_dt": physics_dt}
-    meet: Contact = build(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", **numbers)()
+    meet: Contact = instantiate(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", **numbers)()
     context = {"car": parameters, "physics_dt": physics_dt}
-    vary = None if fleet is None else build(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)()
-    return bind(plant._replace(vary=vary), meet, grip)
+    vary = None if fleet is None else instantiate(fleet, builtins=fleets.__name__, where="dynamics.fleet", **context)()
+    return make_dynamics(plant._replace(vary=vary), meet, grip)
 
 
-def compiled(
+def compile_car(
     car: CarParameters, solver: Solver, *, brakes: Literal["friction", "latched"], physics_dt: float, control_dt: float
-) -> Plant:  # fmt: skip
+) -> CompiledCar:  # fmt: skip
     """The car with all that is derived of it; all cars are this one until `vary` says otherwise.
 
     Raises:
@@ -118,23 +126,23 @@ def compiled(
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt {control_dt} is not a whole multiple of physics_dt {physics_dt}")
-    model = cars.standalone(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
-    at = cars.places(model)
+    model = cars.build_standalone_model(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
+    at = cars.find_addresses(model)
     weights = (model.dof_invweight0[at.spin_v], model.body_invweight0[at.wheel, 0])
-    return Plant(
-        own=Fleet(car, *(jnp.asarray(weight, jnp.float32) for weight in weights)),
+    return CompiledCar(
+        own=CarConstants(car, *(jnp.asarray(weight, jnp.float32) for weight in weights)),
         vary=None,
-        stages=None if solver.algorithm == "arrow" else mjx_backend.compiled(model),
+        stages=None if solver.algorithm == "arrow" else mjx_backend.compile_stages(model),
         places=at,
         latched=brakes == "latched",
         solver=solver,
-        still=cars.rest(model, car),
+        still=cars.find_rest_pose(model, car),
         physics_dt=physics_dt,
         substeps=substeps,
     )
 
 
-def bind(plant: Plant, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
+def make_dynamics(plant: CompiledCar, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
     """The backend of a compiled car, on a road that `grip` tells."""
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
@@ -144,19 +152,19 @@ def bind(plant: Plant, meet: Contact, grip: Callable[..., Any]) -> Dynamics:
     return Dynamics(init=functools.partial(start, plant), advance=advance, read=functools.partial(read, plant))
 
 
-def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
+def start(plant: CompiledCar, key: PRNGKeyArray, scene: Scene) -> Body:
     """Cars at their starts: at ride height, wheels turning as fast as the road passes under them."""
     agents, at = scene.agents, plant.places
     count = agents.yaw.shape[0]
     half = agents.yaw / 2.0
     zero = jnp.zeros_like(half)
     qpos = jnp.tile(jnp.asarray(plant.still, jnp.float32), (count, 1))
-    fleet = None if plant.vary is None else jax.vmap(enlist)(plant.vary(key, scene))
+    fleet = None if plant.vary is None else jax.vmap(derive_constants)(plant.vary(key, scene))
     if fleet is not None:
-        height, travel = jax.vmap(functools.partial(standing, physics_dt=plant.physics_dt))(fleet)
+        height, travel = jax.vmap(functools.partial(place_at_rest, physics_dt=plant.physics_dt))(fleet)
         qpos = qpos.at[:, 2].set(height).at[:, at.suspension_q].set(travel)
     qpos = qpos.at[:, :2].set(agents.position).at[:, 3:7].set(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1))
-    velocity = agents.speed[:, None] * heading(agents.yaw)
+    velocity = agents.speed[:, None] * heading_vector(agents.yaw)
     radius = jnp.broadcast_to(plant.own.car.wheel_radius if fleet is None else fleet.car.wheel_radius, (count,))
     qvel = jnp.zeros((count, 16), jnp.float32).at[:, :2].set(velocity)
     return Body(
@@ -171,7 +179,7 @@ def start(plant: Plant, key: PRNGKeyArray, scene: Scene) -> Body:
 
 
 def _advance(
-    plant: Plant,
+    plant: CompiledCar,
     meet: Contact,
     grip: Callable[..., Any],
     scene: Scene,
@@ -183,57 +191,59 @@ def _advance(
     own = plant.own if body.fleet is None else body.fleet
     car, fields = own.car, {}
     if plant.stages and body.fleet is not None:
-        fields = jax.vmap(functools.partial(mjx_backend.fit, plant.stages.model, plant.places))(body.fleet)
+        fields = jax.vmap(functools.partial(mjx_backend.fit_model, plant.stages.model, plant.places))(body.fleet)
     before = read(plant, body)
-    speed = norm(before.velocity[:, :2])
+    speed = safe_norm(before.velocity[:, :2])
     wheels = wheel_positions(car, before.position[:, :2], before.yaw)
     mu = grip(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
-    steer, drive, brake = wanted(car, action)
-    one = jax.vmap(functools.partial(move, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
-    mass = equations_of_motion.mass(car)
-    near = meet.neighbours(boxes_of(before, scene.agents.size, active, mass), scene.boxes)
+    steer, drive, brake = decode_action(car, action)
+    one = jax.vmap(functools.partial(physics_step, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
+    mass = equations_of_motion.total_mass(car)
+    near = meet.neighbours(collect_boxes(before, scene.agents.size, active, mass), scene.boxes)
 
     def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
-        touching = boxes_of(read(plant, now), scene.agents.size, active, mass)
-        force, torque, strength = meet.forces(touching, later(near, time))
+        touching = collect_boxes(read(plant, now), scene.agents.size, active, mass)
+        force, torque, strength = meet.forces(touching, advance_boxes(near, time))
         command = Command(steer, drive, brake, mu, force, torque)
-        moved, tyres = one(own, fields, Single(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
+        moved, tyres = one(own, fields, CarCarry(now.qpos, now.qvel, now.qacc_warmstart, now.spin_sign), command)
         strongest = jnp.maximum(now.contact_force, strength)
         return replace(now, **moved._asdict(), contact_force=strongest, tyres=tyres), None
 
     zero = jnp.zeros_like(body.contact_force)
     after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), plant.physics_dt * jnp.arange(plant.substeps))
-    return choose(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
+    return tree_where(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
 
 
-def move(plant: Plant, own: Fleet, fields: dict[str, Array], now: Single, command: Command) -> tuple[Single, Tyres]:
+def physics_step(
+    plant: CompiledCar, own: CarConstants, fields: dict[str, Array], now: CarCarry, command: Command
+) -> tuple[CarCarry, Tyres]:
     """One physics step of one car.
 
     Args:
         fields: of MJX's model, if that is used and the car differs from the reference.
     """
-    car, state = own.car, states.seen(own.car, now.qpos, now.qvel)
+    car, state = own.car, states.from_mujoco(own.car, now.qpos, now.qvel)
     sign = jnp.where(jnp.abs(state.spin) > 1e-4, jnp.sign(state.spin), now.spin_sign)
-    engine, friction = pulling(car, command.drive, state.spin), command.brake + car.rolling_torque
-    turn, friction = (engine - command.brake * sign, None) if plant.latched else held(engine, friction, state.spin)
-    load = Load(applied(car, state, command, turn), command.mu, friction, slip_damping(car, state))
+    engine, friction = compute_drive_torque(car, command.drive, state.spin), command.brake + car.rolling_torque
+    turn, friction = (engine - command.brake * sign, None) if plant.latched else compute_net_wheel_torque(engine, friction, state.spin)
+    load = PhysicsStepInput(make_step_input(car, state, command, turn), command.mu, friction, compute_slip_damping(car, state))
     body = own, state, load, now.qpos, now.qvel, now.qacc_warmstart
     if plant.stages is None:
         qpos, qvel, acceleration, tyres = closed_form_step.step(*body, solver=plant.solver, physics_dt=plant.physics_dt)
     else:
         qpos, qvel, acceleration, tyres = mjx_backend.step(plant.stages, fields, *body, solver=plant.solver)
-    return Single(qpos, qvel, acceleration, sign), tyres
+    return CarCarry(qpos, qvel, acceleration, sign), tyres
 
 
 def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Float[Array, " A"]) -> Float[Array, "A 4 2"]:
     """Where the wheels stand in the plane, in the order of `car.WHEELS`; the cars may differ."""
     ahead = AHEAD * jnp.asarray(car.wheelbase / 2)[..., None]
     beside = LEFT * jnp.asarray(car.track / 2)[..., None]
-    forward, left = heading(yaw)[:, None], heading(yaw + jnp.pi / 2)[:, None]
+    forward, left = heading_vector(yaw)[:, None], heading_vector(yaw + jnp.pi / 2)[:, None]
     return position[:, None] + ahead[..., None] * forward + beside[..., None] * left
 
 
-def read(plant: Plant, body: Body) -> Motion:
+def read(plant: CompiledCar, body: Body) -> Motion:
     """What the rest of the system may know of the cars."""
     rotation = states.matrix(body.qpos[:, 3:7].T)
     tyres, loaded = body.tyres, body.tyres.normal > 1.0  # N

@@ -10,17 +10,17 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.dynamics.articulated import contact_solver, equations_of_motion, tyres
 from scenefactory_jax.dynamics.articulated import state as states
-from scenefactory_jax.dynamics.articulated.actuators import Load, springs
+from scenefactory_jax.dynamics.articulated.actuators import PhysicsStepInput, compute_suspension_forces
 from scenefactory_jax.dynamics.articulated.parameters import Solver
-from scenefactory_jax.dynamics.articulated.randomization import Fleet
-from scenefactory_jax.dynamics.articulated.state import State
+from scenefactory_jax.dynamics.articulated.randomization import CarConstants
+from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.tyres import Patch, Tyres
 
 
 def step(
-    own: Fleet,
-    state: State,
-    load: Load,
+    own: CarConstants,
+    state: CarState,
+    load: PhysicsStepInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
@@ -37,24 +37,30 @@ def step(
         qpos, qvel: in MuJoCo's order.
         start: acceleration from which the solver begins: that of the step before.
     """
-    patch = tyres.touch(own, state)
-    problem = problem_of(own, state, patch, load, friction_ratio=solver.friction_ratio, physics_dt=physics_dt)
-    begin = contact_solver.Acceleration(*states.unflat(start, state))
-    found, force = contact_solver.newton(problem, begin, iterations=solver.iterations, line_search=solver.line_search)
-    acceleration = states.flat(found.base, found.own, state)
+    patch = tyres.find_contact_patches(own, state)
+    problem = make_contact_problem(own, state, patch, load, friction_ratio=solver.friction_ratio, physics_dt=physics_dt)
+    begin = contact_solver.Acceleration(*states.unflatten(start, state))
+    found, force = contact_solver.solve_contacts(problem, begin, iterations=solver.iterations, line_search=solver.line_search)
+    acceleration = states.flatten(found.base, found.own, state)
     moved = states.integrate(qpos, qvel, acceleration, physics_dt=physics_dt)
-    return *moved, acceleration, tyres.told(state, patch, force, load.mu)
+    return *moved, acceleration, tyres.compute_tyre_outputs(state, patch, force, load.mu)
 
 
-def problem_of(own: Fleet, state: State, patch: Patch, load: Load, *, friction_ratio: float, physics_dt: float) -> contact_solver.Problem:
+def make_contact_problem(
+    own: CarConstants, state: CarState, patch: Patch, load: PhysicsStepInput, *, friction_ratio: float, physics_dt: float
+) -> contact_solver.Problem:
     """MuJoCo's convex problem of this moment, in the car's axes."""
-    drift = equations_of_motion.drift(state)
-    base, across, joints = equations_of_motion.inertia(own.car, state)
-    given, sprung, held = load.force, springs(own.car, state), equations_of_motion.bias(own.car, state, drift)
+    drift = equations_of_motion.compute_bias_acceleration(state)
+    base, across, joints = equations_of_motion.compute_mass_matrix(own.car, state)
+    given, sprung, held = (
+        load.force,
+        compute_suspension_forces(own.car, state),
+        equations_of_motion.compute_bias_force(own.car, state, drift),
+    )
     smooth = jax.tree.map(lambda a, b, c: a + b - c, given, sprung, held)
-    rows = tyres.rows(own, state, patch, drift, load.slip_damping, friction_ratio=friction_ratio, physics_dt=physics_dt)
+    rows = tyres.make_friction_rows(own, state, patch, drift, load.slip_damping, friction_ratio=friction_ratio, physics_dt=physics_dt)
     none = jnp.zeros(4)
-    brake = (none, none) if load.friction is None else tyres.brake_rows(own, state.spin, physics_dt=physics_dt)
+    brake = (none, none) if load.friction is None else tyres.make_brake_rows(own, state.spin, physics_dt=physics_dt)
     problem = contact_solver.Problem(
         base=base,
         across=across,

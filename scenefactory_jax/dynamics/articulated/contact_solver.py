@@ -54,7 +54,7 @@ class Acceleration(NamedTuple):
     own: list[Number]  # [4] each
 
 
-class Point(NamedTuple):
+class NewtonIterate(NamedTuple):
     """An acceleration, with all that is linear in it: a step adds to each of them in proportion.
 
     They are worked out once and then moved along, never anew. Their rounding is then the same for the slope, its derivative and the search,
@@ -67,14 +67,14 @@ class Point(NamedTuple):
     pull: Acceleration  # M a - smooth forces
 
 
-class Contact(NamedTuple):
+class TyreContactForce(NamedTuple):
     """Force of a tyre's contact (3) and the negative of its derivative, a symmetric 3 x 3."""
 
     force: list[Number]
     stiffness: list[list[Number]]
 
 
-def newton(problem: Problem, start: Acceleration, *, iterations: int, line_search: int) -> tuple[Acceleration, list[Number]]:
+def solve_contacts(problem: Problem, start: Acceleration, *, iterations: int, line_search: int) -> tuple[Acceleration, list[Number]]:
     """Acceleration of a car, and the forces of its tyres' contacts: normal, two tangents.
 
     Args:
@@ -90,8 +90,8 @@ def newton(problem: Problem, start: Acceleration, *, iterations: int, line_searc
 def _minimise(problem: Problem, start: Acceleration, iterations: int, line_search: int) -> Acceleration:
     """Newton's method, a fixed number of steps."""
 
-    def step(here: Point, _: None) -> tuple[Point, None]:
-        along = _linear(problem, _descend(problem, here, _slope(problem, here)))
+    def step(here: NewtonIterate, _: None) -> tuple[NewtonIterate, None]:
+        along = _linear(problem, _descend(problem, here, _gradient(problem, here)))
         length = _search(problem, here, along, steps=line_search)
         return jax.tree.map(lambda a, d: a + length * d, here, along), None
 
@@ -104,14 +104,14 @@ def _minimise_jvp(iterations: int, line_search: int, primals: tuple, tangents: t
     instead compiles for minutes, and says the same where they have converged."""
     problem, start = primals
     at = _minimise(problem, start, iterations, line_search)
-    _, change = jax.jvp(lambda changed: _slope(changed, _point(changed, at)), (problem,), (tangents[0],))
+    _, change = jax.jvp(lambda changed: _gradient(changed, _point(changed, at)), (problem,), (tangents[0],))
     return at, _descend(problem, _point(problem, at), change)
 
 
-def _linear(problem: Problem, along: Acceleration) -> Point:
+def _linear(problem: Problem, along: Acceleration) -> NewtonIterate:
     """J d and M d of a direction d."""
     base, own = along
-    return Point(
+    return NewtonIterate(
         at=along,
         rows=[_dot(row, [*base, *own]) for row in problem.jacobian],
         brake=own[SPIN],
@@ -122,10 +122,10 @@ def _linear(problem: Problem, along: Acceleration) -> Point:
     )
 
 
-def _point(problem: Problem, at: Acceleration) -> Point:
+def _point(problem: Problem, at: Acceleration) -> NewtonIterate:
     """Where an acceleration stands."""
     here = _linear(problem, at)
-    return Point(
+    return NewtonIterate(
         at=at,
         rows=[row - ref for row, ref in zip(here.rows, problem.reference, strict=True)],
         brake=here.brake - problem.brake_reference,
@@ -133,7 +133,7 @@ def _point(problem: Problem, at: Acceleration) -> Point:
     )
 
 
-def _cone(x: Sequence[Number], problem: Problem) -> Contact:
+def _cone(x: Sequence[Number], problem: Problem) -> TyreContactForce:
     """Elliptic cone: the tyre lifts, sticks (all rows are springs) or slides (force on the cone's surface)."""
     cone, mu, d = problem.cone, problem.mu, problem.weight
     n, u, v = x[0] * cone, x[1] * mu, x[2] * mu
@@ -157,7 +157,7 @@ def _cone(x: Sequence[Number], problem: Problem) -> Contact:
         [corner * eu, full * eu * eu + bend * ev * ev + stick[1], (full - bend) * eu * ev],
         [corner * ev, (full - bend) * eu * ev, full * ev * ev + bend * eu * eu + stick[2]],
     ]
-    return Contact(force, stiffness)
+    return TyreContactForce(force, stiffness)
 
 
 def _brake(x: Number, problem: Problem) -> tuple[Number, Number]:
@@ -167,7 +167,7 @@ def _brake(x: Number, problem: Problem) -> tuple[Number, Number]:
     return torque, jnp.where(holds, problem.brake_weight, 0.0)
 
 
-def _slope(problem: Problem, here: Point) -> Acceleration:
+def _gradient(problem: Problem, here: NewtonIterate) -> Acceleration:
     """Gradient of the convex problem: M a less all forces."""
     contact = _cone(here.rows, problem)
     torque, _ = _brake(here.brake, problem)
@@ -177,7 +177,7 @@ def _slope(problem: Problem, here: Point) -> Acceleration:
     return jax.tree.map(jnp.subtract, here.pull, Acceleration(on_base, on_own))
 
 
-def _descend(problem: Problem, here: Point, slope: Acceleration) -> Acceleration:
+def _descend(problem: Problem, here: NewtonIterate, slope: Acceleration) -> Acceleration:
     """The Hessian's inverse times a slope, with opposite sign: the arrow-shaped system, the wheels eliminated first."""
     contact = _cone(here.rows, problem)
     _, hold = _brake(here.brake, problem)
@@ -198,7 +198,7 @@ def _descend(problem: Problem, here: Point, slope: Acceleration) -> Acceleration
     return Acceleration(step, [-r - _dot([shed[i][k] for i in range(BASE)], step) for k, r in enumerate(rest)])
 
 
-def _search(problem: Problem, here: Point, along: Point, *, steps: int) -> Number:
+def _search(problem: Problem, here: NewtonIterate, along: NewtonIterate, *, steps: int) -> Number:
     """How far to go along a direction: a zero of the slope, by Newton steps kept inside a bracket."""
     tilt, terms = _inner(along.at, here.pull), _inner(_magnitude(along.at), _magnitude(here.pull))
     bend = _inner(along.at, along.pull)
@@ -222,7 +222,7 @@ def _search(problem: Problem, here: Point, along: Point, *, steps: int) -> Numbe
     return length
 
 
-def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def invert_arrow_matrix(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Of a small symmetric positive definite matrix, without a library call."""
     count = matrix.shape[0]
     factors = _factor([[matrix[i, j] for j in range(i + 1)] for i in range(count)])

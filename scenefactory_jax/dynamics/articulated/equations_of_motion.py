@@ -11,7 +11,7 @@ Algorithms, chapters 2 and 5; MuJoCo documentation, "Computation", general frame
 from typing import NamedTuple
 
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, GRAVITY, CarParameters
-from scenefactory_jax.dynamics.articulated.state import State
+from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, over_wheels, wheels
 
 FRONT = 0.5 * (1.0 + AHEAD)  # 1 for the wheels that steer
@@ -43,29 +43,29 @@ class Unsprung(NamedTuple):
     across: Number  # [4] about any axis across it
 
 
-def unsprung(car: CarParameters) -> Unsprung:
+def compute_unsprung(car: CarParameters) -> Unsprung:
     """Sums of the parts."""
     about, across = car.wheel_inertia
     mass = car.wheel_mass + car.carrier_mass + FRONT * car.knuckle_mass
     return Unsprung(mass, about, across + car.carrier_inertia + FRONT * car.knuckle_inertia)
 
 
-def mass(car: CarParameters) -> Number:
+def total_mass(car: CarParameters) -> Number:
     """Of the whole car, kg; the cars may have an axis."""
     return car.mass + 4 * (car.wheel_mass + car.carrier_mass) + 2 * car.knuckle_mass
 
 
-def centre(car: CarParameters) -> Vector:
+def centre_of_mass(car: CarParameters) -> Vector:
     """Of the chassis' mass, from the box's centre, m."""
     return Vector(car.mass_forward, 0.0, car.mass_height)
 
 
-def load(car: CarParameters) -> Number:
+def compute_loads(car: CarParameters) -> Number:
     """Weight of the chassis on each wheel at rest, N."""
     return 0.5 * car.mass * GRAVITY * (0.5 + AHEAD * (car.mass_forward / car.wheelbase))
 
 
-def drift(state: State) -> Drift:
+def compute_bias_acceleration(state: CarState) -> Drift:
     """Centripetal, Coriolis and gyroscopic accelerations."""
     rate, up = state.rate, Vector(0.0, 0.0, 1.0)
     steered = up * state.steering
@@ -73,19 +73,19 @@ def drift(state: State) -> Drift:
     return Drift(hub, cross(rate, steered) + cross(rate + steered, state.axle * state.spin))
 
 
-def inertia(car: CarParameters, state: State) -> tuple[Matrix, Matrix, Matrix]:
+def compute_mass_matrix(car: CarParameters, state: CarState) -> tuple[Matrix, Matrix, Matrix]:
     """M: of the chassis (6 x 6, linear before angular), between chassis and wheels (6 x 3), of the wheels' own joints (3 x 3).
 
     The own joints are suspension, spin and steering. They do not meet: the axle is across the other two, and the hub lies on all three.
     A rear wheel, which has no steering, gets a row of zeros with a unit diagonal.
     """
-    wheel, axle, hub = unsprung(car), state.axle, state.hub
-    oval, total = wheel.about - wheel.across, mass(car)
-    x, y, z = centre(car) * car.mass + wheels(hub * wheel.mass)
+    wheel, axle, hub = compute_unsprung(car), state.axle, state.hub
+    oval, total = wheel.about - wheel.across, total_mass(car)
+    x, y, z = centre_of_mass(car) * car.mass + wheels(hub * wheel.mass)
     shift = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # linear momentum of a turn
 
     def second_moment(i: int, j: int) -> Number:
-        chassis, hubs = _second_moment(i, j, car.mass, centre(car)), _second_moment(i, j, wheel.mass, hub)
+        chassis, hubs = _second_moment(i, j, car.mass, centre_of_mass(car)), _second_moment(i, j, wheel.mass, hub)
         own = chassis + over_wheels(hubs + oval * axle[i] * axle[j])
         return own + car.inertia[i] + over_wheels(wheel.across) if i == j else own
 
@@ -104,16 +104,16 @@ def inertia(car: CarParameters, state: State) -> tuple[Matrix, Matrix, Matrix]:
     return [*linear, *angular], across, [[wheel.mass, 0.0, 0.0], [0.0, wheel.about, 0.0], [0.0, 0.0, pivot]]
 
 
-def bias(car: CarParameters, state: State, drift: Drift) -> Forces:
+def compute_bias_force(car: CarParameters, state: CarState, drift: Drift) -> Forces:
     """What keeps every joint from accelerating: the bodies' masses times `drift`, and their weight."""
-    wheel, rate, axle, weightless = unsprung(car), state.rate, state.axle, state.up * GRAVITY
-    chassis = (cross(rate, cross(rate, centre(car))) + weightless) * car.mass
+    wheel, rate, axle, weightless = compute_unsprung(car), state.rate, state.axle, state.up * GRAVITY
+    chassis = (cross(rate, cross(rate, centre_of_mass(car))) + weightless) * car.mass
     push = (drift.hub + weightless) * wheel.mass
     whole = rate + Vector(0.0, 0.0, state.steering) + axle * state.spin
     oval = wheel.about - wheel.across
     torque = drift.turn * wheel.across + axle * (oval * dot(axle, drift.turn)) + cross(whole, axle) * (oval * dot(axle, whole))
     roll, pitch, yaw = car.inertia
-    still = cross(centre(car), chassis) + cross(rate, Vector(roll * rate.x, pitch * rate.y, yaw * rate.z))
+    still = cross(centre_of_mass(car), chassis) + cross(rate, Vector(roll * rate.x, pitch * rate.y, yaw * rate.z))
     return Forces(
         force=chassis + wheels(push),
         torque=still + wheels(cross(state.hub, push) + torque),

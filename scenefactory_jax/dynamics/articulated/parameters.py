@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import mujoco
 import numpy as np
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import pytree
 from scenefactory_jax.dynamics.articulated import bounds
 
@@ -96,21 +96,21 @@ class Solver:
     friction_ratio: float  # impedance of friction over that of the normal force (MuJoCo impratio)
 
 
-def numbers(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
+def read_parameters(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
     """Car and solver of a config's `dynamics`.
 
     Raises:
         ConfigError: an unknown or missing number, or one beyond its `bounds`, by name.
     """
     kinds = {"car": "CarParameters", "solver": "Solver"}
-    car, solver = (build({**entry[k], "_target_": t}, builtins=__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
+    car, solver = (instantiate({**entry[k], "_target_": t}, builtins=__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
     bounds.check(car, where="dynamics.car")
     bounds.check_moments(car, where="dynamics.car")
     bounds.check(solver, where="dynamics.solver")
     return car, solver
 
 
-def spec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:
+def build_mjspec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:
     """One car without ground: body `chassis`, joints `root`, `suspension_*`, `steer_*`, `spin_*`, geoms `box` and `tyre_*`.
 
     Args:
@@ -163,7 +163,7 @@ def _add_wheel(chassis: mujoco.MjsBody, name: str, car: CarParameters, *, visual
         _solid(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1.0])
 
 
-class Places(NamedTuple):
+class ModelAddresses(NamedTuple):
     """Where the compiled car's parts stand in MuJoCo's arrays, wheels in the order of `WHEELS`; all static."""
 
     chassis: int  # body
@@ -177,13 +177,13 @@ class Places(NamedTuple):
     spin_v: np.ndarray
 
 
-def places(model: mujoco.MjModel) -> Places:
+def find_addresses(model: mujoco.MjModel) -> ModelAddresses:
     """Look them up by name."""
 
     def each(kind: Callable[[str], Any], prefix: str, number: str, wheels: Sequence[str] = WHEELS) -> np.ndarray:
         return np.array([np.atleast_1d(getattr(kind(f"{prefix}_{wheel}"), number))[0] for wheel in wheels])
 
-    return Places(
+    return ModelAddresses(
         chassis=model.body("chassis").id,
         wheel=each(model.body, "wheel", "id"),
         tyre=each(model.geom, "tyre", "id"),
@@ -264,9 +264,9 @@ def set_options(model: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> N
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # the dampings are stable at 120 Hz; a second factorisation is not free
 
 
-def standalone(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool, brake_rows: bool) -> mujoco.MjModel:
+def build_standalone_model(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool, brake_rows: bool) -> mujoco.MjModel:
     """One car on an infinite flat ground, compiled."""
-    model = spec(car, visual=visual, brake_rows=brake_rows)
+    model = build_mjspec(car, visual=visual, brake_rows=brake_rows)
     model.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
     add_ground_pairs(model, car, ground="ground")
     set_options(model, solver, physics_dt=physics_dt)
@@ -296,7 +296,9 @@ def stable_limits(car: CarParameters, *, physics_dt: float, where: str) -> None:
         raise ConfigError(f"{where}: the tyres' slip cannot be integrated: {message}")
     for name, (mass, stiffness, damping) in springs.items():
         _check_spring(name, mass, stiffness, damping, physics_dt=physics_dt, where=where)
-    _check_spring("body on the ground", light_corner(car), car.body_stiffness, car.body_damping, physics_dt=physics_dt, where=where)
+    _check_spring(
+        "body on the ground", compute_effective_corner_mass(car), car.body_stiffness, car.body_damping, physics_dt=physics_dt, where=where
+    )
 
 
 def _check_spring(name: str, mass: float, stiffness: float, damping: float, *, physics_dt: float, where: str) -> None:
@@ -306,13 +308,13 @@ def _check_spring(name: str, mass: float, stiffness: float, damping: float, *, p
         raise ConfigError(f"{where}: the {name} cannot be integrated: {message}")
 
 
-def light_corner(car: CarParameters) -> float:
+def compute_effective_corner_mass(car: CarParameters) -> float:
     """Mass that a corner of the chassis pushes against, kg: what a force there moves, turning included."""
     roll, pitch, _ = car.inertia
     return 1.0 / (1.0 / car.mass + (car.width / 2) ** 2 / roll + (car.length / 2) ** 2 / pitch)
 
 
-def rest(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
+def find_rest_pose(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
     """Joint positions of the car standing still on the ground, from 5 s of settling in the C engine."""
     data = mujoco.MjData(model)
     suspension = [model.joint(f"suspension_{name}") for name in WHEELS]

@@ -11,7 +11,7 @@ from scenefactory_jax.dynamics.articulated.vector import Number, Vector, dot, le
 TINY = 1e-6  # rad/s
 
 
-class State(NamedTuple):
+class CarState(NamedTuple):
     """A car's position and velocity, in its own axes."""
 
     height: Array  # of the box's centre above the road, m
@@ -29,7 +29,7 @@ class State(NamedTuple):
     axle: Vector  # its axis of spin
 
 
-def seen(car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> State:
+def from_mujoco(car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> CarState:
     """MuJoCo's arrays as a state."""
     east, north, up = (Vector(*row) for row in matrix(qpos[3:7]))
     velocity = east * qvel[0] + north * qvel[1] + up * qvel[2]
@@ -37,7 +37,7 @@ def seen(car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"])
     sinking, steering, spin = _apart(qvel[6:])
     hub = Vector(AHEAD * (car.wheelbase / 2), LEFT * (car.track / 2), car.wheel_height + travel)
     axle = Vector(-jnp.sin(steer), jnp.cos(steer), 0.0)
-    return State(qpos[2], east, north, up, velocity, Vector(*qvel[3:6]), travel, sinking, steer, steering, spin, hub, axle)
+    return CarState(qpos[2], east, north, up, velocity, Vector(*qvel[3:6]), travel, sinking, steer, steering, spin, hub, axle)
 
 
 def matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
@@ -50,7 +50,7 @@ def matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
     ]
 
 
-def flat(base: list[Number], own: list[Number], state: State) -> Float[Array, "16"]:
+def flatten(base: list[Number], own: list[Number], state: CarState) -> Float[Array, "16"]:
     """Velocities, accelerations or forces by joint, in MuJoCo's order and axes.
 
     Args:
@@ -64,7 +64,7 @@ def flat(base: list[Number], own: list[Number], state: State) -> Float[Array, "1
     return jnp.stack([*world, *base[3:], *joints])
 
 
-def unflat(joints: Float[Array, "16"], state: State) -> tuple[list[Number], list[Number]]:
+def unflatten(joints: Float[Array, "16"], state: CarState) -> tuple[list[Number], list[Number]]:
     """The inverse of `flat`."""
     linear = state.east * joints[0] + state.north * joints[1] + state.up * joints[2]
     suspension, steer, spin = _apart(joints[6:])

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.pytree import struct
+from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.dynamics.articulated.equations_of_motion import FRONT, Drift
-from scenefactory_jax.dynamics.articulated.randomization import Fleet
-from scenefactory_jax.dynamics.articulated.state import State
+from scenefactory_jax.dynamics.articulated.randomization import CarConstants
+from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, length
 
 BRAKE_TIME_CONSTANT = 0.02  # s, MuJoCo's default, and with its damping ratio of 1: it has no stiffness without a position to hold
@@ -21,7 +21,7 @@ IMPEDANCE = 1e-4, 1.0 - 1e-4  # MuJoCo keeps impedances within
 SMALL = 1e-15  # MuJoCo's mjMINVAL: the least regularisation
 
 
-@struct
+@pytree_dataclass
 class Tyres:
     """What the contact patches of a car did in the last physics step, in the order of `car.WHEELS`."""
 
@@ -47,7 +47,7 @@ class Rows(NamedTuple):
     weight: list[Number]  # D; zero in the air
 
 
-def touch(own: Fleet, state: State) -> Patch:
+def find_contact_patches(own: CarConstants, state: CarState) -> Patch:
     """Where an ellipsoid is lowest: at -S up / sqrt(up . S up) from its centre, S the matrix of its squared half axes."""
     car, up, axle = own.car, state.up, state.axle
     lean = dot(axle, up)
@@ -60,7 +60,7 @@ def touch(own: Fleet, state: State) -> Patch:
     return Patch(depth, arm, velocity)
 
 
-def turning(patch: Patch, drift: Drift) -> Vector:
+def compute_jdot_qvel(patch: Patch, drift: Drift) -> Vector:
     """Part of the slip's acceleration at each tyre's contact that J qacc leaves out, m/s^2.
 
     A contact's slip u = J qvel changes by J qacc + dJ/dt qvel. MuJoCo's reference leaves the second term out. A wheel that rolls through a
@@ -72,8 +72,8 @@ def turning(patch: Patch, drift: Drift) -> Vector:
     return drift.hub + cross(drift.turn, patch.arm)
 
 
-def rows(
-    own: Fleet, state: State, patch: Patch, drift: Drift, damping: Number, *, friction_ratio: float, physics_dt: float
+def make_friction_rows(
+    own: CarConstants, state: CarState, patch: Patch, drift: Drift, damping: Number, *, friction_ratio: float, physics_dt: float
 ) -> Rows:  # fmt: skip
     """Of the tyres.
 
@@ -84,7 +84,7 @@ def rows(
     car, arm = own.car, patch.arm
     impedance = jnp.clip(car.tyre_impedance, *IMPEDANCE)
     constant = jnp.maximum(car.tyre_time_constant, 2 * physics_dt)  # MuJoCo's `refsafe`
-    away, place = turning(patch, drift), state.hub + arm
+    away, place = compute_jdot_qvel(patch, drift), state.hub + arm
     axes = (state.up, state.north, -state.east)  # MuJoCo's frame for a plane
     jacobian = []
     for axis in axes:
@@ -99,14 +99,14 @@ def rows(
     return Rows(jacobian, [push, *slow], [normal, tangent, tangent])
 
 
-def brake_rows(own: Fleet, spin: Number, *, physics_dt: float) -> tuple[Number, Number]:
+def make_brake_rows(own: CarConstants, spin: Number, *, physics_dt: float) -> tuple[Number, Number]:
     """a_ref and D of the wheels' dry friction; J is the spin itself."""
     impedance = jnp.clip(own.car.brake_impedance, *IMPEDANCE)
     damping = 2.0 / (impedance * max(BRAKE_TIME_CONSTANT, 2 * physics_dt))
     return -damping * spin, 1.0 / jnp.maximum(own.spin_weight * (1.0 - impedance) / impedance, SMALL)
 
 
-def told(state: State, patch: Patch, force: list[Number], mu: Float[Array, "4"]) -> Tyres:
+def compute_tyre_outputs(state: CarState, patch: Patch, force: list[Number], mu: Float[Array, "4"]) -> Tyres:
     """Of a step's contact forces, normal and two tangents."""
     slip = length(dot(state.east, patch.velocity), dot(state.north, patch.velocity))
     return Tyres(mu=mu, normal=force[0], tangent=length(*force[1:]), slip=jnp.where(patch.depth > 0.0, slip, 0.0))

@@ -10,13 +10,13 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from scenefactory_jax.core.geometry import root
-from scenefactory_jax.core.pytree import struct
+from scenefactory_jax.core.geometry import safe_sqrt
+from scenefactory_jax.core.pytree import pytree_dataclass
 
 Number = Any  # an array, [] of a car or [4] of its wheels; plain where it comes from the reference car alone
 
 
-@struct
+@pytree_dataclass
 class Vector:
     """Along a car's axes: forward, left, up."""
 
@@ -66,4 +66,4 @@ def over_wheels(number: Number) -> Number:
 
 def length(*parts: Number) -> Array:
     """Euclidean length of components; its gradient at zero is zero instead of NaN."""
-    return root(jnp.asarray(sum(part * part for part in parts)))
+    return safe_sqrt(jnp.asarray(sum(part * part for part in parts)))

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pallas import on_gpu
-from scenefactory_jax.core.types import Observation, Policy, Rows
+from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel
 
 ACTIONS = 3  # throttle, steer, brake
@@ -85,7 +85,7 @@ def make(
     )
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
-        groups = sorted(name for name, group in observation.items() if isinstance(group, Rows))
+        groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(chosen) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such group of rows; valid: {', '.join(groups) or 'none'}")
         if not observation:
@@ -135,13 +135,13 @@ class Tower(nn.Module):
     def __call__(self, observation: Observation) -> Float[Array, "*batch outputs"]:
         activate = ACTIVATIONS[self.activation]
         widths = dict(self.rows)
-        vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, Rows)]
+        vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, SetObservation)]
         fused = []
         if vectors:
             layers = Layers(self.vector, self.activation, self.dtype, self.kernels, name="vector")
             fused.append(activate(layers(jnp.concatenate(vectors, axis=-1))))
         for name, group in sorted(observation.items()):
-            if isinstance(group, Rows):
+            if isinstance(group, SetObservation):
                 layers = Layers(widths.get(name, self.rows_default), self.activation, self.dtype, self.kernels, name=f"{name}_rows")
                 fused.append(activate(layers(group.features, group.mask)))
         trunk = Layers(self.trunk, self.activation, self.dtype, self.kernels, name="trunk")

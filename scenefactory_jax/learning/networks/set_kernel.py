@@ -58,7 +58,7 @@ def encode(
     if not mask.size:
         return jnp.zeros((*batch, out), jnp.float32), jnp.zeros((*batch, out), jnp.int32)
     x, mask = x.reshape(-1, width, features), mask.reshape(-1, width)
-    operands = (pallas.shown(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
+    operands = (pallas.block_of(mask)[:, None], x, mask.astype(jnp.int8), _with_bias(first, first_bias), second.astype(dtype), second_bias)
     rows = ROWS if width > FEW else FEW
     pooled, winner = pl.pallas_call(
         functools.partial(_encode, activate=_activations(interpret)[activation][0], rows=rows, width=width, features=features),
@@ -129,7 +129,7 @@ def gradient(
         return jax.tree.map(jnp.zeros_like, weights)
     cotangent = cotangent.reshape(-1, out)
     programs = min(programs, len(cotangent))
-    last = pallas.shown((cotangent != 0.0).any(axis=1)[None])
+    last = pallas.block_of((cotangent != 0.0).any(axis=1)[None])
     activate, slope = _activations(interpret)[activation]
     rounded = second.T.astype(dtype).astype(jnp.float32)
     operands = (last, x.reshape(-1, width, features), winner.reshape(-1, out), cotangent, _with_bias(first, first_bias), rounded)

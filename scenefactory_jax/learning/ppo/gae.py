@@ -1,10 +1,10 @@
 """Generalised advantage estimation for agents that end, worlds that run out of time and slots that stand empty."""
 
-from brax.training.agents.ppo.losses import compute_gae
+from brax.training.agents.ppo.losses import compute_gae as brax_gae
 from jaxtyping import Array, Bool, Float
 
 
-def estimate(
+def compute_gae(
     reward: Float[Array, "T *slots"],
     value: Float[Array, "T *slots"],
     bootstrap: Float[Array, "*slots"],
@@ -32,7 +32,7 @@ def estimate(
         out one factor lambda (r + gamma V_lambda(next) - V, the V-trace form), so that equation 16 is formed here from its returns.
     """
     cut = done | ~active
-    returns, _ = compute_gae(
+    returns, _ = brax_gae(
         truncation=(truncated & ~cut).astype(value.dtype),
         termination=cut.astype(value.dtype),
         rewards=reward * active,

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.pytree import struct
+from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Observation, Policy
 
 
-@struct
+@pytree_dataclass
 class Batch:
     """Samples to learn from, in any order; what the policy said about them when it acted."""
 
@@ -29,7 +29,7 @@ class Batch:
     weight: Float[Array, " N"]
 
 
-def ppo(
+def compute_loss(
     parameters: Any,
     batch: Batch,
     log_std_old: Float[Array, " 3"],
@@ -54,8 +54,8 @@ def ppo(
     """
     mean, log_std, estimate = policy.apply(parameters, batch.observation)
     weight = batch.weight
-    whole = sharding.total(jnp.sum(weight), axis)
-    weighted = functools.partial(share, weight=weight, whole=whole)
+    whole = sharding.sum_over_devices(jnp.sum(weight), axis)
+    weighted = functools.partial(active_fraction, weight=weight, whole=whole)
     # what an empty slot holds must not reach a gradient, not even as 0 x inf
     change = log_probability(batch.action, mean, log_std) - batch.log_probability
     change, advantage, old, target = (jnp.where(weight > 0.0, x, 0.0) for x in (change, batch.advantage, batch.value, batch.returns))
@@ -75,7 +75,7 @@ def ppo(
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": bonus,
-        "kl": weighted(kl(batch.mean, log_std_old, mean, log_std)),
+        "kl": weighted(kl_divergence(batch.mean, log_std_old, mean, log_std)),
         "clip_fraction": weighted((jnp.abs(ratio - 1.0) > clip).astype(jnp.float32)),
     }
     return loss, jax.lax.stop_gradient(facts)
@@ -94,7 +94,7 @@ def gaussian_entropy(log_std: Float[Array, " D"]) -> Float[Array, ""]:
     return jnp.sum(log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e))
 
 
-def kl(
+def kl_divergence(
     mean_old: Float[Array, "*batch D"], log_std_old: Float[Array, " D"], mean: Float[Array, "*batch D"], log_std: Float[Array, " D"]
 ) -> Float[Array, "*batch"]:
     """KL(old || new) of diagonal Gaussians, nats."""
@@ -103,17 +103,17 @@ def kl(
     return 0.5 * jnp.sum(variance_ratio + shift**2 - 1.0 - 2.0 * (log_std_old - log_std), axis=-1)
 
 
-def share(x: Float[Array, "*batch"], *, weight: Float[Array, "*batch"], whole: Float[Array, ""]) -> Float[Array, ""]:
+def active_fraction(x: Float[Array, "*batch"], *, weight: Float[Array, "*batch"], whole: Float[Array, ""]) -> Float[Array, ""]:
     """Part of these samples in a weighted mean over samples of the weight `whole`. A value without weight may be anything, even NaN."""
     return jnp.sum(jnp.where(weight > 0.0, x * weight, 0.0)) / jnp.maximum(whole, 1e-8)
 
 
 def weighted_mean(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, ""]:
     """Mean over what carries weight, on all devices; zero if nothing does."""
-    return sharding.total(share(x, weight=weight, whole=sharding.total(jnp.sum(weight), axis)), axis)
+    return sharding.sum_over_devices(active_fraction(x, weight=weight, whole=sharding.sum_over_devices(jnp.sum(weight), axis)), axis)
 
 
-def normalise(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, "*batch"]:
+def normalize_advantages(x: Float[Array, "*batch"], weight: Float[Array, "*batch"], *, axis: str | None = None) -> Float[Array, "*batch"]:
     """To zero mean and unit standard deviation over what carries weight; zero elsewhere."""
     centred = jnp.where(weight > 0.0, x - weighted_mean(x, weight, axis=axis), 0.0)
     return centred / (jnp.sqrt(weighted_mean(centred**2, weight, axis=axis)) + 1e-8)

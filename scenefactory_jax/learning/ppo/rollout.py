@@ -7,29 +7,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.pytree import choose, struct
-from scenefactory_jax.core.types import Env, Observation, Outcome, Policy, Scene, State
+from scenefactory_jax.core.pytree import pytree_dataclass, tree_where
+from scenefactory_jax.core.types import Env, Observation, Policy, Scene, State, StepResult
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning.ppo.loss import log_probability
 
 
-@struct
-class Lives:
+@pytree_dataclass
+class EpisodeStats:
     """What each slot's agent has collected since its own start."""
 
     returns: Float[Array, "W A"]  # undiscounted
     steps: Float[Array, "W A"]
 
 
-@struct
-class Record:
+@pytree_dataclass
+class SceneStats:
     """What became of the agents of each world since its scene was placed there."""
 
     episodes: Int[Array, " W"]  # lives of agents that ended, by an event or by time
     successes: Int[Array, " W"]  # goals reached
 
 
-@struct
+@pytree_dataclass
 class Sample:
     """One action of every slot and what came of it until the next, as the learner needs it."""
 
@@ -48,19 +48,19 @@ Tally = dict[str, Array]
 """Sums over worlds, agents and time: what metrics are made of."""
 
 
-def collect(
+def collect_rollout(
     env: Env,
     policy: Policy,
     parameters: Any,
     scenes: Scene,
     worlds: State,
     observation: Observation,
-    lives: Lives,
+    lives: EpisodeStats,
     key: PRNGKeyArray,
     *,
     horizon: int,
     axis: str | None = None,
-) -> tuple[State, Observation, Lives, Sample, Tally, Record]:
+) -> tuple[State, Observation, EpisodeStats, Sample, Tally, SceneStats]:
     """Act `horizon` times in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
 
     An action stands for `env.hold` control steps.
@@ -72,14 +72,16 @@ def collect(
         worlds and observation to go on from, lives, samples `[T, W, A]`, the tally of all steps, and the record of each world in them.
     """
 
-    def step(carry: tuple[State, Observation, Lives], key: PRNGKeyArray) -> tuple[tuple[State, Observation, Lives], tuple[Sample, Tally]]:
+    def step(
+        carry: tuple[State, Observation, EpisodeStats], key: PRNGKeyArray
+    ) -> tuple[tuple[State, Observation, EpisodeStats], tuple[Sample, Tally]]:
         worlds, observation, lives = carry
         action_key, start_key = jax.random.split(key)
         mean, log_std, value = policy.apply(parameters, observation)
-        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(sharding.keys(action_key, len(mean), axis))
+        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(sharding.world_keys(action_key, len(mean), axis))
         action = mean + jnp.exp(log_std) * noise
         control = lambda worlds: jax.vmap(env.transition)(scenes, worlds, action)  # noqa: E731
-        after, lives, outcome, counts = environment.act(control, worlds, lives, hold=env.hold, note=_tally)
+        after, lives, outcome, counts = environment.repeat_action(control, worlds, lives, hold=env.hold, note=_tally)
         sample = Sample(
             observation=observation,
             action=action,
@@ -89,29 +91,29 @@ def collect(
             active=worlds.active,
             reward=outcome.reward,
             done=outcome.done,
-            truncated=environment.out_of_time(outcome, worlds.active),
+            truncated=environment.find_truncated_agents(outcome, worlds.active),
         )
-        fresh = jax.vmap(env.start)(sharding.keys(start_key, len(outcome.over), axis), scenes)
-        worlds = choose(outcome.over, fresh, after)
+        fresh = jax.vmap(env.start)(sharding.world_keys(start_key, len(outcome.over), axis), scenes)
+        worlds = tree_where(outcome.over, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
-    record = Record(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/reached")))
+    record = SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/reached")))
     return worlds, observation, lives, samples, jax.tree.map(jnp.sum, counts), record
 
 
-def no_record(worlds: State) -> Record:
+def make_empty_scene_stats(worlds: State) -> SceneStats:
     """Nothing recorded yet."""
     count = len(worlds.step)
-    return Record(jnp.zeros(count, jnp.int32), jnp.zeros(count, jnp.int32))
+    return SceneStats(jnp.zeros(count, jnp.int32), jnp.zeros(count, jnp.int32))
 
 
-def no_lives(worlds: State) -> Lives:
+def make_empty_episode_stats(worlds: State) -> EpisodeStats:
     """Nothing collected yet."""
-    return Lives(jnp.zeros(worlds.active.shape, jnp.float32), jnp.zeros(worlds.active.shape, jnp.float32))
+    return EpisodeStats(jnp.zeros(worlds.active.shape, jnp.float32), jnp.zeros(worlds.active.shape, jnp.float32))
 
 
-def _tally(lives: Lives, worlds: State, outcome: Outcome) -> tuple[Lives, Tally]:
+def _tally(lives: EpisodeStats, worlds: State, outcome: StepResult) -> tuple[EpisodeStats, Tally]:
     """Carry lives on, and sum the control step up for each world: all of them would be one long sum, for which a GPU waits at every step.
 
     Float32 holds sums of up to 16.7 million agent steps exactly.
@@ -123,7 +125,7 @@ def _tally(lives: Lives, worlds: State, outcome: Outcome) -> tuple[Lives, Tally]
     active = worlds.active
     ended = active & (outcome.done | outcome.truncated[:, None])
     reward = jnp.where(active, outcome.reward, 0.0)
-    lives = Lives(lives.returns + reward, lives.steps + active)
+    lives = EpisodeStats(lives.returns + reward, lives.steps + active)
     counts = {
         "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
@@ -136,4 +138,4 @@ def _tally(lives: Lives, worlds: State, outcome: Outcome) -> tuple[Lives, Tally]
         **{f"events/{name}": total(event, active) for name, event in vars(outcome.events).items()},
     }
     gone = ended | outcome.over[:, None]
-    return Lives(jnp.where(gone, 0.0, lives.returns), jnp.where(gone, 0.0, lives.steps)), counts
+    return EpisodeStats(jnp.where(gone, 0.0, lives.returns), jnp.where(gone, 0.0, lives.steps)), counts

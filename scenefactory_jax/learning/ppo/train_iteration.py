@@ -20,8 +20,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import ConfigError, check_number, check_share
-from scenefactory_jax.core.pytree import replace, strong, struct
+from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number
+from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
 from scenefactory_jax.core.types import Env, Observation, Policy, Scene, State
 from scenefactory_jax.learning import initial_parameters
 from scenefactory_jax.learning.ppo import gae, loss, rollout, update
@@ -30,7 +30,7 @@ Metrics = dict[str, Float[Array, ""]]
 MILLION = 1_000_000
 
 
-@struct
+@pytree_dataclass
 class TrainState:
     """All that training carries from one iteration to the next: saving it and going on is the same as going on."""
 
@@ -39,8 +39,8 @@ class TrainState:
     optimiser: optax.OptState
     worlds: State  # with the axis W in front
     observation: Observation  # of `worlds`
-    lives: rollout.Lives
-    record: rollout.Record  # of all worlds, wherever they lie
+    lives: rollout.EpisodeStats
+    record: rollout.SceneStats  # of all worlds, wherever they lie
     key: PRNGKeyArray
     iteration: Int[Array, ""]
     steps: Int[Array, " 2"]  # steps of spawned slots so far: whole millions and the rest, since int32 ends at 2.1 billion
@@ -59,7 +59,7 @@ class Trainer(NamedTuple):
     swap: Callable[[TrainState, Scene, Int[Array, " N"], Scene], tuple[TrainState, Scene]]
 
 
-def make(
+def make_trainer(
     env: Env,
     policy: Policy,
     *,
@@ -111,13 +111,15 @@ def make(
     """
     _check(locals())
     axis, own, everybody = _groups(shards, mesh)
-    adam = update.optimiser(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
-    objective = functools.partial(loss.ppo, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis)
+    adam = update.make_optimizer(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
+    objective = functools.partial(
+        loss.compute_loss, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis
+    )
     rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved)
     passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
-    learn = functools.partial(update.learn, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
+    learn = functools.partial(update.update_epochs, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
     start = functools.partial(_start, env=env, phases=episode_steps // env.hold if initial_phase else 1)
-    act = functools.partial(rollout.collect, env, policy, horizon=horizon, axis=axis)
+    act = functools.partial(rollout.collect_rollout, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
     whole, size = functools.partial(size, groups=everybody), functools.partial(size, groups=own)
@@ -147,13 +149,15 @@ def _compiled(init: Callable, iterate: Callable, restart: Callable, swap: Callab
         return jax.lax.with_sharding_constraint(train_state, shardings)
 
     def spread(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
-        arguments = [(train_state, _places(train_state)), (scenes, sharding.apart(scenes))]
-        return sharding.on_each(iterate, arguments, lambda found: (_places(found[0]), sharding.everywhere(found[1])), mesh)
+        arguments = [(train_state, _places(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
+        return sharding.map_over_devices(
+            iterate, arguments, lambda found: (_places(found[0]), sharding.make_replicated_specs(found[1])), mesh
+        )
 
     def exchanged(train_state: TrainState, scenes: Scene, worlds: Array, fresh: Scene) -> tuple[TrainState, Scene]:
-        arguments = [(train_state, _places(train_state)), (scenes, sharding.apart(scenes))]
-        arguments += [(part, sharding.everywhere(part)) for part in (worlds, fresh)]
-        return sharding.on_each(swap, arguments, lambda found: (_places(found[0]), sharding.apart(found[1])), mesh)
+        arguments = [(train_state, _places(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
+        arguments += [(part, sharding.make_replicated_specs(part)) for part in (worlds, fresh)]
+        return sharding.map_over_devices(swap, arguments, lambda found: (_places(found[0]), sharding.make_sharded_specs(found[1])), mesh)
 
     return Trainer(
         init=jax.jit(lambda key, scenes: placed(init(key, scenes))),
@@ -208,8 +212,8 @@ def _init(
         optimiser=optimiser.init(parameters),
         worlds=worlds,
         observation=observation,
-        lives=rollout.no_lives(worlds),
-        record=rollout.no_record(worlds),
+        lives=rollout.make_empty_episode_stats(worlds),
+        record=rollout.make_empty_scene_stats(worlds),
         key=later_key,
         iteration=jnp.int32(0),
         steps=jnp.zeros(2, jnp.int32),
@@ -220,7 +224,7 @@ def _init(
 def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> TrainState:
     start_key, key = jax.random.split(train_state.key)
     worlds, observation = start(start_key, scenes)
-    empty = {"lives": rollout.no_lives(worlds), "record": rollout.no_record(worlds)}
+    empty = {"lives": rollout.make_empty_episode_stats(worlds), "record": rollout.make_empty_scene_stats(worlds)}
     return _own(replace(train_state, worlds=worlds, observation=observation, key=key, **empty))
 
 
@@ -233,15 +237,15 @@ def _swap(
     """
     start_key, key = jax.random.split(train_state.key)
     begun, seen = _start(start_key, fresh, env=env, phases=1)
-    rows = sharding.own(worlds, len(train_state.worlds.step), axis)
+    rows = sharding.to_local_index(worlds, len(train_state.worlds.step), axis)
 
     def put(held: Any, new: Any) -> Any:
         return jax.tree.map(lambda leaf, row: leaf.at[rows].set(row, mode="drop"), held, new)
 
     held = (train_state.worlds, train_state.observation, train_state.lives, scenes)
-    now, observation, lives, scenes = put(held, (begun, seen, rollout.no_lives(begun), fresh))
+    now, observation, lives, scenes = put(held, (begun, seen, rollout.make_empty_episode_stats(begun), fresh))
     record = jax.tree.map(lambda count: count.at[worlds].set(0), train_state.record)
-    return strong(replace(train_state, worlds=now, observation=observation, lives=lives, record=record, key=key)), scenes
+    return to_strong_type(replace(train_state, worlds=now, observation=observation, lives=lives, record=record, key=key)), scenes
 
 
 def _iterate(
@@ -265,7 +269,7 @@ def _iterate(
     learnt = (train_state.parameters, train_state.optimiser)
     parameters, optimiser, facts = learn(*learnt, batch, log_std, learn_key, train_state.iteration, size=size(worlds))
     facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
-    tally = sharding.total(tally, axis)
+    tally = sharding.sum_over_devices(tally, axis)
     following = TrainState(
         parameters=parameters,
         averaged=None if average is None else _mean(train_state.averaged, parameters, train_state.iteration, average),
@@ -273,12 +277,12 @@ def _iterate(
         worlds=worlds,
         observation=observation,
         lives=lives,
-        record=jax.tree.map(jnp.add, train_state.record, sharding.gathered(lately, axis)),
+        record=jax.tree.map(jnp.add, train_state.record, sharding.gather_over_devices(lately, axis)),
         key=key,
         iteration=train_state.iteration + 1,
         steps=_add(train_state.steps, tally["spawned"]),
     )
-    return strong(following), measure(tally, facts)
+    return to_strong_type(following), measure(tally, facts)
 
 
 def _mean(before: Any, now: Any, iteration: Int[Array, ""], stays: float) -> Any:
@@ -353,7 +357,7 @@ def _batch(
     Only active agents whose time did not run out carry weight.
     """
     flat = functools.partial(_flat, groups=groups)
-    advantage, returns = gae.estimate(
+    advantage, returns = gae.compute_gae(
         samples.reward, samples.value, bootstrap, samples.active, samples.done, samples.truncated, gamma=gamma, gae_lambda=gae_lambda
     )
     weight = (samples.active & ~samples.truncated).astype(jnp.float32)
@@ -367,7 +371,7 @@ def _batch(
         returns=flat(returns),
         weight=flat(weight),
     )
-    return replace(batch, advantage=loss.normalise(batch.advantage, batch.weight, axis=axis)) if normalise_advantage else batch
+    return replace(batch, advantage=loss.normalize_advantages(batch.advantage, batch.weight, axis=axis)) if normalise_advantage else batch
 
 
 def _flat(x: Array, *, groups: int) -> Array:
@@ -382,7 +386,7 @@ def _add(steps: Array, more: Array) -> Array:
 
 def _own(tree: Any) -> Any:
     """Buffers of its own: `jit` may hand an argument (a scene's spawn points) straight through, and donating it would delete the scene."""
-    return jax.tree.map(jnp.copy, strong(tree))
+    return jax.tree.map(jnp.copy, to_strong_type(tree))
 
 
 def _check(numbers: dict[str, Any]) -> None:
@@ -395,7 +399,7 @@ def _check(numbers: dict[str, Any]) -> None:
     for name in ("entropy", "value"):
         check_number(given[name], where=f"ppo.{name}", least=0)
     for name in filter(given.__contains__, ("gamma", "gae_lambda", "sample_share", "average")):
-        check_share(given[name], where=f"ppo.{name}")
+        check_fraction(given[name], where=f"ppo.{name}")
     if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
         bounds = f"[{numbers['learning_rate_min']}, {numbers['learning_rate_max']}]"
         raise ConfigError(f"ppo.learning_rate: {numbers['learning_rate']} is outside [learning_rate_min, learning_rate_max] = {bounds}")

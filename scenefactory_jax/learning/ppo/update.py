@@ -35,13 +35,13 @@ class AdaptiveRate(NamedTuple):
         return self._replace(maximum=jnp.maximum(self.maximum / (1.0 + iteration / self.halved), self.minimum))  # pyright: ignore
 
 
-def optimiser(*, learning_rate: float, max_grad_norm: float) -> optax.GradientTransformation:
+def make_optimizer(*, learning_rate: float, max_grad_norm: float) -> optax.GradientTransformation:
     """Adam behind a bound on the gradient's norm over all parameters; its learning rate is part of its state."""
     adam = optax.inject_hyperparams(optax.adam)(learning_rate=learning_rate)
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), adam)
 
 
-def learn(
+def update_epochs(
     parameters: Any,
     optimiser_state: optax.OptState,
     batch: Batch,
@@ -71,7 +71,7 @@ def learn(
     """
     rate = rate.at(iteration)
     step = functools.partial(_minibatch, loss=loss, optimiser=optimiser, rate=rate, batch=batch, log_std_old=log_std_old, axis=axis)
-    deal = functools.partial(split, weight=batch.weight, minibatches=minibatches, size=size, groups=groups, axis=axis)
+    deal = functools.partial(split_minibatches, weight=batch.weight, minibatches=minibatches, size=size, groups=groups, axis=axis)
 
     def epoch(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
         return jax.lax.scan(step, carry, deal(key))
@@ -81,7 +81,7 @@ def learn(
     moved, broken = facts.pop("moved"), facts.pop("broken")
     means = {name: jnp.sum(jnp.where(moved, fact, 0.0)) / jnp.maximum(jnp.sum(moved), 1) for name, fact in facts.items()}
     held = batch.weight.reshape(groups, -1).sum(axis=1)
-    weight, dealt = sharding.total((held.sum(), jnp.minimum(held, minibatches * (size // groups)).sum()), axis)
+    weight, dealt = sharding.sum_over_devices((held.sum(), jnp.minimum(held, minibatches * (size // groups)).sum()), axis)
     counted = {
         "skipped": jnp.sum(broken, dtype=jnp.float32),
         "learning_rate": optimiser_state[-1].hyperparams["learning_rate"],  # pyright: ignore
@@ -90,7 +90,7 @@ def learn(
     return parameters, optimiser_state, {**means, **counted}
 
 
-def split(
+def split_minibatches(
     key: PRNGKeyArray, weight: Float[Array, " N"], *, minibatches: int, size: int, groups: int = 1, axis: str | None = None
 ) -> Int[Array, "minibatches size"]:
     """Random, disjoint minibatches that share the samples with weight evenly (to one for each group).
@@ -104,7 +104,7 @@ def split(
         order = jnp.argsort(jax.random.uniform(key, weight.shape) + (weight <= 0.0))
         return order[: minibatches * part].reshape(part, minibatches).T
 
-    dealt = jax.vmap(deal)(sharding.keys(key, groups, axis), weight.reshape(groups, each)) + each * jnp.arange(groups)[:, None, None]
+    dealt = jax.vmap(deal)(sharding.world_keys(key, groups, axis), weight.reshape(groups, each)) + each * jnp.arange(groups)[:, None, None]
     return dealt.swapaxes(0, 1).reshape(minibatches, size)
 
 
@@ -122,7 +122,7 @@ def _minibatch(
     """One gradient step; where it is not finite, or no sample has weight, everything stays as it was."""
     parameters, state = carry
     part = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), batch)
-    (total, facts), gradient = sharding.total(jax.value_and_grad(loss, has_aux=True)(parameters, part, log_std_old), axis)
+    (total, facts), gradient = sharding.sum_over_devices(jax.value_and_grad(loss, has_aux=True)(parameters, part, log_std_old), axis)
     norm = optax.global_norm(gradient)
     adapted = jax.tree.map(lambda x: x, state)  # Brax writes into the state's dict
     if rate.desired_kl is not None:
@@ -134,6 +134,6 @@ def _minibatch(
     stepped = optax.apply_updates(parameters, updates)
 
     finite = jnp.isfinite(total) & jnp.isfinite(norm)
-    moved = finite & (sharding.total(jnp.sum(part.weight), axis) > 0.0)
+    moved = finite & (sharding.sum_over_devices(jnp.sum(part.weight), axis) > 0.0)
     carry = jax.tree.map(lambda new, old: jnp.where(moved, new, old), (stepped, adapted), (parameters, state))
     return carry, {**facts, "gradient_norm": norm, "broken": ~finite, "moved": moved}

@@ -37,12 +37,12 @@ def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: 
 def _draw(axes, scene: Scene, inches: float) -> None:
     """One scene's road and cars."""
     points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
-    left, bottom, side = drawing.around(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
+    left, bottom, side = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
     axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal")
     for order, stroke in enumerate(drawing.strokes(scene.road)):
         width = max(stroke.width * inches * 72 / side, 0.25 * stroke.thinnest)
         axes.add_collection(LineCollection(list(stroke.lines), colors=[_rgb(stroke.colour)], linewidths=width, zorder=1 + order / 100))
-    recorded, still = traffic_shapes.at_start(scene)
+    recorded, still = traffic_shapes.shapes_at_start(scene)
     shapes = list(traffic_shapes.shapes(recorded, 0, still))
     axes.add_collection(PolyCollection([shape.points for shape in shapes], facecolors=[_rgb(shape.fill) for shape in shapes], zorder=2.5))
     agents = scene.agents

@@ -109,7 +109,7 @@ def check(trajectory: Trajectory) -> None:
         raise TrajectoryError(f"trajectory {trajectory.title!r}: no steps, so there is nothing to draw")
 
 
-def settle(trajectory: Trajectory) -> Trajectory:
+def sanitize_trajectory(trajectory: Trajectory) -> Trajectory:
     """Checked, and without numbers that cannot be drawn: after a fault of the simulation a car stays, inactive, where it last was.
 
     Raises:
@@ -140,7 +140,7 @@ def to_pixels(view: View, points: Num[np.ndarray, "*n 2"]) -> Float[np.ndarray, 
     return np.stack([columns, rows], axis=-1)
 
 
-def around(points: Num[np.ndarray, "n 2"], *, margin: float, smallest: float) -> tuple[float, float, float]:
+def fit_view(points: Num[np.ndarray, "n 2"], *, margin: float, smallest: float) -> tuple[float, float, float]:
     """(left, bottom, side) of the square around points with a margin, no side below `smallest`; metres."""
     low, high = points.min(axis=0), points.max(axis=0)
     side = max(float((high - low).max()) + 2 * margin, smallest)
@@ -161,7 +161,7 @@ def goal_at(trajectory: Trajectory, step: int) -> Float[np.ndarray, "A 2"]:
     return trajectory.goal[step] if np.ndim(trajectory.goal) == 3 else trajectory.goal
 
 
-def respawns(trajectory: Trajectory) -> bool:
+def find_respawns(trajectory: Trajectory) -> bool:
     """Whether finished agents start again: goals change."""
     return np.ndim(trajectory.goal) == 3 and bool((trajectory.goal != trajectory.goal[:1]).any())
 
@@ -186,7 +186,7 @@ def car_shape(position: Num[np.ndarray, "2"], yaw: float, size: Num[np.ndarray, 
     return ((box * [length, width]) @ rotation + position, (arrow * [length, width]) @ rotation + position)
 
 
-def moves(trajectory: Trajectory) -> Bool[np.ndarray, "T A"]:
+def is_moving(trajectory: Trajectory) -> Bool[np.ndarray, "T A"]:
     """True where the way from the step before to this one was driven: active at both ends, and no respawn between (no car does 100 m/s)."""
     jump = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=-1) > 100.0 / trajectory.control_hz
     driven = trajectory.active[1:] & trajectory.active[:-1] & ~jump & trajectory.present

@@ -50,7 +50,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
         figure = Figure(figsize=(_INCHES * len(cases), height))
         figure.text(0.01 / len(cases), 1 - 0.04 / height, kind.label, fontsize=9, fontweight="bold", va="top")
         for column, case in enumerate(cases):
-            case = case._replace(trajectory=drawing.settle(case.trajectory))
+            case = case._replace(trajectory=drawing.sanitize_trajectory(case.trajectory))
             for row, window in enumerate((_whole(case), _near(case))):
                 width, tall = 1 / len(cases), _INCHES / height
                 place = ((column + 0.01) * width, 1 - head / height - (row + 0.99) * tall, 0.98 * width, 0.98 * tall)
@@ -84,7 +84,7 @@ def _whole(case: Case) -> tuple[float, float, float]:
     agent, trajectory = case.failure.agent, case.trajectory
     way = trajectory.position[trajectory.active[:, agent], agent]
     points = np.concatenate([way, drawing.goal_at(trajectory, _step(case))[[agent]], [case.failure.place]])
-    return drawing.around(points, margin=9.0, smallest=50.0)
+    return drawing.fit_view(points, margin=9.0, smallest=50.0)
 
 
 def _near(case: Case) -> tuple[float, float, float]:
@@ -110,7 +110,7 @@ def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_
     cars = len(trajectory.present)
     if trajectory.others is not None:
         _draw_others(axes, case, step, partner=None if case.hit is None else case.hit - cars)
-    driven, since = drawing.moves(trajectory), max(step - round(before_s * trajectory.control_hz), 0)
+    driven, since = drawing.is_moving(trajectory), max(step - round(before_s * trajectory.control_hz), 0)
     for other in np.flatnonzero(trajectory.present & (trajectory.active[: step + 1].any(axis=0))):
         met = case.hit == other
         if other == agent or not trajectory.active[step, other]:
@@ -133,7 +133,7 @@ def _draw_others(axes: Axes, case: Case, step: int, *, partner: int | None) -> N
     """Everybody who is no agent; whom the car hit in the partner's colour."""
     boxes = case.trajectory.others
     assert boxes is not None
-    still = traffic_shapes.parked(boxes)
+    still = traffic_shapes.shapes_at_rest(boxes)
     for shape in traffic_shapes.shapes(boxes, step, still):
         look = {"facecolor": _rgb(shape.fill), "edgecolor": _rgb(shape.outline), "linewidth": 0.6, "zorder": 2.5}
         axes.add_patch(Polygon(shape.points, **look))

@@ -38,8 +38,8 @@ def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figur
     if whole or not len(present):
         points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
     with matplotlib.rc_context(STYLE):
-        figure, axes, scale = _stage(scene, drawing.around(points, margin=12.0, smallest=50.0), title=title)
-        recorded, still = traffic_shapes.at_start(scene)
+        figure, axes, scale = _stage(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
+        recorded, still = traffic_shapes.shapes_at_start(scene)
         _draw_others(axes, recorded, 0, still)
         for agent in present.tolist():
             look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
@@ -56,14 +56,14 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     Raises:
         TrajectoryError: arrays that do not belong together.
     """
-    trajectory = drawing.settle(trajectory)
-    driven = drawing.moves(trajectory)
+    trajectory = drawing.sanitize_trajectory(trajectory)
+    driven = drawing.is_moving(trajectory)
     with matplotlib.rc_context(STYLE):
-        view = drawing.around(drawing.places(trajectory), margin=12.0, smallest=50.0)
+        view = drawing.fit_view(drawing.places(trajectory), margin=12.0, smallest=50.0)
         title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
         figure, axes, scale = _stage(trajectory.scene, view, title=title)
         if trajectory.others is not None:
-            _draw_others(axes, trajectory.others, 0, traffic_shapes.parked(trajectory.others))
+            _draw_others(axes, trajectory.others, 0, traffic_shapes.shapes_at_rest(trajectory.others))
         for agent in np.flatnonzero(trajectory.present).tolist():
             steps = np.flatnonzero(driven[:, agent])
             way = trajectory.position[:, agent]
@@ -98,7 +98,7 @@ def _stage(scene: Scene, window: tuple[float, float, float], *, title: str) -> t
     axes.set_title(title)
     scale = _INCHES * _SHARE * 72 / side
     lines = drawing.strokes(scene.road)
-    _draw_areas(axes, patch_overlay.areas(scene.weather), zorder=1 + (patch_overlay.under(lines) - 0.5) / 100)
+    _draw_areas(axes, patch_overlay.areas(scene.weather), zorder=1 + (patch_overlay.draw_areas_below(lines) - 0.5) / 100)
     for order, stroke in enumerate(lines):
         width = max(stroke.width * scale, 0.5 * stroke.thinnest)
         look = {"linewidths": width, "capstyle": "round" if width > 4 else "butt", "zorder": 1 + order / 100}

@@ -33,13 +33,13 @@ def areas(weather: Weather) -> list[Area]:
     patches, found = weather.patches, []
     for row in np.flatnonzero(np.asarray(patches.present)):
         film = float(patches.film_mm[row] + patches.follows[row] * weather.film_mm)
-        colour, label = look(SURFACES[int(patches.surface[row])], film)
+        colour, label = colour_area(SURFACES[int(patches.surface[row])], film)
         pieces = outline(np.asarray(patches.vertices[row], float), float(patches.radius[row]), closed=bool(patches.closed[row]))
         found.append(Area(pieces, colour, blend(INK, colour, 0.3), label))
     return found
 
 
-def look(surface: str, film_mm: float) -> tuple[Colour, str]:
+def colour_area(surface: str, film_mm: float) -> tuple[Colour, str]:
     """Colour and name of a condition: the deeper the water, the more of its colour."""
     colour, label = GROUNDS.get(surface, DRY)
     if film_mm <= 0:
@@ -67,6 +67,6 @@ def outline(vertices: Float[np.ndarray, "v 2"], radius: float, *, closed: bool) 
     return pieces
 
 
-def under(strokes: list[Stroke]) -> int:
+def draw_areas_below(strokes: list[Stroke]) -> int:
     """How many of a road's strokes lie below its patches: the lanes' own area, which comes first."""
     return sum(stroke.colour == ASPHALT for stroke in strokes)

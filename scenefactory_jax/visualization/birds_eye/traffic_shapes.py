@@ -24,7 +24,7 @@ class Shape(NamedTuple):
     outline: Colour
 
 
-def at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
+def shapes_at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
     """The recorded others of a packed scene at the logged step at which its agents start, as one step; and who never moves in the log."""
     log, present = scene.log, np.asarray(scene.agents.present)
     apart = np.linalg.norm(np.asarray(log.position) - np.asarray(scene.agents.position)[:, None], axis=-1)
@@ -32,10 +32,10 @@ def at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
     row = int(np.argmin(apart.sum(axis=0))) if len(apart) else 0
     position, yaw, valid = (np.asarray(leaf).swapaxes(0, 1) for leaf in (scene.others.position, scene.others.yaw, scene.others.valid))
     whole = Others(position, yaw, np.broadcast_to(np.asarray(scene.others.size), position.shape), valid)
-    return Others(*(leaf[row : row + 1] for leaf in whole)), parked(whole)
+    return Others(*(leaf[row : row + 1] for leaf in whole)), shapes_at_rest(whole)
 
 
-def parked(others: Others) -> Bool[np.ndarray, " O"]:
+def shapes_at_rest(others: Others) -> Bool[np.ndarray, " O"]:
     """Who, as far as it is there, never leaves its place."""
     first = np.argmax(others.present, axis=0)
     begin = others.position[first, np.arange(others.present.shape[1])]

@@ -90,7 +90,7 @@ def frames(
     return _film(stages, fps=fps, stride=stride, columns=min(columns, len(stages)), panel=panel, trail_s=trail_s)
 
 
-def picture(trajectory: Trajectory, step: int, *, window: tuple[float, float, float], panel: int) -> UInt8[np.ndarray, "N N 3"]:
+def draw_frame(trajectory: Trajectory, step: int, *, window: tuple[float, float, float], panel: int) -> UInt8[np.ndarray, "N N 3"]:
     """One step of one world, without trails and frame.
 
     Args:
@@ -130,13 +130,13 @@ def _film(stages: list[_Stage], *, fps: float | int, stride: int, columns: int, 
 
 def _prepare(trajectory: Trajectory, panel: int, window: tuple[float, float, float] | None = None) -> _Stage:
     """Everything of a world that does not change from frame to frame; without a window its view holds all ways and goals."""
-    trajectory = drawing.settle(trajectory)
-    view = View(*(window or drawing.around(drawing.places(trajectory), margin=9.0, smallest=50.0)), panel * _FINE)
+    trajectory = drawing.sanitize_trajectory(trajectory)
+    view = View(*(window or drawing.fit_view(drawing.places(trajectory), margin=9.0, smallest=50.0)), panel * _FINE)
     steps = np.arange(len(trajectory.active))[:, None]
     last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
     events = {name: happened & trajectory.present for name, happened in trajectory.events.items()}
     happened = sorted((int(t), int(a), name) for name, where in events.items() for t, a in np.argwhere(where))
-    again = drawing.respawns(trajectory)
+    again = drawing.find_respawns(trajectory)
     counts = {n: np.cumsum(e.sum(1)) if again else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()}
     small, bold = max(9, panel // 44), _font(max(9, panel // 44), bold=True)
     numbers = [(str(agent), drawing.blend(drawing.colour_of(agent), INK, 0.7)) for agent in range(len(trajectory.present))]
@@ -145,14 +145,14 @@ def _prepare(trajectory: Trajectory, panel: int, window: tuple[float, float, flo
         view=view,
         background=road_image(drawing.strokes(trajectory.scene.road), view, patches=patch_overlay.areas(trajectory.scene.weather)),
         way=drawing.to_pixels(view, trajectory.position),
-        driven=drawing.moves(trajectory),
+        driven=drawing.is_moving(trajectory),
         ended=steps - last,
         happened=happened,
         counts=counts,
         names=[_sprite(number, bold, colour) for number, colour in numbers],
         goals=[_sprite(number, _font(small * _FINE), colour) for number, colour in numbers],
         labels={name: _sprite(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
-        parked=np.zeros(0, bool) if trajectory.others is None else traffic_shapes.parked(trajectory.others),
+        parked=np.zeros(0, bool) if trajectory.others is None else traffic_shapes.shapes_at_rest(trajectory.others),
     )
 
 
@@ -162,7 +162,7 @@ def road_image(lines: Sequence[Stroke], view: View, *, patches: Sequence[Area] =
     image = Image.new("RGB", (fine.pixels, fine.pixels), GROUND)
     draw = ImageDraw.Draw(image)
     scale = fine.pixels / view.side
-    first = patch_overlay.under(list(lines))
+    first = patch_overlay.draw_areas_below(list(lines))
     for order, stroke in enumerate(lines):
         if order == first:
             _draw_areas(draw, fine, patches)
@@ -309,7 +309,7 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
     clock = f"{now / stage.trajectory.control_hz:.1f} s"
     draw.text((left, top + bar // 2), clock, font=font, fill=INK, anchor="lm")
     counts = {name: int(stage.counts[name][now]) for name in MARKS if name in stage.counts}
-    total, once = int(stage.trajectory.present.sum()), not drawing.respawns(stage.trajectory)
+    total, once = int(stage.trajectory.present.sum()), not drawing.find_respawns(stage.trajectory)
     entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "fault"}
     entries |= {"reached": f"{entries['reached']} of {total}"} if once and "reached" in entries else {}
     while sum(font.getlength(entry) + 12 for entry in entries.values()) > panel - font.getlength(clock) and len(entries) > 1:

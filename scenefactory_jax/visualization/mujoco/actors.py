@@ -23,7 +23,7 @@ TRAIL_HALF_M, TRAIL_M, GOAL_M = 0.12, 0.035, 0.04
 GREY, SKIN = (0.55, 0.56, 0.58, 1.0), (0.80, 0.55, 0.30, 1.0)
 
 
-class Cast(NamedTuple):
+class ActorTrajectories(NamedTuple):
     """One world over its steps, on the host; a car's numbers mean something from its first step on."""
 
     scene: Scene
@@ -36,7 +36,7 @@ class Cast(NamedTuple):
     hz: float
 
 
-def cast(recording: Recording, index: int, car: CarParameters) -> Cast:
+def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTrajectories:
     """One world of a recording, cut one second after its last car is done.
 
     Args:
@@ -54,13 +54,13 @@ def cast(recording: Recording, index: int, car: CarParameters) -> Cast:
     held = np.where(last < 0, np.argmax(active, axis=0), last)
     if shots.joints is None:
         spin = np.cumsum(np.nan_to_num(shots.speed) * active, axis=0) / hz / car.wheel_radius
-        joints = scene_model.posture(car, shots.position, shots.yaw, shots.steer, spin)
+        joints = scene_model.set_posture(car, shots.position, shots.yaw, shots.steer, spin)
     else:
         joints = np.asarray(shots.joints, float)
     others = drawing.Others(*(np.asarray(getattr(shots.others, name)) for name in drawing.Others._fields))
     opacity = np.where(last < 0, 0.0, np.clip(1.0 - (steps - last) / (FADE_S * hz), 0.0, 1.0))
     yaw, goal = shots.yaw[held, agents], shots.goal[held, agents]
-    return Cast(scene, joints[held, agents], yaw, active, opacity, goal, others, hz)
+    return ActorTrajectories(scene, joints[held, agents], yaw, active, opacity, goal, others, hz)
 
 
 def add(
@@ -94,7 +94,7 @@ def add_goals(
         add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, GOAL_M / 2, 0.0), place, 0.0, _colour(int(agent), 0.45 * opacity[agent]))
 
 
-def add_trails(scene: mujoco.MjvScene, whole: Cast, step: int, *, trail_s: float) -> None:
+def add_trails(scene: mujoco.MjvScene, whole: ActorTrajectories, step: int, *, trail_s: float) -> None:
     """Where every car was in the last seconds, fading with age; some ten pieces a second."""
     count, stride = round(trail_s * whole.hz), max(round(whole.hz / 10), 1)
     first = max(step - count, 0)

@@ -19,7 +19,7 @@ from scenefactory_jax.env.rollout import Recording
 from scenefactory_jax.visualization import gif_writer, mp4_writer
 from scenefactory_jax.visualization.mp4_writer import VideoError
 from scenefactory_jax.visualization.mujoco import actors, offscreen_renderer, scene_model
-from scenefactory_jax.visualization.mujoco.actors import Cast
+from scenefactory_jax.visualization.mujoco.actors import ActorTrajectories
 
 SUFFIXES = (".gif", ".mp4", ".png")
 SAMPLES = 6  # frames that a GIF's colours are taken from
@@ -27,7 +27,7 @@ FINE = 2  # pixels drawn for one that is shown, in each direction: multisampling
 FOVY = 45.0  # MuJoCo's, of cameras that no model names
 
 
-class Look(NamedTuple):
+class FilmSettings(NamedTuple):
     """How a film is seen; `conf/replay.yaml` says what each means."""
 
     view: Literal["chase", "bird", "both"]
@@ -44,7 +44,7 @@ class Look(NamedTuple):
     goal_radius_m: float
 
 
-def write(path: Path | str, recording: Recording, *, car: CarParameters, look: Look, world: int = 0) -> Path:
+def write(path: Path | str, recording: Recording, *, car: CarParameters, look: FilmSettings, world: int = 0) -> Path:
     """Write `.png`, one moment; or `.gif`, or `.mp4` (extra `video`), the whole episode.
 
     Args:
@@ -61,7 +61,7 @@ def write(path: Path | str, recording: Recording, *, car: CarParameters, look: L
         raise VideoError(f"{path}: suffix {path.suffix!r} is no film; valid are {', '.join(SUFFIXES)}")
     if path.suffix != ".png":
         mp4_writer.check(path, fps=look.fps)
-    whole = actors.cast(jax.device_get(recording), world, car)
+    whole = actors.make_actors(jax.device_get(recording), world, car)
     followed = _followed(whole, look.car)
     steps = list(range(0, _length(whole, followed, look), look.stride))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -79,7 +79,9 @@ def write(path: Path | str, recording: Recording, *, car: CarParameters, look: L
     return path
 
 
-def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+def frames(
+    whole: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, look: FilmSettings
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """The pictures of some steps, one after the other; `both` puts the view from behind to the left of the one from above.
 
     Raises:
@@ -91,9 +93,9 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
     heading = smooth(np.unwrap(whole.yaw[:, followed]), lag=look.lag_s * whole.hz)
     views = ("chase", "bird") if look.view == "both" else (look.view,)
     above = _above(whole, aspect=look.width / look.height)
-    with offscreen_renderer.painter(built.model, data, width=FINE * look.width, height=FINE * look.height) as paint:
+    with offscreen_renderer.make_painter(built.model, data, width=FINE * look.width, height=FINE * look.height) as paint:
         for step in steps:
-            scene_model.put(built, data, whole.joints[step], whole.opacity[step])
+            scene_model.place_actor(built, data, whole.joints[step], whole.opacity[step])
             behind = chase(whole.joints[step, followed, :3], float(heading[step]), distance_m=look.distance_m, pitch_deg=look.pitch_deg)
 
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
@@ -103,7 +105,7 @@ def frames(whole: Cast, steps: Sequence[int], *, car: CarParameters, look: Look)
 
             shown = []
             for camera in (behind if view == "chase" else above for view in views):
-                scene_model.light(data, camera.lookat)
+                scene_model.place_light(data, camera.lookat)
                 fine = paint(camera, decorate).reshape(look.height, FINE, look.width, FINE, 3)
                 shown.append(fine.mean(axis=(1, 3)).round().astype(np.uint8))
             yield np.concatenate(shown, axis=1)
@@ -118,7 +120,7 @@ def chase(place: Float[np.ndarray, "3"], yaw: float, *, distance_m: float, pitch
     return camera
 
 
-def _above(whole: Cast, *, aspect: float) -> mujoco.MjvCamera:
+def _above(whole: ActorTrajectories, *, aspect: float) -> mujoco.MjvCamera:
     """Straight down on everything that is driven, north up."""
     places = np.concatenate([whole.joints[whole.active][:, :2], whole.goal[whole.active]])
     low, high = places.min(axis=0) - 12.0, places.max(axis=0) + 12.0
@@ -135,7 +137,7 @@ def smooth(values: Float[np.ndarray, " T"], *, lag: float) -> Float[np.ndarray, 
     return np.array(list(itertools.accumulate(values, lambda before, now: before + share * (now - before))))
 
 
-def _followed(whole: Cast, slot: int | None) -> int:
+def _followed(whole: ActorTrajectories, slot: int | None) -> int:
     """The slot that was asked for, or the one whose car drives farthest.
 
     Raises:
@@ -152,7 +154,7 @@ def _followed(whole: Cast, slot: int | None) -> int:
     return slot
 
 
-def _length(whole: Cast, followed: int, look: Look) -> int:
+def _length(whole: ActorTrajectories, followed: int, look: FilmSettings) -> int:
     """Steps of the film: from behind a car it ends a second after that car is done."""
     if look.view == "bird":
         return len(whole.yaw)

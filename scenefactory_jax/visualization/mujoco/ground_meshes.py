@@ -53,9 +53,11 @@ LAYERS: dict[str, Layer] = {
 ASPHALT, ASPHALT_M, PATCH_M = (0.20, 0.21, 0.23, 1.0), 0.008, 0.014
 
 
-def surfaces(scene: Scene) -> list[Surface]:
+def find_surfaces(scene: Scene) -> list[Surface]:
     """Everything flat of one world, on the host."""
-    lines = [(shapely.simplify(shapely.LineString(points), STRAIGHT_M), kind) for points, kind in world_mjcf.chains(scene.road, None)]
+    lines = [
+        (shapely.simplify(shapely.LineString(points), STRAIGHT_M), kind) for points, kind in world_mjcf.join_segments(scene.road, None)
+    ]
     lanes = [line.buffer(LANE_M, quad_segs=4) for line, kind in lines if kind in (*DRIVABLE, LANE_BIKE)]
     asphalt = shapely.union_all(lanes).buffer(CLOSING_M, quad_segs=3).buffer(-CLOSING_M, quad_segs=3) if lanes else None
     found = [] if asphalt is None else [prism("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Env, Observation, Scene, State
-from scenefactory_jax.env.rollout import Act, Shot, shot
+from scenefactory_jax.env.rollout import Act, StepRecord, make_step_record
 from scenefactory_jax.roadgraph import queries
 
 COMMANDS = ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")
@@ -22,7 +22,7 @@ PEDALS = COMMANDS[:5]  # held; the others count when they are pressed
 FAR_M = 1e5  # where the goal of who has none lies
 
 
-class Feel(NamedTuple):
+class KeyboardResponse(NamedTuple):
     """How fast pedals and wheel follow the keys; `conf/drive.yaml` says what each number means."""
 
     rise_s: float
@@ -42,7 +42,7 @@ class Wheel(NamedTuple):
     down: Mapping[str, float] = {}
 
 
-def turned(wheel: Wheel, pressed: Set[str], held: Set[str], *, speed: float, feel: Feel, dt: float) -> Wheel:
+def turn_wheel(wheel: Wheel, pressed: Set[str], held: Set[str], *, speed: float, feel: KeyboardResponse, dt: float) -> Wheel:
     """Pedals and wheel one control step later.
 
     Args:
@@ -72,7 +72,7 @@ class World(NamedTuple):
     """What a drive needs of its world: two compiled functions, and how far from the road the map ends, in metres."""
 
     begin: Callable[[PRNGKeyArray], tuple[State, Observation]]
-    step: Callable[[State, Observation, PRNGKeyArray, Float[Array, "3"]], tuple[State, Observation, Shot, Float[Array, ""]]]
+    step: Callable[[State, Observation, PRNGKeyArray, Float[Array, "3"]], tuple[State, Observation, StepRecord, Float[Array, ""]]]
     dt: float
     car: int
     off_map_m: float
@@ -83,7 +83,7 @@ class Drive(NamedTuple):
 
     state: State
     observation: Observation
-    shot: Shot | None  # of the last step
+    shot: StepRecord | None  # of the last step
     away_m: float  # from the car to the nearest lane, line or edge
     first: PRNGKeyArray  # of the start: a reset draws the same weather, whose patches are on the picture
     key: PRNGKeyArray
@@ -105,12 +105,12 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
 
     def step(
         scene: Scene, parameters: Any, state: State, observation: Observation, key: PRNGKeyArray, action: Float[Array, "3"]
-    ) -> tuple[State, Observation, Shot, Float[Array, ""]]:
+    ) -> tuple[State, Observation, StepRecord, Float[Array, ""]]:
         actions = act(parameters, observation, key).at[car].set(action)
         after, outcome = env.transition(scene, state, actions)
-        squared = queries.segment_squared(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
+        squared = queries.squared_segment_distance(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
         away = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
-        return after, env.observe(scene, after), shot(env, scene, state, after, outcome), away
+        return after, env.observe(scene, after), make_step_record(env, scene, state, after, outcome), away
 
     scene = jax.tree.map(jnp.asarray, scene)
     return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car, off_map_m)
@@ -123,7 +123,7 @@ def start(world: World, *, seed: int) -> Drive:
     return Drive(state, observation, None, 0.0, first, key, Wheel(), paused=False, chasing=True, resets=0, steps=0)
 
 
-def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, feel: Feel) -> Drive:
+def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, feel: KeyboardResponse) -> Drive:
     """One control step, if the drive does not pause. A reset goes back to the start at once; so does a car that is broken or off the map.
 
     Args:
@@ -138,7 +138,7 @@ def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, fe
     if drive.paused:
         return drive
     speed = 0.0 if drive.shot is None else float(drive.shot.speed[world.car])
-    wheel = turned(drive.wheel, pressed, held, speed=speed, feel=feel, dt=world.dt)
+    wheel = turn_wheel(drive.wheel, pressed, held, speed=speed, feel=feel, dt=world.dt)
     action = jnp.array([wheel.throttle, wheel.steer, wheel.brake], jnp.float32)
     key, draw = jax.random.split(drive.key)
     state, observation, seen, away = world.step(drive.state, drive.observation, draw, action)

@@ -46,12 +46,12 @@ def check() -> None:
         OpenGLError: see `painter`.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    with painter(model, mujoco.MjData(model), width=8, height=8) as paint:
+    with make_painter(model, mujoco.MjData(model), width=8, height=8) as paint:
         paint(mujoco.MjvCamera(), lambda scene: None)
 
 
 @contextlib.contextmanager
-def painter(model: mujoco.MjModel, data: mujoco.MjData, *, width: int, height: int) -> Iterator[Paint]:
+def make_painter(model: mujoco.MjModel, data: mujoco.MjData, *, width: int, height: int) -> Iterator[Paint]:
     """A function (camera, decorate) -> picture of `data` as it then is; `decorate` may add geoms to the scene.
 
     Raises:

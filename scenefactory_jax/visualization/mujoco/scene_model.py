@@ -26,7 +26,7 @@ JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the 
 STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
 
 
-class Stage(NamedTuple):
+class RenderModel(NamedTuple):
     """The compiled model and where its cars stand in it."""
 
     model: mujoco.MjModel
@@ -36,7 +36,7 @@ class Stage(NamedTuple):
     paint: Float[np.ndarray, "G 4"]  # every geom's own colour
 
 
-def build(scene: Scene, car: CarParameters) -> Stage:
+def build(scene: Scene, car: CarParameters) -> RenderModel:
     """The world of an episode.
 
     Args:
@@ -44,27 +44,27 @@ def build(scene: Scene, car: CarParameters) -> Stage:
         car: how cars look; each is as long and as wide as its agent, its wheels in proportion.
     """
     model = _empty(scene)
-    for surface in ground_meshes.surfaces(scene):
+    for surface in ground_meshes.find_surfaces(scene):
         _mesh(model, surface)
     slots = np.flatnonzero(np.asarray(scene.agents.present))
     for slot in slots:
         length, width = (float(side) for side in np.asarray(scene.agents.size)[slot])
-        model.attach(_painted(sized(car, length, width), int(slot)), prefix=f"agent{slot}/", frame=model.worldbody.add_frame())
+        model.attach(_painted(fit_buffers(car, length, width), int(slot)), prefix=f"agent{slot}/", frame=model.worldbody.add_frame())
     compiled = model.compile()
     bodies = [compiled.body(f"agent{slot}/chassis").id for slot in slots]
     first = [int(compiled.joint(f"agent{slot}/root").qposadr[0]) for slot in slots]
     geoms = [np.flatnonzero(compiled.body_rootid[compiled.geom_bodyid] == body) for body in bodies]
     joints = np.array(first, int)[:, None] + np.arange(JOINTS)
-    return Stage(compiled, slots, joints, geoms, compiled.geom_rgba.copy())
+    return RenderModel(compiled, slots, joints, geoms, compiled.geom_rgba.copy())
 
 
-def sized(car: CarParameters, length: float, width: float) -> CarParameters:
+def fit_buffers(car: CarParameters, length: float, width: float) -> CarParameters:
     """The car drawn longer and wider, its wheels in proportion."""
     along, across = length / car.length, width / car.width
     return dataclasses.replace(car, length=length, width=width, wheelbase=car.wheelbase * along, track=car.track * across)
 
 
-def posture(
+def set_posture(
     car: CarParameters,
     position: Float[np.ndarray, "*n 2"],
     yaw: Float[np.ndarray, "*n"],
@@ -84,7 +84,7 @@ def posture(
     return joints
 
 
-def put(stage: Stage, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
+def place_actor(stage: RenderModel, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
     """Every car where its joints say, all slots given; what is wholly transparent is not drawn."""
     for row, slot in enumerate(stage.slots):
         data.qpos[stage.joints[row]] = joints[slot]
@@ -94,7 +94,7 @@ def put(stage: Stage, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], op
     mujoco.mj_camlight(stage.model, data)
 
 
-def light(data: mujoco.MjData, place: Float[np.ndarray, "3"]) -> None:
+def place_light(data: mujoco.MjData, place: Float[np.ndarray, "3"]) -> None:
     """Move the sun to where shadows are to be sharp."""
     data.light_xpos[0] = place - 0.5 * SHADOWS_M * np.array(SUN)
 
@@ -129,6 +129,6 @@ def _mesh(model: mujoco.MjSpec, surface: Surface) -> None:
 
 def _painted(car: CarParameters, slot: int) -> mujoco.MjSpec:
     """A car in its slot's colour."""
-    spec = cars.spec(car, visual=True, brake_rows=False)
+    spec = cars.build_mjspec(car, visual=True, brake_rows=False)
     spec.geom("hull").rgba = [*(channel / 255 for channel in drawing.colour_of(slot)), 1.0]
     return spec

@@ -60,7 +60,7 @@ def world(
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in car.worldbody.bodies for joint in body.joints):
         raise ValueError("car: no body with a free joint at the top of the spec; a car must be able to move")
     model = _stage(box_m)
-    for points, kind in chains(scene.road, merge_tolerance_m):
+    for points, kind in join_segments(scene.road, merge_tolerance_m):
         _add_boxes(model, points, COLOURS.get(kind, OTHER), half_width_m, height_m)
     agents = scene.agents
     for slot in np.flatnonzero(np.asarray(agents.present)):
@@ -96,7 +96,7 @@ def _add_others(model: mujoco.MjSpec, boxes: Boxes, height_m: float) -> None:
         )
 
 
-def chains(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float[np.ndarray, "N 2"], int]]:
+def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float[np.ndarray, "N 2"], int]]:
     """The valid segments joined into polylines again, simplified within a tolerance (Douglas-Peucker), and their kinds."""
     valid = np.asarray(road.valid)
     midpoint, direction = np.asarray(road.midpoint, np.float64)[valid], np.asarray(road.direction, np.float64)[valid]

@@ -54,16 +54,16 @@ def write(
         figures=figures,
         videos=videos,
         failed=failed,
-        kinds=failures.numbers(settings["failures"]),
+        kinds=failures.list_thresholds(settings["failures"]),
         files=files,
-        commands=[again(asked, settings)],
+        commands=[format_rerun_command(asked, settings)],
         episodes={"Protocol": f"`{asked['protocol']}`", **circumstances.describe(config)},
     )
 
 
-def again(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+def format_rerun_command(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
-    default = configs.load("evaluate", "run=null", f"protocol={asked['protocol']}")
+    default = configs.load_config("evaluate", "run=null", f"protocol={asked['protocol']}")
     protocol = {**settings.get("protocol", default["protocol"]), "ends": asked["protocols"]}
     own = {name: asked[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": asked["scenes"]}}
     own |= {"out": None, "protocol": protocol}

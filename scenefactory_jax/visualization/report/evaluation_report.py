@@ -212,7 +212,7 @@ def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Pat
     """How agents ended or failed, the worst of each kind, and a list of those that did not reach their goal cleanly."""
     parts = [f"### {name}"]
     if "failure" in records:
-        parts += [failures.table(records), failures.definitions(records, numbers), _worst(folder, name, records, drawn)]
+        parts += [failures.table(records), failures.list_definitions(records, numbers), _worst(folder, name, records, drawn)]
     else:
         result = plots.outcomes(records)
         counts = [[outcome, int(np.sum(result == outcome)), f"{100 * np.mean(result == outcome):.1f} %"] for outcome in plots.OUTCOMES]
@@ -239,7 +239,9 @@ def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path])
     """The pictures of the worst of each kind, folded."""
     if not drawn:
         return ""
-    shown = [_show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.of(records) if kind in drawn]
+    shown = [
+        _show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.rank_failures(records) if kind in drawn
+    ]
     if "film" in drawn:
         shown.append(_show(folder, f"The worst of each kind, {name}; clocks start where the film does", drawn["film"]))
     return "\n\n".join([f"<details><summary>The worst of each kind, side by side ({name})</summary>", *shown, "</details>"])

@@ -21,7 +21,7 @@ def draw(
     out: Path, label: str, records: episode_records.Records, recording: episode_records.Recording, settings: Mapping[str, Any]
 ) -> dict[str, Path]:
     """Draw the worst of every kind that occurred; returns kind -> picture, and "film" -> film if the settings want one."""
-    numbers, found, stem = settings["failures"]["pictures"], failures.of(records), label.replace(", ", "-")
+    numbers, found, stem = settings["failures"]["pictures"], failures.rank_failures(records), label.replace(", ", "-")
     worlds: dict[int, drawing.Trajectory] = {}
 
     def case(failure: Failure) -> Case:
@@ -32,7 +32,7 @@ def draw(
 
     paths = {}
     for kind, ranked in found.items():
-        cases = [case(failure) for failure in failures.worst(ranked, numbers["panels"])]
+        cases = [case(failure) for failure in failures.find_worst_failures(ranked, numbers["panels"])]
         figure = failures_figure(cases, before_s=numbers["before_s"])
         paths[kind] = plots.save(figure, out / f"failures-{stem}-{kind}.png", dpi=120)
     if numbers["video"] and found:

@@ -28,7 +28,7 @@ def write(folder: Path, found: Mapping[str, Any]) -> Path:
         f"{reference['slips']['dynamic']:g} (dynamic). Water films across, in mm. Zero: the tyre floats."
     )
     lines = ["# Friction on wet roads", f"`{found['command']}`", words, table(found)]
-    if compared := versus(found):
+    if compared := compare_with_published(found):
         lines += ["## Beside the published table", compared]
     cliff = (
         "The film at which grip is lost is where the water can no longer be squeezed out to the minimum spacing: 0.8 mm for every surface "
@@ -49,7 +49,7 @@ def table(found: Mapping[str, Any]) -> str:
     return agent_metrics.grid(["Surface", *(f"{film:g}" for film in films)], rows)
 
 
-def versus(found: Mapping[str, Any]) -> str:
+def compare_with_published(found: Mapping[str, Any]) -> str:
     """Static friction beside Table 5 of the paper, for the surfaces and films that both have; empty without any."""
     films = found["reference"]["films_mm"]
     shown = [(at, film) for at, film in enumerate(films) if all(film in row for row in PUBLISHED.values())]

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from scenefactory_jax.core.raw_scene import RawScene, Track
-from scenefactory_jax.core.safe_names import for_terminal
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES
 from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.evaluation import agent_metrics
@@ -96,10 +96,10 @@ def write(
         if chosen:
             with matplotlib.rc_context(plots.STYLE):
                 picture = plots.save(figure(chosen, window_m=window_m), folder / f"{name}.png", dpi=110)
-            lines = [f"- {for_terminal(example.raw.name)}: {example.finding.message}" for example in chosen]
+            lines = [f"- {escape_for_terminal(example.raw.name)}: {example.finding.message}" for example in chosen]
             parts += [f"### {name}", f"![{name}]({picture.name})", "\n".join(lines)]
     if unread:
-        parts += ["## Not read", "\n".join(f"- {for_terminal(line)}" for line in unread)]
+        parts += ["## Not read", "\n".join(f"- {escape_for_terminal(line)}" for line in unread)]
     path = folder / "quality.md"
     path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
@@ -129,7 +129,7 @@ def _draw(axes: Axes, example: Example, window_m: float) -> None:
     raw, finding = example
     step = raw.current if finding.step is None else finding.step
     concerned = [track for track in raw.tracks if track.id in finding.objects]
-    left, bottom, side = drawing.around(_shown(raw, finding, concerned), margin=8.0, smallest=window_m)
+    left, bottom, side = drawing.fit_view(_shown(raw, finding, concerned), margin=8.0, smallest=window_m)
     points = _SIDE_INCHES * 72 / side  # a metre
     axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), xticks=[], yticks=[], aspect="equal", facecolor=_rgb(drawing.GROUND))
     for kinds, colour, width, thinnest in _LOOKS:
@@ -147,7 +147,7 @@ def _draw(axes: Axes, example: Example, window_m: float) -> None:
         look = {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgecolor": _rgb(MARK), "markeredgewidth": 1.6}
         axes.plot(*finding.xyz[:2], **look)
     label = {"transform": axes.transAxes, "fontsize": 6.5, "bbox": {"facecolor": "white", "alpha": 0.8, "linewidth": 0}, "zorder": 5}
-    axes.text(0.02, 0.98, _wrapped(f"{for_terminal(raw.name)}\n{finding.message}"), va="top", **label)
+    axes.text(0.02, 0.98, _wrapped(f"{escape_for_terminal(raw.name)}\n{finding.message}"), va="top", **label)
     axes.text(0.02, 0.02, f"{side:.0f} m, step {step}", **label)
 
 

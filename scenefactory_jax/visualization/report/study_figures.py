@@ -22,7 +22,7 @@ SHOWN = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate
 TREND = (("success_rate", "clean_success_rate"), ("collision_rate", "road_edge_rate"))  # a panel each: the scales differ
 
 
-def all_of(result: Result) -> dict[str, tuple[str, Figure]]:
+def draw_all(result: Result) -> dict[str, tuple[str, Figure]]:
     """Caption -> (file name, figure), those that the study asks for and has the numbers of."""
     makers = {"learning": _learning, "rates": _rates, "matrix": _matrix, "differences": _differences, "trend": _trend}
     found = {}

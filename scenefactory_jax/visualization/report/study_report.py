@@ -23,7 +23,7 @@ def write(folder: Path, result: Result) -> Path:
     """Write `folder`/NAME.md and its figures, and return the report's path."""
     study = result["study"]
     pictures = {}
-    for caption, (name, figure) in study_figures.all_of(result).items():
+    for caption, (name, figure) in study_figures.draw_all(result).items():
         pictures[caption] = plots.save(figure, folder / f"{name}.png")
     parts = [
         f"# {study['name'].replace('_', ' ').capitalize()}",

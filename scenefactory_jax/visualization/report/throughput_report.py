@@ -30,8 +30,8 @@ def line(row: Row) -> str:
 
 def text(result: Mapping[str, Any]) -> str:
     """Everything for the terminal, phases last."""
-    loop = [] if result["baseline"] is None else [beside(result)]
-    loop += [streamed(result)] if streamed(result) else []
+    loop = [] if result["baseline"] is None else [set_beside(result)]
+    loop += [streaming_table(result)] if streaming_table(result) else []
     return "\n\n".join([rows_of(result["rows"]), *loop, *(phases_of(row) for row in _timed(result) if row["phases_ms"])])
 
 
@@ -46,14 +46,14 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
         "Ampere; the physics is in full float32."
     )
     lines = ["# Throughput", made, words, rows_of(result["rows"])]
-    if compared := versus(result):
+    if compared := compare_with_published(result):
         lines += ["## Beside the published figures", compared]
         lines += [parts] if (parts := split(result)) else []
     if result["baseline"] is not None:
-        lines += ["## Without vectorising", beside(result)]
+        lines += ["## Without vectorising", set_beside(result)]
     if shared := over_devices(result):
         lines += ["## Several devices", shared]
-    if streams := streamed(result):
+    if streams := streaming_table(result):
         lines += ["## Scenes that pass through the worlds", streams]
     if len(sizes := _sizes(result)) > 2:
         picture = plots.save(figure(sizes), folder / "scaling.png")
@@ -66,7 +66,7 @@ def write(folder: Path, result: Mapping[str, Any]) -> Path:
     return path
 
 
-def versus(result: Mapping[str, Any]) -> str:
+def compare_with_published(result: Mapping[str, Any]) -> str:
     """Rows of the whole configuration at sizes that the paper reports, beside its figures; empty without any. README shows this table."""
     rows = []
     for row in _sizes(result):
@@ -111,7 +111,7 @@ def over_devices(result: Mapping[str, Any]) -> str:
     return agent_metrics.grid(["Configuration", "Devices", "Slots/s", f"Beside `{one['name']}`"], cells) if cells else ""
 
 
-def streamed(result: Mapping[str, Any]) -> str:
+def streaming_table(result: Mapping[str, Any]) -> str:
     """Rows whose scenes were exchanged while training, and what that costs beside the same size with all scenes in memory; empty without
     any. Slots a second are compared: they do not depend on how many cars the scenes at hand have."""
     rows = []
@@ -176,7 +176,7 @@ def _only_sizes(changes: Mapping[str, Any]) -> bool:
     return sizes and set(scenes) <= {"pack"} and set(scenes.get("pack", {})) <= {"agents"}
 
 
-def beside(result: Mapping[str, Any]) -> str:
+def set_beside(result: Mapping[str, Any]) -> str:
     """The loop's figures, and how much faster the first configuration is."""
     loop, first = result["baseline"], result["rows"][0]
     low, high = loop["agent_steps_per_s_range"]

@@ -22,7 +22,7 @@ from scenefactory_jax.core.types import (
     Road,
     Scene,
 )
-from scenefactory_jax.env.rollout import Recording, Shot
+from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
 from scenefactory_jax.visualization.web.array_packing import Packer
 
@@ -51,14 +51,14 @@ class Light(NamedTuple):
     shown: list[tuple[float, str]]  # (seconds since the episode began, one of LIGHT_STATES)
 
 
-class Posts(NamedTuple):
+class RoadPosts(NamedTuple):
     """What stands on the map and is in no packed scene, in its coordinates."""
 
     lights: tuple[Light, ...] = ()
     signs: tuple[tuple[float, float], ...] = ()  # stop signs
 
 
-def posts(raw: RawScene, centre: Sequence[float]) -> Posts:
+def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
     """Lights and stop signs of a scene as its source holds it.
 
     Args:
@@ -80,7 +80,7 @@ def posts(raw: RawScene, centre: Sequence[float]) -> Posts:
         shown = [(float(times[i]), LIGHT_STATES[int(states[i])]) for i in begins]
         x, y = place - origin
         lights.append(Light((float(x), float(y)), float(np.arctan2(ahead[1], ahead[0])), shown))
-    return Posts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
+    return RoadPosts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
 
 
 def _direction(line: Float[np.ndarray, "N 2"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
@@ -88,7 +88,7 @@ def _direction(line: Float[np.ndarray, "N 2"], place: Float[np.ndarray, "2"]) ->
     return line[nearest + 1] - line[nearest]
 
 
-def world(recording: Recording, index: int, *, name: str, posts: Posts) -> tuple[dict[str, Any], str]:
+def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> tuple[dict[str, Any], str]:
     """Head and arrays of one world, cut one second after its last car is done.
 
     Args:
@@ -130,7 +130,7 @@ def world(recording: Recording, index: int, *, name: str, posts: Posts) -> tuple
     return head, packer.text()
 
 
-def _sound(shots: Shot, active: Bool[np.ndarray, "T A"]) -> Bool[np.ndarray, "T A"]:
+def _sound(shots: StepRecord, active: Bool[np.ndarray, "T A"]) -> Bool[np.ndarray, "T A"]:
     """Where a car's numbers mean something: in its own steps, as far as they are finite."""
     return active & np.isfinite(shots.position).all(axis=-1) & np.isfinite(shots.yaw)
 
@@ -142,7 +142,7 @@ def _held(sound: Bool[np.ndarray, "T A"]) -> Int[np.ndarray, "T A"]:
     return np.maximum(np.maximum.accumulate(np.where(sound, steps, 0), axis=0), first)
 
 
-def _add_cars(packer: Packer, shots: Shot, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> None:
+def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> None:
     """Every car's numbers, car by car; steps that are not its own repeat the last that is, which costs nothing."""
     ever, agents = active.any(axis=0), np.arange(active.shape[1])
     columns = {
@@ -163,7 +163,7 @@ def _near(time: Float[np.ndarray, "T A"]) -> Float[np.ndarray, "T A"]:
     return np.where(time <= TTC_MOST_S, time, np.nan)
 
 
-def _cars(scene: Scene, shots: Shot, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
+def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
     """Every present car: its slot, size, the spans of steps in which it drives, and its goals, each with the step from which it counts."""
     found = []
     for car in np.flatnonzero(np.asarray(scene.agents.present) | active.any(axis=0)):
@@ -181,7 +181,7 @@ def spans(true: Bool[np.ndarray, " T"]) -> list[list[int]]:
     return [[int(first), int(end) - 1] for first, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)]
 
 
-def _events(shots: Shot, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
+def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
     """What happened, in order. A car that starts again in the step of its end has left the place: the step before tells it."""
     found = []
     for name, happened in vars(shots.events).items():
@@ -194,11 +194,11 @@ def _events(shots: Shot, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, 
     return sorted(found, key=lambda event: (event["step"], event["car"]))
 
 
-def _add_others(packer: Packer, scene: Scene, shots: Shot) -> list[dict[str, Any]]:
+def _add_others(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[str, Any]]:
     """Everybody else who is ever there: size, kind, spans, and whether it only stands."""
     whole = drawing.Others(*(np.asarray(getattr(shots.others, name)) for name in drawing.Others._fields))
     seen = np.flatnonzero(whole.present.any(axis=0))
-    still, held = traffic_shapes.parked(whole), _held(whole.present)
+    still, held = traffic_shapes.shapes_at_rest(whole), _held(whole.present)
     kinds = np.asarray(scene.others.kind) if len(scene.others.kind) == whole.present.shape[1] else None
     take = lambda leaf: np.stack([leaf[held[:, row], row] for row in seen]) if len(seen) else np.zeros((0, len(held)))  # noqa: E731
     for name, leaf in {"other:x": whole.position[..., 0], "other:y": whole.position[..., 1], "other:yaw": whole.yaw}.items():

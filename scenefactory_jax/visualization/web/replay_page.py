@@ -16,7 +16,7 @@ import jax
 from scenefactory_jax.env.rollout import Recording
 from scenefactory_jax.visualization.birds_eye.drawing import AGENTS, GOAL_RADIUS, MARKS
 from scenefactory_jax.visualization.web import replay_data
-from scenefactory_jax.visualization.web.replay_data import Posts
+from scenefactory_jax.visualization.web.replay_data import RoadPosts
 from scenefactory_jax.visualization.web.term_styles import term_looks
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def write(
     recording: Recording,
     *,
     names: Sequence[str] = (),
-    posts: Sequence[Posts] = (),
+    posts: Sequence[RoadPosts] = (),
     title: str = "replay",
     goal_radius_m: float = GOAL_RADIUS,
 ) -> Path:
@@ -74,7 +74,7 @@ def document(
     recording: Recording,
     *,
     names: Sequence[str] = (),
-    posts: Sequence[Posts] = (),
+    posts: Sequence[RoadPosts] = (),
     title: str = "replay",
     goal_radius_m: float = GOAL_RADIUS,
 ) -> str:
@@ -87,7 +87,7 @@ def document(
         if given and len(given) != count:
             raise ReplayError(f"{what}: {len(given)} for {count} worlds; wanted is one for each, or none")
     worlds = [
-        replay_data.world(recording, index, name=names[index] if names else f"world {index}", posts=posts[index] if posts else Posts())
+        replay_data.world(recording, index, name=names[index] if names else f"world {index}", posts=posts[index] if posts else RoadPosts())
         for index in range(count)
     ]
     head = {

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 
 from scenefactory_jax.core.raw_scene import RawScene, Track
-from scenefactory_jax.data.curation.quality_gate import Finding, point
-from scenefactory_jax.data.packing.pack import corners
+from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
+from scenefactory_jax.data.packing.pack import box_corners
 
 
 def times(raw: RawScene, *, share: float) -> list[Finding]:
@@ -55,7 +55,7 @@ def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
     """Vehicles whose boxes lie in each other at the current step, by a share of the smaller box."""
     tracks = [track for track in raw.tracks if track.kind == "vehicle" and track.valid[raw.current]]
     now = raw.current
-    boxes = np.array([shapely.Polygon(corners(t.xyz[now, :2], float(t.yaw[now]), *t.size[:2])) for t in tracks], dtype=object)
+    boxes = np.array([shapely.Polygon(box_corners(t.xyz[now, :2], float(t.yaw[now]), *t.size[:2])) for t in tracks], dtype=object)
     if len(boxes) < 2:
         return []
     one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
@@ -68,7 +68,7 @@ def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
             ids = (tracks[first].id, tracks[second].id)
             place = (tracks[first].xyz[now] + tracks[second].xyz[now]) / 2
             message = f"vehicles {ids[0]} and {ids[1]} share {100 * part:.0f} % of the smaller box at the current step"
-            found.append(Finding(message, float(part), share, point(place), now, ids))
+            found.append(Finding(message, float(part), share, describe_point(place), now, ids))
     return found
 
 

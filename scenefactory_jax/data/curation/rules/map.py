@@ -7,9 +7,9 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import DRIVABLE, EDGES
-from scenefactory_jax.data.curation.quality_gate import Finding, point
+from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
 
 
 def levels(raw: RawScene, *, rise_m: float) -> list[Finding]:
@@ -53,7 +53,7 @@ def short_lanes(raw: RawScene, *, least_m: float) -> list[Finding]:
         if line.kind in DRIVABLE:
             length = float(np.linalg.norm(np.diff(line.xyz[:, :2], axis=0), axis=1).sum())
             if length < least_m:
-                place = point(line.xyz[0]) if len(line.xyz) else None
+                place = describe_point(line.xyz[0]) if len(line.xyz) else None
                 found.append(Finding(f"lane {line.id} is {length:.2f} m long", length, least_m, place, roads=(line.id,)))
     return found
 
@@ -71,7 +71,7 @@ def kinks(raw: RawScene, *, turn_deg: float, least_step_m: float) -> list[Findin
         long = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) >= least_step_m)
         turn = np.rad2deg(_turns(step[long]))
         if len(turn) and (value := float(turn.max())) > turn_deg:
-            place = point(line.xyz[long[int(np.argmax(turn)) + 1]])
+            place = describe_point(line.xyz[long[int(np.argmax(turn)) + 1]])
             found.append(Finding(f"lane {line.id} turns by {value:.0f} degrees at a point", value, turn_deg, place, roads=(line.id,)))
     return found
 
@@ -93,7 +93,7 @@ def tight_turns(raw: RawScene, *, radius_m: float, piece_m: float) -> list[Findi
         length = np.linalg.norm(chord[1:], axis=1)
         radius = np.divide(length, 2 * sine, out=np.full(len(sine), np.inf), where=sine > 0)
         if (value := float(radius.min())) < radius_m:
-            place = point(points[int(np.argmin(radius)) + 1])
+            place = describe_point(points[int(np.argmin(radius)) + 1])
             found.append(Finding(f"lane {line.id} turns with a radius of {value:.1f} m", value, radius_m, place, roads=(line.id,)))
     return found
 
@@ -140,7 +140,7 @@ def small_map(raw: RawScene, *, beyond_m: float) -> list[Finding]:
         away = shapely.distance(hull, shapely.points(track.xyz[steps, :2]))
         value, step = float(away.max()), int(steps[np.argmax(away)])
         message = f"vehicle {track.id} is {value:.0f} m beyond the map at step {step}"
-        found.append(Finding(message, value, beyond_m, point(track.xyz[step]), step, (track.id,)))
+        found.append(Finding(message, value, beyond_m, describe_point(track.xyz[step]), step, (track.id,)))
     return found
 
 
@@ -152,4 +152,4 @@ def _long(raw: RawScene) -> Iterator[Polyline]:
 def _turns(step: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " M"]:
     """Changes of direction from each step to the next, radians."""
     yaw = np.arctan2(step[:, 1], step[:, 0])
-    return np.abs(wrapped(np.diff(yaw)))
+    return np.abs(wrap_angles(np.diff(yaw)))

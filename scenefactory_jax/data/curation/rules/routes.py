@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from scenefactory_jax.core.instantiate import build
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
 from scenefactory_jax.core.types import DRIVEWAY, EDGES
-from scenefactory_jax.data.curation.quality_gate import Finding, Point, point
+from scenefactory_jax.data.curation.quality_gate import Finding, Point, describe_point
 from scenefactory_jax.roadgraph import lane_graph, routes
 
 
@@ -35,9 +35,9 @@ def unreachable(
     movers = [(track, last) for track, last in _movers(raw, least_travel_m) if track.valid[raw.current]]
     if not movers:
         return []
-    linked = build(topology, builtins="scenefactory_jax.roadgraph.lane_topology", where="quality.rules.unreachable.topology")(raw)
-    net = build(network, builtins=routes, where="quality.rules.unreachable.network")(lane_graph.make(linked.roads))
-    find = build({**search, "count": 1}, builtins=routes, where="quality.rules.unreachable.search")
+    linked = instantiate(topology, builtins="scenefactory_jax.roadgraph.lane_topology", where="quality.rules.unreachable.topology")(raw)
+    net = instantiate(network, builtins=routes, where="quality.rules.unreachable.network")(lane_graph.make(linked.roads))
+    find = instantiate({**search, "count": 1}, builtins=routes, where="quality.rules.unreachable.search")
     found = []
     for track, last in movers:
         start, goal = track.xyz[raw.current], track.xyz[last]
@@ -45,7 +45,7 @@ def unreachable(
             continue
         distance = float(np.linalg.norm(goal[:2] - start[:2]))
         message = f"vehicle {track.id}: no route over lanes to its goal {distance:.0f} m away"
-        found.append(Finding(message, distance, least_travel_m, point(goal), last, (track.id,)))
+        found.append(Finding(message, distance, least_travel_m, describe_point(goal), last, (track.id,)))
     return found
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from scenefactory_jax.core.raw_scene import RawScene, Track
-from scenefactory_jax.core.scene_arrays import wrapped
-from scenefactory_jax.data.curation.quality_gate import Finding, point
+from scenefactory_jax.core.scene_arrays import wrap_angles
+from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
 
 Excess = tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"]]  # steps, and what was measured there
 
@@ -40,7 +40,7 @@ def yaw_rate(raw: RawScene, *, most_rad_s: float) -> list[Finding]:
 
     def measure(track: Track) -> Excess:
         steps = _neighbours(track)
-        turn = np.abs(wrapped(track.yaw[steps + 1] - track.yaw[steps]))
+        turn = np.abs(wrap_angles(track.yaw[steps + 1] - track.yaw[steps]))
         return steps + 1, turn / np.diff(raw.times)[steps]
 
     return _worst(raw, measure, most_rad_s, "turns at {:.1f} rad/s")
@@ -113,7 +113,9 @@ def _sizes(raw: RawScene, axis: int, word: str, range_m: list[float]) -> list[Fi
         value, step = track.size[axis], int(np.argmax(track.valid))
         if not range_m[0] <= value <= range_m[1]:
             limit = range_m[0] if value < range_m[0] else range_m[1]
-            found.append(Finding(f"vehicle {track.id} is {value:.2f} m {word}", value, limit, point(track.xyz[step]), step, (track.id,)))
+            found.append(
+                Finding(f"vehicle {track.id} is {value:.2f} m {word}", value, limit, describe_point(track.xyz[step]), step, (track.id,))
+            )
     return found
 
 
@@ -126,7 +128,7 @@ def _worst(raw: RawScene, measure: Callable[[Track], Excess], limit: float, word
             step = int(steps[np.argmax(values)])
             more = int((values > limit).sum())
             message = f"vehicle {track.id} {words.format(value)} at step {step}" + (f" ({more} steps in all)" if more > 1 else "")
-            found.append(Finding(message, value, limit, point(track.xyz[step]), step, (track.id,)))
+            found.append(Finding(message, value, limit, describe_point(track.xyz[step]), step, (track.id,)))
     return found
 
 

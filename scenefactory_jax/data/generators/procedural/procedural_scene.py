@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import EDGE_BOUNDARY, EDGE_MEDIAN, LANE_STREET
 from scenefactory_jax.data.generators.curves import Points, heading, resample
 from scenefactory_jax.data.generators.procedural.road_layout import (
@@ -70,9 +70,9 @@ def generate(
         check_positive(value, f"generate.{name}")
 
     kind = kinds[index % len(kinds)]
-    lay_out = build(blocks[kind], builtins=f"{PACKAGE}.roads", where=f"generate.blocks.{kind}")
-    find_edges = build(edges, builtins=f"{PACKAGE}.surface", where="generate.edges")
-    drive = build(traffic, builtins=f"{PACKAGE}.traffic", where="generate.traffic")
+    lay_out = instantiate(blocks[kind], builtins=f"{PACKAGE}.roads", where=f"generate.blocks.{kind}")
+    find_edges = instantiate(edges, builtins=f"{PACKAGE}.surface", where="generate.edges")
+    drive = instantiate(traffic, builtins=f"{PACKAGE}.traffic", where="generate.traffic")
     times = log_dt * np.arange(log_steps)
     for redraw in range(REDRAWS):
         rng = np.random.default_rng(np.random.SeedSequence((seed, index, redraw)))
@@ -159,7 +159,7 @@ def _track(index: int, origin: Float[np.ndarray, " 2"], car: Car, size: Sequence
         kind="vehicle",
         size=(float(size[0]), float(size[1]), float(size[2])),
         xyz=np.concatenate([position, np.full((len(position), 1), size[2] / 2)], axis=1),
-        yaw=wrapped(car.drive.yaw),
+        yaw=wrap_angles(car.drive.yaw),
         velocity=car.drive.speed[:, None] * heading(car.drive.yaw),
         valid=np.ones(len(position), bool),
     )

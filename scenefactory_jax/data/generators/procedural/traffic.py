@@ -9,8 +9,8 @@ from jaxtyping import Float
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.generators.curves import arc_length, heading
 from scenefactory_jax.data.generators.procedural.road_layout import Lane, check_positive, check_range, entries
-from scenefactory_jax.data.generators.speed_profile import Drive, Limits, Route, comfortable, drive, make_route
-from scenefactory_jax.data.packing.pack import corners, overlaps
+from scenefactory_jax.data.generators.speed_profile import Drive, Limits, Route, drive, limit_by_curvature, make_route
+from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
 WAITS_S = (0.0, 1.5, 3.0)  # how long a car that gives way stands still, tried in turn
 EASED = 0.7  # share of the limit at which a car that would touch another tries again
@@ -27,7 +27,7 @@ class Car(NamedTuple):
     drive: Drive
 
 
-class Numbers(NamedTuple):
+class TrafficNumbers(NamedTuple):
     """The numbers of `populate` that its parts share."""
 
     travel: list[float]
@@ -86,7 +86,7 @@ def populate(
     Raises:
         ConfigError: a number that makes no sense, by name.
     """
-    numbers = Numbers(
+    numbers = TrafficNumbers(
         travel_m, start_gap_m, goal_gap_m, end_margin_m, (car_size_m[0], car_size_m[1]), float(times[current] - times[0]),
         Limits(acceleration_mps2, braking_mps2, lateral_mps2), inside_share, conflict_share, standing_share,
     )  # fmt: skip
@@ -103,7 +103,7 @@ def populate(
     return placed
 
 
-def _check(cars: list[int], car_size: list[float], numbers: Numbers) -> None:
+def _check(cars: list[int], car_size: list[float], numbers: TrafficNumbers) -> None:
     """Refuse numbers that make no sense, by name."""
     check_range(cars, "traffic.cars", low=1.0)
     check_range(numbers.travel, "traffic.travel_m", low=1.0)
@@ -125,7 +125,7 @@ def _try_car(
     times: Float[np.ndarray, " L"],
     current: int,
     placed: list[Car],
-    numbers: Numbers,
+    numbers: TrafficNumbers,
 ) -> Car | None:
     """A random car, if it fits in with those already placed."""
     ids, route = _draw_route(rng, lanes, before, numbers)
@@ -134,7 +134,7 @@ def _try_car(
     if route is None:
         return None
     limit = eager * lanes[ids[0]].limit
-    cap = comfortable(route, limit, numbers.limits)
+    cap = limit_by_curvature(route, limit, numbers.limits)
     start_speed = 0.0 if standing else share * float(np.sqrt(cap[0]))
     first = drive(route, cap, times, numbers.limits, start_speed=start_speed)
     if not _fits(first, current, placed, numbers) or (must_conflict and not any(_cross(route, first, car) for car in placed)):
@@ -146,7 +146,7 @@ def _try_car(
 
 
 def _draw_route(
-    rng: np.random.Generator, lanes: list[Lane], before: list[tuple[int, ...]], numbers: Numbers
+    rng: np.random.Generator, lanes: list[Lane], before: list[tuple[int, ...]], numbers: TrafficNumbers
 ) -> tuple[tuple[int, ...], Route | None]:
     """A random way along connected lanes, long enough for the history and a travel in the range; None where the road ends too early."""
     lengths = np.array([arc_length(lane.points)[-1] for lane in lanes])
@@ -178,14 +178,14 @@ def _variants(
     placed: list[Car],
     start_speed: float,
     limit: float,
-    numbers: Numbers,
+    numbers: TrafficNumbers,
 ) -> Iterator[Drive]:
     """The motion as drawn; then, if it touches somebody, slower ones and ones that give way."""
     yield first
     step = _touches(first, placed, numbers.size)
     if step is None:
         return
-    slow = comfortable(route, EASED * limit, numbers.limits)
+    slow = limit_by_curvature(route, EASED * limit, numbers.limits)
     if start_speed**2 <= slow[0]:
         yield drive(route, slow, times, numbers.limits, start_speed=start_speed)
     stop_at = first.place[step] - numbers.size[0]
@@ -194,7 +194,7 @@ def _variants(
             yield drive(route, cap, times, numbers.limits, start_speed=start_speed, stop_at=float(stop_at), wait=wait)
 
 
-def _fits(own: Drive, current: int, placed: list[Car], numbers: Numbers) -> bool:
+def _fits(own: Drive, current: int, placed: list[Car], numbers: TrafficNumbers) -> bool:
     """Whether the travel lies in the range and start and goal keep their distances."""
     travel = own.place[-1] - own.place[current]
     if not numbers.travel[0] <= travel <= numbers.travel[1]:
@@ -205,7 +205,7 @@ def _fits(own: Drive, current: int, placed: list[Car], numbers: Numbers) -> bool
     if np.min(np.linalg.norm(own.position[-1] - goals, axis=1)) < numbers.goal_gap:
         return False
     room = numbers.start_gap, numbers.size[1] + SIDE_GAP_M  # each car's own half of the gap to the next
-    rooms = [corners(drive.position[current], float(drive.yaw[current]), *room) for drive in (own, *(car.drive for car in placed))]
+    rooms = [box_corners(drive.position[current], float(drive.yaw[current]), *room) for drive in (own, *(car.drive for car in placed))]
     return not overlaps(rooms[0], np.stack(rooms[1:])).any()
 
 

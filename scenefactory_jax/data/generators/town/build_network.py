@@ -24,7 +24,7 @@ class Choice(NamedTuple):
     driveway: Callable[..., Block]
     roundabout: Callable[..., Block]
     parking_lot: Callable[..., Block]
-    links: road_segments.Numbers
+    links: road_segments.RoadDimensions
     roundabout_share: float  # of junctions that can be one
     signal_share: tuple[float, ...]  # by the rank of the second street at a junction
     all_way_share: float  # of junctions without lights whose streets are equal
@@ -34,9 +34,9 @@ class Choice(NamedTuple):
     skew: float  # most that an arm turns from the straight way to the next junction
 
 
-def choice(
+def make_choice(
     blocks: Mapping[str, Callable[..., Block]],
-    roads: road_segments.Numbers,
+    roads: road_segments.RoadDimensions,
     *,
     roundabout_share: float,
     signal_share: list[float],
@@ -69,7 +69,7 @@ def choice(
     )
 
 
-def realise(rng: np.random.Generator, plan: Plan, choice: Choice) -> Network | None:
+def build_network(rng: np.random.Generator, plan: Plan, choice: Choice) -> Network | None:
     """Build a plan; None where two nodes are too close to one another for what stands on them, or a street cannot change its lanes."""
     blocks: list[Block] = []
     ends: dict[tuple[int, int], tuple[int, int] | Port] = {}  # (node, edge) -> (block, port), or the end of the town

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path
-from scenefactory_jax.data.generators.town.path_conflicts import ROW_M, Table, Zones
+from scenefactory_jax.data.generators.town.path_conflicts import ROW_M, PathProjections, Zones
 from scenefactory_jax.data.generators.town.traffic_lights import CLOSED, CLOSING, SIGN
 
 FREE_EXPONENT = 4.0  # of the IDM
@@ -28,7 +28,7 @@ class Users(NamedTuple):
     enters: Float[np.ndarray, " N"]  # s; they wait outside the town until then, and until there is room
 
 
-class Manners(NamedTuple):
+class DriverParameters(NamedTuple):
     """Numbers of the drivers, SI units."""
 
     acceleration: float
@@ -55,8 +55,8 @@ class World(NamedTuple):
     """What does not change while they drive."""
 
     users: Users
-    manners: Manners
-    table: Table
+    manners: DriverParameters
+    table: PathProjections
     zones: Zones
     cap: Float[np.ndarray, "N P"]
     yaw: Float[np.ndarray, "N P"]
@@ -68,11 +68,11 @@ class World(NamedTuple):
 def simulate(
     paths: list[Path],
     users: Users,
-    table: Table,
+    table: PathProjections,
     zones: Zones,
     gates: Int[np.ndarray, "G L"],
     times: Float[np.ndarray, " L"],
-    manners: Manners,
+    manners: DriverParameters,
 ) -> Motion:
     """Drive everybody through all steps; speeds and places are integrated as those of the steps' constant accelerations."""
     world = _world(paths, users, table, zones, manners)
@@ -96,7 +96,7 @@ def simulate(
     return Motion(*(np.stack(column) for column in zip(*log, strict=True)))
 
 
-def _world(paths: list[Path], users: Users, table: Table, zones: Zones, manners: Manners) -> World:
+def _world(paths: list[Path], users: Users, table: PathProjections, zones: Zones, manners: DriverParameters) -> World:
     """Paths as tables, the last value repeated."""
     most = max(len(path.points) for path in paths)
     cap, yaw = (np.stack([np.pad(column, (0, most - len(column)), mode="edge") for column in columns])
@@ -139,7 +139,7 @@ def _accelerate(
     return np.clip(free - brake, -manners.hardest, manners.acceleration), waited, room
 
 
-def _idm(manners: Manners, speed: np.ndarray, gap: np.ndarray, ahead: np.ndarray | float, standing: float) -> np.ndarray:
+def _idm(manners: DriverParameters, speed: np.ndarray, gap: np.ndarray, ahead: np.ndarray | float, standing: float) -> np.ndarray:
     """The IDM's braking for something ahead, m/s^2, as a positive number."""
     headway = manners.headway_s if standing == manners.gap_m else 0.5 * manners.headway_s
     closing = speed * (speed - ahead) / (2 * np.sqrt(manners.acceleration * manners.braking))

@@ -6,13 +6,13 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.data.generators.curves import Points, arc_length
 from scenefactory_jax.data.generators.procedural.road_layout import check_range, draw
-from scenefactory_jax.data.generators.town.lane_paths import to_the_right
+from scenefactory_jax.data.generators.town.lane_paths import change_to_right
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, Spot
 
 CAR_M = 5.0  # depth of an apron's pavement crossing and half a car: where the middle of a parked car is
 
 
-def draw_aprons(
+def draw_driveways(
     rng: np.random.Generator,
     network: Network,
     kerbs: list[Points],
@@ -38,7 +38,7 @@ def draw_aprons(
         return outlines, spots
     turns = [lane.points[::4] for lane in network.lanes if lane.rank != ON_ROAD]
     turns = KDTree(np.concatenate(turns)) if turns else None
-    places, rights = [arc_length(kerb) for kerb in kerbs], [to_the_right(kerb) for kerb in kerbs]
+    places, rights = [arc_length(kerb) for kerb in kerbs], [change_to_right(kerb) for kerb in kerbs]
     lengths = np.array([place[-1] for place in places])
     for _ in range(int(rng.integers(count[0], count[1] + 1))):
         chosen = int(rng.choice(len(kerbs), p=lengths / lengths.sum()))

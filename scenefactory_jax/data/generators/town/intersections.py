@@ -175,7 +175,7 @@ def _assemble(
         path = _cycle_path(centre, arms, mouths, a, b)
         street = arms[a].street
         lanes.append(Lane(path, street.bike, street.limit, _rank(street, "right", control), LANE_BIKE, governed.get((a, False))))
-    strips = [paved(lane, PAVED_M) for lane in lanes[: len(turns)]]
+    strips = [find_paved_area(lane, PAVED_M) for lane in lanes[: len(turns)]]
     waiting = {stop.arm for stop in stops}
     return Block(
         kind=f"{len(arms)}_arms",
@@ -189,7 +189,7 @@ def _assemble(
     )
 
 
-def paved(lane: Lane, beside: float) -> shapely.Polygon:
+def find_paved_area(lane: Lane, beside: float) -> shapely.Polygon:
     """The surface that a lane needs, with so much beside it."""
     return shapely.LineString(lane.points).simplify(0.03).buffer(lane.width / 2 + beside, cap_style="flat")
 
@@ -349,7 +349,7 @@ def roundabout(
         zebra = bool(rng.random() < crosswalk_share)
         walks += [_crosswalk(centre, arm, index, mouth + depth + 0.8, depth)] if zebra else []
         ports.append(Port(centre + mouth * heading(arm.yaw), arm.yaw, arm.street, ((base + 1,),), ((base,),), controlled=True))
-    return Block("roundabout", lanes, follows, areas=[paved(lane, RING_PAVED_M) for lane in lanes], crosswalks=walks, ports=ports)
+    return Block("roundabout", lanes, follows, areas=[find_paved_area(lane, RING_PAVED_M) for lane in lanes], crosswalks=walks, ports=ports)
 
 
 def _ring(centre: Float[np.ndarray, " 2"], radius: float, start: float, end: float) -> Points:

@@ -29,7 +29,7 @@ class Path(NamedTuple):
         return (len(self.points) - 1) * STEP_M
 
 
-class Piece(NamedTuple):
+class PathPiece(NamedTuple):
     """Part of a way, with one limit and one right of way."""
 
     points: Points
@@ -39,7 +39,7 @@ class Piece(NamedTuple):
     lane: int
 
 
-def make_path(pieces: list[Piece], *, eager: float, lateral: float, braking: float) -> Path:
+def make_path(pieces: list[PathPiece], *, eager: float, lateral: float, braking: float) -> Path:
     """Pieces that follow one another as one path, with a speed for every bend that is braked for in time.
 
     Args:
@@ -67,16 +67,16 @@ def make_path(pieces: list[Piece], *, eager: float, lateral: float, braking: flo
     return Path(points, yaw, cap, rank, gates, tuple(piece.lane for piece in pieces))
 
 
-def draw_way(
+def draw_path(
     rng: np.random.Generator, network: Network, lane: int, begin: float, length: float, *, change_share: float, change_m: list[float]
-) -> list[Piece]:
+) -> list[PathPiece]:
     """A random way from a place on a lane: which exit at every fork, and now and then another lane.
 
     Args:
         change_share: how likely a car changes lanes on a lane that is long enough.
         change_m: shortest and longest way over which it does.
     """
-    pieces: list[Piece] = []
+    pieces: list[PathPiece] = []
     left = length
     control: int | None = None
     while True:
@@ -94,7 +94,7 @@ def draw_way(
             lane, control = target, None
             own, place = network.lanes[lane], arc_length(network.lanes[lane].points)
         if not pieces or place[-1] - begin > STEP_M / 10:
-            pieces.append(Piece(_part(own.points, place, begin, float(place[-1])), own.limit, own.rank, control, lane))
+            pieces.append(PathPiece(_part(own.points, place, begin, float(place[-1])), own.limit, own.rank, control, lane))
         left -= float(place[-1]) - begin
         if left <= 0 or not network.exits[lane]:
             return pieces
@@ -104,7 +104,7 @@ def draw_way(
 
 def _change(
     network: Network, lane: int, target: int, begin: float, start: float, end: float, control: int | None
-) -> tuple[list[Piece], float]:
+) -> tuple[list[PathPiece], float]:
     """The way to `start` on a lane and from there over to its neighbour; and the place on it where the way arrives."""
     own, other = network.lanes[lane], network.lanes[target]
     place, beside = arc_length(own.points), arc_length(other.points)
@@ -114,10 +114,10 @@ def _change(
     share = (share * share * (3 - 2 * share))[:, None]
     mine = np.stack([np.interp(at, place, own.points[:, i]) for i in (0, 1)], axis=-1)
     theirs = np.stack([np.interp(at * scale, beside, other.points[:, i]) for i in (0, 1)], axis=-1)
-    over = Piece((1 - share) * mine + share * theirs, own.limit, CHANGING, None, lane)
+    over = PathPiece((1 - share) * mine + share * theirs, own.limit, CHANGING, None, lane)
     if start - begin < STEP_M:
         return [over._replace(gate=control)], end * scale
-    return [Piece(_part(own.points, place, begin, start), own.limit, own.rank, control, lane), over], end * scale
+    return [PathPiece(_part(own.points, place, begin, start), own.limit, own.rank, control, lane), over], end * scale
 
 
 def _part(points: Points, place: Float[np.ndarray, " N"], begin: float, end: float) -> Points:
@@ -127,16 +127,16 @@ def _part(points: Points, place: Float[np.ndarray, " N"], begin: float, end: flo
     return np.concatenate([ends[:1], points[inside], ends[1:]])
 
 
-def to_the_right(points: Points) -> Points:
+def change_to_right(points: Points) -> Points:
     """Unit vectors to the right of a polyline at its points."""
     step = np.gradient(points, axis=0)
     return np.stack([step[:, 1], -step[:, 0]], axis=-1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
 
 
-def aside(pieces: list[Piece], right: float) -> list[Piece]:
+def offset_path(pieces: list[PathPiece], right: float) -> list[PathPiece]:
     """The same way at a distance to its right, for those who keep to the side."""
     whole = np.concatenate([pieces[0].points, *(piece.points[1:] for piece in pieces[1:])])
-    moved = whole + right * to_the_right(whole)
+    moved = whole + right * change_to_right(whole)
     found, at = [], 0
     for piece in pieces:
         found.append(piece._replace(points=moved[at : at + len(piece.points)]))
@@ -146,5 +146,5 @@ def aside(pieces: list[Piece], right: float) -> list[Piece]:
 
 def walk(points: Points, speed: float, *, crosswalk: tuple[float, int] | None) -> Path:
     """A way on foot, with the place and the gate of a crosswalk on it."""
-    path = make_path([Piece(points, speed, WALKING, None, -1)], eager=1.0, lateral=np.inf, braking=1.0)
+    path = make_path([PathPiece(points, speed, WALKING, None, -1)], eager=1.0, lateral=np.inf, braking=1.0)
     return path._replace(gates=() if crosswalk is None else (crosswalk,))

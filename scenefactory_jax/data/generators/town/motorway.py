@@ -9,7 +9,7 @@ from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, integrate
 from scenefactory_jax.data.generators.procedural.road_layout import DOUBLE_YELLOW, draw
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Block, Joint, Lane, Network, Port, Street, assemble
-from scenefactory_jax.data.generators.town.road_segments import Numbers, lay_way, shifted, stacked
+from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, lay_road, shift_line, stack_lines
 
 
 def motorway(
@@ -58,7 +58,7 @@ def motorway(
         places = [draw(rng, span, f"motorway.{name}", low=-half) for span, name in ((join_m, "join_m"), (leave_m, "leave_m"))]
         added, taken = (draw(rng, auxiliary_m, "motorway.auxiliary_m") for _ in places)
         rows = [round((half + place) / FINE_M) if rng.random() < ramp_share else None for place in places]
-        numbers = Numbers(bay=taken, hold=added, taper=taper_m, solid=0.0, shoulder=shoulder_m, spot=1.0, spot_margin=0.0)
+        numbers = RoadDimensions(bay=taken, hold=added, taper=taper_m, solid=0.0, shoulder=shoulder_m, spot=1.0, spot_margin=0.0)
         main = _carriageway(carriageway, street, numbers, rows[0], rows[1])
         ramps = [
             _ramp(port, np.radians(draw(rng, ramp_turn_deg, "motorway.ramp_turn_deg")), ramp_radius_m, ramp_limit_mps, shoulder_m, half)
@@ -72,7 +72,7 @@ def motorway(
     return assemble(blocks, joints)
 
 
-def _carriageway(curve: Curve, street: Street, numbers: Numbers, join: int | None, leave: int | None) -> Block:
+def _carriageway(curve: Curve, street: Street, numbers: RoadDimensions, join: int | None, leave: int | None) -> Block:
     """One direction, its lanes on the right of the curve, with a port for each ramp at the given points of the curve."""
     count, last = street.forward, len(curve[0]) - 1
     stretches = []  # from point, to point, lanes at its start, lanes at its end
@@ -86,10 +86,10 @@ def _carriageway(curve: Curve, street: Street, numbers: Numbers, join: int | Non
     if not stretches:
         stretches = [(0, last, count, count)]
     ways = [
-        lay_way((curve[0][a : b + 1], curve[1][a : b + 1]), first, then, street, numbers, side="right", controlled=False)
+        lay_road((curve[0][a : b + 1], curve[1][a : b + 1]), first, then, street, numbers, side="right", controlled=False)
         for a, b, first, then in stretches
     ]
-    block = stacked("motorway", ways)
+    block = stack_lines("motorway", ways)
     base = np.concatenate([[0], np.cumsum([len(way.lanes) for way in ways])]).tolist()
     follows, ports = list(block.follows), []
     for i, (way, following) in enumerate(itertools.pairwise(ways)):
@@ -98,7 +98,7 @@ def _carriageway(curve: Curve, street: Street, numbers: Numbers, join: int | Non
     for i, (a, b, first, then) in enumerate(stretches):
         for row, wide, joins in ((a, first, True), (b, then, False)):
             if wide > count:
-                place = shifted((curve[0][row : row + 1], curve[1][row : row + 1]), beside)[0]
+                place = shift_line((curve[0][row : row + 1], curve[1][row : row + 1]), beside)[0]
                 slot = ((ways[i].start[-1] if joins else ways[i].end[-1]) + base[i],)
                 yaw = float(curve[1][row]) + (np.pi if joins else 0.0)
                 ports.append(Port(place, yaw, street, () if joins else (slot,), (slot,) if joins else ()))

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import ConfigError, build
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.generators.procedural.road_layout import BROKEN_WHITE
-from scenefactory_jax.data.generators.town.build_network import realise
+from scenefactory_jax.data.generators.town.build_network import build_network
 from scenefactory_jax.data.generators.town.cross_sections import make_class
 from scenefactory_jax.data.generators.town.road_network import Network, Street
 
@@ -52,16 +52,18 @@ def draw_network(
     if set(blocks) != set(SITES):
         wrong = sorted(set(blocks) ^ set(SITES))[0]
         raise ConfigError(f"{where}.blocks.{wrong}: missing or unknown; valid: {', '.join(SITES)}")
-    makers = {name: build(entry, builtins=f"{PACKAGE}.plans", where=f"{where}.plans.{name}") for name, entry in layouts.items()}
+    makers = {name: instantiate(entry, builtins=f"{PACKAGE}.plans", where=f"{where}.plans.{name}") for name, entry in layouts.items()}
     classes = [make_class(name, rank, numbers) for rank, (name, numbers) in enumerate(streets.items(), start=1)]
-    built = {name: build(blocks[name], builtins=f"{PACKAGE}.{module}", where=f"{where}.blocks.{name}") for name, module in SITES.items()}
-    add_lots = build(lots, builtins=f"{PACKAGE}.plans", where=f"{where}.lots")
-    numbers = build(roads, builtins=f"{PACKAGE}.links", where=f"{where}.roads")()
-    choice = build(junctions, builtins=f"{PACKAGE}.build", where=f"{where}.junctions")(built, numbers)
+    built = {
+        name: instantiate(blocks[name], builtins=f"{PACKAGE}.{module}", where=f"{where}.blocks.{name}") for name, module in SITES.items()
+    }
+    add_lots = instantiate(lots, builtins=f"{PACKAGE}.plans", where=f"{where}.lots")
+    numbers = instantiate(roads, builtins=f"{PACKAGE}.links", where=f"{where}.roads")()
+    choice = instantiate(junctions, builtins=f"{PACKAGE}.build", where=f"{where}.junctions")(built, numbers)
     if rng.random() < motorway_share:
-        return "motorway", build(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
+        return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
     kind = str(rng.choice(list(makers)))
     lane = Street(1, 1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_WHITE + 3)
     plan = makers[kind](rng, reach, classes)
-    network = None if plan is None else realise(rng, add_lots(rng, plan, reach, lane), choice)
+    network = None if plan is None else build_network(rng, add_lots(rng, plan, reach, lane), choice)
     return None if network is None else (kind, network)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import FINE_M, connect, heading
 from scenefactory_jax.data.generators.procedural.road_layout import draw
-from scenefactory_jax.data.generators.town.intersections import paved
+from scenefactory_jax.data.generators.town.intersections import find_paved_area
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Block, Lane, Port, Spot, Street
 
 AISLE_M = 6.0  # width that a car needs to turn into a space at a right angle
@@ -41,7 +41,7 @@ def parking_lot(
     lanes = [Lane(put(path), LANE_M, limit_mps, ON_ROAD) for path in paths]
     wide = half + AISLE_M / 2 + SPACE_M[0] + 0.3
     corners = np.array([[THROAT_M - 5.0, -wide], [far + AISLE_M / 2 + 0.3, -wide], [far + AISLE_M / 2 + 0.3, wide], [THROAT_M - 5.0, wide]])
-    areas = [shapely.Polygon(put(corners)), *(paved(lane, 0.3) for lane in lanes[::4])]
+    areas = [shapely.Polygon(put(corners)), *(find_paved_area(lane, 0.3) for lane in lanes[::4])]
     throat = np.array([[-0.1, -gate - LANE_M / 2], [6.0, -gate - LANE_M / 2], [6.0, gate + LANE_M / 2], [-0.1, gate + LANE_M / 2]])
     port = Port(place, yaw, street, ((4,),), ((0,),))
     along = np.arange(THROAT_M + SPACE_M[1] / 2, far - half, SPACE_M[1])

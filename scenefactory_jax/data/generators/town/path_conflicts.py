@@ -14,7 +14,7 @@ SIDE_M = 0.35  # between two who pass one another
 ALONG = 0.7  # cosine between two ways that run together
 
 
-class Table(NamedTuple):
+class PathProjections(NamedTuple):
     """The projection of every way on every other."""
 
     place: Float[np.ndarray, "N N S"]  # [i, j, row]: place on j's way of a row of i's; NaN where j's way is not near
@@ -34,7 +34,7 @@ class Zones(NamedTuple):
     rank: Float[np.ndarray, " Z"]  # own's right of way less the other's
 
 
-def find_conflicts(paths: list[Path], width: Float[np.ndarray, " N"]) -> tuple[Table, Zones]:
+def find_conflicts(paths: list[Path], width: Float[np.ndarray, " N"]) -> tuple[PathProjections, Zones]:
     """Project all ways on one another; two ways meet where the boxes that drive them would touch.
 
     Args:
@@ -58,7 +58,7 @@ def find_conflicts(paths: list[Path], width: Float[np.ndarray, " N"]) -> tuple[T
     # the mean over all near points is the projection: they lie around it
     with np.errstate(invalid="ignore"):
         place = (ROW_M * np.bincount(key, weights=row[both[:, 1]], minlength=size) / hits).reshape(count, count, most)
-    return Table(place, rows), _zones(paths, place)
+    return PathProjections(place, rows), _zones(paths, place)
 
 
 def _zones(paths: list[Path], place: Float[np.ndarray, "N N S"]) -> Zones:

@@ -19,7 +19,7 @@ SHORTEST_M = 6.0  # of a lane before and behind a taper
 Pose = tuple[Float[np.ndarray, " 2"], float]
 
 
-class Numbers(NamedTuple):
+class RoadDimensions(NamedTuple):
     """Measures that all roads of a town share, m."""
 
     bay: float  # length of a gained lane before the junction
@@ -31,14 +31,14 @@ class Numbers(NamedTuple):
     spot_margin: float  # between the first space and the road's end
 
 
-def numbers(
+def make_dimensions(
     *, bay_m: float, hold_m: float, taper_m: float, solid_m: float, shoulder_m: float, spot_m: float, spot_margin_m: float
-) -> Numbers:
+) -> RoadDimensions:
     """`Numbers` from a config entry."""
-    return Numbers(bay_m, hold_m, taper_m, solid_m, shoulder_m, spot_m, spot_margin_m)
+    return RoadDimensions(bay_m, hold_m, taper_m, solid_m, shoulder_m, spot_m, spot_margin_m)
 
 
-class Way(NamedTuple):
+class RoadAxis(NamedTuple):
     """One direction of a road. `start` and `end` are the lanes at each slot of its two ends."""
 
     lanes: list[Lane]
@@ -52,7 +52,7 @@ class Way(NamedTuple):
     cycles: tuple[int, ...]
 
 
-def link(one: Port, other: Port, via: list[Pose], numbers: Numbers) -> Block:
+def link(one: Port, other: Port, via: list[Pose], numbers: RoadDimensions) -> Block:
     """The road from a port to another: port 0 meets the first, port 1 the second.
 
     Args:
@@ -63,7 +63,7 @@ def link(one: Port, other: Port, via: list[Pose], numbers: Numbers) -> Block:
     points, yaw = reference
     back = (points[::-1], yaw[::-1] + np.pi)
     ways = [
-        lay_way(curve, len(first.leaving), len(second.entering), street, numbers, side=second.side, controlled=second.controlled)
+        lay_road(curve, len(first.leaving), len(second.entering), street, numbers, side=second.side, controlled=second.controlled)
         for curve, first, second in ((reference, one, other), (back, other, one))
         if first.leaving
     ]
@@ -72,12 +72,12 @@ def link(one: Port, other: Port, via: list[Pose], numbers: Numbers) -> Block:
     kind = "curve" if np.ptp(yaw) > CURVED else "straight"
     changed = [len(b.entering) - len(a.leaving) for a, b in ((one, other), (other, one))]
     kind = "lane_drop" if min(changed) < 0 else "lane_gain" if max(changed) > 0 else kind
-    block = stacked(kind, ways)
+    block = stack_lines(kind, ways)
     islands = [_median(points, street, numbers)] if both and street.median > 2 * numbers.shoulder + 0.5 else []
     return block._replace(lines=[*block.lines, *lines], islands=islands, ports=_ports(one, other, ways))
 
 
-def stacked(kind: str, ways: list[Way]) -> Block:
+def stack_lines(kind: str, ways: list[RoadAxis]) -> Block:
     """Ways as one block, without ports."""
     base, lanes, follows, beside = 0, [], [], []
     for way in ways:
@@ -89,7 +89,7 @@ def stacked(kind: str, ways: list[Way]) -> Block:
     return Block(kind, lanes, follows, beside, lines, [way.area for way in ways], spots=[spot for way in ways for spot in way.spots])
 
 
-def _ports(one: Port, other: Port, ways: list[Way]) -> list[Port]:
+def _ports(one: Port, other: Port, ways: list[RoadAxis]) -> list[Port]:
     """The road's own ends, facing those it was laid between."""
     ahead = ways[0] if one.leaving else None
     back = ways[-1] if other.leaving else None
@@ -114,20 +114,20 @@ def _reference(one: Port, other: Port, via: list[Pose]) -> Curve:
     return points, yaw
 
 
-def shifted(curve: Curve, right: float | Float[np.ndarray, " N"]) -> Points:
+def shift_line(curve: Curve, right: float | Float[np.ndarray, " N"]) -> Points:
     """The curve at a distance to its right, which may vary along it."""
     points, yaw = curve
     return points + np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1) * np.broadcast_to(right, len(points))[:, None]
 
 
-def _median(points: Points, street: Street, numbers: Numbers) -> shapely.Polygon:
+def _median(points: Points, street: Street, numbers: RoadDimensions) -> shapely.Polygon:
     """The strip between the directions, rounded at its ends."""
     half = street.median / 2 - numbers.shoulder
     trim = max(2, round((half + 1.0) / 0.25))
     return shapely.LineString(points[trim:-trim]).simplify(0.02).buffer(half, quad_segs=4)
 
 
-def lay_way(curve: Curve, before: int, behind: int, street: Street, numbers: Numbers, *, side: str, controlled: bool) -> Way:
+def lay_road(curve: Curve, before: int, behind: int, street: Street, numbers: RoadDimensions, *, side: str, controlled: bool) -> RoadAxis:
     """One direction along a curve, its lanes on its right: `before` at the start, `behind` at the end, one more or less at most.
 
     Args:
@@ -146,7 +146,7 @@ def lay_way(curve: Curve, before: int, behind: int, street: Street, numbers: Num
     follows: list[tuple[int, int]] = []
 
     def lay(rows: slice, right: np.ndarray | float, rank: int = ON_ROAD) -> int:
-        points = shifted((curve[0][rows], curve[1][rows]), np.broadcast_to(right, place.shape)[rows])
+        points = shift_line((curve[0][rows], curve[1][rows]), np.broadcast_to(right, place.shape)[rows])
         lanes.append(Lane(points, street.width, street.limit, rank, street.kind))
         return len(lanes) - 1
 
@@ -167,15 +167,15 @@ def lay_way(curve: Curve, before: int, behind: int, street: Street, numbers: Num
     outer = street.median / 2 + street.width * count
     cycles = (len(lanes),) if street.bike else ()
     if street.bike:
-        lanes.append(Lane(shifted(curve, outer + street.bike / 2), street.bike, street.limit, ON_ROAD, LANE_BIKE))
+        lanes.append(Lane(shift_line(curve, outer + street.bike / 2), street.bike, street.limit, ON_ROAD, LANE_BIKE))
     room = _room(place, street, numbers)
     area = _area(curve, street, outer + street.bike + room + numbers.shoulder, numbers.shoulder)
     spots = _spots(curve, place, outer + street.bike + room / 2, numbers) if street.parking and length > 40.0 else []
     lines = _lines(curve, place, sections, outer, street, numbers, controlled=controlled)
-    return Way(lanes, follows, beside, lines, area, spots, start, finish, cycles)
+    return RoadAxis(lanes, follows, beside, lines, area, spots, start, finish, cycles)
 
 
-def _taper(before: int, behind: int, length: float, numbers: Numbers) -> tuple[float, float]:
+def _taper(before: int, behind: int, length: float, numbers: RoadDimensions) -> tuple[float, float]:
     """Where a taper begins and ends: a lane is gained just before the road's end and dropped soon after its start."""
     room = max(length - 2 * SHORTEST_M, 2.0)
     taper = min(numbers.taper, 0.8 * room)
@@ -193,7 +193,7 @@ def _strands(before: int, behind: int, side: str) -> list[tuple[int, int]]:
     return [*((slot, slot) for slot in range(before)), (before - 1, before)]
 
 
-def _room(place: Float[np.ndarray, " N"], street: Street, numbers: Numbers) -> Float[np.ndarray, " N"]:
+def _room(place: Float[np.ndarray, " N"], street: Street, numbers: RoadDimensions) -> Float[np.ndarray, " N"]:
     """Width of the parking strip along the road: none near its ends."""
     if not street.parking or place[-1] <= 40.0:
         return np.zeros_like(place)
@@ -206,16 +206,16 @@ def _area(curve: Curve, street: Street, outer: Float[np.ndarray, " N"], shoulder
     step = slice(None, None, 4)
     rows = np.unique(np.concatenate([np.arange(len(outer))[step], [len(outer) - 1]]))
     thinned = curve[0][rows], curve[1][rows]
-    kerb = shifted(thinned, outer[rows])
+    kerb = shift_line(thinned, outer[rows])
     # a hair over the middle, so that the two directions share area and become one surface
-    inner = shifted(thinned, -0.05 if street.forward and street.backward else -shoulder)
+    inner = shift_line(thinned, -0.05 if street.forward and street.backward else -shoulder)
     return shapely.Polygon(np.concatenate([inner, kerb[::-1]]))
 
 
-def _spots(curve: Curve, place: Float[np.ndarray, " N"], beside: Float[np.ndarray, " N"], numbers: Numbers) -> list[Spot]:
+def _spots(curve: Curve, place: Float[np.ndarray, " N"], beside: Float[np.ndarray, " N"], numbers: RoadDimensions) -> list[Spot]:
     """Kerbside parking spaces, one behind the other."""
     at = np.arange(numbers.spot_margin + numbers.spot / 2, place[-1] - numbers.spot_margin - numbers.spot / 2, numbers.spot)
-    points, yaw = shifted(curve, beside), curve[1]
+    points, yaw = shift_line(curve, beside), curve[1]
     places = np.stack([np.interp(at, place, points[:, 0]), np.interp(at, place, points[:, 1])], axis=-1)
     return [Spot(spot, float(turn)) for spot, turn in zip(places, np.interp(at, place, yaw), strict=True)]
 
@@ -226,7 +226,7 @@ def _lines(
     sections: list[tuple[slice, int]],
     outer: Float[np.ndarray, " N"],
     street: Street,
-    numbers: Numbers,
+    numbers: RoadDimensions,
     *,
     controlled: bool,
 ) -> list[Line]:
@@ -235,12 +235,12 @@ def _lines(
     solid = place[-1] - (numbers.solid if controlled else 0.0)
     for rows, count in sections:
         for slot in range(1, count):
-            points = shifted((curve[0][rows], curve[1][rows]), street.median / 2 + slot * street.width)
+            points = shift_line((curve[0][rows], curve[1][rows]), street.median / 2 + slot * street.width)
             split = int(np.searchsorted(place[rows], solid))
             parts = ((BROKEN_WHITE, points[: split + 1]), (SOLID_WHITE, points[split:]))
             lines += [Line(kind, part) for kind, part in parts if len(part) > 4]
     if street.median:
-        lines.append(Line(SOLID_YELLOW, shifted(curve, street.median / 2)))
+        lines.append(Line(SOLID_YELLOW, shift_line(curve, street.median / 2)))
     if street.bike or street.kind != LANE_STREET:
-        lines.append(Line(SOLID_WHITE, shifted(curve, outer)))
+        lines.append(Line(SOLID_WHITE, shift_line(curve, outer)))
     return lines

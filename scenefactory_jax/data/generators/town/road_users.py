@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET, RoadUser
 from scenefactory_jax.data.generators.curves import Points, arc_length
 from scenefactory_jax.data.generators.procedural.road_layout import draw
-from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, aside, draw_way, make_path, to_the_right, walk
+from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, change_to_right, draw_path, make_path, offset_path, walk
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network
 
 LOT_MPS = 5.0  # lanes with lower limits are those of parking lots and driveways
@@ -17,7 +17,7 @@ MIDDLE_SHARE = 0.35  # of the town's half side: where the first car starts, for 
 LATEST = 0.7  # share of the log after which nobody sets out to cross a road
 
 
-class Goer(NamedTuple):
+class SimulatedUser(NamedTuple):
     """A road user before he sets off."""
 
     kind: RoadUser
@@ -28,7 +28,7 @@ class Goer(NamedTuple):
     enters: float
 
 
-class Driving(NamedTuple):
+class DrivingNumbers(NamedTuple):
     """Cars, how their drivers differ and what they allow themselves."""
 
     size_m: list[list[float]]  # ranges of length, width and height
@@ -42,7 +42,7 @@ class Driving(NamedTuple):
     change_m: list[float]  # way over which it does
 
 
-class Cyclists(NamedTuple):
+class CyclistNumbers(NamedTuple):
     """People on bicycles."""
 
     count: list[int]
@@ -50,7 +50,7 @@ class Cyclists(NamedTuple):
     speed_mps: list[float]
 
 
-class People(NamedTuple):
+class PedestrianNumbers(NamedTuple):
     """People on foot: who crosses at a crosswalk, and who walks along a kerb."""
 
     crossers: list[int]
@@ -78,15 +78,15 @@ def draw_cars(
     count: int,
     times: Float[np.ndarray, " L"],
     reach: float,
-    driving: Driving,
-) -> list[Goer]:
+    driving: DrivingNumbers,
+) -> list[SimulatedUser]:
     """Cars on random lanes, the first near the middle, and some that come in on a road later on. Fewer where there is no room."""
     entries = network.entries
     usable = [i for i, lane in enumerate(network.lanes) if lane.kind != LANE_BIKE and lane.rank == ON_ROAD]
     lengths = np.array([arc_length(network.lanes[i].points)[-1] for i in usable])
     weights = lengths * np.array([1.0 if network.lanes[i].limit > LOT_MPS else driving.lot_share for i in usable], float)
     inlets = [i for i in usable if not entries[i] and network.exits[i] and np.abs(network.lanes[i].points[0]).max() < 2 * reach]
-    found: list[Goer] = []
+    found: list[SimulatedUser] = []
     places: list[np.ndarray] = []
     for _ in range(6 * count + 30):
         if len(found) == count:
@@ -109,7 +109,7 @@ def draw_cars(
         if not later:
             places.append(place)
         speed = float(path.cap[0] * rng.uniform(0.6, 1.0))
-        found.append(Goer("vehicle", size, path, 0.0, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
+        found.append(SimulatedUser("vehicle", size, path, 0.0, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
     return found
 
 
@@ -125,15 +125,15 @@ def _drive(
     lane: int,
     begin: float,
     times: Float[np.ndarray, " L"],
-    driving: Driving,
+    driving: DrivingNumbers,
     right: float = 0.0,
 ) -> Path | None:
     """A way long enough for the log."""
     far = 1.1 * network.lanes[lane].limit * (times[-1] - times[0]) + 30.0
-    pieces = draw_way(rng, network, lane, begin, far, change_share=0.0 if right else driving.change_share, change_m=driving.change_m)
+    pieces = draw_path(rng, network, lane, begin, far, change_share=0.0 if right else driving.change_share, change_m=driving.change_m)
     if sum(len(piece.points) for piece in pieces) * 0.25 < 15.0:
         return None
-    pieces = aside(pieces, right) if right else pieces
+    pieces = offset_path(pieces, right) if right else pieces
     eager = draw(rng, driving.eager, "traffic.driving.eager")
     return make_path(pieces, eager=eager, lateral=driving.lateral_mps2, braking=driving.braking_mps2)
 
@@ -143,13 +143,13 @@ def draw_cyclists(
     network: Network,
     times: Float[np.ndarray, " L"],
     reach: float,
-    driving: Driving,
-    cyclists: Cyclists,
-) -> list[Goer]:
+    driving: DrivingNumbers,
+    cyclists: CyclistNumbers,
+) -> list[SimulatedUser]:
     """Cyclists on the lanes that are theirs, or on the right of others."""
     own = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_BIKE and lane.rank == ON_ROAD]
     slow = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_STREET and lane.rank == ON_ROAD and not network.right[i]]
-    found: list[Goer] = []
+    found: list[SimulatedUser] = []
     for _ in range(number(rng, cyclists.count) if own or slow else 0):
         lane = int(rng.choice(own if own and rng.random() < 0.7 else slow or own))
         points = network.lanes[lane].points
@@ -161,15 +161,15 @@ def draw_cyclists(
         if path is not None:
             speed = draw(rng, cyclists.speed_mps, "traffic.cyclists.speed_mps")
             path = path._replace(cap=np.minimum(path.cap, speed))
-            found.append(Goer("cyclist", cyclists.size_m, path, 0.0, speed, -np.inf))
+            found.append(SimulatedUser("cyclist", cyclists.size_m, path, 0.0, speed, -np.inf))
     return found
 
 
 def draw_crossers(
-    rng: np.random.Generator, network: Network, times: Float[np.ndarray, " L"], people: People
-) -> list[Goer]:
+    rng: np.random.Generator, network: Network, times: Float[np.ndarray, " L"], people: PedestrianNumbers
+) -> list[SimulatedUser]:
     """People on foot who cross at a crosswalk at some moment of the log."""
-    found: list[Goer] = []
+    found: list[SimulatedUser] = []
     for _ in range(number(rng, people.crossers) if network.crosswalks else 0):
         walked = int(rng.integers(len(network.crosswalks)))
         ends = network.crosswalks[walked].ends[:: int(rng.choice([-1, 1]))]
@@ -183,7 +183,7 @@ def draw_crossers(
         way = np.stack([ends[0] - before * ahead, ends[1] + after * ahead]) + side
         path = walk(way, speed, crosswalk=(before, len(network.stops) + walked) if lit else None)
         enters = float(rng.uniform(times[0], LATEST * times[-1]))
-        found.append(Goer("pedestrian", people.size_m, path, 0.0, speed, enters))
+        found.append(SimulatedUser("pedestrian", people.size_m, path, 0.0, speed, enters))
     return found
 
 
@@ -192,7 +192,7 @@ def draw_strollers(
     kerbs: list[Points],
     surface: shapely.Geometry,
     seconds: float,
-    people: People,
+    people: PedestrianNumbers,
 ) -> list[tuple[Points, float]]:
     """Ways of people on pavements, and their speeds."""
     if not kerbs:
@@ -208,7 +208,7 @@ def draw_strollers(
         at = np.arange(0.0, need, STEP_M) + rng.uniform(0.0, place[-1] - need)
         points = np.stack([np.interp(at, place, kerb[:, i]) for i in (0, 1)], axis=-1)
         # the surface is on a kerb's left
-        points = points + draw(rng, people.pavement_m, "traffic.people.pavement_m") * to_the_right(points)
+        points = points + draw(rng, people.pavement_m, "traffic.people.pavement_m") * change_to_right(points)
         if not shapely.contains_xy(surface, points[:, 0], points[:, 1]).any():
             found.append((points[:: int(rng.choice([-1, 1]))], speed))
     return found

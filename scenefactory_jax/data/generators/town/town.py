@@ -8,20 +8,20 @@ from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import Points
 from scenefactory_jax.data.generators.town.road_network import Network
-from scenefactory_jax.data.generators.town.traffic import Actor, moved, settle_times
+from scenefactory_jax.data.generators.town.traffic import TownUser, choose_start_times, move_track
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 REPOPULATIONS = 3  # times that traffic is drawn anew for a network
 
 
-class Parts(NamedTuple):
+class TownParts(NamedTuple):
     """What makes a town, each bound to its numbers; see `generate.generate`."""
 
     network: Callable[..., tuple[str, Network] | None]
     kerbs: Callable[..., tuple[list[Points], list[Points], object]]
     aprons: Callable[..., tuple[list[Points], list]]
     gates: Callable[..., Gates]
-    traffic: Callable[..., list[Actor]]
+    traffic: Callable[..., list[TownUser]]
 
 
 class Log(NamedTuple):
@@ -45,11 +45,11 @@ class Town(NamedTuple):
     islands: list[Points]
     aprons: list[Points]
     gates: Gates
-    actors: list[Actor]
+    actors: list[TownUser]
     sdc: int  # of the actors
 
 
-def draw_town(rng: np.random.Generator, reach: float, parts: Parts, log: Log) -> Town | None:
+def draw_town(rng: np.random.Generator, reach: float, parts: TownParts, log: Log) -> Town | None:
     """A town; None where its plan cannot be built or too few cars move."""
     drawn = parts.network(rng, reach)
     if drawn is None:
@@ -59,7 +59,7 @@ def draw_town(rng: np.random.Generator, reach: float, parts: Parts, log: Log) ->
     pavements = [] if kind == "motorway" else outer
     aprons, spots = parts.aprons(rng, network, pavements, surface)
     network = network._replace(spots=[*network.spots, *spots])
-    times = settle_times(log.times, log.warm_s)
+    times = choose_start_times(log.times, log.warm_s)
     gates = parts.gates(rng, network, times)
     for _ in range(REPOPULATIONS):
         recorded = _record(rng, parts.traffic(rng, network, pavements, surface, reach, times, gates), log)
@@ -68,10 +68,10 @@ def draw_town(rng: np.random.Generator, reach: float, parts: Parts, log: Log) ->
     return None
 
 
-def _record(rng: np.random.Generator, actors: list[Actor], log: Log) -> tuple[list[Actor], int] | None:
+def _record(rng: np.random.Generator, actors: list[TownUser], log: Log) -> tuple[list[TownUser], int] | None:
     """Traffic as one of the cars near the middle would record it, and that car's index; None where too few cars move."""
     now, logs = log.current, [actor.since(-len(log.times)) for actor in actors]
-    moving = [i for i, a in enumerate(logs) if a.kind == "vehicle" and a.valid[now] and moved(a, now) > log.travel_m]
+    moving = [i for i, a in enumerate(logs) if a.kind == "vehicle" and a.valid[now] and move_track(a, now) > log.travel_m]
     near = [i for i in moving if np.abs(logs[i].position[now]).max() <= log.sdc_m and logs[i].valid[: now + 1].all()]
     near = [i for i in near if logs[i].valid.all()] or near
     if not near:

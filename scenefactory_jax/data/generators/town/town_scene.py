@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError, build, check_number
+from scenefactory_jax.core.instantiate import ConfigError, check_number, instantiate
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.scene_arrays import wrapped
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
 from scenefactory_jax.data.generators.procedural.road_layout import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
-from scenefactory_jax.data.generators.town.town import Log, Parts, Town, draw_town
-from scenefactory_jax.data.generators.town.traffic import Actor
+from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, draw_town
+from scenefactory_jax.data.generators.town.traffic import TownUser
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.scenes.town"
@@ -70,7 +70,7 @@ def generate(
     entries = {"networks": network, "surface": surface, "aprons": aprons, "signals": signals, "traffic": traffic}
     places = ("network", "surface", "aprons", "signals", "traffic")
     built = zip(entries.items(), places, strict=True)
-    parts = Parts(*(build(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{place}") for (module, entry), place in built))
+    parts = TownParts(*(instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{place}") for (module, entry), place in built))
     times = log_dt * np.arange(log_steps)
     log = Log(times, log_current, warm_s, sdc_m, sight_m, travel_m=traffic["travel_m"][0], least=traffic["cars"][0])
     for redraw in range(REDRAWS):
@@ -135,11 +135,11 @@ def _lights(network: Network, gates: Gates, steps: int) -> tuple[Light, ...]:
     return tuple(found)
 
 
-def _track(index: int, actor: Actor) -> Track:
+def _track(index: int, actor: TownUser) -> Track:
     """An actor's log, zeros where it is not seen."""
     mask = actor.valid
     position = np.concatenate([actor.position, np.full((len(mask), 1), actor.size[2] / 2)], axis=1)
-    yaw = wrapped(actor.yaw)
+    yaw = wrap_angles(actor.yaw)
     velocity = actor.speed[:, None] * heading(actor.yaw)
     position, velocity = (np.where(mask[:, None], column, 0.0) for column in (position, velocity))
     return Track(index, actor.kind, actor.size, position, np.where(mask, yaw, 0.0), velocity, mask)

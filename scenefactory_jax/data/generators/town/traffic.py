@@ -12,17 +12,17 @@ from scenefactory_jax.data.generators.curves import Points, arc_length, heading
 from scenefactory_jax.data.generators.procedural.road_layout import check_positive, check_range, draw
 from scenefactory_jax.data.generators.town import road_users
 from scenefactory_jax.data.generators.town.bounds import fill
-from scenefactory_jax.data.generators.town.driver_model import Manners, Users, simulate
+from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
 from scenefactory_jax.data.generators.town.path_conflicts import find_conflicts
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
-from scenefactory_jax.data.packing.pack import corners, overlaps
+from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
 WARM_STEP_S = 0.2  # while traffic settles before the log
 
 
-class Actor(NamedTuple):
+class TownUser(NamedTuple):
     """One road user over the whole log."""
 
     kind: RoadUser
@@ -32,12 +32,12 @@ class Actor(NamedTuple):
     speed: Float[np.ndarray, " L"]
     valid: Bool[np.ndarray, " L"]
 
-    def since(self, step: int) -> "Actor":
+    def since(self, step: int) -> "TownUser":
         """The log from a step on."""
-        return Actor(self.kind, self.size, self.position[step:], self.yaw[step:], self.speed[step:], self.valid[step:])
+        return TownUser(self.kind, self.size, self.position[step:], self.yaw[step:], self.speed[step:], self.valid[step:])
 
 
-def settle_times(times: Float[np.ndarray, " L"], warm_s: float) -> Float[np.ndarray, " M"]:
+def choose_start_times(times: Float[np.ndarray, " L"], warm_s: float) -> Float[np.ndarray, " M"]:
     """The log's times, and those before it while traffic settles."""
     return np.concatenate([times[0] - np.arange(round(warm_s / WARM_STEP_S), 0, -1) * WARM_STEP_S, times])
 
@@ -58,7 +58,7 @@ def populate(
     parked_share: list[float],
     cyclists: Mapping[str, Any],
     people: Mapping[str, Any],
-) -> list[Actor]:
+) -> list[TownUser]:
     """Everybody who is on the road over `times`, the log's and those before.
 
     Args:
@@ -76,10 +76,13 @@ def populate(
     """
     for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_share, "parked_share")):
         check_range(span, f"traffic.{name}", low=0.0)
-    rules, taste = fill(Manners, manners, "traffic.manners"), fill(road_users.Driving, driving, "traffic.driving")
+    rules, taste = fill(DriverParameters, manners, "traffic.manners"), fill(road_users.DrivingNumbers, driving, "traffic.driving")
     for name, value in rules._asdict().items():
         check_positive(value, f"traffic.manners.{name}")
-    walking, cycling = fill(road_users.People, people, "traffic.people"), fill(road_users.Cyclists, cyclists, "traffic.cyclists")
+    walking, cycling = (
+        fill(road_users.PedestrianNumbers, people, "traffic.people"),
+        fill(road_users.CyclistNumbers, cyclists, "traffic.cyclists"),
+    )
     goers = [
         *road_users.draw_cars(rng, network, road_users.number(rng, cars), times, reach, taste),
         *road_users.draw_cyclists(rng, network, times, reach, taste, cycling),
@@ -89,10 +92,12 @@ def populate(
     parked = _park(rng, network, draw(rng, parked_share, "traffic.parked_share"), taste.size_m, times)
     actors = [*_drive(goers, gates, times, rules), *(_stroll(*stroll, walking.size_m, times) for stroll in strolls), *parked]
     actors = [_cut(actor, times, travel_m[1]) for actor in actors]
-    return keep_apart([actor for actor in actors if actor.kind != "vehicle" or _on_road(actor, surface, reach)])
+    return separate_users([actor for actor in actors if actor.kind != "vehicle" or _on_road(actor, surface, reach)])
 
 
-def _drive(goers: list[road_users.Goer], gates: Gates, times: Float[np.ndarray, " L"], manners: Manners) -> list[Actor]:
+def _drive(
+    goers: list[road_users.SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], manners: DriverParameters
+) -> list[TownUser]:
     """Everybody's log as they go their ways together."""
     if not goers:
         return []
@@ -106,23 +111,25 @@ def _drive(goers: list[road_users.Goer], gates: Gates, times: Float[np.ndarray, 
         row = motion.place[:, own] / STEP_M
         at = np.arange(len(goer.path.points))
         position = np.stack([np.interp(row, at, goer.path.points[:, i]) for i in (0, 1)], axis=-1)
-        found.append(Actor(goer.kind, goer.size, position, np.interp(row, at, goer.path.yaw), motion.speed[:, own], motion.present[:, own]))
+        found.append(
+            TownUser(goer.kind, goer.size, position, np.interp(row, at, goer.path.yaw), motion.speed[:, own], motion.present[:, own])
+        )
     return found
 
 
-def _stroll(points: Points, speed: float, size: tuple[float, float, float], times: Float[np.ndarray, " L"]) -> Actor:
+def _stroll(points: Points, speed: float, size: tuple[float, float, float], times: Float[np.ndarray, " L"]) -> TownUser:
     """A walk at a constant speed."""
     place = arc_length(points)
     at = np.minimum(speed * (times - times[0]), place[-1])
     position = np.stack([np.interp(at, place, points[:, i]) for i in (0, 1)], axis=-1)
     step = np.gradient(points, axis=0)
     yaw = np.interp(at, place, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
-    return Actor("pedestrian", size, position, yaw, np.full(len(times), speed), at < place[-1])
+    return TownUser("pedestrian", size, position, yaw, np.full(len(times), speed), at < place[-1])
 
 
 def _park(
     rng: np.random.Generator, network: Network, share: float, size_m: list[list[float]], times: Float[np.ndarray, " L"]
-) -> list[Actor]:
+) -> list[TownUser]:
     """Cars that stand in some of the parking spaces all the time."""
     found = []
     for spot in network.spots:
@@ -130,26 +137,26 @@ def _park(
             size = road_users.draw_size(rng, size_m)
             place = spot.place + rng.uniform(-0.2, 0.2) * heading(spot.yaw)
             still = np.tile(place, (len(times), 1)), np.full(len(times), spot.yaw), np.zeros(len(times)), np.ones(len(times), bool)
-            found.append(Actor("vehicle", size, *still))
+            found.append(TownUser("vehicle", size, *still))
     return found
 
 
-def _cut(actor: Actor, times: Float[np.ndarray, " L"], most: float) -> Actor:
+def _cut(actor: TownUser, times: Float[np.ndarray, " L"], most: float) -> TownUser:
     """The log up to where it has gone farther than the most since time 0."""
     step = np.linalg.norm(np.diff(actor.position, axis=0), axis=1) * (actor.valid[1:] & actor.valid[:-1] & (times[:-1] >= 0))
     return actor._replace(valid=actor.valid & (np.concatenate([[0.0], np.cumsum(step)]) <= most))
 
 
-def _on_road(actor: Actor, surface: shapely.Geometry, reach: float) -> bool:
+def _on_road(actor: TownUser, surface: shapely.Geometry, reach: float) -> bool:
     """Whether a moving car's corners stay on the surface; beyond the town it goes on unseen."""
     if not (actor.speed > 0.1).any():
         return True
     rows = np.flatnonzero(actor.valid & (np.abs(actor.position).max(axis=1) < reach - 6.0))[::2]
-    points = corners(actor.position[rows], actor.yaw[rows], *actor.size[:2]).reshape(-1, 2)
+    points = box_corners(actor.position[rows], actor.yaw[rows], *actor.size[:2]).reshape(-1, 2)
     return bool(shapely.contains_xy(surface, points[:, 0], points[:, 1]).all())
 
 
-def keep_apart(actors: list[Actor]) -> list[Actor]:
+def separate_users(actors: list[TownUser]) -> list[TownUser]:
     """Without those who touch somebody at any step: whoever touches most goes first."""
     left = list(range(len(actors)))
     touching = _touching(actors)
@@ -161,7 +168,7 @@ def keep_apart(actors: list[Actor]) -> list[Actor]:
     return [actors[i] for i in left]
 
 
-def _touching(actors: list[Actor]) -> list[tuple[int, int]]:
+def _touching(actors: list[TownUser]) -> list[tuple[int, int]]:
     """Pairs whose boxes overlap at some step at which both are there."""
     if len(actors) < 2:
         return []
@@ -176,13 +183,12 @@ def _touching(actors: list[Actor]) -> list[tuple[int, int]]:
     rows, cols = rows[meet], cols[meet]
     near = np.linalg.norm(position[rows] - position[cols], axis=2) < (radius[rows] + radius[cols])[:, None]
     pair, step = np.nonzero(near & valid[rows] & valid[cols])
-    boxes = np.stack([corners(a.position, a.yaw, *a.size[:2]) for a in actors])
+    boxes = np.stack([box_corners(a.position, a.yaw, *a.size[:2]) for a in actors])
     hit = overlaps(boxes[rows[pair], step], boxes[cols[pair], step])
     return sorted({(int(rows[p]), int(cols[p])) for p in pair[hit]})
 
 
-def moved(actor: Actor, current: int) -> float:
+def move_track(actor: TownUser, current: int) -> float:
     """Metres from a step on."""
     rows = actor.valid[current:]
     return float(np.linalg.norm(np.diff(actor.position[current:][rows], axis=0), axis=1).sum()) if rows.any() else 0.0
-
