@@ -28,9 +28,9 @@ commands: {", ".join(configs.COMMANDS)}
   scenes    look at, choose, divide   op=info|filter|split|merge|dedupe|... scenes.path=BANK out=BANK
   render    scenes as MJCF and images scenes.path=FOLDER_OR_BANK out=FOLDER
   replay    a page to watch and ask   run=RUN_DIR scenes.path=FOLDER_OR_BANK worlds=4 seconds=20 out=replay.html|.gif|.mp4|.png|.rrd
-  drive     a car, by keyboard        run=RUN_DIR scenes.path=FOLDER_OR_BANK weather=dry|ice|... dynamics=mjx_car|bicycle
+  drive     a car, by keyboard        run=RUN_DIR scenes.path=FOLDER_OR_BANK weather=dry|ice|... dynamics=articulated|bicycle
   export    a policy to hand on        run=RUN_DIR out=FOLDER
-  bench     measure speed             experiment=published scenes.path=FOLDER_OR_BANK suite=throughput out=FOLDER
+  bench     measure speed             experiment=paper scenes.path=FOLDER_OR_BANK suite=throughput out=FOLDER
   validate  hold the physics to tests validation=reduced|full parts='[drives,laws]' resume=true workers=N out=FOLDER
   study     an experiment, whole      study=navigation|transfer|friction|... train_scenes=BANK test_scenes=BANK
   weather   what friction there is    weather=dry|wet|... out=FOLDER

@@ -229,8 +229,8 @@ def measure(
     edge_range_m: float,
     upright_min: float,
     height_min_m: float,
-    box_m: float,
-    stray_m: float,
+    scene_size_m: float,
+    max_start_distance_m: float,
     stray_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
@@ -250,12 +250,12 @@ def measure(
     has_lane = len(place.lanes.kind) > 0
     edge_gap, edge_ttc = _edges(place.edges, agent, crowd, edge_half_width_m, edge_range_m)
     fell = agent.upright < upright_min or agent.elevation < height_min_m
-    lost = strayed > max(stray_m, stray_ratio * agent.route)
+    lost = strayed > max(max_start_distance_m, stray_ratio * agent.route)
     events = {
         "fault": False,
         "reached": math.hypot(*to_goal) <= goal_radius_m,
         "collided": agent.contact_force >= collision_force_n and agent.age >= collision_grace_steps,
-        "crashed": fell or lost or bool(abs(agent.position).max() > 0.5 * box_m),
+        "crashed": fell or lost or bool(abs(agent.position).max() > 0.5 * scene_size_m),
         "touched_edge": edge_gap <= edge_radius_m,
     }
     return Facts(

@@ -162,7 +162,7 @@ def make(config: Mapping[str, Any]) -> Task:
     """
     _refuse(config)
     bound = functools.partial(instantiate, builtins=one)
-    entries = {name: entry for name, entry in config["observe"].items() if entry is not None}
+    entries = {name: entry for name, entry in config["observations"].items() if entry is not None}
     groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
     terms = []
     for name, entry in config["reward"].items():
@@ -181,10 +181,10 @@ def make(config: Mapping[str, Any]) -> Task:
         engine=_engine(config),
         draw=jax.jit(draw),
         groups=groups,
-        measure=bound({"_target_": "measure", **_without_kernels(config["facts"])}, where="facts"),
-        judge=bound({"_target_": "judge", **config["ends"]}, where="ends"),
+        measure=bound({"_target_": "compute", **_without_kernels(config["step_metrics"])}, where="step_metrics"),
+        judge=bound({"_target_": "evaluate", **config["termination"]}, where="termination"),
         terms=terms,
-        circles=config["facts"]["circles"],
+        circles=config["step_metrics"]["circles"],
         episode_steps=parts.episode_steps,
     )
 
@@ -199,15 +199,15 @@ def _refuse(config: Mapping[str, Any]) -> None:
     dynamics, weather = config["dynamics"], config["weather"]
     if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
-    if config["controls"] != {"command": {"_target_": "separate_pedals"}, "every": 1}:
-        raise ConfigError(f"controls: {config['controls']}; the baseline has pedals, read at every control step")
-    if config["others"]["_target_"] != "ignore":
-        raise ConfigError(f"others._target_: {config['others']['_target_']}; the baseline has ignore")
-    if config["spawn"]["respawn_clear_m"] is not None:
-        raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; the baseline has null")
+    if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
+        raise ConfigError(f"controls: {config['actions']}; the baseline has pedals, read at every control step")
+    if config["traffic"]["_target_"] != "ignore":
+        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has ignore")
+    if config["spawning"]["respawn_clearance_m"] is not None:
+        raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":
         raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
-    for group in ("observe", "reward"):
+    for group in ("observations", "reward"):
         for name, entry in config[group].items():
             if entry is not None and "." in entry["_target_"]:
                 raise ConfigError(f"{group}.{name}._target_: {entry['_target_']}; the baseline has built-in ones")
@@ -227,7 +227,7 @@ def _engine(config: Mapping[str, Any]) -> Engine:
         rig=functools.cache(lambda count: mujoco_c.make_encounter(car, newton, touch, count=count, **limits)),
         still=cars.find_rest_pose(alone.model, car),
         substeps=round(timing["physics_hz"] / timing["control_hz"]),
-        apart_m=config["facts"]["box_m"],
+        apart_m=config["step_metrics"]["scene_size_m"],
     )
 
 

@@ -88,8 +88,8 @@ def make_pool(
         config = configs.load_config("train", *([ALONE] if alone else []), *overrides)
     elif overrides:
         config = configs.apply_overrides(config, overrides)
-    if not lives and config["spawn"]["respawn_clear_m"] is not None:
-        raise ConfigError(f"spawn.respawn_clear_m: {config['spawn']['respawn_clear_m']}; here a car that ended stays so: set it to null")
+    if not lives and config["spawning"]["respawn_clearance_m"] is not None:
+        raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null")
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
     scene_source.use_compilation_cache()

@@ -39,7 +39,7 @@ class Drive(ParallelEnv):
         scenes: to draw episodes from; None: the config's.
 
     Raises:
-        ConfigError: cars that begin anew (`spawn.respawn_clear_m`), or what `scenefactory_jax.make` and `load_scenes` raise.
+        ConfigError: cars that begin anew (`spawning.respawn_clearance_m`), or what `scenefactory_jax.make` and `load_scenes` raise.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ ASIDE = ("out", "resume", "variants", "baseline", "name")  # keys of a bench tha
 
 
 def bench(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure a config (`load("bench", "experiment=published", ...)`) or each of its variants; medians over `repeats`.
+    """Measure a config (`load("bench", "experiment=paper", ...)`) or each of its variants; medians over `repeats`.
 
     Returns:
         The rows, which are also printed and, with `out`, written there as bench.json and throughput.md.

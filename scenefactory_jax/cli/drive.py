@@ -29,7 +29,7 @@ NAMED = ("up", "down", "left", "right", "space", "enter", "home", "end", "insert
 CODES = {name: getattr(glfw, f"KEY_{name.upper()}") for name in NAMED}
 CODES |= {chr(code).lower(): code for code in range(glfw.KEY_A, glfw.KEY_Z + 1)}
 LATE_S = 0.5  # by which a slow display may lag before the drive slows down
-FREE = ("ends=invincible", "timing.episode_s=3600")  # of a run that is driven in
+FREE = ("termination=goal_only", "timing.episode_s=3600")  # of a run that is driven in
 
 
 class View(NamedTuple):

@@ -200,7 +200,7 @@ def read_values(path: Path) -> dict[str, Any]:
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A run's config with other settings: `dynamics=bicycle` replaces a whole group of the environment, `timing.episode_s=20` one number.
 
-    A run's config holds values, no references: what follows another key in `conf/` (`observe.road.kernels` follows `facts.kernels`) does
+    A run's config holds values, no references: what follows another key in `conf/` (`observations.road.kernels` follows `step_metrics.kernels`) does
     not follow here, and a whole group comes with what the default environment says of such keys, not the run's.
 
     Raises:

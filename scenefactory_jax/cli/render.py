@@ -39,7 +39,7 @@ def render(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"index: {index}; valid: 0 to {count - 1}")
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), loaded.scene)
     context = {"control_dt": 1.0 / config["timing"]["control_hz"]}
-    who = instantiate(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context)
+    who = instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context)
     scene = replace(scene, boxes=who(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
     spec = world(config, scene)
     out = Path(config["out"])
@@ -70,7 +70,7 @@ def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
         raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: mjx_car, mjx_published")
     parameters, solver = cars.read_parameters(dynamics)
     car = cars.build_mjspec(parameters, visual=True, brake_rows=False)
-    spec = world_mjcf.world(scene, car, box_m=config["scenes"]["pack"]["box_m"], **config["world"])
+    spec = world_mjcf.world(scene, car, scene_size_m=config["scenes"]["pack"]["scene_size_m"], **config["world"])
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):
         cars.add_ground_pairs(spec, parameters, ground="ground", prefix=f"agent{slot}/")
     cars.set_options(spec, solver, physics_dt=1.0 / config["timing"]["physics_hz"])

@@ -33,14 +33,14 @@ def compare(config: Mapping[str, Any]) -> Path:
         entry = configs.load_config("scenes", f"scenes={other}")["scenes"] if other in _entries() else {**own, "path": other}
         scenes[other if Path(other).name in scenes else Path(other).name] = entry
     reference = next(iter(scenes))
-    box_m = float(scenes[reference]["pack"]["box_m"])
+    scene_size_m = float(scenes[reference]["pack"]["scene_size_m"])
     sets = {}
     for name, entry in scenes.items():
-        samples = report.collect(_checked(entry, limit), box_m=box_m)
+        samples = report.collect(_checked(entry, limit), scene_size_m=scene_size_m)
         if not len(samples["vehicles"]):
             raise SceneError(f"{entry['path']}: no usable scene to compare as {name!r}")
         sets[name] = samples
-    path = report.write(Path(config["out"]), reference, sets, box_m=box_m, command=configs.format_command("scenes"))
+    path = report.write(Path(config["out"]), reference, sets, scene_size_m=scene_size_m, command=configs.format_command("scenes"))
     print(f"{report.table(reference, sets)}\n{path}", flush=True)
     return path
 

@@ -28,7 +28,7 @@ FAILURE_KINDS = {name: Key(float, 0) for name in ("own_share", "own_mps", "stuck
 FAILURE_PICTURES = {"enable": FLAG, "panels": COUNT, "before_s": Key(float, 0), "video": FLAG}
 FAILURES = {"notes": FAILURE_NOTES, "kinds": FAILURE_KINDS, "pictures": FAILURE_PICTURES}
 JUDGE = {"seed": SEED, "repeats": COUNT, "chunk_steps": COUNT, "ttc_limit_s": Key(float, 0), "bootstrap": COUNT, "untrained": FLAG}
-PROTOCOL = {"name": Key(str), "settings": Key(list[str]), "ends": Key(list[str]), "seed": SEED, "repeats": COUNT}
+PROTOCOL = {"name": Key(str), "settings": Key(list[str]), "termination": Key(list[str]), "seed": SEED, "repeats": COUNT}
 EVALUATION = {"enable": FLAG, "every": Key(int | list[int] | None, 0), "protocols": Key(list[str]), **JUDGE}
 TRAIN = {"name": Key(str), "out": PLACE, "resume": FLAG, "seed": SEED, "worlds": COUNT, "iterations": COUNT}
 TRAIN |= {"devices": Key(int | None, 1), "stream": Key(dict | None)}
@@ -75,7 +75,7 @@ MERGE = {"banks": Key(list[str]), "duplicates": Key(Literal["refuse", "first"])}
 DEDUPE = {"tolerance_m": Key(float, 0.001), "share": Key(float, 0), "slack": Key(float, 1e-6)}
 SIMULATE, EXPORT = {"seconds": Key(float, 0.01), "worlds": COUNT}, {"format": Key(str)}
 OPERATIONS = {"info": INFO, "sheet": SHEET, "sample": SAMPLE, "split": SPLIT, "merge": MERGE, "dedupe": DEDUPE, "simulate": SIMULATE}
-COMPARED = {"others": Key(list[str]), "limit": COUNT}
+COMPARED = {"traffic": Key(list[str]), "limit": COUNT}
 OPERATIONS |= {"export": EXPORT, "compare": COMPARED}
 CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG, "features": Key(dict | None), "spread": Key(dict)}
 BANK = {"shard_scenes": COUNT, "compression": Key(Literal["zstd", "lz4"] | None)}
@@ -117,7 +117,7 @@ def check_train(config: Mapping[str, Any]) -> None:
 
 
 def _check_protocols(protocols: list[str], *, where: str) -> None:
-    known = sorted(path.stem for path in (configs.find_conf() / "ends").glob("*.yaml"))
+    known = sorted(path.stem for path in (configs.find_conf() / "termination").glob("*.yaml"))
     for protocol in protocols or [None]:
         if protocol not in known:
             raise ConfigError(f"{where}: {protocols}; valid: one or more of {', '.join(known)}")
@@ -131,7 +131,7 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     """
     check(config, {"run": Key(str), "trust": FLAG, "out": PLACE, "overrides": Key(list[str]), **JUDGE})
     check(config["protocol"], PROTOCOL, where="protocol")
-    _check_protocols(config["protocol"]["ends"], where="protocol.ends")
+    _check_protocols(config["protocol"]["termination"], where="protocol.ends")
     check_video(config["video"], where="video")
     check_failures(config, where="failures")
 

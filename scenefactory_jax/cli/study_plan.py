@@ -15,8 +15,8 @@ from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.env import environment
 
-TASK = tuple(group for group in environment.GROUPS if group != "ends")  # how episodes end is the protocol's
-LEARNER = (*TASK, "ends", "policy", "ppo", "devices")  # what programs of training are made of
+TASK = tuple(group for group in environment.GROUPS if group != "termination")  # how episodes end is the protocol's
+LEARNER = (*TASK, "termination", "policy", "ppo", "devices")  # what programs of training are made of
 # What changes nothing about what is learnt
 ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
 TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, and what it began with

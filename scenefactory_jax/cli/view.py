@@ -80,7 +80,7 @@ def _check(config: Mapping[str, Any]) -> None:
 
 
 def _write(config: Mapping[str, Any], settings: Mapping[str, Any], recording: Recording, shown: "RecordedWorlds") -> Path:
-    out, goal = Path(config["out"]), settings["facts"]["goal_radius_m"]
+    out, goal = Path(config["out"]), settings["step_metrics"]["goal_radius_m"]
     title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
     if out.suffix in film.SUFFIXES:
         return film.write(out, recording, car=choose_film_settings(settings), look=film.FilmSettings(**config["film"], goal_radius_m=goal))

@@ -44,7 +44,7 @@ def make(
     damping: float,
     friction: float,
     mass: float,
-    yield_s: float,
+    momentum_transfer_s: float,
     nearest: int,
     height: float,
     physics_dt: float | None = None,
@@ -58,11 +58,11 @@ def make(
     Raises:
         ConfigError: a number out of its range, or a contact too stiff for `physics_dt`, by name.
     """
-    check_numbers({"stiffness": stiffness, "mass": mass, "yield_s": yield_s}, where="dynamics.contact", above=0.0)
+    check_numbers({"stiffness": stiffness, "mass": mass, "momentum_transfer_s": momentum_transfer_s}, where="dynamics.contact", above=0.0)
     check_numbers({"damping": damping, "friction": friction, "nearest": nearest}, where="dynamics.contact", least=0.0)
     if physics_dt is not None:
         _check_stable(stiffness, damping, mass / 2, physics_dt=physics_dt)
-    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, yield_s=yield_s, height=height)
+    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height)
     return Contact(functools.partial(find_neighbours, nearest=nearest), functools.partial(compute_forces, **numbers))
 
 
@@ -104,7 +104,7 @@ def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
 
 
 def compute_forces(
-    cars: Boxes, near: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, yield_s: float, height: float
+    cars: Boxes, near: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, momentum_transfer_s: float, height: float
 ) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
@@ -117,12 +117,12 @@ def compute_forces(
         cars: bodies that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
             more than `height` do not meet.
         near: what each car may touch, leaves `[A, K, ...]`: see `neighbours`. It is on its way and feels nothing. One of finite mass cannot
-            yield as it would, so its push ends where it would have taken on the car's speed within `yield_s`.
+            yield as it would, so its push ends where it would have taken on the car's speed within `momentum_transfer_s`.
         stiffness: of a contact along a whole face of two cars, N/m.
         damping: along the same face, N s/m. A contact never pulls.
         friction: Coulomb coefficient of the bodies. Below the cone `damping` resists sliding, which is as stable as the normal force.
         mass: of the two cars that `stiffness` and `damping` are meant for, kg.
-        yield_s: s in which a body of finite mass takes on the speed of the car that hits it.
+        momentum_transfer_s: s in which a body of finite mass takes on the speed of the car that hits it.
         height: of the boxes, m.
     """
     count, beside = near.mass.shape
@@ -132,7 +132,7 @@ def compute_forces(
     if beside:
         one = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
         other = _still(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), near), mass)
-        pushed = tuple(leaf.reshape(count, beside, *leaf.shape[1:]) for leaf in _between(one, other, yield_s, **numbers)[:2])
+        pushed = tuple(leaf.reshape(count, beside, *leaf.shape[1:]) for leaf in _between(one, other, momentum_transfer_s, **numbers)[:2])
         touched = (safe_norm(pushed[0]) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         first, second = np.triu_indices(count, 1)
@@ -165,7 +165,7 @@ def _share(touched: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def _between(
     one: Boxes,
     other: Boxes,
-    yield_s: float | None,
+    momentum_transfer_s: float | None,
     *,
     stiffness: float,
     damping: float,
@@ -185,9 +185,9 @@ def _between(
     sliding = dot(speed, tangent[:, None])
     scale = (2.0 / (mass / one.mass + mass / other.mass))[:, None]
     push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * stiffness * depths + 0.5 * damping * closing), 0.0), 0.0)
-    if yield_s is not None:
+    if momentum_transfer_s is not None:
         reduced = 0.5 * mass * scale
-        most = 0.5 * reduced * jnp.maximum(closing, 0.0) / yield_s  # one of two points
+        most = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # one of two points
         push = jnp.where(jnp.isfinite(other.mass)[:, None], jnp.minimum(push, most), push)
     drag = jnp.clip(scale * (0.5 * damping * sliding), -friction * push, friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]

@@ -31,13 +31,13 @@ from scenefactory_jax.core.types import (
 from scenefactory_jax.env import observations, rewards, spawning, termination
 from scenefactory_jax.weather import friction, rain, road_condition
 
-GROUPS = ("timing", "controls", "dynamics", "weather", "spawn", "others", "facts", "ends", "reward", "observe")  # of a config
+GROUPS = ("timing", "actions", "dynamics", "weather", "spawning", "traffic", "step_metrics", "termination", "reward", "observations")  # of a config
 
 
 KEYS = {  # of the groups that no one function takes
     "timing": ("physics_hz", "control_hz", "episode_s"),
-    "controls": ("command", "every"),
-    "spawn": ("draw", "respawn_clear_m"),
+    "actions": ("command", "action_repeat"),
+    "spawning": ("sampler", "respawn_clearance_m"),
     "weather": ("draw", "grip", "patches", "rain"),
 }
 
@@ -64,7 +64,7 @@ class EnvParts(NamedTuple):
     control_dt: float  # s; the weather moves on by as much before every control step
     # None parks finished agents until the world ends (the paper's rule); a number of metres starts them again at a fresh draw
     # once no active car stands within that distance
-    respawn_clear_m: float | None
+    respawn_clearance_m: float | None
 
 
 def make_env(config: Mapping[str, Any]) -> Env:
@@ -83,43 +83,43 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
     _require(config)
-    timing, clear_m = config["timing"], config["spawn"]["respawn_clear_m"]
+    timing, clear_m = config["timing"], config["spawning"]["respawn_clearance_m"]
     for key, value in timing.items():
         check_type(value, float, where=f"timing.{key}")
         check_number(value, where=f"timing.{key}", above=0.0)
     if episode_steps(timing) < 1:
         raise ConfigError(f"timing.episode_s: {timing['episode_s']}; wanted is a control step, {1 / timing['control_hz']:g} s, or more")
-    check_type(clear_m, float | None, where="spawn.respawn_clear_m")
+    check_type(clear_m, float | None, where="spawning.respawn_clearance_m")
     if clear_m is not None:
-        check_number(clear_m, where="spawn.respawn_clear_m", least=0.0)
+        check_number(clear_m, where="spawning.respawn_clearance_m", least=0.0)
     context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
     grip = friction.make(config["weather"]["grip"])
     dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
     bound = functools.partial(instantiate, builtins="scenefactory_jax.env.step_metrics")
-    termination.check(config["ends"].get("ending", []), where="ends")
+    termination.check(config["termination"].get("ending", []), where="termination")
     return EnvParts(
         dynamics=dynamics,
-        command=instantiate(config["controls"]["command"], builtins="scenefactory_jax.env.actions", where="controls.command"),
+        command=instantiate(config["actions"]["command"], builtins="scenefactory_jax.env.actions", where="actions.command"),
         hold=_hold(config),
-        draw_agents=spawning.make(config["spawn"]["draw"]),
+        draw_agents=spawning.make(config["spawning"]["sampler"]),
         draw_weather=road_condition.make(config["weather"]),
-        others=instantiate(config["others"], builtins="scenefactory_jax.env.traffic", where="others", **context),
-        measure=bound({"_target_": "measure", **config["facts"]}, where="facts"),
-        judge=instantiate({"_target_": "judge", **config["ends"]}, builtins="scenefactory_jax.env.termination", where="ends"),
+        others=instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context),
+        measure=bound({"_target_": "compute", **config["step_metrics"]}, where="step_metrics"),
+        judge=instantiate({"_target_": "evaluate", **config["termination"]}, builtins="scenefactory_jax.env.termination", where="termination"),
         terms=rewards.make(config["reward"], **context),
-        groups=observations.make(config["observe"], **context),
+        groups=observations.make(config["observations"], **context),
         episode_steps=episode_steps(timing),
         control_dt=context["control_dt"],
-        respawn_clear_m=clear_m,
+        respawn_clearance_m=clear_m,
     )
 
 
 def _hold(config: Mapping[str, Any]) -> int:
     """Control steps from one action to the next; episodes hold a whole number of actions."""
-    hold, steps = config["controls"]["every"], episode_steps(config["timing"])
-    check_type(hold, int, where="controls.every")
+    hold, steps = config["actions"]["action_repeat"], episode_steps(config["timing"])
+    check_type(hold, int, where="actions.action_repeat")
     if hold < 1 or steps % hold:
-        raise ConfigError(f"controls.every: {hold}; wanted is a divisor of the {steps} control steps of an episode")
+        raise ConfigError(f"actions.action_repeat: {hold}; wanted is a divisor of the {steps} control steps of an episode")
     return hold
 
 
@@ -262,11 +262,11 @@ def _transition(parts: EnvParts, scene: Scene, state: State, action: Float[Array
     after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
     reward, terms = rewards.sum_terms(RewardInput(scene, state, after.previous_action, after, measured, events), parts.terms)
     truncated = after.step >= parts.episode_steps
-    if parts.respawn_clear_m is None:
+    if parts.respawn_clearance_m is None:
         over = truncated | ~jnp.any(after.active)
     else:
         over = truncated
-        after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clear_m)
+        after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clearance_m)
     return to_strong_type(after), StepResult(None, reward, terms, events, done, truncated, over, measured)
 
 

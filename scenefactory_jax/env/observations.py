@@ -72,7 +72,7 @@ def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[
         ConfigError: an unknown surface, by name.
     """
     if unknown := [name for name in surfaces if name not in SURFACES]:
-        raise ConfigError(f"observe.weather.surfaces: {unknown[0]!r}; valid: {', '.join(SURFACES)}")
+        raise ConfigError(f"observations.weather.surfaces: {unknown[0]!r}; valid: {', '.join(SURFACES)}")
     film_mm, surface = condition_at(state.weather, state.motion.position[:, :2])
     listed = jnp.array([SURFACES.index(name) for name in surfaces], jnp.int32)
     one_hot = (surface[:, None] == listed).astype(jnp.float32)
@@ -244,7 +244,7 @@ def _rows(features: Float[Array, "A N F"], mask: Bool[Array, "A N"], count: int)
     return SetObservation(jnp.pad(features, ((0, 0), (0, padding), (0, 0))), jnp.pad(mask, ((0, 0), (0, padding))))
 
 
-def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "observe", **context: Any) -> dict[str, Group]:
+def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "observations", **context: Any) -> dict[str, Group]:
     """Config entries -> name -> group with its numbers bound; an entry of null is left out."""
     return {
         name: instantiate(entry, builtins=__name__, where=f"{where}.{name}", **context)

@@ -24,10 +24,10 @@ Draw = Callable[[PRNGKeyArray, Scene], Agents]
 
 
 LEAST = {"candidates": 1, "travel_min_m": 0.0, "margin_m": 0.0, "start_gap_m": 0.0, "goal_gap_m": 0.0}
-PART = ("draw", "share", "respawn_clear_m")  # keys of a mixture's part, which is an entry of the config group
+PART = ("sampler", "share", "respawn_clearance_m")  # keys of a mixture's part, which is an entry of the config group
 
 
-def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
+def make(entry: Mapping[str, Any], *, where: str = "spawning.sampler") -> Draw:
     """A `draw` entry with its numbers bound; those of a mixture are entries of `spawn` themselves, each with a share, or null.
 
     Raises:
@@ -50,16 +50,16 @@ def make(entry: Mapping[str, Any], *, where: str = "spawn.draw") -> Draw:
 
 def _part(part: Mapping[str, Any], *, where: str) -> tuple[float, Draw]:
     """Share and draw of one part of a mixture."""
-    for key in ("draw", "share"):
+    for key in ("sampler", "share"):
         if key not in part:
             raise ConfigError(f"{where}.{key}: missing; a part is an entry of `spawn` and its share")
     if unknown := [key for key in part if key not in PART]:
-        raise ConfigError(f"{where}.{unknown[0]}: unknown key; valid: draw, share")
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key; valid: sampler, share")
     check_type(part["share"], float, where=f"{where}.share")
     check_number(part["share"], where=f"{where}.share", above=0.0)
-    if part.get("respawn_clear_m") is not None:
-        raise ConfigError(f"{where}.respawn_clear_m: {part['respawn_clear_m']}; it belongs to the whole `spawn`")
-    return float(part["share"]), make(part["draw"], where=f"{where}.draw")
+    if part.get("respawn_clearance_m") is not None:
+        raise ConfigError(f"{where}.respawn_clearance_m: {part['respawn_clearance_m']}; it belongs to the whole `spawn`")
+    return float(part["share"]), make(part["sampler"], where=f"{where}.sampler")
 
 
 def _check(numbers: Mapping[str, Any], *, where: str) -> None:

@@ -28,8 +28,8 @@ def compute(
     edge_range_m: float,
     upright_min: float,
     height_min_m: float,
-    box_m: float,
-    stray_m: float,
+    scene_size_m: float,
+    max_start_distance_m: float,
     stray_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
@@ -58,7 +58,7 @@ def compute(
     beside = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
     lane, edge_gap = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
     strayed = safe_norm(position - after.agents.position)
-    limits = {"upright_min": upright_min, "height_min_m": height_min_m, "box_m": box_m, "stray_m": stray_m, "stray_ratio": stray_ratio}
+    limits = {"upright_min": upright_min, "height_min_m": height_min_m, "scene_size_m": scene_size_m, "max_start_distance_m": max_start_distance_m, "stray_ratio": stray_ratio}
     events = Events(
         fault=fault,
         reached=safe_norm(to_goal) <= goal_radius_m,
@@ -95,12 +95,12 @@ def _stopping(speed: Float[Array, " A"], grip: Float[Array, " A"], gravity_mps2:
 
 
 def _has_crashed(
-    motion: Motion, agents: Agents, strayed: Float[Array, " A"], *, upright_min, height_min_m, box_m, stray_m, stray_ratio
+    motion: Motion, agents: Agents, strayed: Float[Array, " A"], *, upright_min, height_min_m, scene_size_m, max_start_distance_m, stray_ratio
 ) -> Bool[Array, " A"]:
     """Tipped over or fallen, outside the scene, or further from the start than any way to the goal asks for."""
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
-    outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * box_m
-    return fell | outside | (strayed > jnp.maximum(stray_m, stray_ratio * agents.route))
+    outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * scene_size_m
+    return fell | outside | (strayed > jnp.maximum(max_start_distance_m, stray_ratio * agents.route))
 
 
 def _measure_lane(scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]) -> dict[str, Array]:

@@ -120,8 +120,8 @@ def _among(others: TrafficLog, kinds: list[RoadUser]) -> Bool[Array, " O"]:
 def _masses(mass_kg: Mapping[str, float | None]) -> Float[Array, " kinds"]:
     """Masses in the order of ROAD_USERS."""
     if set(mass_kg) != set(ROAD_USERS):
-        raise ConfigError(f"others.mass_kg: {', '.join(mass_kg) or 'nothing'}; wanted exactly {', '.join(ROAD_USERS)}")
+        raise ConfigError(f"traffic.mass_kg: {', '.join(mass_kg) or 'nothing'}; wanted exactly {', '.join(ROAD_USERS)}")
     for kind, mass in mass_kg.items():
         if mass is not None and not mass > 0:
-            raise ConfigError(f"others.mass_kg.{kind}: {mass}; wanted is a mass above 0, or null for what nothing moves")
+            raise ConfigError(f"traffic.mass_kg.{kind}: {mass}; wanted is a mass above 0, or null for what nothing moves")
     return jnp.array([jnp.inf if (mass := mass_kg[kind]) is None else mass for kind in ROAD_USERS], jnp.float32)

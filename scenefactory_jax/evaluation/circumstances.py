@@ -19,12 +19,12 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
         config: of an environment with its scenes, resolved.
     """
     found = {}
-    if "spawn" in config:
-        found["Starts"] = _starts(config["spawn"]["draw"])
+    if "spawning" in config:
+        found["Starts"] = _starts(config["spawning"]["sampler"])
     if "weather" in config:
         found["Weather"] = _weather(config["weather"])
-    if "others" in config:
-        name = config["others"]["_target_"]
+    if "traffic" in config:
+        name = config["traffic"]["_target_"]
         found["Background traffic"] = TRAFFIC.get(name, f"`{name}`")
     if "dynamics" in config:
         found["Dynamics"] = _dynamics(config["dynamics"])
@@ -32,8 +32,8 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
         found["Longest episode"] = f"{config['timing']['episode_s']:g} s"
     if "pack" in config.get("scenes", {}):
         pack = config["scenes"]["pack"]
-        if {"agents", "centre", "box_m"} <= set(pack):
-            found["Scenes"] = f"up to {pack['agents']} agents in {pack['box_m']:g} m x {pack['box_m']:g} m, centre {pack['centre']}"
+        if {"agents", "centre", "scene_size_m"} <= set(pack):
+            found["Scenes"] = f"up to {pack['agents']} agents in {pack['scene_size_m']:g} m x {pack['scene_size_m']:g} m, centre {pack['centre']}"
     return found
 
 

@@ -50,9 +50,9 @@ def make_episode_runner(
         worlds: how many of the worlds to record; None: all.
         steps: how many of the steps to record; None: all.
     """
-    once = {"spawn": {**config["spawn"], "respawn_clear_m": None}}  # an agent is judged by one life, also of a run that starts it again
+    once = {"spawning": {**config["spawning"], "respawn_clearance_m": None}}  # an agent is judged by one life, also of a run that starts it again
     env, policy = (
-        environment.make_env({**config, **once, "ends": configs.load_config("task", f"ends={protocol}")["ends"]}),
+        environment.make_env({**config, **once, "termination": configs.load_config("task", f"termination={protocol}")["termination"]}),
         make_policy(config),
     )
     index = np.tile(np.arange(len(scenes)), settings["repeats"])

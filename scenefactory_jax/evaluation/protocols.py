@@ -42,7 +42,7 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     asked = {"run": str(config["run"]), "scenes": config["scenes"]["path"], "overrides": config["overrides"]}
     asked |= {"protocol": protocol["name"], "trust": config["trust"]}
-    return evaluate_protocols(trained, run, scenes, out, asked=asked, settings=config, protocols=protocol["ends"])
+    return evaluate_protocols(trained, run, scenes, out, asked=asked, settings=config, protocols=protocol["termination"])
 
 
 def after_training(config: Mapping[str, Any], folder: Path) -> Result:

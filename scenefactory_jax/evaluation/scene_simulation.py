@@ -27,7 +27,7 @@ MEANING = {
 def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
     """Step every scene for `simulate.seconds` and print what went wrong, scene by scene.
 
-    The default follows the log (`dynamics=replay`); `dynamics=bicycle spawn=standing` lets cars stand.
+    The default follows the log (`dynamics=log_playback`); `dynamics=bicycle spawning=from_rest` lets cars stand.
 
     Returns:
         Scene name -> counts, see MEANING.

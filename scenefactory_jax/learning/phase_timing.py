@@ -36,7 +36,7 @@ class PhaseTimes(NamedTuple):
 
 def control_steps(config: Mapping[str, Any]) -> int:
     """Of a rollout."""
-    return config["ppo"]["horizon"] * config["controls"]["every"]
+    return config["ppo"]["horizon"] * config["actions"]["action_repeat"]
 
 
 def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:

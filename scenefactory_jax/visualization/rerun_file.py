@@ -174,7 +174,7 @@ class _World:
             quaternions=np.c_[zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)],
             colors=np.full(len(rows), pack_polylines(OTHER)),
         )
-        self.columns("others", np.arange(len(present)), columns.partition(present.sum(axis=1)))
+        self.columns("traffic", np.arange(len(present)), columns.partition(present.sum(axis=1)))
 
 
 def series(shots: StepRecord) -> Mapping[str, Float[np.ndarray, "T A"]]:

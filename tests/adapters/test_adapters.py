@@ -30,9 +30,9 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
 
 
-@pytest.mark.parametrize("observe", ["reference", "foresight"])  # together all groups of the package
+@pytest.mark.parametrize("observations", ["reference", "foresight"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
-    settings = hydra_config.load_config("train", SMOKE, f"observe={observe}", "dynamics=bicycle", "ends=invincible", "scenes.pack.agents=4")
+    settings = hydra_config.load_config("train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4")
     env, given = environment.make_env(settings), scenes(agents=4).scene
 
     def step(given, carry, key):
@@ -106,7 +106,7 @@ def test_a_step_of_an_episode_is_the_environments_own():
 
 
 def test_a_step_is_all_control_steps_of_an_action():
-    held = episodes.make_pool(hydra_config.load_config("train", SMOKE), ["controls.every=3"], scenes(agents=4), alone=False)
+    held = episodes.make_pool(hydra_config.load_config("train", SMOKE), ["actions.action_repeat=3"], scenes(agents=4), alone=False)
     assert (held.steps, held.step_hz) == (20, 10.0)
     episode = episodes.start_episodes(held.env, held.scenes, jax.random.key(3), 1)
     action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
@@ -126,7 +126,7 @@ def test_a_step_is_all_control_steps_of_an_action():
     ("override", "message"),
     [
         ("scenes.pack.agents=4", r"scenes\.pack\.agents: 4; this environment drives one car: set scenes\.pack\.agents=1"),
-        ("spawn.respawn_clear_m=5.0", r"spawn\.respawn_clear_m: 5\.0; here a car that ended stays so"),
+        ("spawning.respawn_clearance_m=5.0", r"spawning\.respawn_clearance_m: 5\.0; here a car that ended stays so"),
         ("dynamics=hover", "Could not find 'dynamics/hover'"),
         ("timing.control_hz=0", r"timing\.control_hz: 0"),
     ],

@@ -73,7 +73,7 @@ def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_
     ids=["ppo", "sac"],
 )
 def test_the_learners_of_brax_train_on_it(train, plan, loss):
-    env = Drive(None, [*ALONE, "~observe.road", "~observe.neighbours"], scenes())  # less to compile
+    env = Drive(None, [*ALONE, "~observations.road", "~observations.neighbours"], scenes())  # less to compile
     sizes = {"num_envs": 4, "num_eval_envs": 2, "batch_size": 4, "episode_length": env.episode_length, "max_devices_per_host": 1}
     shown = []
     with learning():

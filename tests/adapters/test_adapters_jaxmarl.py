@@ -97,7 +97,7 @@ def test_scenes_may_be_an_argument_and_are_a_constant_otherwise(env):
 
 
 def test_independent_ppo_learns_to_drive_on():
-    lean = LogWrapper(Drive(None, [SMOKE, "~observe.road", "~observe.neighbours"], scenes(agents=4)))  # less to compile
+    lean = LogWrapper(Drive(None, [SMOKE, "~observations.road", "~observations.neighbours"], scenes(agents=4)))  # less to compile
     parameters, rewards, told = jax.jit(make_train(lean, worlds=16, horizon=60, updates=20, rate=1e-2))(jax.random.PRNGKey(0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)) and told["returned_episode_lengths"].max() <= 60
     assert rewards[-8:].mean() > rewards[:4].mean() + 0.05  # progress pays

@@ -73,11 +73,11 @@ def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
 
 def test_the_whole_configuration_comes_first():
     """The loops in Python are compared with the first row."""
-    config = load_config("bench", "experiment=published", "suite=throughput")
+    config = load_config("bench", "experiment=paper", "suite=throughput")
     name, changes = next(iter(config["variants"].items()))
     assert (name, changes) == ("256 x 16", {"phases": True})
     full = config["variants"]["bicycle environment 4096 x 16, no empty slots"]
-    assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawn"]["draw"]["_target_"] == "random_pairs"
+    assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawning"]["sampler"]["_target_"] == "random_pairs"
     assert next(iter(load_config("bench", "suite=streaming")["variants"])) == "in memory"
 
 
@@ -113,11 +113,11 @@ def test_only_the_whole_configuration_stands_beside_published_figures():
 def test_the_ratio_is_split_into_plain_jax_and_kernels():
     row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "horizon": 8, "fits": True}
     row |= {"changes": {"phases": True}, "per_s": 77000.0}
-    plain = {**row, "changes": {"policy": {"kernels": False}, "facts": {"kernels": False}}, "per_s": 38500.0}
+    plain = {**row, "changes": {"policy": {"kernels": False}, "step_metrics": {"kernels": False}}, "per_s": 38500.0}
     assert report.split({"rows": [row, plain]}) == (
         "At 256 x 16 plain JAX alone makes 38,500 steps/s, 2.0 times the published figure; the kernels make that 2.0 times faster."
     )
-    for other in ({"changes": {"phases": False}}, {"worlds": 255}, {"changes": {"facts": {"kernels": False}, "seed": 0}}):
+    for other in ({"changes": {"phases": False}}, {"worlds": 255}, {"changes": {"step_metrics": {"kernels": False}, "seed": 0}}):
         assert report.split({"rows": [row, {**plain, **other}]}) == ""
 
 
@@ -166,7 +166,7 @@ def test_variants_change_values_and_replace_entries():
 
 @pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.find_conf() / "suite").glob("*.yaml")))
 def test_every_variant_of_a_suite_is_a_config(suite):
-    config = load_config("bench", "experiment=published", f"suite={suite}")
+    config = load_config("bench", "experiment=paper", f"suite={suite}")
     for name, changes in config["variants"].items():
         schema.check(command.changed(config, changes, where=name), schema.BENCH)
 

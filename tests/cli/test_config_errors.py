@@ -108,8 +108,8 @@ def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, 
 
 
 def test_a_mistake_in_the_config_is_no_scene_s_fault_in_a_stream():
-    source = batches.open(hydra_config.load_config("scenes", "scenes.pack.box_m=-1.0")["scenes"])
-    with pytest.raises(ConfigError, match=r"^scenes\.pack\.box_m: -1; wanted is a number above 0"):
+    source = batches.open(hydra_config.load_config("scenes", "scenes.pack.scene_size_m=-1.0")["scenes"])
+    with pytest.raises(ConfigError, match=r"^scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
         batches.measure(source, None, grid={"radius_m": None}, sample=1, headroom=1.0, given={}, seed=0)
 
 
@@ -134,7 +134,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     ("override", "message"),
     [
         ("wrlds=3", r"wrlds: unknown key 'wrlds'; the top level has: checkpoint_every, .*worlds"),
-        ("facts.circles.radius=1", r"facts\.circles\.radius: unknown key 'radius'; facts\.circles has: radius_floor_m, "),
+        ("step_metrics.circles.radius=1", r"step_metrics\.circles\.radius: unknown key 'radius'; step_metrics\.circles has: radius_floor_m, "),
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
         ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, others, road, steps"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': base bicycle mjx_car mjx_published replay"),
@@ -208,16 +208,16 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
         ("ppo.gamma=1.5", "ppo.gamma: 1.5; wanted is a number from 0 to 1"),
         ("policy.trunk=wide", "policy.trunk: 'wide' is of type str, wanted list[int]"),
         ("policy.activation=gelu", "policy.activation: 'gelu'"),
-        ("facts.box_m=abc", "facts.box_m: 'abc' is of type str, wanted float"),
+        ("step_metrics.scene_size_m=abc", "step_metrics.scene_size_m: 'abc' is of type str, wanted float"),
         ("reward.goal.weight=big", "reward.goal.weight: 'big' is of type str, wanted float"),
         ("~reward.goal.weight", "reward.goal.weight: missing"),
-        ("observe.road.count=many", "observe.road.count: 'many' is of type str, wanted int"),
+        ("observations.road.count=many", "observations.road.count: 'many' is of type str, wanted int"),
         ("timing.control_hz=0", "timing.control_hz: 0; wanted is a number above 0"),
         ("timing.episode_s=long", "timing.episode_s: 'long' is of type str, wanted float"),
-        ("spawn.respawn_clear_m=near", "spawn.respawn_clear_m: 'near' is of type str, wanted float | None"),
+        ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: 'near' is of type str, wanted float | None"),
         ("dynamics.wheelbase=long", "dynamics.wheelbase: 'long' is of type str, wanted float"),
         ("weather.grip.mode=sticky", "weather.grip.mode: 'sticky'"),
-        ("ends.ending=[fault,reached,bored]", "ends.ending: unknown event 'bored'; valid: fault, reached, collided, crashed, touched_edge"),
+        ("termination.ending=[fault,reached,bored]", "termination.ending: unknown event 'bored'; valid: fault, reached, collided, crashed, touched_edge"),
     ],
 )
 def test_a_wrong_value_of_a_part_is_named(override, message):

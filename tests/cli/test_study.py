@@ -27,16 +27,16 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 TOY = {
-    "base": ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observe.ego._target_=study_parts.ego"],
+    "base": ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observations.ego._target_=study_parts.ego"],
     "common": ["evaluation.every=1"],
-    "examined": ["timing.episode_s=1", "spawn=logged", "weather=dry", "others=ignore", "reward=reference"],
+    "examined": ["timing.episode_s=1", "spawning=logged", "weather=dry", "traffic=none", "reward=paper"],
     "trainings": {"all terms": [], "one scene": ["scenes.take.count=1"], "no TTC": ["reward.ttc=null", "ppo.learning_rate=1.0e-2"]},
-    "conditions": {"dry": [], "at random": ["spawn=random_pairs", "weather=snow"]},
+    "conditions": {"dry": [], "at random": ["spawning=random_pairs", "weather=snow"]},
     "protocols": ["strict"],
     "judged": {"all terms": ["dry", "at random"], "one scene": ["dry"], "no TTC": ["dry"]},
     "floors": {
         "untrained": {"of": "all terms", "overrides": [], "conditions": ["dry"], "seeds": None},
-        "log replay": {"of": "all terms", "overrides": ["dynamics=replay"], "conditions": ["dry"], "seeds": 1},
+        "log replay": {"of": "all terms", "overrides": ["dynamics=log_playback"], "conditions": ["dry"], "seeds": 1},
     },
     "compare": [["all terms", "no TTC"], ["untrained", "all terms"]],
     "figures": ["learning", "rates", "matrix", "differences", "trend"],
@@ -295,7 +295,7 @@ ONE_PROTOCOL = ("transfer", "friction", "winter", "floors", "network", "rewards"
 def steps_of(config):
     """Control steps that a training simulates, those of empty slots included."""
     assert config["minutes"] is None
-    return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["controls"]["every"]])
+    return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -307,9 +307,9 @@ def test_every_study_is_whole(name, tmp_path):
     assert entry["study"]["seeds"] == [0, 1, 2] and plan.trainings and plan.judgings
     for built in {one.program: one.config for one in (*plan.trainings, *plan.judgings)}.values():
         assert built["scenes"]["path"] == "train.bank" and built["scenes"]["heldout"]["path"] == "it's.bank"
-        environment.make_parts(built | {"ends": hydra_config.load_config("task")["ends"]})
+        environment.make_parts(built | {"termination": hydra_config.load_config("task")["termination"]})
     assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
-    assert {one.config["spawn"]["respawn_clear_m"] for one in plan.judgings} == {None}  # one life a car
+    assert {one.config["spawning"]["respawn_clearance_m"] for one in plan.judgings} == {None}  # one life a car
 
 
 def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
@@ -320,7 +320,7 @@ def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
     for name, condition in conditions.items():
         asked = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
         rows = [one for one in plan.judgings if (one.row, one.condition) == ("rigid body", condition)]
-        assert {one.protocol for one in rows} >= set(asked["protocol"]["ends"])
+        assert {one.protocol for one in rows} >= set(asked["protocol"]["termination"])
         assert rows[0].config == hydra_config.apply_overrides(rows[0].training.config, asked["protocol"]["settings"])
         assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
 
@@ -348,7 +348,7 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
 def test_networks_of_the_studies_fit_their_observations(name, base):
     plan = study_plan.make(hydra_config.load_config("study", f"study={name}", "seeds=[0]", f"study.base=[{base},scenes.count=1]"))
     scene = scene_source.load_training_scenes(plan.trainings[0].config["scenes"])[0]
-    networks = {json.dumps([one.config["observe"], one.config["policy"]]): one.config for one in plan.trainings}
+    networks = {json.dumps([one.config["observations"], one.config["policy"]]): one.config for one in plan.trainings}
     for entry in networks.values():
         env, policy = environment.make_env(entry), training_loop.make_policy(entry)
         seen = jax.eval_shape(env.reset, jax.random.key(0), scene)[1]

@@ -99,7 +99,7 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
 
 def test_the_report_compares_and_its_files_are_there(whole):
     text, settings = (whole.folder / "report.md").read_text(), told(whole.folder / "report.md")
-    assert settings["run"] == str(whole.folder) and settings["protocol"]["ends"] == ["strict"]
+    assert settings["run"] == str(whole.folder) and settings["protocol"]["termination"] == ["strict"]
     # every report says how its episodes began and in what weather
     shown = "| Starts | as recorded, at the recorded speed |\n| Weather | AC 0 mm |\n| Background traffic | none |\n| Dynamics | `"
     assert f"| Protocol | `trained` |\n{shown}" in text
@@ -326,7 +326,7 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(policy_io, "SHIPPED", tmp_path / "pretrained")
     monkeypatch.chdir(tmp_path)
     trained = scenefactory_jax.load_policy("handy")
-    assert trained.folder == kept and trained.config["observe"] == whole.config["observe"]
+    assert trained.folder == kept and trained.config["observations"] == whole.config["observations"]
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
     again = evaluate(
         hydra_config.load_config("evaluate", "run=handy", "protocol.ends=[strict]", "video.enable=false", "failures.pictures.enable=false")
@@ -377,7 +377,7 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
         assert all(records[event["name"]][rows[event["car"]]] for event in shown["events"])
         assert sum(event["name"] == "reached" for event in shown["events"]) == sum(records["reached"][row] for row in rows.values())
     with pytest.raises(ConfigError, match=r"dynamics: decided by the run .*; to change it: overrides='\[dynamics=\.\.\.\]'"):
-        replay(hydra_config.load_config("replay", f"run={whole.folder}", "dynamics=mjx_car"))
+        replay(hydra_config.load_config("replay", f"run={whole.folder}", "dynamics=articulated"))
 
 
 # ---- convert -> bank -> train
@@ -568,7 +568,7 @@ def builds(whole_config):
 @pytest.mark.parametrize("option", options())
 def test_every_option_builds(option):
     lean = [] if option.startswith("dynamics=") else ["dynamics=bicycle"]
-    if option == "policy=seeker":  # learns nothing: it is judged in place of a policy
+    if option == "policy=pure_pursuit":  # learns nothing: it is judged in place of a policy
         builds(hydra_config.apply_overrides(hydra_config.load_config("train", *lean), [option]))
     else:
         builds(hydra_config.load_config("train", option, *lean))
@@ -593,7 +593,7 @@ def test_what_a_suite_says_counts(name):
     assert {key: found[key] for key in said if key != "variants"} == {key: said[key] for key in said if key != "variants"}
 
 
-RUNS = (["experiment=quick", "scenes=womd"], ["experiment=published", "dynamics=bicycle", "weather=ice", "others=replay", "spawn=mixed"])
+RUNS = (["experiment=quick", "scenes=womd"], ["experiment=paper", "dynamics=bicycle", "weather=ice", "traffic=log_playback", "spawning=mixed"])
 
 
 @pytest.mark.parametrize("name", names("protocol"))
@@ -607,7 +607,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     if name == "trained":
         assert judged == runs
         return
-    own = ("observe", "controls", "ends")  # what the policy learnt to see and to do; how agents end is `protocol.ends`
+    own = ("observations", "actions", "termination")  # what the policy learnt to see and to do; how agents end is `protocol.ends`
     for group in set(environment.GROUPS) - set(own):
         assert judged[0][group] == judged[1][group], group
     assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load_config("train", "scenes=womd")["scenes"]["pack"]
@@ -618,7 +618,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
 
 def test_episodes_are_described():
     tell = lambda *words: circumstances.describe(hydra_config.load_config("train", *words))  # noqa: E731
-    found = tell("spawn=varied", "weather=storm", "others=replay", "dynamics=bicycle", "scenes=town")
+    found = tell("spawning=mixture", "weather=storm", "traffic=log_playback", "dynamics=bicycle", "scenes=town")
     along = "40% somewhere on the recorded way; 40% random, start and goal along lanes"
     assert found["Starts"] == f"20% as recorded, from rest; {along}" and found["Dynamics"] == "`bicycle`"
     assert found["Weather"].startswith("40% AC 0 mm, 15% AC 0.3 mm, ") and found["Weather"].endswith("; patches: puddles; rain: `onset`")

@@ -71,7 +71,7 @@ def street(tmp_path, readers):
 def test_stack_pads_with_masked_rows(street):
     small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
     stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "others": 0} and not report.cuts
+    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "traffic": 0} and not report.cuts
     assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
     for world, scene in enumerate((small, large)):
         for name, leaf in columns.flatten(scene).items():
@@ -182,10 +182,10 @@ def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
 
 def test_what_cannot_be_packed_is_refused_or_named(made):
     _, opened = made
-    tools = TOOLS | {"pack": packer(box_m=2.0)}
+    tools = TOOLS | {"pack": packer(scene_size_m=2.0)}
     with pytest.raises(SceneError, match=r"scene 0, street: tracks: no agent is left of 2: 1 .*; leave it out, or change"):
         bank_reader.load(opened, [0], capacity=NONE, **tools)
-    found = bank_reader.pack_scenes(opened, [1, 0], **TOOLS | {"pack": packer(box_m=2.0, require_agents=False, centre="mean")})
+    found = bank_reader.pack_scenes(opened, [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
     assert isinstance(found[0], Reject) and found[0].scene == "straße" and "no driving lane" in found[0].reason
 
 
@@ -324,7 +324,7 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     [reject] = summary.rejects
     assert Path(reject["source"]).name == "b.json" and "cut short" in reject["reason"]
     opened = bank_reader.open(tmp_path / "bank")
-    assert list(opened.rejects) == list(summary.rejects) and opened.settings["box_m"] == 200.0
+    assert list(opened.rejects) == list(summary.rejects) and opened.settings["scene_size_m"] == 200.0
     assert opened.index.files == ("a.json", "b.json", "c.json", "deep/d.json.gz") and opened.index.complete
     assert opened.metadata["format"].to_pylist() == ["gpudrive", "gpudrive", "scenefactory"]
     lines = conversion.describe(summary)
@@ -336,7 +336,7 @@ def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
     """The cars have 4 m to go: none of their goals lies in a box of 6 m."""
     folder, out = streets(tmp_path / "in", "a", "b"), tmp_path / "bank"
     written(folder, document(name="still", objects=[thing(0, speed=0)]), "c.json")
-    narrow = packer(box_m=6.0)
+    narrow = packer(scene_size_m=6.0)
     summary = conversion.convert(folder, out, **options(pack=narrow))
     opened = bank_reader.open(out)
     assert opened.names == ("a", "b", "still") and summary.refused == {"no_agent_left": 3} and not summary.rejects
@@ -407,8 +407,8 @@ def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     read = []
     reader = lambda path: read.append(path.stem) or eventful.read(path)  # noqa: E731
     if kept:
-        with pytest.raises(SceneError, match=r"other settings \(box_m: 200\.0 there, 150\.0 here\); give another out, or remove it"):
-            conversion.convert(folder, out, **options(settings=WOMD["pack"] | {"box_m": 150.0}))
+        with pytest.raises(SceneError, match=r"other settings \(scene_size_m: 200\.0 there, 150\.0 here\); give another out, or remove it"):
+            conversion.convert(folder, out, **options(settings=WOMD["pack"] | {"scene_size_m": 150.0}))
     summary = conversion.convert(folder, out, **options(formats={"eventful": reader}))
     assert read == names[kept:] and summary.scenes == 7 and summary.agents_kept == 14
     whole = conversion.convert(folder, tmp_path / "straight", **options())
@@ -478,8 +478,8 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
         with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
-        with pytest.raises(ConfigError, match=r"scenes\.pack\.box_m: -1; wanted is a number above 0"):
-            conversion.read(folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(box_m=-1.0), workers=workers)
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
+            conversion.read(folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(scene_size_m=-1.0), workers=workers)
     assert not (tmp_path / "bank").exists()
 
 
@@ -640,7 +640,7 @@ def stand_in_car():
     return car
 
 
-LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "other_height_m": 1.5, "box_m": 200.0}
+LOOKS = {"half_width_m": 0.05, "height_m": 0.02, "goal_radius_m": 3.0, "other_height_m": 1.5, "scene_size_m": 200.0}
 
 
 def test_a_scene_becomes_one_model(street):

@@ -378,7 +378,7 @@ def test_cut_segments_are_counted_by_reason(street):
     np.testing.assert_allclose(2 * scene.road.half_length, [1.0, 1.0, 0.5], rtol=1e-6)
     np.testing.assert_allclose(scene.road.arc, [0.5, 5.5, 198.75])
     with pytest.raises(SceneError, match="no driving lane within 20 m"):
-        prepared(raw, box_m=40.0)
+        prepared(raw, scene_size_m=40.0)
     doubled = replace(raw, roads=(replace(raw.roads[0], xyz=np.repeat(points, 2, axis=0)),))  # and not repaired by the checks
     assert packer(require_agents=False)(doubled)[1].segments_cut == {"outside_box": 2, "gap": 2, "degenerate": 6}
 

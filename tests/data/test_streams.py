@@ -54,7 +54,7 @@ def trainer_of(**numbers):
 
 @pytest.fixture(scope="module")
 def trainer():
-    return trainer_of(initial_phase=True)
+    return trainer_of(stagger_episodes=True)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def swapped(trainer):
     """States and scenes before and after other scenes came into worlds 6, 1 and 4, and what a restart in them alone gives."""
     stage, fresh, worlds = scenes(WORLDS), scenes(3, task=2), np.array([6, 1, 4])
     state, _ = trainer.iterate(trainer.init(jax.random.key(0), stage), stage)
-    alone = trainer_of(initial_phase=False).restart(jax.tree.map(jnp.copy, state), fresh)
+    alone = trainer_of(stagger_episodes=False).restart(jax.tree.map(jnp.copy, state), fresh)
     before = bits((state, stage))
     after, stage = trainer.swap(state, stage, worlds, fresh)
     kept = bits((after, stage))

@@ -345,7 +345,7 @@ def test_turns_use_every_lane():
 
 
 def test_realism_tells_sets_apart(scenes):
-    half, other = (distribution_distance.collect(part, box_m=200.0) for part in (scenes[::2], scenes[1::2]))
+    half, other = (distribution_distance.collect(part, scene_size_m=200.0) for part in (scenes[::2], scenes[1::2]))
     same = distribution_distance.compare(half, half)
     assert distribution_distance.mean_distance(same) == 0.0 and all(one is None or one.wasserstein == 0.0 for one in same.values())
     slow = half | {"speed_mps": half["speed_mps"] + 100.0}
@@ -357,7 +357,7 @@ def test_realism_tells_sets_apart(scenes):
 
 def test_realism_counts_what_is_there(scenes):
     scene = next(scene for scene in scenes if scene.lights)
-    samples = distribution_distance.measure(scene, box_m=1e4)
+    samples = distribution_distance.measure(scene, scene_size_m=1e4)
     assert samples["lights"] == len(scene.lights)
     assert samples["vehicles"] == sum(t.kind == "vehicle" and t.valid[scene.current] for t in scene.tracks)
     lanes = [road.xyz for road in scene.roads if road.kind in DRIVABLE]
@@ -365,7 +365,7 @@ def test_realism_counts_what_is_there(scenes):
 
 
 def test_realism_writes_a_report(scenes, tmp_path):
-    sets = {name: distribution_distance.collect(part, box_m=200.0) for name, part in (("logged", scenes[:6]), ("town", scenes[6:12]))}
-    path = distribution_distance.write(tmp_path, "logged", sets, box_m=200.0, command="scenes op=compare")
+    sets = {name: distribution_distance.collect(part, scene_size_m=200.0) for name, part in (("logged", scenes[:6]), ("town", scenes[6:12]))}
+    path = distribution_distance.write(tmp_path, "logged", sets, scene_size_m=200.0, command="scenes op=compare")
     text = path.read_text()
     assert "lanes in the box, m" in text and (tmp_path / "realism.png").stat().st_size > 10_000

@@ -31,7 +31,7 @@ SMALL = {
     "bench": ["worlds=4", "warmup=0", "repeats=1"],
     "evaluate": ["bootstrap=20", "chunk_steps=30"],
     "replay": ["seconds=0.5", "film.at_s=0.2", "film.width=160", "film.height=90"],
-    "study": ["study.base=[experiment=smoke,worlds=2,reward=wary]", "study.seeds=[0]", "evaluation.bootstrap=20", "progress=false"],
+    "study": ["study.base=[experiment=smoke,worlds=2,reward=safe_smooth]", "study.seeds=[0]", "evaluation.bootstrap=20", "progress=false"],
     "validate": ["validation.drives.draw.count=3", "validation.drives.draw.seconds=2.0", "parts=[drives]"],
     "sysid": [
         "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1], refinement: [2,1], brake_preservation: [2,1]}",

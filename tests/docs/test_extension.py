@@ -114,11 +114,11 @@ LOGGER = """
 
 TERM = ["+reward.haste={_target_: my_terms.haste, weight: 0.25, unit_mps: 10.0}"]
 TERM += ["+reward.jerk={_target_: my_terms.jerkiness, weight: -1.0}"]
-GROUP = ["+observe.clock={_target_: my_groups.clock, period_s: 2.0}", "+observe.mates={_target_: my_groups.mates, scale_m: 50.0}"]
+GROUP = ["+observations.clock={_target_: my_groups.clock, period_s: 2.0}", "+observations.mates={_target_: my_groups.mates, scale_m: 50.0}"]
 DYNAMICS = ["~dynamics", "+dynamics={_target_: my_backend.make, gain_mps2: 3.0, height_m: 0.5}"]
-CRUISE = ["controls.command._target_=my_controls.cruise", "+controls.command.gentle=0.5"]
+CRUISE = ["actions.command._target_=my_controls.cruise", "+actions.command.gentle=0.5"]
 LOGGERS = ["loggers=[tensorboard]", "+loggers.mine={_target_: my_logger.make, file: rows.json}"]
-LEAN = [f"~{place}.{name}" for place in ("observe", "policy.rows") for name in ("road", "neighbours")]  # compiles sooner
+LEAN = [f"~{place}.{name}" for place in ("observations", "policy.rows") for name in ("road", "neighbours")]  # compiles sooner
 FORMAT = "+scenes.formats.mine={_target_: my_reader.read, step_s: 0.2}"
 
 
@@ -179,7 +179,7 @@ def test_what_an_action_means_is_one_function_and_one_entry(mine):
 
 
 def test_a_dynamics_backend_is_one_file_and_one_entry(mine):
-    env = environment.make_env(hydra_config.load_config("task", *DYNAMICS, "observe=small"))
+    env = environment.make_env(hydra_config.load_config("task", *DYNAMICS, "observations=small"))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
     state = env.start(jax.random.key(0), scene)
     step = jax.jit(env.transition)
@@ -221,8 +221,8 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
         ("+reward.haste={_target_: my_terms.haste, weight: 1.0}", r"reward\.haste\.unit_mps: missing"),
         ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"reward\.haste\.unit_mps: 'fast'.*wanted float"),
         ("+reward.haste={_target_: my_terms.hurry, weight: 1.0}", r"'my_terms\.hurry' is not in my_terms; valid: haste, jerkiness"),
-        ("+observe.clock={_target_: my_clocks.clock}", r"observe\.clock\._target_: cannot import 'my_clocks'"),
-        ("+observe.clock={_target_: my_groups.clock, period_s: 1.0, phase: 2.0}", r"observe\.clock\.phase: unknown key.*valid: period_s"),
+        ("+observations.clock={_target_: my_clocks.clock}", r"observations\.clock\._target_: cannot import 'my_clocks'"),
+        ("+observations.clock={_target_: my_groups.clock, period_s: 1.0, phase: 2.0}", r"observations\.clock\.phase: unknown key.*valid: period_s"),
     ],
 )
 def test_a_part_of_ones_own_is_checked_like_any_other(mine, override, message):

@@ -10,7 +10,7 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.i
 SHORT = '"timing.episode_s=2"'
 SHORTER = {  # how well it learns is for other tests: notebook -> what a test runs in place of a line, and what must be there in the end
     "01_quickstart": (
-        {'"iterations=25"': '"iterations=2"', '"spawn=logged"]': '"spawn=logged", "dynamics=bicycle"]', "steps=300": "steps=30"},
+        {'"iterations=25"': '"iterations=2"', '"spawning=logged"]': '"spawning=logged", "dynamics=bicycle"]', "steps=300": "steps=30"},
         "runs/quickstart-*/evaluation/report.md",
     ),
     "02_scenes": ({"scenes.count=24": "scenes.count=8"}, "outputs/scenes/parts/test/bank.json"),

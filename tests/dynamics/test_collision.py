@@ -323,7 +323,7 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
         ({"damping": -1.0}, "dynamics.contact.damping"),
         ({"friction": -0.3}, "dynamics.contact.friction"),
         ({"mass": 0.0}, "dynamics.contact.mass"),
-        ({"yield_s": 0.0}, "dynamics.contact.yield_s"),
+        ({"momentum_transfer_s": 0.0}, "dynamics.contact.momentum_transfer_s"),
         ({"nearest": -1}, "dynamics.contact.nearest: -1; wanted is a number of at least 0"),
         ({"stiffness": 1e9}, "stiffness 1e.09 and damping 30000 cannot be integrated: .* at physics_dt 0.00833"),
         ({"damping": 3e5}, "cannot be integrated"),

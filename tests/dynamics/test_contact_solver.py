@@ -20,7 +20,7 @@ RATIO = 10.0
 
 @pytest.fixture(scope="module")
 def model():
-    entry = load_config("task", "dynamics=mjx_car")["dynamics"]
+    entry = load_config("task", "dynamics=articulated")["dynamics"]
     car = cars.CarParameters(**entry["car"])
     exact = cars.Solver(**{**entry["solver"], "algorithm": "Newton", "iterations": 100, "line_search": 50, "tolerance": 1e-12})
     return cars.build_standalone_model(car, exact, physics_dt=1 / 120, visual=False, brake_rows=True), car

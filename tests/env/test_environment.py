@@ -47,7 +47,7 @@ def glide() -> Dynamics:
 
 @pytest.fixture(scope="module")
 def config():
-    return scenefactory_jax.load("task")
+    return scenefactory_jax.load_config("task")
 
 
 def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.no_traffic, hold=1):
@@ -58,13 +58,13 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         draw_agents=draw,
         draw_weather=keep_condition,
         others=beside,
-        measure=functools.partial(step_metrics.compute, **config["facts"]),
-        judge=functools.partial(termination.evaluate, ending=ending or config["ends"]["ending"]),
+        measure=functools.partial(step_metrics.compute, **config["step_metrics"]),
+        judge=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
         terms=rewards.make(config["reward"]),
-        groups=observations.make({**config["observe"], "road": {**config["observe"]["road"], "count": 40}}),
+        groups=observations.make({**config["observations"], "road": {**config["observations"]["road"], "count": 40}}),
         episode_steps=steps,
         control_dt=1 / 30,
-        respawn_clear_m=respawn,
+        respawn_clearance_m=respawn,
     )
     return environment.assemble(parts)
 
@@ -184,7 +184,7 @@ def test_reset_is_pure_and_shapes_are_the_published_ones(env, two_cars, config):
     assert observation["road"].features.shape == (2, 40, 5) and observation["neighbours"].features.shape == (2, 24, 7)
     np.testing.assert_allclose(observation["ego"][0], [0.2, 0, 0, 1, 0.2, 0.6, 0], atol=1e-6)
     np.testing.assert_allclose(observation["neighbours"].features[0, 0, :4], [0.3, 0.005, 0.04, 0.02], atol=1e-6)
-    assert config["observe"]["road"]["count"] == 350
+    assert config["observations"]["road"]["count"] == 350
 
 
 def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
@@ -198,7 +198,7 @@ def test_road_observation_is_a_scan_of_the_storage(env, two_cars):
 
 def test_encounters_by_hand_and_from_any_frame(env):
     """Head on, 1 m beside each other: centres are closest in 2 s, circles of the fronts meet before; a third car is far behind."""
-    numbers = scenefactory_jax.load("task", "observe=encounters")["observe"]["neighbours"]
+    numbers = scenefactory_jax.load_config("task", "observations=encounters")["observations"]["neighbours"]
     del numbers["_target_"]
 
     def seen(turn, shift):
@@ -230,11 +230,11 @@ def test_one_pedal_brakes_below_zero():
 
 def test_controls_are_what_dynamics_and_rewards_are_given(config):
     """Off the throttle a bicycle rolls on; with one pedal it brakes."""
-    own = scenefactory_jax.load("task", "dynamics=bicycle", "spawn=logged", "observe.road=null")
+    own = scenefactory_jax.load_config("task", "dynamics=bicycle", "spawning=logged", "observations.road=null")
     scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]], speeds=[10.0])
 
     def speed_after(entry):
-        env = environment.make_env({**own, "controls": {"command": entry, "every": 1}})
+        env = environment.make_env({**own, "actions": {"command": entry, "action_repeat": 1}})
         state, _ = env.reset(jax.random.key(0), scene)
         state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
         return float(geometry.safe_norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
@@ -254,9 +254,9 @@ def test_an_action_stands_until_the_next_is_read(config):
         state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
         taken.append(float(state.previous_action[0, 0]))
     np.testing.assert_allclose(taken, [0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
-    for every, message in ((7, "controls.every: 7; wanted is a divisor of the 1500 control steps"), (0, "controls.every: 0; wanted")):
+    for every, message in ((7, "actions.action_repeat: 7; wanted is a divisor of the 1500 control steps"), (0, "actions.action_repeat: 0; wanted")):
         with pytest.raises(ConfigError, match=message):
-            environment.make_env({**config, "controls": {**config["controls"], "every": every}})
+            environment.make_env({**config, "actions": {**config["actions"], "action_repeat": every}})
 
 
 def test_a_step_is_an_action_with_all_its_control_steps(config):
@@ -303,7 +303,7 @@ def test_a_car_knows_how_it_turns(env):
 
 def test_the_lane_ahead_by_hand(env):
     """With the lane and 1 m left of it, against it, and 12 m before its end at x = 60, where the places stay."""
-    numbers = scenefactory_jax.load("task", "observe=foresight")["observe"]["lane"]
+    numbers = scenefactory_jax.load_config("task", "observations=lane_preview")["observations"]["lane"]
     del numbers["_target_"]
     yaws = [0.1, np.pi, 0.0]
     scene = scene_of([[0.2, 1.0], [0.0, -2.0], [48.0, 0.0]], [[9, 9]] * 3, yaws=yaws, speeds=[0.0, 0, 5])
@@ -324,7 +324,7 @@ def test_the_lane_ahead_by_hand(env):
 
 def test_without_road_edges_every_observation_is_finite():
     """The nearest edge is then infinitely far, and as far as it can read."""
-    numbers = scenefactory_jax.load("task", "observe=foresight", "dynamics=bicycle")
+    numbers = scenefactory_jax.load_config("task", "observations=lane_preview", "dynamics=bicycle")
     scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
     scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
     _, seen = environment.make_env(numbers).reset(jax.random.key(0), scene)
@@ -417,7 +417,7 @@ def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
 
 def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     """It breaks in the first step: nothing is known of it but its start. Nor is a speed a number whose square is none."""
-    notes = scenefactory_jax.load("evaluate", "run=town")["failures"]["notes"]
+    notes = scenefactory_jax.load_config("evaluate", "run=town")["failures"]["notes"]
     broken = lambda parameters, observation: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
     episode = episodes.begin(env, jax.random.key(0), two_cars)
     far = episode.tally.goal_distance
@@ -525,7 +525,7 @@ def test_random_pairs_keep_their_promises():
     slots = 8
     scene = scene_of(np.zeros((slots, 2)), np.ones((slots, 2)))
     scene = replace(scene, lanes=road_of(lines, capacity=900))
-    numbers = scenefactory_jax.load("task", "spawn=random_pairs")["spawn"]["draw"] | {"travel_max_m": 50.0}
+    numbers = scenefactory_jax.load_config("task", "spawning=random_pairs")["spawning"]["sampler"] | {"travel_max_m": 50.0}
     del numbers["_target_"]
     draw = jax.jit(jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers)))
     agents = draw(jax.random.split(jax.random.key(3), 20))
@@ -555,7 +555,7 @@ def test_cars_underway_start_on_their_recorded_ways():
     speed = np.broadcast_to((goal - start) / 8.0, position.shape)
     tracks = {"position": jnp.asarray(position, jnp.float32), "velocity": jnp.asarray(speed, jnp.float32)}
     log = replace(scene.log, **tracks, valid=jnp.asarray(valid))
-    numbers = scenefactory_jax.load("task", "spawn=underway", "spawn.draw.start_gap_m=4.0")["spawn"]["draw"]
+    numbers = scenefactory_jax.load_config("task", "spawning=along_log", "spawning.sampler.start_gap_m=4.0")["spawning"]["sampler"]
     del numbers["_target_"]
     draw = jax.jit(jax.vmap(lambda key: spawning.along_log(key, replace(scene, log=log), **numbers)))
     agents = jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(4), 200)))
@@ -578,7 +578,7 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
     x = np.arange(-60, 60.1, 0.5)
     scene = scene_of(np.zeros((4, 2)), np.ones((4, 2)), speeds=4 * [3.0])
     scene = replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))], capacity=300))
-    entry = scenefactory_jax.load("task", "spawn=mixed", "spawn.draw.parts.random.share=1.5")["spawn"]["draw"]
+    entry = scenefactory_jax.load_config("task", "spawning=mixed", "spawning.sampler.parts.random.share=1.5")["spawning"]["sampler"]
     agents = jax.jit(jax.vmap(lambda key: spawning.make(entry)(key, scene)))(jax.random.split(jax.random.key(0), 400))
     recorded = (agents.position == scene.agents.position).all(axis=(1, 2))
     assert abs(recorded.mean() - 0.25) < 0.07 and not agents.speed.any()
@@ -589,14 +589,14 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"parts": None}, "spawn.draw.parts: None; wanted are entries"),
-        ({"parts": {"a": {"draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: missing"),
-        ({"parts": {"a": {"share": 0.0, "draw": {"_target_": "logged"}}}}, "spawn.draw.parts.a.share: 0; wanted is a number above 0"),
-        ({"parts": {"a": {"share": 1, "draw": {"_target_": "nobody"}}}}, "spawn.draw.parts.a.draw._target_: 'nobody' is not in"),
-        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "respawn_clear_m": 5.0}}}, "a.respawn_clear_m: 5.0; it belongs"),
-        ({"parts": {"a": {"share": 1, "draw": {"_target_": "logged"}, "shar": 3}}}, "spawn.draw.parts.a.shar: unknown key"),
-        ({"parts": {"a": None}}, "spawn.draw.parts: {'a': None}; wanted are entries"),
-        ({"shares": [1.0]}, "spawn.draw.shares: unknown key of mixed"),
+        ({"parts": None}, "spawning.sampler.parts: None; wanted are entries"),
+        ({"parts": {"a": {"sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: missing"),
+        ({"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: 0; wanted is a number above 0"),
+        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.draw._target_: 'nobody' is not in"),
+        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}}, "a.respawn_clearance_m: 5.0; it belongs"),
+        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "shar": 3}}}, "spawning.sampler.parts.a.shar: unknown key"),
+        ({"parts": {"a": None}}, "spawning.sampler.parts: {'a': None}; wanted are entries"),
+        ({"shares": [1.0]}, "spawning.sampler.shares: unknown key of mixed"),
     ],
 )
 def test_mistakes_in_a_mixture_are_named(change, message):
@@ -607,21 +607,21 @@ def test_mistakes_in_a_mixture_are_named(change, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("spawn.draw.candidates=0", "spawn.draw.candidates: 0; wanted is a number of at least 1"),
-        ("spawn.draw.travel_min_m=-50", "spawn.draw.travel_min_m: -50; wanted is a number of at least 0"),
-        ("spawn.draw.travel_max_m=5", r"spawn.draw.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
-        ("spawn.draw.car_size_m=[4.0]", r"spawn.draw.car_size_m: \[4.0\]; wanted is \[length, width\]"),
-        ("spawn.respawn_clear_m=-1", "spawn.respawn_clear_m: -1; wanted is a number of at least 0"),
-        ("+spawn.respawn_clear=4", "spawn.respawn_clear: unknown key; valid: draw, respawn_clear_m"),
-        ("~controls.every", "controls.every: missing; controls needs command, every"),
+        ("spawning.sampler.candidates=0", "spawning.sampler.candidates: 0; wanted is a number of at least 1"),
+        ("spawning.sampler.travel_min_m=-50", "spawning.sampler.travel_min_m: -50; wanted is a number of at least 0"),
+        ("spawning.sampler.travel_max_m=5", r"spawning.sampler.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
+        ("spawning.sampler.car_size_m=[4.0]", r"spawning.sampler.car_size_m: \[4.0\]; wanted is \[length, width\]"),
+        ("spawning.respawn_clearance_m=-1", "spawning.respawn_clearance_m: -1; wanted is a number of at least 0"),
+        ("+spawning.respawn_clear=4", "spawning.respawn_clear: unknown key; valid: draw, respawn_clearance_m"),
+        ("~actions.action_repeat", "actions.action_repeat: missing; controls needs command, every"),
         ("timing.episode_s=inf", "timing.episode_s: inf; wanted is a finite number above 0"),
         ("timing.episode_s=0.001", "timing.episode_s: 0.001; wanted is a control step, 0.0333333 s, or more"),
-        ("ends.ending=null", "ends.ending: None is of type NoneType"),
+        ("termination.ending=null", "termination.ending: None is of type NoneType"),
     ],
 )
 def test_numbers_that_cannot_work_are_refused_by_name(override, message):
     with pytest.raises(ConfigError, match=message):
-        environment.make_env(scenefactory_jax.load("task", "spawn=random_pairs", "dynamics=bicycle", override))
+        environment.make_env(scenefactory_jax.load_config("task", "spawning=random_pairs", "dynamics=bicycle", override))
 
 
 def test_respawn_starts_finished_cars_again(config):
@@ -634,4 +634,4 @@ def test_respawn_starts_finished_cars_again(config):
 
 def test_unknown_ending_is_refused():
     with pytest.raises(ConfigError, match="unknown event 'colided'; valid: fault, reached"):
-        termination.check(["fault", "reached", "colided"], where="ends")
+        termination.check(["fault", "reached", "colided"], where="termination")

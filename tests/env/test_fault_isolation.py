@@ -18,7 +18,7 @@ NUMBERS = dict(seed=3, steps=12, fault_step=5, world=0, agent=1, iterations=2)
 
 
 def config(*overrides):
-    return load_config("task", "observe=small", "ends=invincible", *overrides)
+    return load_config("task", "observations=small", "termination=goal_only", *overrides)
 
 
 def worlds():

@@ -57,7 +57,7 @@ def street():
 
 @pytest.fixture(scope="module")
 def env():
-    return environment.make_env(load_config("task", "dynamics=bicycle", "observe=small", "others=replay"))
+    return environment.make_env(load_config("task", "dynamics=bicycle", "observations=small", "traffic=log_playback"))
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 
 
 def numbers_of(name, **changes):
-    return {key: value for key, value in load_config("task", f"others={name}")["others"].items() if key != "_target_"} | changes
+    return {key: value for key, value in load_config("task", f"traffic={name}")["traffic"].items() if key != "_target_"} | changes
 
 
 def bound(name, *, control_dt=CONTROL, **changes):
@@ -130,8 +130,8 @@ def test_kinds_rows_and_masses_are_the_configs(street):
         at(street, "replay", 0, mass_kg={"vehicle": None})
     with pytest.raises(ConfigError, match=r"mass_kg\.vehicle: 0.0"):
         at(street, "replay", 0, mass_kg={**heavy, "vehicle": 0.0})
-    with pytest.raises(ConfigError, match=r"others\.kinds.*horse"):
-        environment.make_env(load_config("task", "dynamics=bicycle", "others=replay", "others.kinds=[horse]"))
+    with pytest.raises(ConfigError, match=r"traffic\.kinds.*horse"):
+        environment.make_env(load_config("task", "dynamics=bicycle", "traffic=log_playback", "traffic.kinds=[horse]"))
 
 
 def test_static_keeps_the_parked_where_they_stood():
@@ -162,7 +162,7 @@ def test_padding_and_empty_logs_are_nobody():
 
 @pytest.fixture(scope="module")
 def config():
-    return scenefactory_jax.load("task")
+    return scenefactory_jax.load_config("task")
 
 
 def test_neighbours_and_ttc_know_the_others(street, config):
@@ -207,7 +207,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
     scene = scene_of(np.zeros((6, 2)), np.ones((6, 2)))
     scene = with_tracks(replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))])), *(track([p, 1.0]) for p in (-30.0, 0.0, 25.0)))
     scene = replace(scene, boxes=at(scene, "static", 0))
-    numbers = load_config("task", "spawn=random_pairs")["spawn"]["draw"] | {"travel_max_m": 20.0}
+    numbers = load_config("task", "spawning=random_pairs")["spawning"]["sampler"] | {"travel_max_m": 20.0}
     del numbers["_target_"]
     agents = jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers))(jax.random.split(jax.random.key(3), 20))
     starts = np.asarray(agents.position)[np.asarray(agents.present)]
@@ -222,7 +222,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
 
 
 def test_a_car_that_drives_into_a_parked_one_has_collided():
-    env = environment.make_env(load_config("task", "dynamics=bicycle", "others=static", "observe=small"))
+    env = environment.make_env(load_config("task", "dynamics=bicycle", "traffic=parked", "observations=small"))
     scene = with_tracks(scene_of([[0, 0], [0, 4]], [[50, 0], [50, 4]], speeds=[10.0, 10.0], half_width=9.0), track([14.0, 0.3]))
     state, step = env.start(jax.random.key(0), scene), jax.jit(env.transition)
     when = None
@@ -308,12 +308,12 @@ def test_banks_and_stacks_carry_others(tmp_path, logged):
     for name, leaf in columns.flatten(full.scene).items():
         np.testing.assert_array_equal(columns.flatten(bank_reader.pack_scenes(opened, [0], **tools)[0].scene)[name], leaf)
     stacked, report = bank_reader.load(opened, [1, 0, 1], capacity={}, **tools)
-    assert report.capacity["others"] == 4 and stacked.others.valid.any(-1).sum(1).tolist() == [1, 4, 1]
+    assert report.capacity["traffic"] == 4 and stacked.others.valid.any(-1).sum(1).tolist() == [1, 4, 1]
     assert stacked.boxes.present.shape == (3, 0)
-    cut, report = stack.stack([full.scene, less.scene], capacity={"others": 2})
-    assert [(c.axis, c.had, c.kept) for c in report.cuts] == [("others", 4, 2)] and cut.others.kind[0].tolist() == [0, 1]
-    none, report = stack.stack([full.scene], capacity={"others": 0})
-    assert none.others.position.shape == (1, 0, STEPS, 2) and "others=0: 4 of 4" in "\n".join(stack.describe(report))
+    cut, report = stack.stack([full.scene, less.scene], capacity={"traffic": 2})
+    assert [(c.axis, c.had, c.kept) for c in report.cuts] == [("traffic", 4, 2)] and cut.others.kind[0].tolist() == [0, 1]
+    none, report = stack.stack([full.scene], capacity={"traffic": 0})
+    assert none.others.position.shape == (1, 0, STEPS, 2) and "traffic=0: 4 of 4" in "\n".join(stack.describe(report))
 
 
 def real(shared_data, count=None):

@@ -105,7 +105,7 @@ def settings():
 def played(tmp_path_factory, settings):
     """All drives at once, with the strict protocol: records, recording."""
     where = tmp_path_factory.mktemp("x")
-    config = smoke(where, "dynamics=replay", "others=static", f"timing.episode_s={SECONDS}", "weather.patches=null")
+    config = smoke(where, "dynamics=log_playback", "traffic=parked", f"timing.episode_s={SECONDS}", "weather.patches=null")
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(scripted(*drive) for drive in DRIVES.values()))
     scenes = scene_source.Scenes(scene_source.attach_grids(stacked, config["scenes"]), tuple(NAMES), "")
     with quick_compilation():

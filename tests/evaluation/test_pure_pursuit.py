@@ -16,7 +16,7 @@ DT_S, BASE_M, LIMIT_RAD = 0.05, 2.6, 0.55654
 
 @pytest.fixture(scope="module")
 def seeker():
-    config = apply_overrides(load_config("train", "experiment=laptop"), ["policy=seeker"])
+    config = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit"])
     policy = make_policy(config)
     return policy._replace(apply=jax.jit(policy.apply))
 
@@ -62,7 +62,7 @@ def test_it_holds_its_speed_and_takes_any_batch_and_any_parameters(seeker):
 
 
 def test_what_it_cannot_drive_by_is_named(seeker):
-    settings = apply_overrides(load_config("train", "experiment=laptop"), ["policy=seeker"])["policy"]
+    settings = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit"])["policy"]
     with pytest.raises(ConfigError, match=r"a seeker needs the group `ego` of the observation; it has: turning"):
         seeker.apply({}, {"turning": jnp.zeros(2)})
     for key in ("wheelbase_m", "speed_mps", "goal_scale_m"):

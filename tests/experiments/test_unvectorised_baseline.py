@@ -17,7 +17,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.env.termination import EVENTS
 from scenefactory_jax.learning.training_loop import make_policy
 
-SMALL = ["scenes.count=2", "scenes.pack.agents=6", "observe.road.count=24", "spawn=random_pairs", "weather=wet"]
+SMALL = ["scenes.count=2", "scenes.pack.agents=6", "observations.road.count=24", "spawning=random_pairs", "weather=wet"]
 NETWORK = ["policy.vector=[8,8]", "policy.rows.road=[8,8]", "policy.rows.neighbours=[8]", "policy.trunk=[8]", "policy.actor_head_scale=1.0"]
 MOMENTS, SECONDS = 16, 1.0
 
@@ -232,7 +232,7 @@ def test_a_broken_number_ends_everybody_with_a_fault(task, scene, tmp_path, monk
 
 
 def test_measure_gives_positive_numbers(config, scene, parameters):
-    short = {**config, "timing": {**config["timing"], "episode_s": 0.2}, "spawn": {"draw": {"_target_": "logged"}, "respawn_clear_m": None}}
+    short = {**config, "timing": {**config["timing"], "episode_s": 0.2}, "spawning": {"sampler": {"_target_": "logged"}, "respawn_clearance_m": None}}
     result = baseline_environment.measure(short, [scene, scene], parameters, steps=8, repeats=2, seed=0)  # with restarts
     low, high = result["agent_steps_per_s_range"]
     assert 0 < low <= result["agent_steps_per_s"] <= high < np.inf
@@ -242,7 +242,7 @@ def test_measure_gives_positive_numbers(config, scene, parameters):
     assert sum(phases[name] for name in baseline_environment.PHASES) == pytest.approx(phases["whole"], rel=0.5)
 
 
-@pytest.mark.parametrize("override", ["dynamics=bicycle", "others=static", "weather=storm", "+reward.own={_target_: my.term, weight: 1.0}"])
+@pytest.mark.parametrize("override", ["dynamics=bicycle", "traffic=parked", "weather=storm", "+reward.own={_target_: my.term, weight: 1.0}"])
 def test_what_only_the_device_has_is_named(override):
     with pytest.raises(ConfigError, match="baseline has"):
         baseline_environment.make(sf.load_config("bench", override))

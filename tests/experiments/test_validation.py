@@ -31,7 +31,7 @@ STUCK = random_drives.Sequences(
 @pytest.fixture(scope="module")
 def entry():
     """The shipped car, with the shipped solver."""
-    return load_config("task", "dynamics=mjx_car")["dynamics"]
+    return load_config("task", "dynamics=articulated")["dynamics"]
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_mechanics_are_those_of_rigid_bodies(entry):
 
 
 def test_places_of_the_wheels_rates():
-    dynamics = load_config("task", "dynamics=mjx_car")["dynamics"]
+    dynamics = load_config("task", "dynamics=articulated")["dynamics"]
     car, solver = cars.CarParameters(**dynamics["car"]), cars.Solver(**dynamics["solver"])
     model = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
     assert isinstance(model, mujoco.MjModel)

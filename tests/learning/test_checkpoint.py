@@ -20,7 +20,7 @@ STAGE = 4
 def fresh():
     """A trainer of its own, as in a new process."""
     env = probe(life=3, episode_steps=20)
-    numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 20}
+    numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 20}
     numbers["average"] = 0.5
     return train_iteration.make_trainer(env, late_fusion.make(**SMALL), **numbers)
 

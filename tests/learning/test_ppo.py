@@ -218,7 +218,7 @@ def course():
     """Agents who would live 5 steps in worlds of 4: all run out of time."""
     env, traces = counted(probe(life=5, episode_steps=4))
     return train_iteration.make_trainer(
-        env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 4}
+        env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 4}
     ), traces
 
 
@@ -283,7 +283,7 @@ def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length
 
 def test_worlds_begin_where_an_action_is_read():
     env = probe(life=5, episode_steps=12)._replace(hold=3)
-    trainer = train_iteration.make_trainer(env, late_fusion.make(**SMALL), **{**NUMBERS, "initial_phase": True, "episode_steps": 12})
+    trainer = train_iteration.make_trainer(env, late_fusion.make(**SMALL), **{**NUMBERS, "stagger_episodes": True, "episode_steps": 12})
     steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
     assert set(steps.tolist()) == {0, 3, 6, 9}
 
@@ -323,7 +323,7 @@ def test_configs_build(name):
 def probes():
     """One compiled trainer for all probes: task -> (action mean and value for cues, metrics of every iteration)."""
     policy = late_fusion.make(**SMALL)
-    trainer = train_iteration.make_trainer(probe(), policy, **{**NUMBERS, "sample_share": 0.75})  # two of three slots are spawned
+    trainer = train_iteration.make_trainer(probe(), policy, **{**NUMBERS, "sample_fraction": 0.75})  # two of three slots are spawned
     apply = jax.jit(policy.apply)
 
     def train_on(task, iterations):

@@ -85,6 +85,6 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
 
 
 def test_configs_look_as_far_as_their_observation():
-    assert load_config("train", "experiment=published")["scenes"]["cells"]["radius_m"] == 10.0
-    assert load_config("train", "observe.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
+    assert load_config("train", "experiment=paper")["scenes"]["cells"]["radius_m"] == 10.0
+    assert load_config("train", "observations.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
     assert load_config("convert")["scenes"]["cells"]["radius_m"] is None

@@ -43,9 +43,9 @@ NEAR = {True: 1e-6, False: 0.01}  # of means, on the machine of the record (thre
 WORLDS, AGENTS, STEPS, TOWNS = 4, 4, 200, 8
 BACKENDS = ("mjx_car", "mjx_published", "bicycle", "replay")
 OTHERS = ("ignore", "replay", "static")
-BUSY = ("others=replay", "weather=split")
+BUSY = ("traffic=log_playback", "weather=split")
 WEATHERS = ("mixed", "puddles", "split", "onset", "winter")
-SMALL = ("experiment=smoke", "scenes=town", f"scenes.count={WORLDS}", f"scenes.pack.agents={AGENTS}", "scenes.pack.others=8")
+SMALL = ("experiment=smoke", "scenes=town", f"scenes.count={WORLDS}", f"scenes.pack.agents={AGENTS}", "scenes.pack.traffic=8")
 SMALL += ("progress=false",)
 FILES = ("scenes=womd", "scenes.pack.require_agents=false")
 FORMATS = (
@@ -54,7 +54,7 @@ FORMATS = (
 )  # fmt: skip
 QUICK = (
     "experiment=quick", *SMALL[1:], f"worlds={WORLDS}", "ppo.horizon=6", "ppo.epochs=1", "ppo.minibatches=2", "policy.vector=[16]",
-    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observe.road.count=16", "others=replay", "weather=mixed",
+    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16", "traffic=log_playback", "weather=mixed",
 )  # fmt: skip
 
 
@@ -192,8 +192,8 @@ def towns() -> Any:
 
 CASES: dict[str, Callable[[], Any]] = {
     **{f"environment dynamics={name}": functools.partial(environment, f"dynamics={name}", *BUSY) for name in BACKENDS},
-    "environment by mjx.step": functools.partial(environment, "dynamics=mjx_car", "dynamics.solver.algorithm=Newton", *BUSY),
-    **{f"environment others={name}": functools.partial(environment, f"others={name}") for name in OTHERS},
+    "environment by mjx.step": functools.partial(environment, "dynamics=articulated", "dynamics.solver.algorithm=Newton", *BUSY),
+    **{f"environment traffic={name}": functools.partial(environment, f"traffic={name}") for name in OTHERS},
     **{f"environment weather={name}": functools.partial(environment, f"weather={name}") for name in WEATHERS},
     "training smoke": functools.partial(training, *SMALL),
     "training quick": functools.partial(training, *QUICK),

@@ -85,10 +85,10 @@ def _report_jumps(raw, limit_m_s, lines):
 
 
 def pack(
-    raw, *, box_m, centre, gap_m, outline_m, agents, min_travel_m, car_size_m, start_speed, log_from, require_agents, others, others_least_m
+    raw, *, scene_size_m, centre, gap_m, outline_m, agents, min_travel_m, car_size_m, start_speed, log_from, require_agents, others, others_least_m
 ):
     origin, centred_on = _centre(raw, centre)
-    half = box_m / 2
+    half = scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)
     first = raw.current if log_from == "current" else 0
@@ -107,7 +107,7 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
-        others_kept=len(beside["others.kind"]),
+        others_kept=len(beside["traffic.kind"]),
         others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,

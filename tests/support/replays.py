@@ -20,7 +20,7 @@ POSTS = (RoadPosts((Light((10.0, 0.0), 0.0, [(0.0, "stop"), (1.0, "go")]),), ((1
 
 def made() -> Recording:
     """Car 0 reaches its goal, car 1 steers off the road, car 2 drives on; the second world is the first one mirrored in its order."""
-    settings = hydra_config.load_config("train", "experiment=smoke", "ends=invincible", "timing.episode_s=10")
+    settings = hydra_config.load_config("train", "experiment=smoke", "termination=goal_only", "timing.episode_s=10")
     starts, goals = np.array([[-20.0, 0.0], [-40.0, 0.0], [-50.0, -3.0]]), np.array([[-8.0, 0.0], [50.0, 0.0], [55.0, -3.0]])
     scenes = [scene_of(starts, goals, speeds=[8.0, 12.0, 5.0]), scene_of(starts[::-1], goals[::-1], speeds=[5.0, 12.0, 8.0])]
     scene = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)

@@ -26,7 +26,7 @@ OURS = ("jit(_iterate)", "jit(_swap)", "jit(spread)", "jit(exchanged)")  # the f
 def learn(devices, shards):
     """Parameters and metrics after three iterations, other scenes in half of the worlds between them; and what was compiled."""
     mesh = sharding.make_mesh(devices)
-    numbers = {**NUMBERS, "desired_kl": 0.01, "initial_phase": True, "episode_steps": 6, "sample_share": 0.75, "shards": shards}
+    numbers = {**NUMBERS, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 6, "sample_fraction": 0.75, "shards": shards}
     trainer = train_iteration.make_trainer(probe(life=5, episode_steps=6), late_fusion.make(**SMALL), **numbers, mesh=mesh)
     stage = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
     fresh = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS // 2, task=2)), mesh)

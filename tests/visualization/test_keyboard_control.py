@@ -65,7 +65,7 @@ def test_stop_brakes_at_once_whatever_else_is_held():
 @pytest.fixture(scope="module")
 def built():
     """Two bicycles; yours is the one in slot 1, and its goal would lie right before it."""
-    settings = hydra_config.load_config("drive", "dynamics=bicycle", "others=ignore", "observe=small")
+    settings = hydra_config.load_config("drive", "dynamics=bicycle", "traffic=none", "observations=small")
     scene = scene_of([[-20.0, 0.0], [-50.0, -3.0]], [[60.0, 0.0], [-44.0, -3.0]], speeds=[5.0, 5.0])
     act = lambda parameters, observation, key: jnp.full((2, 3), 0.0)  # noqa: E731
     return keyboard_control.world(environment.make_env(settings), scene, act, None, car=1, dt=DT, off_map_m=30.0)

@@ -100,7 +100,7 @@ def test_cars_events_and_others(page, recording):
             assert (driven == active[index, :, car["slot"]]).all()
     assert {event["name"] for event in first["events"]} >= {"reached", "touched_edge"}
     assert [car["goals"] for car in first["cars"]] == [[[0, -8.0, 0.0]], [[0, 50.0, 0.0]], [[0, 55.0, -3.0]]]
-    users = [(user["spans"], user["parked"]) for user in first["others"]]
+    users = [(user["spans"], user["parked"]) for user in first["traffic"]]
     assert users == [([[STEPS // 2, STEPS - 1]], False), ([[0, STEPS - 1]], True)]
     assert first["lights"][0]["shown"] == [[0.0, "stop"], [1.0, "go"]] and first["signs"] == [[12.0, 5.0]] and not second["lights"]
 

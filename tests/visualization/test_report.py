@@ -108,7 +108,7 @@ def test_others_are_drawn_where_they_are(trajectory):
     assert shapes.shapes_at_rest(beside(trajectory).others).tolist() == [True, False, True]
     birds_eye_figures.trajectory_figure(beside(trajectory))
     wrong = beside(trajectory)
-    with pytest.raises(drawing.TrajectoryError, match=r"others\.yaw: shape \(61, 2\)"):
+    with pytest.raises(drawing.TrajectoryError, match=r"traffic\.yaw: shape \(61, 2\)"):
         drawing.check(wrong._replace(others=wrong.others._replace(yaw=np.zeros((61, 2)))))
 
 

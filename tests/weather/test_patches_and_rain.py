@@ -142,7 +142,7 @@ def test_drawn_areas_are_the_patches():
 
 
 def test_dry_surfaces_have_their_textbook_friction():
-    grip = instantiate.instantiate(scenefactory_jax.load("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(scenefactory_jax.load_config("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
     wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
     spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
@@ -150,7 +150,7 @@ def test_dry_surfaces_have_their_textbook_friction():
 
 
 def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
-    entry = scenefactory_jax.load("task")["weather"]["grip"]
+    entry = scenefactory_jax.load_config("task")["weather"]["grip"]
     condition = on(patch([[0, 5]], radius=5.0, surface=0, film=0.5), film=0.3)
     wheels = jnp.array([[[1.3, 1.0], [1.3, -1.0], [-1.3, 1.0], [-1.3, -1.0]]])
     for mode, wet, damp in (("static", 0.8595, 0.9594), ("dynamic", 0.6770, 0.8302), ("speed", 0.8595, 0.9594)):
@@ -290,8 +290,8 @@ def test_given_shapes_lie_where_they_are_given():
 
 
 def config_of(*overrides):
-    lean = ("dynamics=bicycle", "~observe.road", "~observe.neighbours")
-    return scenefactory_jax.load("task", *lean, *overrides) | {"reward": {}}
+    lean = ("dynamics=bicycle", "~observations.road", "~observations.neighbours")
+    return scenefactory_jax.load_config("task", *lean, *overrides) | {"reward": {}}
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -354,7 +354,7 @@ def test_the_token_lists_the_surfaces_that_it_is_told():
     ice = PUDDLE.replace("SMA", "ICE")
     tokens = {"[AC,SMA,OGFC]": [[0.2, 0, 0, 0], [0, 1, 0, 0]], "[ICE,AC]": [[0.2, 1, 0], [0, 0, 1]], "[]": [[0.2], [0]]}
     for surfaces, wanted in tokens.items():
-        _, seen = scenefactory_jax.make(config_of(ice, f"observe.weather.surfaces={surfaces}")).reset(KEY, scene)
+        _, seen = scenefactory_jax.make(config_of(ice, f"observations.weather.surfaces={surfaces}")).reset(KEY, scene)
         np.testing.assert_allclose(seen["weather"], wanted, atol=1e-6)
 
 
@@ -396,7 +396,7 @@ def test_the_report_says_how_the_film_changed():
         ("weather.rain={_target_: schedule, time_s: [1.0, 1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.time_s: .*ascending"),
         ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.film_mm: 2 films for 1 times"),
         ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [-0.1]}", r"weather\.rain\.film_mm: .*nothing below 0"),
-        ("observe.weather.surfaces=[AC,MUD]", r"observe\.weather\.surfaces: 'MUD'; valid: AC, SMA"),
+        ("observations.weather.surfaces=[AC,MUD]", r"observations\.weather\.surfaces: 'MUD'; valid: AC, SMA"),
     ],
 )
 def test_refuses_by_name(override, message):

@@ -64,14 +64,14 @@ class Difference(NamedTuple):
     counts: tuple[int, int]
 
 
-def measure(raw: RawScene, *, box_m: float) -> Samples:
+def measure(raw: RawScene, *, scene_size_m: float) -> Samples:
     """Samples of every quantity in one scene.
 
     Args:
-        box_m: side of the square in which things count, around the recording car at the current step, or the mean of the road points.
+        scene_size_m: side of the square in which things count, around the recording car at the current step, or the mean of the road points.
     """
     centre = _centre(raw)
-    inside = lambda points: np.abs(points[:, :2] - centre).max(axis=1) <= box_m / 2  # noqa: E731
+    inside = lambda points: np.abs(points[:, :2] - centre).max(axis=1) <= scene_size_m / 2  # noqa: E731
     roads = [(road.kind, road.xyz[:, :2], inside(road.xyz)) for road in raw.roads]
     long = [(kind, points, near) for kind, points, near in roads if len(points) >= 2 and near.any()]
     count = lambda kind: np.array([sum(near.any() for own, _, near in roads if own == kind)], float)  # noqa: E731
@@ -89,7 +89,7 @@ def measure(raw: RawScene, *, box_m: float) -> Samples:
         "driveways": count(DRIVEWAY),
         "lights": np.array([len({light.lane for light in raw.lights})], float),
     }
-    return samples | _measure_traffic(raw, centre, box_m / 2)
+    return samples | _measure_traffic(raw, centre, scene_size_m / 2)
 
 
 def _measure_traffic(raw: RawScene, centre: Float[np.ndarray, "2"], half: float) -> Samples:
@@ -168,9 +168,9 @@ def _changes(track: Track, dt: float) -> tuple[Float[np.ndarray, " N"], Float[np
     return ((speed[last] - speed[first]) / span)[valid], (turned / span)[driven]
 
 
-def collect(scenes: Iterable[RawScene], *, box_m: float) -> Samples:
+def collect(scenes: Iterable[RawScene], *, scene_size_m: float) -> Samples:
     """The samples of many scenes, pooled."""
-    found = [measure(raw, box_m=box_m) for raw in scenes]
+    found = [measure(raw, scene_size_m=scene_size_m) for raw in scenes]
     return {name: _joined([one[name] for one in found]) for name in QUANTITIES}
 
 
@@ -237,13 +237,13 @@ def figure(reference: str, sets: Mapping[str, Samples]) -> Figure:
     return whole
 
 
-def write(folder: Path, reference: str, sets: Mapping[str, Samples], *, box_m: float, command: str) -> Path:
+def write(folder: Path, reference: str, sets: Mapping[str, Samples], *, scene_size_m: float, command: str) -> Path:
     """Write `folder`/realism.md and realism.png, and return the report's path."""
     folder.mkdir(parents=True, exist_ok=True)
     picture = plots.save(figure(reference, sets), folder / "realism.png")
     scenes = ", ".join(f"{name}: {len(samples['vehicles'])}" for name, samples in sets.items())
     words = (
-        f"Scenes: {scenes}. Everything within {box_m:g} m by {box_m:g} m around the recording car. KS is the largest difference between "
+        f"Scenes: {scenes}. Everything within {scene_size_m:g} m by {scene_size_m:g} m around the recording car. KS is the largest difference between "
         "two distribution functions (0: the same, 1: nothing in common), W the earth mover's distance in standard deviations, both from "
         f"{reference}; the mean is over the quantities that both sets have. In the figure all histograms have the same area and the "
         "outermost bars hold what lies beyond."

@@ -24,7 +24,7 @@ from scenefactory_jax.data.packing.stack import AXES, ROW_MULTIPLE, describe, st
 from scenefactory_jax.roadgraph import spatial_grid
 
 Excess = Literal["cut", "skip"]
-GROWING = (*columns.ROADS, "others", *spatial_grid.SIZES)  # the sizes of which another scene may need more than any that was measured
+GROWING = (*columns.ROADS, "traffic", *spatial_grid.SIZES)  # the sizes of which another scene may need more than any that was measured
 SHOWN = 3  # reasons in a message
 
 
@@ -158,9 +158,9 @@ def measure(
         if rows is None:
             rows = int(np.ceil(most * headroom)) if name in GROWING else most
             rows = -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE if name in columns.ROADS else rows
-        elif isinstance(rows, bool) or not isinstance(rows, int) or rows < (name != "others"):
+        elif isinstance(rows, bool) or not isinstance(rows, int) or rows < (name != "traffic"):
             raise ConfigError(f"stream.capacity.{name}: {rows!r} is no capacity; valid: 1 or more (others: 0), or null to measure it")
-        elif name in GROWING and name != "others" and rows < (least := min(need[name] for need in needs)):
+        elif name in GROWING and name != "traffic" and rows < (least := min(need[name] for need in needs)):
             raise ConfigError(f"stream.capacity.{name}: {rows}; all {len(needs)} scenes of the sample need more: {least} to {most}")
         sizes[name] = rows
     return sizes

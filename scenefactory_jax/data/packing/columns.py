@@ -37,7 +37,7 @@ def _describe(kind: type, prefix: str = "") -> dict[str, Column]:
         if dataclasses.is_dataclass(entry.type):
             found |= _describe(entry.type, f"{name}.")  # pyright: ignore[reportArgumentType]
             continue
-        names = {"P": prefix.rstrip("."), "A": "agents", "O": "others", "L": "steps"}
+        names = {"P": prefix.rstrip("."), "A": "agents", "O": "traffic", "L": "steps"}
         axes = tuple(names.get(axis) or int(axis) for axis in entry.type.dim_str.split())  # pyright: ignore
         found[name] = Column(_dtype(entry.type), axes)
     return found

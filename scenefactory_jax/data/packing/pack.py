@@ -69,7 +69,7 @@ def prepare(raw: RawScene, *, check: Callable[..., Any], pack: Callable[..., Any
 def pack(
     raw: RawScene,
     *,
-    box_m: float,
+    scene_size_m: float,
     centre: Literal["sdc", "mean"],
     gap_m: float,
     agents: int,
@@ -86,7 +86,7 @@ def pack(
 
     Args:
         raw: a checked scene.
-        box_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
+        scene_size_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
         centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
         gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (SceneFactory).
         agents, require_agents: slots, for the cars nearest to the centre; whether a scene in which none is left is refused.
@@ -102,8 +102,8 @@ def pack(
         Unpackable: no lane segment in the box, or no agent where one is required.
         ConfigError: a number that makes no sense.
     """
-    _check(box_m, car_size_m, others, outline_m)
-    (origin, centred_on), half = _centre(raw, centre), box_m / 2
+    _check(scene_size_m, car_size_m, others, outline_m)
+    (origin, centred_on), half = _centre(raw, centre), scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
     logs = _around(stack_tracks(raw.tracks, len(raw.times)), origin)
@@ -124,7 +124,7 @@ def pack(
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=len(chosen),
         agents_dropped=dropped,
-        others_kept=len(beside["others.kind"]),
+        others_kept=len(beside["traffic.kind"]),
         others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
@@ -139,13 +139,13 @@ def _scene(leaves: dict[str, np.ndarray]) -> Scene:
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
 
 
-def _check(box_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:
+def _check(scene_size_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:
     """Refuse numbers that make no sense."""
-    check_number(box_m, where="scenes.pack.box_m", above=0)
+    check_number(scene_size_m, where="scenes.pack.scene_size_m", above=0)
     check_number(outline_m, where="scenes.pack.outline_m", above=0)
     if car_size_m is not None and not (len(car_size_m) == 2 and min(car_size_m) > 0):
         raise ConfigError(f"scenes.pack.car_size_m: {car_size_m}; wanted are length and width, both above 0, or null")
-    check_number(others, where="scenes.pack.others", least=0)
+    check_number(others, where="scenes.pack.traffic", least=0)
 
 
 def _around(logs: Logs, origin: Float[np.ndarray, "3"]) -> Logs:

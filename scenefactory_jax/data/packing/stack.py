@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.packing import columns
 
-AXES = (*columns.ROADS, "agents", "steps", "others")
+AXES = (*columns.ROADS, "agents", "steps", "traffic")
 ROW_MULTIPLE = 256  # road capacities are rounded up to this, so that similar selections share a compiled program
 Leaves = dict[str, np.ndarray]
 
@@ -81,7 +81,7 @@ def _compact(world: Leaves) -> Leaves:
         valid = world[f"{part}.valid"]
         if not valid.all():
             world = world | {name: leaf[valid] for name, leaf in world.items() if name.startswith(f"{part}.")}
-    return _rows(world, "others", np.flatnonzero(world["others.valid"].any(axis=1)))
+    return _rows(world, "traffic", np.flatnonzero(world["traffic.valid"].any(axis=1)))
 
 
 def _rows(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
@@ -90,7 +90,7 @@ def _rows(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
 
 
 def _count(world: Leaves, axis: str) -> int:
-    name = {"agents": "agents.present", "steps": "log.valid", "others": "others.kind"}.get(axis, f"{axis}.valid")
+    name = {"agents": "agents.present", "steps": "log.valid", "traffic": "traffic.kind"}.get(axis, f"{axis}.valid")
     return world[name].shape[-1]
 
 
@@ -100,7 +100,7 @@ def _resolve(worlds: Sequence[Leaves], capacity: Mapping[str, int | None]) -> di
         raise SceneError(f"capacity.{unknown[0]}: unknown; valid: {', '.join(AXES)}")
     sizes = {}
     for axis in AXES:
-        rows, least = capacity.get(axis), 0 if axis == "others" else 1
+        rows, least = capacity.get(axis), 0 if axis == "traffic" else 1
         if rows is None:
             rows = max(least, *(_count(world, axis) for world in worlds))
             rows = -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE if axis in columns.ROADS else rows
@@ -114,9 +114,9 @@ def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCoun
     """One world with exactly these rows."""
     world = _fit_agents(world, sizes["agents"], index, cuts)
     world = _fit_steps(world, sizes["steps"], index, cuts)
-    if (had := _count(world, "others")) > sizes["others"]:
-        cuts.append(CutCounts(index, "others", had, sizes["others"], None))
-        world = _rows(world, "others", np.arange(sizes["others"]))
+    if (had := _count(world, "traffic")) > sizes["traffic"]:
+        cuts.append(CutCounts(index, "traffic", had, sizes["traffic"], None))
+        world = _rows(world, "traffic", np.arange(sizes["traffic"]))
     for part in columns.ROADS:
         had = _count(world, part)
         if had > sizes[part]:

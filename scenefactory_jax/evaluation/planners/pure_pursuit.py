@@ -26,8 +26,8 @@ def make(
         wheelbase_m: of the cars that it drives, with `steering_limit_rad`, the angle of the front wheels at an action of one.
         speed_mps: that it holds.
         speed_band_mps: so far from that speed the pedal is down all the way.
-        goal_scale_m: `observe.ego.distance_scale_m`: what the observed goal was divided by.
-        speed_scale_mps: `observe.ego.speed_scale_mps`, likewise.
+        goal_scale_m: `observations.ego.distance_scale_m`: what the observed goal was divided by.
+        speed_scale_mps: `observations.ego.speed_scale_mps`, likewise.
 
     Returns:
         A policy without parameters that matter: it reads none, so it can be judged in place of any other. Its values are zero.

@@ -66,13 +66,13 @@ def make_trainer(
     horizon: int,
     epochs: int,
     minibatches: int,
-    sample_share: float,
+    sample_fraction: float,
     permutation: Literal["once", "each_epoch"],
     learning_rate: float,
     desired_kl: float | None,
     learning_rate_min: float,
     learning_rate_max: float,
-    learning_rate_halved: float | None,
+    learning_rate_half_life: float | None,
     gamma: float,
     gae_lambda: float,
     clip: float,
@@ -81,7 +81,7 @@ def make_trainer(
     value: float,
     max_grad_norm: float,
     normalise_advantage: bool,
-    initial_phase: bool,
+    stagger_episodes: bool,
     average: float | None,
     episode_steps: int,
     shards: int | None,
@@ -91,15 +91,15 @@ def make_trainer(
 
     Args:
         horizon, epochs, minibatches: actions of a rollout (`env.hold` control steps each), passes over it, gradient steps in each.
-        sample_share: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
+        sample_fraction: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
             a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
-        learning_rate_halved: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
+        learning_rate_half_life: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
         gamma, gae_lambda: discount of an action, and the advantage's mix of horizons.
         clip, value_clip, entropy, value: bounds of the probability ratio and of the value loss (None: none), weights of entropy and value.
         normalise_advantage: over the active samples of the whole rollout.
-        initial_phase: worlds start at random times of their episodes, so that they do not run out of time together.
+        stagger_episodes: worlds start at random times of their episodes, so that they do not run out of time together.
         average: share of the parameters' running mean that stays at every iteration; the mean is what is judged. None: there is no mean.
         episode_steps: control steps of an episode.
         shards: groups of worlds whose samples are shuffled on their own; each gives every minibatch an equal part. None: one a device.
@@ -115,13 +115,13 @@ def make_trainer(
     objective = functools.partial(
         loss.compute_loss, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis
     )
-    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_halved)
+    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_half_life)
     passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
     learn = functools.partial(update.update_epochs, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
-    start = functools.partial(_start, env=env, phases=episode_steps // env.hold if initial_phase else 1)
+    start = functools.partial(_start, env=env, phases=episode_steps // env.hold if stagger_episodes else 1)
     act = functools.partial(rollout.collect_rollout, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
-    size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_share=sample_share)
+    size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_fraction=sample_fraction)
     whole, size = functools.partial(size, groups=everybody), functools.partial(size, groups=own)
     init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=whole, average=average is not None)
     iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis, average=average)
@@ -233,7 +233,7 @@ def _swap(
 ) -> tuple[TrainState, Scene]:
     """Every device starts all fresh scenes, and keeps those of its own worlds.
 
-    At the beginning of their episodes, whatever `initial_phase` says: a life that its world's clock cuts short would count as a failure.
+    At the beginning of their episodes, whatever `stagger_episodes` says: a life that its world's clock cuts short would count as a failure.
     """
     start_key, key = jax.random.split(train_state.key)
     begun, seen = _start(start_key, fresh, env=env, phases=1)
@@ -291,21 +291,21 @@ def _mean(before: Any, now: Any, iteration: Int[Array, ""], stays: float) -> Any
     return jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, before, now)
 
 
-def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_share: float, groups: int = 1) -> int:
+def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_fraction: float, groups: int = 1) -> int:
     """Samples in a minibatch.
 
     Raises:
-        ConfigError: the whole rollout (`sample_share` 1) does not divide into the minibatches, or a minibatch would be empty.
+        ConfigError: the whole rollout (`sample_fraction` 1) does not divide into the minibatches, or a minibatch would be empty.
     """
     count, agents = worlds.active.shape
     samples = horizon * count * agents
     if count % groups:
         raise ConfigError(f"worlds: {count} do not divide into {groups} shards")
-    size = int(samples // groups * sample_share) // minibatches * groups
-    if size < 1 or (sample_share == 1.0 and samples % (minibatches * groups)):
+    size = int(samples // groups * sample_fraction) // minibatches * groups
+    if size < 1 or (sample_fraction == 1.0 and samples % (minibatches * groups)):
         counted = f"horizon {horizon} x {count} worlds x {agents} agents = {samples} samples"
         parts = f"{minibatches} minibatches" + (f" of {groups} shards" if groups > 1 else "")
-        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_share}) do not divide into {parts}")
+        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_fraction}) do not divide into {parts}")
     return size
 
 
@@ -321,7 +321,7 @@ def measure(tally: rollout.Tally, facts: dict[str, Array]) -> Metrics:
     `reward` and `reward/...`: mean of a step of an active agent. `events/...`: new events for each agent's life that ended, by event or by
     time; `count/...`: the same as a number. `life/...`: undiscounted return and steps of those lives. `share/active`: of the steps of
     spawned slots; `steps/...`: of this iteration. `speed`: m/s. `ppo/...`: means over the minibatches; `ppo/skipped`: minibatches that were
-    not finite and therefore moved nothing; `ppo/left_out`: active samples that `sample_share` left out, as a share.
+    not finite and therefore moved nothing; `ppo/left_out`: active samples that `sample_fraction` left out, as a share.
     """
     steps, ends = jnp.maximum(tally["active"], 1.0), jnp.maximum(tally["ended"], 1.0)
     spawned = tally["spawned"].astype(jnp.float32)
@@ -393,12 +393,12 @@ def _check(numbers: dict[str, Any]) -> None:
     given = {name: value for name, value in numbers.items() if value is not None}
     for name in ("horizon", "epochs", "minibatches", "episode_steps"):
         check_number(given[name], where=f"ppo.{name}", least=1)
-    positive = ("learning_rate", "max_grad_norm", "clip", "sample_share", "learning_rate_halved", "desired_kl", "value_clip")
+    positive = ("learning_rate", "max_grad_norm", "clip", "sample_fraction", "learning_rate_half_life", "desired_kl", "value_clip")
     for name in filter(given.__contains__, positive):
         check_number(given[name], where=f"ppo.{name}", above=0)
     for name in ("entropy", "value"):
         check_number(given[name], where=f"ppo.{name}", least=0)
-    for name in filter(given.__contains__, ("gamma", "gae_lambda", "sample_share", "average")):
+    for name in filter(given.__contains__, ("gamma", "gae_lambda", "sample_fraction", "average")):
         check_fraction(given[name], where=f"ppo.{name}")
     if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
         bounds = f"[{numbers['learning_rate_min']}, {numbers['learning_rate_max']}]"

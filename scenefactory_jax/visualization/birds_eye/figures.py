@@ -152,7 +152,7 @@ def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: 
         look = {"color": _rgb(area.colour), "markeredgecolor": _rgb(area.edge), "markeredgewidth": 0.6}
         handles.append(Line2D([], [], marker="s", linestyle="none", markersize=8, label=area.label, **look))
     if beside:
-        handles.append(Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(OTHERS), markersize=7, label="others"))
+        handles.append(Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(OTHERS), markersize=7, label="traffic"))
     for name in events:
         mark = MARKS[name]
         handles.append(Line2D([], [], marker=mark.marker, linestyle="none", color=_rgb(mark.colour), markersize=8, label=mark.label))

@@ -36,7 +36,7 @@ def world(
     height_m: float,
     goal_radius_m: float,
     other_height_m: float,
-    box_m: float,
+    scene_size_m: float,
 ) -> mujoco.MjSpec:
     """Ground plane `ground`, road as thin visual boxes, car `agent{slot}/...` at each present agent's start, and `goal{slot}` discs.
 
@@ -52,14 +52,14 @@ def world(
         height_m: of the boxes.
         goal_radius_m: of the discs.
         other_height_m: of the others.
-        box_m: side of the ground that is drawn, and the viewer's scale; physically the plane is infinite.
+        scene_size_m: side of the ground that is drawn, and the viewer's scale; physically the plane is infinite.
 
     Raises:
         ValueError: the spec has no body with a free joint at the top.
     """
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in car.worldbody.bodies for joint in body.joints):
         raise ValueError("car: no body with a free joint at the top of the spec; a car must be able to move")
-    model = _stage(box_m)
+    model = _stage(scene_size_m)
     for points, kind in join_segments(scene.road, merge_tolerance_m):
         _add_boxes(model, points, COLOURS.get(kind, OTHER), half_width_m, height_m)
     agents = scene.agents
@@ -114,18 +114,18 @@ def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float
         yield points, int(kind[begin])
 
 
-def _stage(box_m: float) -> mujoco.MjSpec:
+def _stage(scene_size_m: float) -> mujoco.MjSpec:
     """Ground, light, a camera from above, and the viewer's scale."""
     model = mujoco.MjSpec()
     model.modelname = "scene"
-    model.stat.center, model.stat.extent = [0.0, 0.0, 0.0], box_m / 2
+    model.stat.center, model.stat.extent = [0.0, 0.0, 0.0], scene_size_m / 2
     model.visual.global_.offwidth, model.visual.global_.offheight = 1920, 1920
     model.visual.map.znear, model.visual.map.zfar = 0.005, 20.0  # in extents
     headlight, sun = model.visual.headlight, mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     headlight.ambient, headlight.diffuse, headlight.specular = [0.5, 0.5, 0.5], [0.2, 0.2, 0.2], [0.0, 0.0, 0.0]
     light = model.worldbody.add_light(type=sun, pos=[0, 0, 50], dir=[0.3, 0.2, -1.0], castshadow=False)
     light.diffuse, light.specular = [0.4, 0.4, 0.4], [0.0, 0.0, 0.0]
-    side = box_m / 2
+    side = scene_size_m / 2
     ground = mujoco.mjtGeom.mjGEOM_PLANE
     model.worldbody.add_geom(name="ground", type=ground, size=[side, side, 1.0], rgba=[0.22, 0.23, 0.25, 1.0])
     height = side / np.tan(np.deg2rad(22.5)) * 1.02

@@ -64,7 +64,7 @@ def write(
 def format_rerun_command(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
     default = configs.load_config("evaluate", "run=null", f"protocol={asked['protocol']}")
-    protocol = {**settings.get("protocol", default["protocol"]), "ends": asked["protocols"]}
+    protocol = {**settings.get("protocol", default["protocol"]), "termination": asked["protocols"]}
     own = {name: asked[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": asked["scenes"]}}
     own |= {"out": None, "protocol": protocol}
     wanted, usual = (

@@ -122,7 +122,7 @@ def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> t
             {"label": area.label, "colour": list(area.colour), "pieces": [np.round(piece, 2).tolist() for piece in area.pieces]}
             for area in patch_overlay.areas(scene.weather)
         ],
-        "others": users,
+        "traffic": users,
         "lights": [light._asdict() for light in posts.lights],
         "signs": [[round(x, 2), round(y, 2)] for x, y in posts.signs],
         "arrays": packer.directory,
