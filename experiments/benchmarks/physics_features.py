@@ -41,7 +41,7 @@ def costs(
 def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     """Worlds with others: where the source has none, cars driving straight on, so that every variant has something to look at."""
     present = worlds.agents.present
-    if worlds.others.valid.shape[1] or not count:
+    if worlds.traffic_log.valid.shape[1] or not count:
         return worlds
     rng = np.random.default_rng(seed)
     shape, steps = (present.shape[0], count), worlds.log.valid.shape[2]
@@ -57,7 +57,7 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     columns = {name: jnp.asarray(column, jnp.float32) for name, column in columns.items()}
     columns |= {"valid": jnp.ones((*shape, steps), bool), "kind": jnp.zeros(shape, jnp.int32)}
     tracks = jax.vmap(lambda columns: TrafficLog(**columns))(columns)
-    return replace(worlds, others=tracks)
+    return replace(worlds, traffic_log=tracks)
 
 
 def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, seed: int) -> dict[str, Any]:

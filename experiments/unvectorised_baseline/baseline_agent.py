@@ -38,7 +38,7 @@ class Agent:
     contact_force: float = 0.0  # largest of another car in the last control step, N
     active: bool = True
     age: int = 0  # control steps
-    happened: set[str] = dataclasses.field(default_factory=set)
+    past_events: set[str] = dataclasses.field(default_factory=set)
 
 
 class Segments(NamedTuple):
@@ -240,23 +240,23 @@ def measure(
 ) -> Facts:
     """Facts of the step that brought an agent from `before` to where it is, amid those who were on stage in it.
 
-    A car whose state is not finite has the event `fault` and nothing else.
+    A car whose state is not finite has the event `numerical_error` and nothing else.
     """
     if not np.isfinite([*agent.position, *agent.velocity, agent.elevation, agent.yaw, agent.upright, agent.contact_force]).all():
-        return Facts(0.0, 0.0, 0.0, 0.0, False, False, False, math.inf, math.inf, {name: name == "fault" for name in EVENTS})
+        return Facts(0.0, 0.0, 0.0, 0.0, False, False, False, math.inf, math.inf, {name: name == "numerical_error" for name in EVENTS})
     to_goal = agent.goal - agent.position
-    speed, strayed = math.hypot(*agent.velocity), math.hypot(*(agent.position - agent.start))
+    speed, distance_from_start = math.hypot(*agent.velocity), math.hypot(*(agent.position - agent.start))
     progress, offset, distance, alignment = _lane(place.lanes, agent, before, to_goal)
     has_lane = len(place.lanes.kind) > 0
     edge_gap, edge_ttc = _edges(place.edges, agent, crowd, edge_half_width_m, edge_range_m)
     fell = agent.upright < upright_min or agent.elevation < height_min_m
-    lost = strayed > max(max_start_distance_m, stray_ratio * agent.route)
+    lost = distance_from_start > max(max_start_distance_m, stray_ratio * agent.route)
     events = {
-        "fault": False,
-        "reached": math.hypot(*to_goal) <= goal_radius_m,
-        "collided": agent.contact_force >= collision_force_n and agent.age >= collision_grace_steps,
-        "crashed": fell or lost or bool(abs(agent.position).max() > 0.5 * scene_size_m),
-        "touched_edge": edge_gap <= edge_radius_m,
+        "numerical_error": False,
+        "goal_reached": math.hypot(*to_goal) <= goal_radius_m,
+        "collision": agent.contact_force >= collision_force_n and agent.age >= collision_grace_steps,
+        "out_of_bounds": fell or lost or bool(abs(agent.position).max() > 0.5 * scene_size_m),
+        "road_edge_contact": edge_gap <= edge_radius_m,
     }
     return Facts(
         speed=speed,
@@ -308,9 +308,9 @@ def _edges(edges: Segments, agent: Agent, crowd: Crowd, half_width_m: float, ran
 
 def judge(agent: Agent, facts: Facts, *, ending: list[str]) -> str | None:
     """The step's new event, which the agent remembers; it leaves the stage if that is an ending one."""
-    new = next((name for name in EVENTS if facts.events[name] and name not in agent.happened), None)
+    new = next((name for name in EVENTS if facts.events[name] and name not in agent.past_events), None)
     if new is not None:
-        agent.happened.add(new)
+        agent.past_events.add(new)
         agent.active = new not in ending
     return new
 

@@ -12,8 +12,8 @@ Differences from the environment on the device:
 - The engine has double precision and stops its solver by tolerance, with the config's iterations as the limit.
 - Contacts between cars are MuJoCo's box-box contacts with the spring's law (`oracle.meeting`). Several at once on one car do not share
   their strength, as `contact.forces` lets them.
-- A car that rolls over sinks through the road, since only tyres touch it; the event `crashed` comes all the same.
-- A number that is not finite breaks its whole world, not one car: all its agents end with `fault`.
+- A car that rolls over sinks through the road, since only tyres touch it; the event `out_of_bounds` comes all the same.
+- A number that is not finite breaks its whole world, not one car: all its agents end with `numerical_error`.
 - Finished cars hang in the air off stage, where nothing touches them.
 """
 

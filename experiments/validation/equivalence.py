@@ -116,7 +116,7 @@ def compare(
 def histograms(run: Run, reference: Run, *, bins: int) -> dict[str, Histogram]:
     """The wheels' forces of both runs over common bins; the range is the reference's, without its outermost thousandth."""
     quantities = {name: (getattr(run, name), getattr(reference, name)) for name in ("normal", "tangent", "slip")}
-    quantities["grip_use"] = (_use(run), _use(reference))
+    quantities["friction_utilization"] = (_use(run), _use(reference))
     found = {}
     for name, (one, other) in quantities.items():
         edges = np.linspace(0.0, max(float(np.quantile(other, 0.999)), 1e-6), bins + 1)

@@ -24,7 +24,7 @@ class Finding(NamedTuple):
     """What one fault did."""
 
     name: str  # of what became NaN
-    faults: int  # events `fault` of the broken car; 1 is right
+    faults: int  # events `numerical_error` of the broken car; 1 is right
     other_faults: int  # of everybody else
     ended: bool  # it is not active from that step on
     unclean: tuple[str, ...]  # leaves that hold NaN afterwards; its body may, if that is where the NaN was put
@@ -144,7 +144,7 @@ def judge(
 ) -> Finding:
     """Compare a run with a broken car with the run without a fault, and with the one in which the car left instead."""
     state, outcome = hurt
-    fault = np.asarray(outcome.events.fault)
+    fault = np.asarray(outcome.events.numerical_error)
     own = int(fault[:, world, agent].sum())
     ended = bool(fault[step, world, agent]) and not np.asarray(state.active)[step:, world, agent].any()
     agents = fault.shape[2]

@@ -77,7 +77,7 @@ def _encounters(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
 
 def _laws(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:
     """Of the shipped car; the other backends stand in the report's tables."""
-    own = result["backends"].get("mjx_car")
+    own = result["backends"].get("articulated")
     if own is None:
         return []
     arrays = {name: {key: np.array(value) for key, value in found.items()} for name, found in own.items()}

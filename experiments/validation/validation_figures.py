@@ -14,7 +14,7 @@ from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 Result = Mapping[str, Any]
 BATCHED, REFERENCE, GREY = COLOURS[0], COLOURS[1], "#777777"
 MARKERS = "osD^vP*X"
-NAMES = {"mjx_car": "mjx_car", "latched": "mjx_car, latched brakes", "published": "mjx_published", "bicycle": "bicycle"}
+NAMES = {"articulated": "articulated", "latched": "mjx_car, latched brakes", "published": "articulated_paper", "bicycle": "bicycle"}
 
 
 def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:
@@ -83,7 +83,12 @@ def settings(result: Result) -> Figure:
 
 def histograms(result: Result) -> Figure:
     """Forces, grip and slip of the wheels in both engines."""
-    shown = {"normal": "Normal force, kN", "tangent": "Friction force, kN", "grip_use": "Share of grip in use", "slip": "Slip, m/s"}
+    shown = {
+        "normal": "Normal force, kN",
+        "tangent": "Friction force, kN",
+        "friction_utilization": "Share of grip in use",
+        "slip": "Slip, m/s",
+    }
     with matplotlib.rc_context(STYLE):
         figure, grid = _panels(9.5, 5.2, 2, 2)
         for axes, (name, title) in zip(grid, shown.items(), strict=True):

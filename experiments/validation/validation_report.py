@@ -227,7 +227,7 @@ def _stopping(result: Result) -> Sequence[str]:
 def _hops(result: Result) -> str:
     """Why the way may be longer than that of tyres that slide throughout."""
     share = np.array(result["locked_c_m"]) / np.array(result["grip_limit_m"])
-    worst, friction = int(share.argmax()), result["backends"]["mjx_car"]["locked"]["friction"]
+    worst, friction = int(share.argmax()), result["backends"]["articulated"]["locked"]["friction"]
     return (
         f"The C engine needs up to {share[worst]:.3f} of the way of tyres that slide, at friction {friction[worst]:g}: "
         "wheels that lock so suddenly hop, and the soft contact does not reach the whole friction of a wheel's short landings."
@@ -244,7 +244,7 @@ def _ways(found: Mapping[str, np.ndarray]) -> list[str]:
 
 def _brakes(found: Mapping[str, Mapping[str, np.ndarray]], limit: np.ndarray) -> str:
     """What brakes as friction and latched ones do where wheels lock."""
-    pair = [found.get(str(NAMES[name])) for name in ("mjx_car", "latched")]
+    pair = [found.get(str(NAMES[name])) for name in ("articulated", "latched")]
     if pair[0] is None or pair[1] is None:
         return ""
     share = pair[1]["distance_m"] / limit

@@ -89,7 +89,9 @@ def make_pool(
     elif overrides:
         config = configs.apply_overrides(config, overrides)
     if not lives and config["spawning"]["respawn_clearance_m"] is not None:
-        raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null")
+        raise ConfigError(
+            f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null"
+        )
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
     scene_source.use_compilation_cache()

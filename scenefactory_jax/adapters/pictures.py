@@ -23,7 +23,7 @@ class ShownWorld(NamedTuple):
     scene: Array  # index into the pool
     motion: Motion
     active: Array  # [A]
-    happened: Events
+    past_events: Events
     agents: Agents
     weather: Weather
     boxes: Boxes
@@ -50,14 +50,14 @@ class Painter:
             yaw=shown.motion.yaw[None],
             speed=np.linalg.norm(shown.motion.velocity[:, :2], axis=-1)[None],
             active=shown.agents.present[None],  # a car that has ended still stands there
-            events={name: (happened & ~shown.active)[None] for name, happened in vars(shown.happened).items()},
+            events={name: (past_events & ~shown.active)[None] for name, past_events in vars(shown.past_events).items()},
             size=shown.agents.size,
             goal=shown.agents.goal,
             present=shown.agents.present,
             control_hz=self._pool.step_hz,
             title="",
             weather="",
-            others=drawing.Others(*(np.asarray(column)[None] for column in _columns(shown.boxes))),
+            traffic=drawing.Others(*(np.asarray(column)[None] for column in _columns(shown.boxes))),
         )
         left, bottom = place[0] - _SIDE_M / 2
         return video.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
@@ -81,7 +81,7 @@ def check_mode(mode: Any) -> None:
 def _shown(env: Env, scenes: Scene, world: Episode) -> ShownWorld:
     state = world.state
     now = env.now(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
-    return ShownWorld(world.scene, state.motion, state.active, state.happened, state.agents, state.weather, now.boxes)
+    return ShownWorld(world.scene, state.motion, state.active, state.past_events, state.agents, state.weather, now.traffic)
 
 
 def _columns(boxes: Boxes) -> list[np.ndarray]:

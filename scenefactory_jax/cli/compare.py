@@ -44,7 +44,7 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     schema.check(config, schema.COMPARE)
     if not config["metrics"]:
-        raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/reached")
+        raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/goal_reached")
     runs = [_read(folder) for folder in _find(config["runs"])]
     for run in runs:
         if missing := [name for name in (STEPS, *config["metrics"]) if name not in run.metrics[0]]:

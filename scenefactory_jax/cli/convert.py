@@ -31,12 +31,12 @@ def convert(config: Mapping[str, Any]) -> Summary:
         if config[key] is None:
             raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")
     scenes = config["scenes"]
-    features, built_in = config["features"], "scenefactory_jax.scenes"
+    features = config["features"]
     own = ("features", "bank", "quality", "lanes")
     settings = {key: scenes[key] for key in ("formats", "check", "pack")} | {key: config[key] for key in own}
     judged = {"rules": quality_gate.make(config["quality"]["rules"]), **{key: config["quality"][key] for key in ("reject", "drop")}}
     quality_gate.check_names(**judged)
-    rebuild = instantiate(config["lanes"]["topology"], builtins=f"{built_in}.topology", where="lanes.topology")
+    rebuild = instantiate(config["lanes"]["topology"], builtins="scenefactory_jax.roadgraph.lane_topology", where="lanes.topology")
     rebuild(NOTHING)  # which refuses numbers that make no sense, before a file is read
     readers = scene_source.make_readers(scenes)
     gate = functools.partial(quality_gate.gate, check=readers["check"], **judged)
@@ -47,9 +47,9 @@ def convert(config: Mapping[str, Any]) -> Summary:
             config["out"],
             **readers,
             refine=functools.partial(complete, check=readers["check"], rebuild=rebuild, gate=gate),
-            features=None if features is None else instantiate(features, builtins=f"{built_in}.catalogue", where="features"),
+            features=None if features is None else instantiate(features, builtins="scenefactory_jax.data.bank.catalogue", where="features"),
             settings=settings,
-            spread=instantiate(config["spread"], builtins=f"{built_in}.spread", where="spread"),
+            spread=instantiate(config["spread"], builtins="scenefactory_jax.core.parallel.task_map", where="spread"),
             **config["bank"],
             on_file=lambda done, total: bar.update(task, completed=done, total=total),
         )

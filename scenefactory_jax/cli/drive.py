@@ -172,7 +172,7 @@ def _show(
     scene_model.place_light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0
-    actors.add_others(marks, drawing.Others(*(np.asarray(getattr(seen.others, name))[None] for name in drawing.Others._fields)), 0)
+    actors.add_others(marks, drawing.Others(*(np.asarray(getattr(seen.traffic, name))[None] for name in drawing.Others._fields)), 0)
     turn = (float(yaw[built.car]) - heading + np.pi) % (2 * np.pi) - np.pi
     heading += turn / (1.0 + view.lag_s / built.dt)
     if now.chasing:
@@ -187,7 +187,7 @@ def dashboard(now: Drive, built: World) -> tuple[str, str]:
     seen, car = now.shot, built.car
     assert seen is not None
     lines = {
-        "speed": f"{3.6 * seen.speed[car]:.0f} km/h", "friction": f"{seen.grip[car]:.2f}", "grip used": f"{100 * seen.grip_use[car]:.0f} %",
+        "speed": f"{3.6 * seen.speed[car]:.0f} km/h", "friction": f"{seen.grip[car]:.2f}", "grip used": f"{100 * seen.friction_utilization[car]:.0f} %",
         "throttle": f"{now.wheel.throttle:.2f}", "brake": f"{now.wheel.brake:.2f}", "wheel": f"{now.wheel.steer:+.2f}",
         "contact": f"{seen.contact_force[car] / 1000:.0f} kN", "time": f"{now.steps * built.dt:.1f} s" + (", paused" if now.paused else ""),
     }  # fmt: skip

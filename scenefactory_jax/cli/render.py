@@ -40,7 +40,7 @@ def render(config: Mapping[str, Any]) -> Path:
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), loaded.scene)
     context = {"control_dt": 1.0 / config["timing"]["control_hz"]}
     who = instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context)
-    scene = replace(scene, boxes=who(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
+    scene = replace(scene, traffic=who(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
     spec = world(config, scene)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)

@@ -271,7 +271,7 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
             records, _ = examine(_weights(one, shared))
             with atomic_file.write_atomically(one.file) as half:
                 agent_metrics.write_csv(half, records)
-            counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("reached", "clean", "collided")]
+            counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("goal_reached", "clean", "collision")]
             print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
         longest = max(longest, time.monotonic() - begun)
     return True

@@ -16,7 +16,7 @@ from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import study_report as report
 
 RESULT, TRAINED = "result.json", "trained.json"
-CURVES = ("events/reached", "events/collided", "events/touched_edge", "reward")
+CURVES = ("events/goal_reached", "events/collision", "events/road_edge_contact", "reward")
 POINTS = 120  # of a learning curve
 DIGITS = 5
 AGENTS = "agents"  # folder of the tables of agents

@@ -145,7 +145,7 @@ def published(config: Mapping[str, Any]) -> tuple[Replay, np.ndarray]:
     """The published car, with its own friction of the surfaces and nothing left open."""
     friction = config["sysid"]["published_friction"]
     return candidate_simulation.make(
-        config["traffic"]["published"], parameter_space.make({}), friction, physics_hz=float(config["physics_hz"])
+        config["others"]["published"], parameter_space.make({}), friction, physics_hz=float(config["physics_hz"])
     ), np.zeros(0)
 
 

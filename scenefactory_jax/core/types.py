@@ -156,9 +156,9 @@ class Scene:
     agents: Agents
     log: AgentLog
     weather: Weather
-    others: TrafficLog
-    boxes: Boxes  # where the others are now; nobody is there until an environment says so
-    cells: SpatialGrid | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
+    traffic_log: TrafficLog
+    traffic: Boxes  # where the others are now; nobody is there until an environment says so
+    road_grid: SpatialGrid | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
 
 
 @pytree_dataclass
@@ -173,7 +173,7 @@ class Motion:
     steer: Float[Array, " A"]  # mean angle of the front wheels
     contact_force: Float[Array, " A"]  # largest force of another car or box in the last control step, N
     grip: Float[Array, " A"]  # friction coefficient, mean over the wheels
-    grip_use: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
+    friction_utilization: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
     slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
 
 
@@ -181,11 +181,11 @@ class Motion:
 class Events:
     """What can happen to an agent. At most one is true in one step: the order of the fields is the order of precedence."""
 
-    fault: Bool[Array, " A"]
-    reached: Bool[Array, " A"]
-    collided: Bool[Array, " A"]
-    crashed: Bool[Array, " A"]
-    touched_edge: Bool[Array, " A"]
+    numerical_error: Bool[Array, " A"]
+    goal_reached: Bool[Array, " A"]
+    collision: Bool[Array, " A"]
+    out_of_bounds: Bool[Array, " A"]
+    road_edge_contact: Bool[Array, " A"]
 
 
 @pytree_dataclass
@@ -206,10 +206,10 @@ class StepMetrics:
     edge_ttc: Float[Array, " A"]
     edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2
-    strayed: Float[Array, " A"]  # distance from the start
+    distance_from_start: Float[Array, " A"]  # distance from the start
     contact_force: Float[Array, " A"]
     grip: Float[Array, " A"]
-    grip_use: Float[Array, " A"]
+    friction_utilization: Float[Array, " A"]
     slip: Float[Array, " A"]
     off_lane: Bool[Array, " A"]
     idle: Bool[Array, " A"]
@@ -225,7 +225,7 @@ class State:
     agents: Agents  # this episode's starts and goals
     weather: Weather  # this episode's road condition
     active: Bool[Array, " A"]  # on stage and not finished
-    happened: Events  # events so far, in this agent's life
+    past_events: Events  # events so far, in this agent's life
     age: Int[Array, " A"]  # control steps since the agent's own start
     previous_action: Float[Array, "A 3"]
     step: Int[Array, ""]

@@ -32,7 +32,7 @@ class Body:
     yaw_rate: Float[Array, " A"]
     contact_force: Float[Array, " A"]
     grip: Float[Array, " A"]
-    grip_use: Float[Array, " A"]
+    friction_utilization: Float[Array, " A"]
 
 
 def make(
@@ -68,7 +68,7 @@ def make(
         drag: deceleration per speed, 1/s; `air_drag` per speed squared, 1/m.
         speed_limit: m/s.
         contact: numbers of `contact.make`.
-        grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `grip_use` is the acceleration over friction times
+        grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `friction_utilization` is the acceleration over friction times
             gravity and exceeds one where a real car would slide.
 
     Raises:
@@ -86,11 +86,11 @@ def make(
         moved = integrate_bicycle(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
         mu = grip(scene.weather, body.position, body.speed)
         cars = collect_boxes(read(moved, height=centre_height), scene.agents.size, active, mass)
-        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.boxes), control_dt))
+        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.traffic), control_dt))
         along, across = (moved.speed - body.speed) / control_dt, moved.yaw_rate * moved.speed
         wanted = safe_norm(jnp.stack([along, across], axis=-1))
-        moved = replace(moved, contact_force=force, grip=mu, grip_use=wanted / (mu * GRAVITY))
-        held = replace(body, contact_force=jnp.zeros_like(force), grip_use=jnp.zeros_like(force))
+        moved = replace(moved, contact_force=force, grip=mu, friction_utilization=wanted / (mu * GRAVITY))
+        held = replace(body, contact_force=jnp.zeros_like(force), friction_utilization=jnp.zeros_like(force))
         return tree_where(active, moved, held)
 
     return Dynamics(init=init, advance=advance, read=functools.partial(read, height=centre_height))
@@ -152,6 +152,6 @@ def read(body: Body, *, height: float) -> Motion:
         steer=body.steer,
         contact_force=body.contact_force,
         grip=body.grip,
-        grip_use=body.grip_use,
+        friction_utilization=body.friction_utilization,
         slip=zero,
     )

@@ -62,7 +62,9 @@ def make(
     check_numbers({"damping": damping, "friction": friction, "nearest": nearest}, where="dynamics.contact", least=0.0)
     if physics_dt is not None:
         _check_stable(stiffness, damping, mass / 2, physics_dt=physics_dt)
-    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height)
+    numbers = dict(
+        stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height
+    )
     return Contact(functools.partial(find_neighbours, nearest=nearest), functools.partial(compute_forces, **numbers))
 
 

@@ -57,7 +57,7 @@ def make(
             steer=zero,
             contact_force=zero,
             grip=grip(scene.weather, position, safe_norm(velocity)),
-            grip_use=zero,
+            friction_utilization=zero,
             slip=zero,
         )
 
@@ -68,7 +68,7 @@ def make(
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         motion = at(scene, body.steps + 1)
         cars = collect_boxes(motion, scene.agents.size, active, mass)
-        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.boxes), control_dt))
+        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.traffic), control_dt))
         moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
         return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 

@@ -31,7 +31,18 @@ from scenefactory_jax.core.types import (
 from scenefactory_jax.env import observations, rewards, spawning, termination
 from scenefactory_jax.weather import friction, rain, road_condition
 
-GROUPS = ("timing", "actions", "dynamics", "weather", "spawning", "traffic", "step_metrics", "termination", "reward", "observations")  # of a config
+GROUPS = (
+    "timing",
+    "actions",
+    "dynamics",
+    "weather",
+    "spawning",
+    "traffic",
+    "step_metrics",
+    "termination",
+    "reward",
+    "observations",
+)  # of a config
 
 
 KEYS = {  # of the groups that no one function takes
@@ -55,7 +66,7 @@ class EnvParts(NamedTuple):
     hold: int  # control steps from one action to the next
     draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
     draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
-    others: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
+    traffic: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
     measure: Callable[[Scene, State, State], StepMetrics]
     judge: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
     terms: Mapping[str, tuple[float, rewards.Term]]
@@ -103,9 +114,11 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         hold=_hold(config),
         draw_agents=spawning.make(config["spawning"]["sampler"]),
         draw_weather=road_condition.make(config["weather"]),
-        others=instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context),
+        traffic=instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context),
         measure=bound({"_target_": "compute", **config["step_metrics"]}, where="step_metrics"),
-        judge=instantiate({"_target_": "evaluate", **config["termination"]}, builtins="scenefactory_jax.env.termination", where="termination"),
+        judge=instantiate(
+            {"_target_": "evaluate", **config["termination"]}, builtins="scenefactory_jax.env.termination", where="termination"
+        ),
         terms=rewards.make(config["reward"], **context),
         groups=observations.make(config["observations"], **context),
         episode_steps=episode_steps(timing),
@@ -223,14 +236,14 @@ def find_truncated_agents(outcome: StepResult, active: Bool[Array, "*W A"]) -> B
 
 def _now(parts: EnvParts, scene: Scene, state: State) -> Scene:
     """The scene as it is at a state's moment: this episode's agents and weather, and the others where they are."""
-    return replace(scene, agents=state.agents, weather=state.weather, boxes=parts.others(scene, state.step))
+    return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic(scene, state.step))
 
 
 def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
     """A fresh episode, or one whose clock is already at a later control step: rain and the others are as they are then."""
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
-    scene = replace(scene, boxes=parts.others(scene, step))
+    scene = replace(scene, traffic=parts.traffic(scene, step))
     agents = spawning.admit_cars(parts.draw_agents(agents_key, scene))
     weather = rain.advance_rain(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
@@ -242,7 +255,7 @@ def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""
         agents=agents,
         weather=weather,
         active=agents.present,
-        happened=termination.make_empty_events(count),
+        past_events=termination.make_empty_events(count),
         age=jnp.zeros(count, jnp.int32),
         previous_action=jnp.zeros((count, 3), jnp.float32),
         step=step,
@@ -258,8 +271,8 @@ def _transition(parts: EnvParts, scene: Scene, state: State, action: Float[Array
     after = _advance(parts.dynamics, scene, state, action)
     scene = _now(parts, scene, after)
     measured, after = _restore_non_finite(parts.measure(scene, state, after), state, after)
-    events, done = parts.judge(measured, state.happened, state.active)
-    after = replace(after, active=state.active & ~done, happened=jax.tree.map(jnp.logical_or, state.happened, events))
+    events, done = parts.judge(measured, state.past_events, state.active)
+    after = replace(after, active=state.active & ~done, past_events=jax.tree.map(jnp.logical_or, state.past_events, events))
     reward, terms = rewards.sum_terms(RewardInput(scene, state, after.previous_action, after, measured, events), parts.terms)
     truncated = after.step >= parts.episode_steps
     if parts.respawn_clearance_m is None:
@@ -296,7 +309,7 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
 def _restore_non_finite(measured: StepMetrics, before: State, after: State) -> tuple[StepMetrics, State]:
     """A car whose motion is no longer finite is put back where it last was, and its action forgotten: its NaN reaches neither rewards nor
     observations nor anybody else."""
-    fault = measured.events.fault
+    fault = measured.events.numerical_error
     clean = StepMetrics(**{name: _finite(value) for name, value in vars(measured).items() if name != "events"}, events=measured.events)
     body, motion = tree_where(fault, (before.body, before.motion), (after.body, after.motion))
     action = jnp.where(fault[:, None], 0.0, after.previous_action)  # it may be what was broken
@@ -314,7 +327,7 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
     fresh = spawning.admit_cars(draw_agents(draw_key, scene))
     body = dynamics.init(body_key, replace(scene, agents=fresh))
     waiting = ~state.active & fresh.present & is_finite(dynamics.read(body))
-    clear = spawning.is_clear(fresh, state.motion.position[:, :2], state.active, scene.boxes, clear_m=clear_m)
+    clear = spawning.is_clear(fresh, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
     begins = waiting & clear
     agents, body = tree_where(begins, (fresh, body), (state.agents, state.body))
     count = begins.shape[0]
@@ -324,7 +337,7 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
         motion=dynamics.read(body),
         agents=agents,
         active=state.active | begins,
-        happened=tree_where(begins, termination.make_empty_events(count), state.happened),
+        past_events=tree_where(begins, termination.make_empty_events(count), state.past_events),
         age=jnp.where(begins, 0, state.age),
         previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
         key=key,

@@ -226,7 +226,7 @@ def _nearest(
     Their mask says who is there at all, the pairs how each of them and the car meet.
     """
     motion, cars = state.motion, len(state.active)
-    everyone = surrogate_safety.collect_road_users(motion, state.agents.size, state.active, scene.boxes)
+    everyone = surrogate_safety.collect_road_users(motion, state.agents.size, state.active, scene.traffic)
     others = everyone.present[None] & ~jnp.eye(cars, len(everyone.present), dtype=bool)
     apart = everyone.position[None] - everyone.position[:cars, None]
     squared = jnp.where(others, dot(apart, apart), jnp.inf)

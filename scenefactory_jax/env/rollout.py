@@ -37,12 +37,12 @@ class StepRecord:
     edge_ttc: Float[Array, " A"]
     goal_distance: Float[Array, " A"]
     grip: Float[Array, " A"]
-    grip_use: Float[Array, " A"]
+    friction_utilization: Float[Array, " A"]
     slip: Float[Array, " A"]
     contact_force: Float[Array, " A"]
     wheels: Tyres | None  # None: the dynamics has no wheels of its own
     joints: Float[Array, "A 17"] | None  # chassis and wheels in MuJoCo's order; None: the dynamics has no joints
-    others: Boxes
+    traffic: Boxes
     film_mm: Float[Array, ""]  # of water on the open road
 
 
@@ -104,11 +104,11 @@ def make_step_record(env: Env, scene: Scene, before: State, after: State, outcom
         edge_ttc=facts.edge_ttc,
         goal_distance=facts.goal_distance,
         grip=facts.grip,
-        grip_use=facts.grip_use,
+        friction_utilization=facts.friction_utilization,
         slip=facts.slip,
         contact_force=facts.contact_force,
         wheels=tyres if isinstance(tyres, Tyres) else None,
         joints=joints,
-        others=env.now(scene, after).boxes,
+        traffic=env.now(scene, after).traffic,
         film_mm=after.weather.film_mm,
     )

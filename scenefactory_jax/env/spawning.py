@@ -130,7 +130,7 @@ def along_log(
     row = jnp.maximum(row, jnp.argmax(log.valid, axis=1)[:, None])  # nor before the car is first seen
     read = jax.vmap(lambda track, rows: track[rows])
     start = read(log.position, row)
-    usable = cars.present[:, None] & read(log.valid, row) & ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
+    usable = cars.present[:, None] & read(log.valid, row) & ~_beside(start, scene.traffic, within_m=0.5 * start_gap_m)
     goals = jnp.broadcast_to(cars.goal[:, None], start.shape)
     chosen, present = _choose(start, goals, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
     pick = functools.partial(_pick, chosen=chosen, present=present)
@@ -180,7 +180,7 @@ def random_pairs(
         & (jnp.abs(goal_arc - start_arc - travel) < CONTIGUOUS_M)
         & (jnp.abs(last_arc - first_arc - travel - 2 * margin_m) < 2 * CONTIGUOUS_M)
     )
-    unbroken &= ~_beside(start, scene.boxes, within_m=0.5 * start_gap_m)
+    unbroken &= ~_beside(start, scene.traffic, within_m=0.5 * start_gap_m)
     chosen, present = _choose(start, goal, unbroken, start_gap_m=start_gap_m, goal_gap_m=goal_gap_m)
     pick = functools.partial(_pick, chosen=chosen, present=present)
     size = jnp.broadcast_to(jnp.array(car_size_m, jnp.float32), (slots, 2))

@@ -46,10 +46,10 @@ def compute(
     Args:
         kernels: Triton kernels for the road where there is an NVIDIA GPU; False: plain JAX everywhere.
     """
-    motion, active, cars, fault = after.motion, before.active, len(before.active), _are_broken(after)
+    motion, active, cars, broken = after.motion, before.active, len(before.active), _are_broken(after)
     position, velocity = motion.position[:, :2], motion.velocity[:, :2]
     everyone = surrogate_safety.collect_road_users(
-        motion, after.agents.size, active & ~fault, scene.boxes
+        motion, after.agents.size, active & ~broken, scene.traffic
     )  # a faulty car collides with nothing
     centres, radius = cover_with_circles(everyone.position, everyone.yaw, everyone.size, **circles)
     pairs = surrogate_safety.compare_pairs(centres, radius, everyone.velocity, motion.yaw, drac_gap_floor_m=drac_gap_floor_m)
@@ -57,14 +57,20 @@ def compute(
     edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
     beside = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
     lane, edge_gap = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
-    strayed = safe_norm(position - after.agents.position)
-    limits = {"upright_min": upright_min, "height_min_m": height_min_m, "scene_size_m": scene_size_m, "max_start_distance_m": max_start_distance_m, "stray_ratio": stray_ratio}
+    distance_from_start = safe_norm(position - after.agents.position)
+    limits = {
+        "upright_min": upright_min,
+        "height_min_m": height_min_m,
+        "scene_size_m": scene_size_m,
+        "max_start_distance_m": max_start_distance_m,
+        "stray_ratio": stray_ratio,
+    }
     events = Events(
-        fault=fault,
-        reached=safe_norm(to_goal) <= goal_radius_m,
-        collided=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
-        crashed=_has_crashed(motion, after.agents, strayed, **limits),
-        touched_edge=edge_gap <= 0,
+        numerical_error=broken,
+        goal_reached=safe_norm(to_goal) <= goal_radius_m,
+        collision=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
+        out_of_bounds=_has_crashed(motion, after.agents, distance_from_start, **limits),
+        road_edge_contact=edge_gap <= 0,
     )
     return StepMetrics(
         speed=speed,
@@ -76,8 +82,8 @@ def compute(
         edge_ttc=beside.edge_ttc,
         edge_gap=edge_gap,
         drac=jnp.max(jnp.where(everyone.present[None], pairs.drac, 0.0), axis=1),
-        strayed=strayed,
-        **{name: getattr(motion, name) for name in ("contact_force", "grip", "grip_use", "slip")},
+        distance_from_start=distance_from_start,
+        **{name: getattr(motion, name) for name in ("contact_force", "grip", "friction_utilization", "slip")},
         off_lane=lane["has_lane"] & ((lane["lane_offset"] > off_lane_lateral_m) | (lane["lane_distance"] > off_lane_distance_m)),
         idle=speed < idle_speed_mps,
         events=events,
@@ -95,12 +101,20 @@ def _stopping(speed: Float[Array, " A"], grip: Float[Array, " A"], gravity_mps2:
 
 
 def _has_crashed(
-    motion: Motion, agents: Agents, strayed: Float[Array, " A"], *, upright_min, height_min_m, scene_size_m, max_start_distance_m, stray_ratio
+    motion: Motion,
+    agents: Agents,
+    distance_from_start: Float[Array, " A"],
+    *,
+    upright_min,
+    height_min_m,
+    scene_size_m,
+    max_start_distance_m,
+    stray_ratio,
 ) -> Bool[Array, " A"]:
     """Tipped over or fallen, outside the scene, or further from the start than any way to the goal asks for."""
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * scene_size_m
-    return fell | outside | (strayed > jnp.maximum(max_start_distance_m, stray_ratio * agents.route))
+    return fell | outside | (distance_from_start > jnp.maximum(max_start_distance_m, stray_ratio * agents.route))
 
 
 def _measure_lane(scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]) -> dict[str, Array]:

@@ -12,17 +12,17 @@ from scenefactory_jax.core.types import Events, StepMetrics
 EVENTS = tuple(field.name for field in dataclasses.fields(Events))
 
 
-def evaluate(facts: StepMetrics, happened: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
+def evaluate(facts: StepMetrics, past_events: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
     """New events of this step and the agents that they end.
 
     An event is new once in an agent's life. If several are new in one step, the first in the order of `EVENTS` counts (the paper's events
-    are mutually exclusive). `ending` names the events after which an agent leaves the stage; the others are only noted (an "invincible"
+    are mutually exclusive). `ending` names the events after which an agent leaves the stage; the others are only noted (an "goal_only"
     agent).
     """
     taken = jnp.zeros_like(active)
     new = {}
     for name in EVENTS:
-        new[name] = getattr(facts.events, name) & ~getattr(happened, name) & active & ~taken
+        new[name] = getattr(facts.events, name) & ~getattr(past_events, name) & active & ~taken
         taken = taken | new[name]
     done = jnp.zeros_like(active)
     for name in ending:
@@ -40,7 +40,7 @@ def check(ending: Any, *, where: str) -> None:
     for name in ending:
         if name not in EVENTS:
             raise ConfigError(f"{where}.ending: unknown event {name!r}; valid: {', '.join(EVENTS)}")
-    if "fault" not in ending or "reached" not in ending:
+    if "numerical_error" not in ending or "goal_reached" not in ending:
         raise ConfigError(f"{where}.ending: {ending} must hold 'fault' and 'reached': a broken or a finished car cannot drive on")
 
 

@@ -31,7 +31,7 @@ def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: float, start
         start_row: row of the log at which episodes begin; a vehicle that is not seen then is left out.
         elevation_m: of the boxes' centres.
     """
-    others = scene.others
+    others = scene.traffic_log
     row = min(start_row, others.valid.shape[1] - 1)
     zero = jnp.zeros_like(others.yaw[:, row])
     return Boxes(
@@ -76,7 +76,7 @@ def log_traffic(
     Raises:
         ConfigError: `mass_kg` does not name exactly ROAD_USERS, or a mass is not above 0.
     """
-    others, dt = scene.others, scene.log.dt
+    others, dt = scene.traffic_log, scene.log.dt
     row = start_row + step.astype(jnp.float32) * (control_dt / dt)
     row = jnp.where(jnp.abs(row - jnp.round(row)) < SNAP, jnp.round(row), row)
     before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(others.valid)

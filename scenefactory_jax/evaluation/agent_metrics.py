@@ -19,12 +19,12 @@ Records = Mapping[str, np.ndarray]
 
 COLUMNS: dict[str, type] = {
     "scene": str, "world": int, "seed": int, "agent": int,
-    "reached": bool, "collided": bool, "crashed": bool, "touched_edge": bool, "fault": bool, "clean": bool,
+    "goal_reached": bool, "collision": bool, "out_of_bounds": bool, "road_edge_contact": bool, "numerical_error": bool, "clean": bool,
     "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
     "max_drac": float, "min_ttc_s": float, "mean_ttc_s": float, "has_ttc": bool, "mean_speed": float, "max_contact_force_n": float,
-    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "grip_use": float, "stopping_margin_m": float,
+    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "friction_utilization": float, "stopping_margin_m": float,
 }  # fmt: skip
-EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")
+EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
 NEAR_MISS_TTC = 2.0  # s
 BEND = 1.05  # way over straight line
@@ -84,7 +84,7 @@ def _unfinished(records: Records) -> np.ndarray:
 
 
 METRICS: dict[str, Metric] = {
-    "success_rate": _share("Success rate", "Agents that came within the goal radius, of all spawned agents.", "reached"),
+    "success_rate": _share("Success rate", "Agents that came within the goal radius, of all spawned agents.", "goal_reached"),
     "clean_success_rate": _share(
         "Clean success rate", "Agents that reached the goal and had no other event, of all spawned agents.", "clean"),
     "clean_bend_rate": Metric(
@@ -92,10 +92,10 @@ METRICS: dict[str, Metric] = {
         "straight line to the goal. Most ways are straight, and on those a car that nobody steers arrives, too.",
         lambda records: records["clean"], _bends, rate=True),
     "collision_rate": _share(
-        "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collided"),
-    "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "touched_edge"),
-    "crash_rate": _share("Crash rate", "Agents that tipped over, fell or strayed too far, of all spawned agents.", "crashed"),
-    "fault_rate": _share("Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "fault"),
+        "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collision"),
+    "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "road_edge_contact"),
+    "crash_rate": _share("Crash rate", "Agents that tipped over, fell or strayed too far, of all spawned agents.", "out_of_bounds"),
+    "fault_rate": _share("Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "numerical_error"),
     "unfinished_rate": Metric(
         "Out of time", SHARE, "Agents with no event at all when the episode's time was up, of all spawned agents.",
         _unfinished, _spawned, rate=True),
@@ -115,16 +115,16 @@ METRICS: dict[str, Metric] = {
         lambda records: records["min_ttc_s"] < NEAR_MISS_TTC, _spawned, by_world=True, rate=True),
     "mean_time_to_goal_s": Metric(
         "Time to goal", "s", "Mean time from start to goal of the agents that reached it.",
-        lambda records: records["time_s"], lambda records: np.asarray(records["reached"], bool)),
+        lambda records: records["time_s"], lambda records: np.asarray(records["goal_reached"], bool)),
     "mean_remaining_m": Metric(
         "Remaining distance", "m", "Mean straight-line distance to the goal at the end, of all spawned agents.",
         lambda records: records["end_distance_m"], _spawned),
     "yaw_acceleration": Metric(
         "Yaw acceleration", "rad/s²", "|Change of the yaw rate| over time: each agent's mean over its steps; mean over agents. A car that "
         "weaves shows here; at no moment beyond 1.93 is comfortable (nuPlan).", lambda records: records["yaw_acceleration"], _spawned),
-    "grip_use": Metric(
+    "friction_utilization": Metric(
         "Friction use", SHARE, "Tyre force over what the road's friction allows: each agent's mean over its steps; mean over agents.",
-        lambda records: records["grip_use"], _spawned),
+        lambda records: records["friction_utilization"], _spawned),
     "stopping_margin_m": Metric(
         "Stopping margin", "m", "Way free straight ahead less the way to a stop with all of the road's friction, v²/(2 µ g): each agent's "
         "least; mean over the agents that had anybody ahead.",

@@ -33,7 +33,9 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
     if "pack" in config.get("scenes", {}):
         pack = config["scenes"]["pack"]
         if {"agents", "centre", "scene_size_m"} <= set(pack):
-            found["Scenes"] = f"up to {pack['agents']} agents in {pack['scene_size_m']:g} m x {pack['scene_size_m']:g} m, centre {pack['centre']}"
+            found["Scenes"] = (
+                f"up to {pack['agents']} agents in {pack['scene_size_m']:g} m x {pack['scene_size_m']:g} m, centre {pack['centre']}"
+            )
     return found
 
 

@@ -50,7 +50,9 @@ def make_episode_runner(
         worlds: how many of the worlds to record; None: all.
         steps: how many of the steps to record; None: all.
     """
-    once = {"spawning": {**config["spawning"], "respawn_clearance_m": None}}  # an agent is judged by one life, also of a run that starts it again
+    once = {
+        "spawning": {**config["spawning"], "respawn_clearance_m": None}
+    }  # an agent is judged by one life, also of a run that starts it again
     env, policy = (
         environment.make_env({**config, **once, "termination": configs.load_config("task", f"termination={protocol}")["termination"]}),
         make_policy(config),
@@ -78,7 +80,7 @@ def make_episode_runner(
 
     @jax.jit
     def boxes(scene, state):  # that depends on nothing but the scene and the step, so it need not be kept
-        at = lambda step: env.now(scene, replace(state, step=step)).boxes  # noqa: E731
+        at = lambda step: env.now(scene, replace(state, step=step)).traffic  # noqa: E731
         return jax.lax.map(at, jnp.arange(1, steps + 1, dtype=jnp.int32))
 
     def run(parameters):
@@ -108,8 +110,8 @@ def _records(
     """One row for every spawned agent of every world; film and surface are the open road's at the start."""
     row_world, row_agent = np.nonzero(present)
     of = lambda leaf: np.asarray(leaf)[row_world, row_agent]  # noqa: E731
-    events = {name: of(value) for name, value in vars(tally.happened).items()}
-    others = events["collided"] | events["crashed"] | events["touched_edge"] | events["fault"]
+    events = {name: of(value) for name, value in vars(tally.past_events).items()}
+    others = events["collision"] | events["out_of_bounds"] | events["road_edge_contact"] | events["numerical_error"]
     steps = np.maximum(of(tally.steps), 1)
     seen = of(tally.ttc_steps)
     return {
@@ -118,7 +120,7 @@ def _records(
         "seed": np.full(len(row_world), seed),
         "agent": row_agent,
         **events,
-        "clean": events["reached"] & ~others,
+        "clean": events["goal_reached"] & ~others,
         "time_s": of(tally.steps) / control_hz,
         "route_m": of(state.agents.route),
         "start_distance_m": of(started),
@@ -133,7 +135,7 @@ def _records(
         "film_mm": np.asarray(weather.film_mm)[row_world],
         "surface": np.array(SURFACES)[np.asarray(weather.surface)[row_world]],
         "friction": of(tally.grip_sum) / steps,
-        "grip_use": of(tally.grip_use_sum) / steps,
+        "friction_utilization": of(tally.grip_use_sum) / steps,
         "stopping_margin_m": of(tally.margin_min),
     }
 
@@ -188,7 +190,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_describe(weather, seconds=end / control_hz),
-        others=Others(*(np.asarray(getattr(boxes, name))[:end] for name in Others._fields)),
+        traffic=Others(*(np.asarray(getattr(boxes, name))[:end] for name in Others._fields)),
     )
 
 

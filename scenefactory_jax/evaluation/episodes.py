@@ -24,7 +24,7 @@ Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 class EpisodeMetrics:
     """Running record of one episode."""
 
-    happened: Events
+    past_events: Events
     ended: Bool[Array, " A"]
     steps: Int[Array, " A"]
     goal_distance: Float[Array, " A"]
@@ -70,7 +70,7 @@ def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
     zero, none = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32)
     distance = jnp.linalg.norm(state.agents.goal - state.motion.position[:, :2], axis=1)
     tally = EpisodeMetrics(
-        happened=termination.make_empty_events(count),
+        past_events=termination.make_empty_events(count),
         ended=jnp.zeros(count, bool),
         steps=none,
         goal_distance=distance,
@@ -103,8 +103,8 @@ def run_episode_chunk(
         before = replace(episode.state, active=episode.state.active & ~episode.over)
         action = act(parameters, episode.observation)
         state, outcome = env.transition(scene, before, action)
-        seen, boxes = episode.tally, env.now(scene, state).boxes
-        found = failure_signals.update(seen.clues, seen.happened, scene.lanes, boxes, before, state, outcome.facts, **notes)
+        seen, boxes = episode.tally, env.now(scene, state).traffic
+        found = failure_signals.update(seen.clues, seen.past_events, scene.lanes, boxes, before, state, outcome.facts, **notes)
         tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
         place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = EpisodeFrame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
@@ -117,12 +117,12 @@ def _note(
     tally: EpisodeMetrics, before: State, after: State, outcome: StepResult, found: FailureSignals, *, ttc_limit_s: float
 ) -> EpisodeMetrics:
     facts = outcome.facts
-    active = before.active & ~facts.events.fault  # a broken car's facts are no measurements
+    active = before.active & ~facts.events.numerical_error  # a broken car's facts are no measurements
     seen = active & jnp.isfinite(facts.ttc)
-    happened = jax.tree.map(lambda old, new: old | (new & before.active), tally.happened, facts.events)
+    past_events = jax.tree.map(lambda old, new: old | (new & before.active), tally.past_events, facts.events)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
     return EpisodeMetrics(
-        happened=happened,
+        past_events=past_events,
         ended=tally.ended | (outcome.done & before.active),
         steps=tally.steps + active.astype(jnp.int32),
         goal_distance=jnp.where(active, facts.goal_distance, tally.goal_distance),
@@ -133,7 +133,7 @@ def _note(
         speed_sum=add(tally.speed_sum, facts.speed),
         swing_sum=add(tally.swing_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
         grip_sum=add(tally.grip_sum, facts.grip),
-        grip_use_sum=add(tally.grip_use_sum, facts.grip_use),
+        grip_use_sum=add(tally.grip_use_sum, facts.friction_utilization),
         margin_min=jnp.minimum(tally.margin_min, jnp.where(active, facts.stopping_margin, jnp.inf)),
         force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
         clues=found,

@@ -16,7 +16,7 @@ from scenefactory_jax.env.termination import EVENTS
 from scenefactory_jax.roadgraph.queries import squared_segment_distance
 
 REACH_M = 0.5  # boxes this much larger on every side touch whom the car touched, also where the impact has parted them already
-FAILURE_EVENTS = tuple(name for name in EVENTS if name != "reached")  # the order of precedence, as everywhere
+FAILURE_EVENTS = tuple(name for name in EVENTS if name != "goal_reached")  # the order of precedence, as everywhere
 
 
 @pytree_dataclass
@@ -69,7 +69,7 @@ def begin(state: State, distance: Float[Array, " A"]) -> FailureSignals:
 
 def update(
     clues: FailureSignals,
-    happened: Events,
+    past_events: Events,
     lanes: Road,
     boxes: Boxes,
     before: State,
@@ -96,14 +96,14 @@ def update(
         rest_m: radius of the circle that a car at rest does not leave.
         near_m: who has been within this distance of the goal was near it.
     """
-    active, motion = before.active & ~facts.events.fault, after.motion  # a broken car's facts are no measurements
+    active, motion = before.active & ~facts.events.numerical_error, after.motion  # a broken car's facts are no measurements
     place = motion.position[:, :2]
     now = EventMoment(jnp.broadcast_to(after.step, active.shape), place)
     driven = safe_norm(place - before.motion.position[:, :2])
 
     harms = jnp.stack([getattr(facts.events, name) for name in FAILURE_EVENTS])
     harmed = before.active & harms.any(0) & ~clues.harmed
-    met = active & facts.events.collided & ~happened.collided
+    met = active & facts.events.collision & ~past_events.collision
     closer = active & (facts.goal_distance < clues.closest_m)
     closest = jnp.where(closer, facts.goal_distance, clues.closest_m)
     gone = jnp.where(active & (closest <= near_m), facts.goal_distance - closest, 0.0)

@@ -25,7 +25,7 @@ class Kind(NamedTuple):
 
 
 KINDS: dict[str, Kind] = {
-    "fault": Kind("fault of the simulation", "the car's state is no longer finite: a bug, no driving error.", "speed before", "m/s"),
+    "numerical_error": Kind("fault of the simulation", "the car's state is no longer finite: a bug, no driving error.", "speed before", "m/s"),
     "at_fault": Kind(
         "collision, at fault", "the first event is a collision into which the car itself drove: it moved towards the other (by "
         "`own_mps` or more, along the normal of the contact) with at least `own_share` of the closing speed. Into a parked or standing car "
@@ -46,8 +46,14 @@ KINDS: dict[str, Kind] = {
         "stuck", "no event; in the last `stuck_s` or longer it did not leave a circle of `rest_m` about one place.", "stood still", "s"),
     "out_of_time": Kind("out of time", "no event; still under way when time was up.", "left to the goal", "m"),
 }  # fmt: skip
-FLAGS = {"at_fault": "at fault in a collision", "wrong_way": "wrong way", "overshot": "overshoot", "stuck": "stuck", "reached": "arrived"}
-_HARMS = {"fault": "fault", "crashed": "crash", "touched_edge": "edge"}
+FLAGS = {
+    "at_fault": "at fault in a collision",
+    "wrong_way": "wrong way",
+    "overshot": "overshoot",
+    "stuck": "stuck",
+    "goal_reached": "arrived",
+}
+_HARMS = {"numerical_error": "numerical_error", "out_of_bounds": "crash", "road_edge_contact": "edge"}
 
 
 class Failure(NamedTuple):
@@ -64,9 +70,7 @@ class Failure(NamedTuple):
     flags: tuple[str, ...]  # keys of FLAGS; those that the kind says already are left out
 
 
-def classify(
-    clues: Records, *, own_share: float, own_mps: float, stuck_s: float, away_m: float
-) -> dict[str, np.ndarray]:
+def classify(clues: Records, *, own_share: float, own_mps: float, stuck_s: float, away_m: float) -> dict[str, np.ndarray]:
     """Columns for records: each agent's kind, its moment and severity, the flags, and what was measured for them.
 
     Args:
@@ -77,9 +81,9 @@ def classify(
     own, other = np.maximum(clues["own_mps"], 0.0), np.maximum(clues["other_mps"], 0.0)
     drove = (own >= own_mps) & (own >= own_share * (own + other))
     head_on = drove & (other >= own_share * (own + other))
-    at_fault = clues["collided"] & drove & ~(head_on & clues["other_against"] & ~clues["own_against"])
+    at_fault = clues["collision"] & drove & ~(head_on & clues["other_against"] & ~clues["own_against"])
     closing = np.maximum(clues["own_mps"] + clues["other_mps"], 0.0)
-    late = ~clues["reached"]
+    late = ~clues["goal_reached"]
     stuck = late & (clues["still_s"] >= stuck_s)
     overshot = late & (clues["gone_m"] >= away_m)
 
@@ -87,7 +91,7 @@ def classify(
     candidates = {"wrong_way": (clues["wrong_way"], "against"), "overshoot": (overshot, "closest"), "stuck": (stuck, "rest")}
     begun = np.stack([np.where(true, clues[f"{moment}_s"], np.inf) for true, moment in candidates.values()])
     kind = np.where(np.isfinite(begun).any(0), np.array(list(candidates))[np.argmin(begun, axis=0)], "out_of_time")
-    kind = np.where(harm == "collided", np.where(at_fault, "at_fault", "struck"), kind)
+    kind = np.where(harm == "collision", np.where(at_fault, "at_fault", "struck"), kind)
     kind = np.select([harm == name for name in _HARMS], list(_HARMS.values()), kind)
     kind = np.where(clues["clean"], NONE, kind)
 

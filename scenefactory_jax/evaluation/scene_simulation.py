@@ -19,8 +19,8 @@ MEANING = {
     "overlapping": "cars that touch another car or object in the first step",
     "on_edge": "cars that touch a road edge in the first step",
     "off_lane": "cars that begin away from any driving lane",
-    "collided": "cars that hit another car or object at some step",
-    "touched_edge": "cars that touched a road edge at some step",
+    "collision": "cars that hit another car or object at some step",
+    "road_edge_contact": "cars that touched a road edge at some step",
 }
 
 
@@ -68,14 +68,14 @@ def drive(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str,
         return after, (outcome.facts, state.active)
 
     _, (facts, active) = jax.lax.scan(advance, state, length=steps)
-    events, ever = facts.events, lambda happened: jnp.any(happened & active, axis=0)  # facts of finished cars mean nothing
+    events, ever = facts.events, lambda past_events: jnp.any(past_events & active, axis=0)  # facts of finished cars mean nothing
     marks = {
         "cars": present,
-        "faults": ever(events.fault),
+        "faults": ever(events.numerical_error),
         "overlapping": (facts.contact_force[0] > 0) & present,
-        "on_edge": events.touched_edge[0] & present,
+        "on_edge": events.road_edge_contact[0] & present,
         "off_lane": facts.off_lane[0] & present,
-        "collided": ever(events.collided),
-        "touched_edge": ever(events.touched_edge),
+        "collision": ever(events.collision),
+        "road_edge_contact": ever(events.road_edge_contact),
     }
     return {name: jnp.sum(mark) for name, mark in marks.items()}

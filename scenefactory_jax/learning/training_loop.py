@@ -228,6 +228,6 @@ def step(
 
 def describe(row: Mapping[str, float | int]) -> str:
     """One line on how training stands."""
-    names = {"reached": "goal", "collided": "collision", "touched_edge": "edge", "crashed": "crash"}
+    names = {"goal_reached": "goal", "collision": "collision", "road_edge_contact": "edge", "out_of_bounds": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
     return f"{rates} | {row['casps']:,.0f} steps/s"

@@ -119,7 +119,7 @@ def gather_segments(
 
     A scene with cells of at least that radius is looked up there, with the same result. Cars that are not active see nothing.
     """
-    if scene.cells is None or scene.cells.radius_m < radius_m:
+    if scene.road_grid is None or scene.road_grid.radius_m < radius_m:
         offset = position[:, None, :] - scene.road.midpoint
         found = first_edge_hits(active[:, None] & scene.road.valid & (dot(offset, offset) <= radius_m**2), count=count)
         return _rows(scene.road, *found, position, yaw, radius_m=radius_m, kind_scale=kind_scale)
@@ -137,8 +137,8 @@ def gather_segments(
             road, grid, first, last, position, heading_vector(-yaw), count=count, radius_m=radius_m, kind_scale=kind_scale
         )
 
-    first, last = spatial_grid.find_cell_bounds(scene.cells, position)
-    given = (scene.road, scene.cells, first, jnp.where(active, last, first), position, yaw)
+    first, last = spatial_grid.find_cell_bounds(scene.road_grid, position)
+    given = (scene.road, scene.road_grid, first, jnp.where(active, last, first), position, yaw)
     return SetObservation(*(_answer(quick, plain, *given) if kernels else plain(*given)))
 
 

@@ -25,9 +25,14 @@ ROUND = np.linspace(0.0, 2 * np.pi, 33)
 # name -> (what it is, how to read it of the shots); lines of one name share a plot
 SERIES = {
     "speed": "m/s", "throttle": "-1..1", "steer": "-1..1", "brake": "-1..1", "ttc": "s", "edge_ttc": "s", "friction": "coefficient",
-    "grip_use": "share", "contact_force": "N", "goal_distance": "m", "reward": "per step",
+    "friction_utilization": "share", "contact_force": "N", "goal_distance": "m", "reward": "per step",
 }  # fmt: skip
-PLOTS = {"speed": ("speed",), "actions": ("throttle", "steer", "brake"), "ttc": ("ttc", "edge_ttc"), "friction": ("friction", "grip_use")}
+PLOTS = {
+    "speed": ("speed",),
+    "actions": ("throttle", "steer", "brake"),
+    "ttc": ("ttc", "edge_ttc"),
+    "friction": ("friction", "friction_utilization"),
+}
 PLOTS |= {"reward": ("reward",)}
 
 
@@ -162,7 +167,7 @@ class _World:
             self.columns("events", np.array([step for step, _, _ in found]), self.rr.TextLog.columns(text=text, color=colours))
 
     def _send_others(self) -> None:
-        others, present = self.shots.others, np.asarray(self.shots.others.present)
+        others, present = self.shots.traffic, np.asarray(self.shots.traffic.present)
         if not present.any():
             return
         steps, rows = np.nonzero(present)

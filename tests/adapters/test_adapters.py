@@ -32,7 +32,9 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
 
 @pytest.mark.parametrize("observations", ["reference", "foresight"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
-    settings = hydra_config.load_config("train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4")
+    settings = hydra_config.load_config(
+        "train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4"
+    )
     env, given = environment.make_env(settings), scenes(agents=4).scene
 
     def step(given, carry, key):

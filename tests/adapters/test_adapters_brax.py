@@ -42,7 +42,7 @@ def test_a_step_keeps_the_shape_of_the_state_and_says_what_happened(env):
         np.testing.assert_allclose(terms, state.reward, atol=1e-4)
         if state.done:
             break
-    assert state.done == 1 and state.metrics["events/touched_edge"] == 1 and step._cache_size() == 1
+    assert state.done == 1 and state.metrics["events/road_edge_contact"] == 1 and step._cache_size() == 1
 
 
 @pytest.mark.parametrize("wrapping", [wrap, repeating])

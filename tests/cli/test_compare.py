@@ -12,10 +12,10 @@ from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
 
-METRICS = ("events/reached", "reward")
+METRICS = ("events/goal_reached", "reward")
 
 
-def run(folder, *, seed, dtype="float32", reached=(0.0, 0.2, 0.4, 0.6), agents=None):
+def run(folder, *, seed, dtype="float32", goal_reached=(0.0, 0.2, 0.4, 0.6), agents=None):
     """A run's folder as `train` leaves it, with 100 agent steps an iteration."""
     folder.mkdir(parents=True)
     config = {"name": "mine", "seed": seed, "out": str(folder), "policy": {"dtype": dtype, "trunk": [64, 64]}}
@@ -25,7 +25,7 @@ def run(folder, *, seed, dtype="float32", reached=(0.0, 0.2, 0.4, 0.6), agents=N
         writer.writeheader()
         for i, share in enumerate(reached, start=1):
             row = {"iteration": i, "minutes": 0.5 * i, "steps/total": 100 * i, "casps": 1000.0 + seed}
-            writer.writerow(row | {"events/reached": share, "reward": seed})
+            writer.writerow(row | {"events/goal_reached": share, "reward": seed})
     if agents is not None:
         agent_metrics.write_csv(folder / "agents-strict.csv", agents)
     return folder
@@ -39,13 +39,13 @@ def settings(*runs, **numbers):
 def test_seeds_of_one_setting_are_one_group(tmp_path, capsys):
     for seed in (0, 1):
         run(tmp_path / f"plain-{seed}", seed=seed)
-    run(tmp_path / "half", seed=0, dtype="bfloat16", reached=(0.5, 0.5))
+    run(tmp_path / "half", seed=0, dtype="bfloat16", goal_reached=(0.5, 0.5))
     result = compare(settings(tmp_path / "plain-*", tmp_path / "half", out=str(tmp_path / "out")))
     assert list(result["groups"]) == ["policy.dtype=float32", "policy.dtype=bfloat16"]
     group = result["groups"]["policy.dtype=float32"]
     assert group["runs"] == ["plain-0", "plain-1"] and group["seeds"] == [0, 1] and group["steps"] == [100, 200, 300, 400]
-    np.testing.assert_allclose(group["curves"]["events/reached"][0], [0.0, 0.1, 0.3, 0.5])  # running means of two
-    np.testing.assert_allclose(group["last"]["events/reached"], [0.5, 0.5])  # of the last two of four
+    np.testing.assert_allclose(group["curves"]["events/goal_reached"][0], [0.0, 0.1, 0.3, 0.5])  # running means of two
+    np.testing.assert_allclose(group["last"]["events/goal_reached"], [0.5, 0.5])  # of the last two of four
     assert group["last"]["reward"] == [0.0, 1.0] and group["casps"] == [1000.0, 1001.0] and group["minutes"] == [2.0, 2.0]
     text = (tmp_path / "out" / "compare.md").read_text()
     assert "| policy.dtype=float32 | 2 | 4 | 0.0 M | 2.0 [2.0, 2.0] | 1,000 [1,000, 1,001] | 0.5 [0.5, 0.5] | 0.5 [0, 1] |" in text
@@ -55,13 +55,13 @@ def test_seeds_of_one_setting_are_one_group(tmp_path, capsys):
 
 
 def test_a_shorter_seed_cuts_its_group(tmp_path):
-    runs = [run(tmp_path / "a", seed=0), run(tmp_path / "b", seed=1, reached=(0.1, 0.3, 0.5))]
+    runs = [run(tmp_path / "a", seed=0), run(tmp_path / "b", seed=1, goal_reached=(0.1, 0.3, 0.5))]
     [group] = compare(settings(*runs, out=str(tmp_path / "out")))["groups"].values()
     assert group["iterations"] == 3 and [len(curve) for curve in group["curves"]["reward"]] == [3, 3]
 
 
 def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
-    first, second = records(reached=3, missed=1), records(reached=1, missed=3)
+    first, second = records(goal_reached=3, missed=1), records(goal_reached=1, missed=3)
     runs = [run(tmp_path / "a", seed=0, agents=first), run(tmp_path / "b", seed=1, agents=second)]
     [group] = compare(settings(*runs, out=str(tmp_path / "out")))["groups"].values()
     found = group["evaluated"]["strict"]["success_rate"]
@@ -80,7 +80,7 @@ def records():
         count = reached + missed
         good = np.arange(count) < reached
         columns = {name: np.zeros(count, dtype) for name, dtype in agent_metrics.COLUMNS.items()}
-        columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "reached": good, "clean": good}
+        columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "goal_reached": good, "clean": good}
         return columns
 
     return made

@@ -134,7 +134,10 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     ("override", "message"),
     [
         ("wrlds=3", r"wrlds: unknown key 'wrlds'; the top level has: checkpoint_every, .*worlds"),
-        ("step_metrics.circles.radius=1", r"step_metrics\.circles\.radius: unknown key 'radius'; step_metrics\.circles has: radius_floor_m, "),
+        (
+            "step_metrics.circles.radius=1",
+            r"step_metrics\.circles\.radius: unknown key 'radius'; step_metrics\.circles has: radius_floor_m, ",
+        ),
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
         ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, others, road, steps"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': base bicycle mjx_car mjx_published replay"),
@@ -175,8 +178,8 @@ def test_an_unknown_config_is_named():
         ("train", "resume=maybe", "resume: 'maybe' is of type str, wanted bool"),
         ("train", "out=3", "out: 3 is of type int, wanted str | None"),
         ("train", "evaluation.protocols=strict", "evaluation.protocols: 'strict' is of type str, wanted list[str]"),
-        ("train", "evaluation.protocols=[sharp]", "evaluation.protocols: ['sharp']; valid: one or more of invincible, strict"),
-        ("train", "evaluation.protocols=[]", "evaluation.protocols: []; valid: one or more of invincible, strict"),
+        ("train", "evaluation.protocols=[sharp]", "evaluation.protocols: ['sharp']; valid: one or more of goal_only, strict"),
+        ("train", "evaluation.protocols=[]", "evaluation.protocols: []; valid: one or more of goal_only, strict"),
         ("train", "evaluation.repeats=0", "evaluation.repeats: 0; wanted is at least 1"),
         ("train", "evaluation.video.fps=fast", "evaluation.video.fps: 'fast' is of type str, wanted float"),
         ("train", "evaluation.video.suffix=.avi", "evaluation.video.suffix: '.avi'"),
@@ -217,7 +220,10 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
         ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: 'near' is of type str, wanted float | None"),
         ("dynamics.wheelbase=long", "dynamics.wheelbase: 'long' is of type str, wanted float"),
         ("weather.grip.mode=sticky", "weather.grip.mode: 'sticky'"),
-        ("termination.ending=[fault,reached,bored]", "termination.ending: unknown event 'bored'; valid: fault, reached, collided, crashed, touched_edge"),
+        (
+            "termination.ending=[fault,reached,bored]",
+            "termination.ending: unknown event 'bored'; valid: fault, reached, collided, crashed, road_edge_contact",
+        ),
     ],
 )
 def test_a_wrong_value_of_a_part_is_named(override, message):

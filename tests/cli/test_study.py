@@ -264,7 +264,7 @@ def test_a_study_stops_in_time_and_tells_what_is_missing(tmp_path, capsys):
         ({"compare": [["all terms", "nobody"]]}, r"study\.compare\.0: unknown 'nobody'; valid: all terms, one scene, .*log replay"),
         ({"compare": [["all terms"]]}, r"study\.compare: \['all terms'\]; wanted are pairs"),
         ({"colour": "red"}, r"study\.colour: unknown key; valid: name, question"),
-        ({"protocols": ["lenient"]}, r"study\.protocols: \['lenient'\]; valid: one or more of invincible, strict"),
+        ({"protocols": ["lenient"]}, r"study\.protocols: \['lenient'\]; valid: one or more of goal_only, strict"),
         ({"figures": ["pie"]}, r"study\.figures: \['pie'\]"),
         ({"floors": {"f": {"of": "all terms"}}}, r"study\.floors\.f\.overrides: missing"),
     ],
@@ -302,7 +302,7 @@ def steps_of(config):
 def test_every_study_is_whole(name, tmp_path):
     """Every training and judging builds, and whatever is compared or drawn is judged."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
-    assert entry["study"]["protocols"] == ["invincible"] + ["strict"] * (name not in ONE_PROTOCOL)
+    assert entry["study"]["protocols"] == ["goal_only"] + ["strict"] * (name not in ONE_PROTOCOL)
     plan = study_plan.make(entry | {"test_scenes": "it's.bank", "study": {**entry["study"], "protocols": ["strict"]}})
     assert entry["study"]["seeds"] == [0, 1, 2] and plan.trainings and plan.judgings
     for built in {one.program: one.config for one in (*plan.trainings, *plan.judgings)}.values():

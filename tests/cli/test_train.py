@@ -272,28 +272,28 @@ def told(report: Path):
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
-    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.ends=[invincible]"]))
-    assert set(first.records) == {"strict", "invincible"} and set(second.records) == {"invincible"} and first.report.is_file()
-    for again, protocol in ((second, "invincible"), (whole, "strict")):  # strict: what training itself wrote
+    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.ends=[goal_only]"]))
+    assert set(first.records) == {"strict", "goal_only"} and set(second.records) == {"goal_only"} and first.report.is_file()
+    for again, protocol in ((second, "goal_only"), (whole, "strict")):  # strict: what training itself wrote
         assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
-    strict, invincible = (first.records[name] for name in ("strict", "invincible"))
+    strict, goal_only = (first.records[name] for name in ("strict", "goal_only"))
     kept = [file.name for file in sorted(first.folder.glob("agents-*.csv"))]
     result_file.begin(first.folder, {"scenes": None})  # as the next evaluation does
-    assert kept == ["agents-invincible.csv", "agents-strict.csv"] and [file.name for file in first.folder.iterdir()] == ["judged.json"]
+    assert kept == ["agents-goal_only.csv", "agents-strict.csv"] and [file.name for file in first.folder.iterdir()] == ["judged.json"]
     assert (
-        result_file.read_evaluated(second.folder)["protocols"] == ["invincible"]
+        result_file.read_evaluated(second.folder)["protocols"] == ["goal_only"]
         and result_file.read_evaluated(second.folder)["seed"] == 1000
     )
-    ended = strict["collided"] | strict["crashed"] | strict["touched_edge"]
-    assert ended.any() and (invincible["time_s"] >= strict["time_s"]).all()
+    ended = strict["collision"] | strict["out_of_bounds"] | strict["road_edge_contact"]
+    assert ended.any() and (goal_only["time_s"] >= strict["time_s"]).all()
 
 
 def test_other_settings_of_a_run(whole, tmp_path):
     short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
-    changed = judged(whole, tmp_path / "short", *small, "protocol.ends=[invincible]", short)
-    assert set(changed.records) == {"invincible"} and changed.records["invincible"]["time_s"].max() <= 1.0
-    assert told(changed.report) == {**asked(whole, None, *small, "protocol.ends=[invincible]", short), "out": None}
+    changed = judged(whole, tmp_path / "short", *small, "protocol.ends=[goal_only]", short)
+    assert set(changed.records) == {"goal_only"} and changed.records["goal_only"]["time_s"].max() <= 1.0
+    assert told(changed.report) == {**asked(whole, None, *small, "protocol.ends=[goal_only]", short), "out": None}
     assert changed.report.read_text().startswith("# smoke: evaluation on scenes not seen in training\n")
     assert (tmp_path / "short" / "video.gif").is_file()
     assert hydra_config.read(whole.folder)["timing"]["episode_s"] == 2
@@ -301,7 +301,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
         "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
-        "protocol.ends=[perhaps]": r"protocol\.ends: \['perhaps'\]; valid: one or more of invincible, strict",
+        "protocol.ends=[perhaps]": r"protocol\.ends: \['perhaps'\]; valid: one or more of goal_only, strict",
     }.items():
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
@@ -343,7 +343,7 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
 
 def test_scores_and_titles_name_other_scenes(whole, tmp_path):
     asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "protocol": "recorded", "trust": True}
-    asked["protocols"] = ["invincible", "strict"]
+    asked["protocols"] = ["goal_only", "strict"]
     result_file.begin(tmp_path, asked)
     assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
     assert named("unseen", whole.folder) == "unseen"
@@ -375,7 +375,9 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
             steps = sum(last - first + 1 for first, last in car["spans"])
             assert steps == round(records["time_s"][rows[car["slot"]]] * 30)
         assert all(records[event["name"]][rows[event["car"]]] for event in shown["events"])
-        assert sum(event["name"] == "reached" for event in shown["events"]) == sum(records["reached"][row] for row in rows.values())
+        assert sum(event["name"] == "goal_reached" for event in shown["events"]) == sum(
+            records["goal_reached"][row] for row in rows.values()
+        )
     with pytest.raises(ConfigError, match=r"dynamics: decided by the run .*; to change it: overrides='\[dynamics=\.\.\.\]'"):
         replay(hydra_config.load_config("replay", f"run={whole.folder}", "dynamics=articulated"))
 
@@ -593,7 +595,10 @@ def test_what_a_suite_says_counts(name):
     assert {key: found[key] for key in said if key != "variants"} == {key: said[key] for key in said if key != "variants"}
 
 
-RUNS = (["experiment=quick", "scenes=womd"], ["experiment=paper", "dynamics=bicycle", "weather=ice", "traffic=log_playback", "spawning=mixed"])
+RUNS = (
+    ["experiment=quick", "scenes=womd"],
+    ["experiment=paper", "dynamics=bicycle", "weather=ice", "traffic=log_playback", "spawning=mixed"],
+)
 
 
 @pytest.mark.parametrize("name", names("protocol"))

@@ -479,7 +479,9 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
         with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
         with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
-            conversion.read(folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(scene_size_m=-1.0), workers=workers)
+            conversion.read(
+                folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(scene_size_m=-1.0), workers=workers
+            )
     assert not (tmp_path / "bank").exists()
 
 
@@ -667,7 +669,7 @@ def test_others_stand_in_the_model_and_can_be_hit(street):
     f = lambda *rows: jnp.array(rows, jnp.float32)  # noqa: E731
     still, size = f([0, 0], [0, 0]), f([4, 2], [4, 2])
     boxes = Boxes(f([9, 3], [0, 0]), f(0.7, 0), f(0.5, 0), still, f(0, 0), size, f(np.inf, np.inf), jnp.array([True, False]))
-    model = world_mjcf.world(replace(scene, boxes=boxes), stand_in_car(), merge_tolerance_m=None, **LOOKS).compile()
+    model = world_mjcf.world(replace(scene, traffic=boxes), stand_in_car(), merge_tolerance_m=None, **LOOKS).compile()
     assert model.geom("other0").size.tolist() == [2.0, 1.0, 0.75] and model.geom("other0").contype == 1
     with pytest.raises(KeyError):
         model.geom("other1")

@@ -414,7 +414,9 @@ def test_what_cannot_be_done_is_named(town, overrides, message):
 def test_scenes_are_simulated(capsys):
     small = ["scenes.count=3", "scenes.pack.agents=4", "simulate.worlds=2", "simulate.seconds=0.2", "op=simulate"]
     found = scenes(hydra_config.load_config("scenes", *small))
-    assert all(list(row) == ["cars", "faults", "overlapping", "on_edge", "off_lane", "collided", "touched_edge"] for row in found.values())
+    assert all(
+        list(row) == ["cars", "faults", "overlapping", "on_edge", "off_lane", "collision", "road_edge_contact"] for row in found.values()
+    )
     clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
     assert clean == [True] * 3
     assert "3 scenes, 6 steps each; 3 without any of these" in capsys.readouterr().out

@@ -15,7 +15,10 @@ from scenefactory_jax.roadgraph import spatial_grid
 PROCEDURAL = hydra_config.load_config("scenes")["scenes"]
 WOMD = hydra_config.load_config("convert", "scenes=womd")["scenes"]
 GENERATE = instantiate(PROCEDURAL["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="generate")
-SETTINGS = [{}, {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"}]
+SETTINGS = [
+    {},
+    {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"},
+]
 CHECK = {key: value for key, value in WOMD["check"].items() if key != "_target_"}
 NUMBERS = {key: value for key, value in WOMD["pack"].items() if key != "_target_"} | {"require_agents": False}
 

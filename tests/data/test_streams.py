@@ -293,7 +293,7 @@ def test_room_for_more_changes_no_look_up():
     places = np.random.default_rng(0).uniform(-90.0, 90.0, (200, 2)).astype(np.float32)
     seen = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "most": 400}):
-        grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).cells)
+        grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).road_grid)
         rows, listed = map(np.asarray, spatial_grid.list_segments(grid, *spatial_grid.find_cell_bounds(grid, jnp.asarray(places))))
         seen.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
     assert seen[0] == seen[1] and any(seen[0])

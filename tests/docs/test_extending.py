@@ -41,7 +41,9 @@ def test_the_parts_of_the_page_drive_together(page):
     parts = [word for word in overrides if "my_reader" not in word]
     assert set(blocks) == {"my_terms", "my_groups", "my_controls", "my_backend", "my_reader"}
     assert all(any(name in word for word in overrides) for name in blocks)
-    env = environment.make_env(hydra_config.load_config("task", *parts, "observations=small", "~observations.road", "~observations.neighbours"))
+    env = environment.make_env(
+        hydra_config.load_config("task", *parts, "observations=small", "~observations.road", "~observations.neighbours")
+    )
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
     state, step = env.start(jax.random.key(0), scene), jax.jit(env.step)
     actions = [[0.8, 0.0, -1.0]] * 10 + [[0.0, 0.5, -1.0]] * 10 + [[-1.0, 0.0, -1.0]] * 10

@@ -74,7 +74,7 @@ BACKEND = """
         def read(body):
             nothing = jnp.zeros(len(body.place), jnp.float32)
             flat = lambda xy, z: jnp.concatenate([xy, jnp.full_like(xy[:, :1], z)], axis=1)
-            names = ("yaw", "yaw_rate", "steer", "contact_force", "grip_use", "slip")
+            names = ("yaw", "yaw_rate", "steer", "contact_force", "friction_utilization", "slip")
             rest = dict.fromkeys(names, nothing) | {"upright": nothing + 1, "grip": nothing + 1}
             return Motion(position=flat(body.place, height_m), velocity=flat(body.velocity, 0.0), **rest)
 
@@ -222,7 +222,10 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
         ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"reward\.haste\.unit_mps: 'fast'.*wanted float"),
         ("+reward.haste={_target_: my_terms.hurry, weight: 1.0}", r"'my_terms\.hurry' is not in my_terms; valid: haste, jerkiness"),
         ("+observations.clock={_target_: my_clocks.clock}", r"observations\.clock\._target_: cannot import 'my_clocks'"),
-        ("+observations.clock={_target_: my_groups.clock, period_s: 1.0, phase: 2.0}", r"observations\.clock\.phase: unknown key.*valid: period_s"),
+        (
+            "+observations.clock={_target_: my_groups.clock, period_s: 1.0, phase: 2.0}",
+            r"observations\.clock\.phase: unknown key.*valid: period_s",
+        ),
     ],
 )
 def test_a_part_of_ones_own_is_checked_like_any_other(mine, override, message):

@@ -28,7 +28,7 @@ LANES = 500.0 * np.arange(8)
 EVERYONE = jnp.ones(8, bool)
 KEY = jax.random.key(0)
 CHUNK = 30  # control steps in one compiled run: a second
-BACKENDS = ("mjx_car", "bicycle", "replay")
+BACKENDS = ("articulated", "bicycle", "replay")
 
 
 @functools.cache
@@ -99,7 +99,7 @@ def acceleration(motion):
 @pytest.fixture(scope="module")
 def braking():
     """All cars brake fully from 15 m/s for 34 s."""
-    return drive("mjx_car", scene_for(speed=15.0), constant(brake=1.0, seconds=34))
+    return drive("articulated", scene_for(speed=15.0), constant(brake=1.0, seconds=34))
 
 
 def test_braking_distance_is_the_tyres_limit_or_the_brakes(braking):
@@ -117,7 +117,7 @@ def test_braking_distance_is_the_tyres_limit_or_the_brakes(braking):
 
 def test_braked_cars_hold_still(braking):
     body, _ = braking
-    _, (_, motion) = drive("mjx_car", scene_for(), constant(brake=1.0, seconds=10), body=body)
+    _, (_, motion) = drive("articulated", scene_for(), constant(brake=1.0, seconds=10), body=body)
     still = MU >= 0.1  # at 0.05 the car is not there yet
     moved = np.linalg.norm(motion.position[-1] - motion.position[0], axis=-1)
     assert moved[still].max() < 1e-3
@@ -125,9 +125,9 @@ def test_braked_cars_hold_still(braking):
 
 def test_tyres_use_no_more_than_their_grip(braking):
     _, (_, motion) = braking
-    assert motion.grip_use.max() < 1.01
+    assert motion.friction_utilization.max() < 1.01
     np.testing.assert_allclose(motion.grip[0], MU, rtol=1e-6)
-    sliding = motion.grip_use[CHUNK, (MU <= 0.5)]
+    sliding = motion.friction_utilization[CHUNK, (MU <= 0.5)]
     np.testing.assert_allclose(sliding, 1.0, atol=0.01)
     slip = motion.slip[:, np.isclose(MU, 0.1)]
     assert slip[CHUNK] > 12.0 and slip[-1] < 0.01
@@ -136,7 +136,7 @@ def test_tyres_use_no_more_than_their_grip(braking):
 
 @pytest.mark.parametrize("steer", [0.25, -0.5])
 def test_yaw_rate_is_that_of_a_rolling_car_at_low_speed(steer):
-    _, (_, motion) = drive("mjx_car", scene_for(speed=3.0), constant(steer=steer, seconds=2))
+    _, (_, motion) = drive("articulated", scene_for(speed=3.0), constant(steer=steer, seconds=2))
     speed = np.linalg.norm(motion.velocity[-1, :, :2], axis=-1)
     # the box's centre runs ahead of the rear axle: v cos(beta) tan(steer) / L with tan(beta) = tan(steer) / 2
     beta = np.arctan(np.tan(motion.steer[-1]) / 2)
@@ -157,9 +157,9 @@ def test_trajectories_agree_with_the_c_engine():
     MJX runs in float32 with Newton 2/4, the C engine in float64 to convergence. Measured: 4 cm after 3 s where cars slide, 1 mm where
     they grip; the bounds leave a factor of three, for other platforms' rounding.
     """
-    car, solver = numbers_of("mjx_car")
+    car, solver = numbers_of("articulated")
     speed, action = np.linspace(4, 16, 8), random_controls(0, 3, 15)
-    _, (body, _) = drive("mjx_car", scene_for(speed=speed), action)
+    _, (body, _) = drive("articulated", scene_for(speed=speed), action)
     for i in range(8):
         converged = {"physics_dt": 1 / 120, "substeps": 4, "iterations": 100, "line_search": 50}
         truth = mujoco_c.simulate(car, solver, action[:, i], np.full(4, float(MU[i])), speed=float(speed[i]), **converged)
@@ -173,7 +173,7 @@ def test_trajectories_agree_with_the_c_engine():
 
 def test_locked_stops_reach_the_tyre_limit_in_the_c_engine():
     """With brakes four times as strong, so that wheels lock at any friction: from 15 m/s, within 3 % of v^2 / (2 mu g) less the air."""
-    car, solver = numbers_of("mjx_car")
+    car, solver = numbers_of("articulated")
     strong = dataclasses.replace(car, brake_torque_front=4 * car.brake_torque_front, brake_torque_rear=4 * car.brake_torque_rear)
     for mu in (0.3, 0.86, 1.1):
         action = np.tile(np.array([0.0, 0.0, 1.0]), (240, 1))
@@ -184,17 +184,17 @@ def test_locked_stops_reach_the_tyre_limit_in_the_c_engine():
 
 
 def test_a_whole_episode_of_random_driving_stays_finite_and_upright():
-    _, (body, motion) = drive("mjx_car", scene_for(speed=np.linspace(0, 20, 8)), random_controls(1, 50, 6))
+    _, (body, motion) = drive("articulated", scene_for(speed=np.linspace(0, 20, 8)), random_controls(1, 50, 6))
     assert np.isfinite(body.qpos).all() and np.isfinite(body.qvel).all()
     assert motion.upright.min() > 0.97
     height = motion.position[..., 2]
     assert height.min() > 0.65 and height.max() < 0.85
     assert np.linalg.norm(motion.velocity, axis=-1).max() < 25 and np.abs(motion.steer).max() < 1.05 * LOCK
-    assert motion.grip_use.max() < 1.01
+    assert motion.friction_utilization.max() < 1.01
 
 
 def test_a_hard_turn_on_the_best_road_slides_and_does_not_roll_over():
-    _, (_, motion) = drive("mjx_car", scene_for(speed=20.0), constant(throttle=1.0, steer=1.0, seconds=3))
+    _, (_, motion) = drive("articulated", scene_for(speed=20.0), constant(throttle=1.0, steer=1.0, seconds=3))
     assert motion.upright.min() > 0.97
     assert (acceleration(motion) < 1.05 * MU * G).all()
     assert (acceleration(motion) > 0.8 * MU * G)[MU >= 0.3].all()
@@ -209,7 +209,7 @@ def rear_end(offset):
 
 @pytest.mark.parametrize("offset", [0.0, 0.9])
 def test_a_rear_end_collision_keeps_momentum_and_does_not_penetrate(offset):
-    _, (_, motion) = drive("mjx_car", rear_end(offset), constant(seconds=1))
+    _, (_, motion) = drive("articulated", rear_end(offset), constant(seconds=1))
     touching = np.nonzero(motion.contact_force.max(1) > 25)[0]
     assert 2 <= len(touching) <= 8
     before, after = touching[0] - 1, touching[-1] + 1
@@ -228,8 +228,8 @@ def test_a_rear_end_collision_keeps_momentum_and_does_not_penetrate(offset):
 def test_inactive_cars_are_held_bit_for_bit_and_touch_nobody():
     scene = rear_end(0.0)
     active = EVERYONE.at[1].set(False)
-    body, (_, motion) = drive("mjx_car", scene, constant(throttle=1.0), active)
-    start = backend("mjx_car")[2](scene)
+    body, (_, motion) = drive("articulated", scene, constant(throttle=1.0), active)
+    start = backend("articulated")[2](scene)
     for name in ("qpos", "qvel", "qacc_warmstart"):
         np.testing.assert_array_equal(getattr(body, name)[1], getattr(start, name)[1])
     assert not motion.contact_force.any() and motion.position[-1, 0, 0] > 9.0
@@ -238,17 +238,17 @@ def test_inactive_cars_are_held_bit_for_bit_and_touch_nobody():
 @pytest.mark.parametrize("leaf", ["qpos", "qvel"])
 def test_a_broken_car_changes_nobody_else(leaf):
     scene = rear_end(0.0)
-    start = backend("mjx_car")[2](scene)
+    start = backend("articulated")[2](scene)
     broken = replace(start, **{leaf: getattr(start, leaf).at[1].set(np.nan)})
-    body, _ = drive("mjx_car", scene, constant(throttle=1.0), body=broken)
-    alone, _ = drive("mjx_car", scene, constant(throttle=1.0), EVERYONE.at[1].set(False))
+    body, _ = drive("articulated", scene, constant(throttle=1.0), body=broken)
+    alone, _ = drive("articulated", scene, constant(throttle=1.0), EVERYONE.at[1].set(False))
     others = np.arange(8) != 1
     assert not np.isfinite(body.qpos[1]).all()
     for a, b in zip(jax.tree.leaves(body), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(np.asarray(a)[others], np.asarray(b)[others])
 
 
-@pytest.mark.parametrize("name", ["mjx_car", "bicycle"])
+@pytest.mark.parametrize("name", ["articulated", "bicycle"])
 def test_permuting_agents_permutes_results(name):
     order = np.array([1, 0, 5, 2, 7, 3, 4, 6])
     scene, action = rear_end(0.4), random_controls(4, 1, 6)
@@ -283,12 +283,12 @@ def test_contract_of_a_backend(name):
 
 
 def test_cars_start_at_rest_height_with_turning_wheels():
-    _, (_, motion) = drive("mjx_car", scene_for(yaw=np.linspace(-3, 3, 8), speed=np.linspace(0, 20, 8)), constant())
+    _, (_, motion) = drive("articulated", scene_for(yaw=np.linspace(-3, 3, 8), speed=np.linspace(0, 20, 8)), constant())
     assert np.ptp(motion.position[..., 2]) < 0.01  # nothing drops or jumps
     np.testing.assert_allclose(motion.yaw[0], np.linspace(-3, 3, 8), atol=0.01)
     np.testing.assert_allclose(np.linalg.norm(motion.velocity[0], axis=-1), np.linspace(0, 20, 8), atol=0.03)
     assert motion.slip[1:].max() < 0.25 and np.abs(motion.yaw_rate).max() < 0.02
-    height = motion.position[-1, 0, 2] + config("mjx_car")["car"]["mass_height"]
+    height = motion.position[-1, 0, 2] + config("articulated")["car"]["mass_height"]
     assert height == pytest.approx(0.575, abs=0.005)
 
 
@@ -313,7 +313,7 @@ def test_bicycle_circle_closes_and_braking_stops():
 
 
 def test_bicycle_and_car_share_limits():
-    bicycle, car = config("bicycle"), config("mjx_car")["car"]
+    bicycle, car = config("bicycle"), config("articulated")["car"]
     assert bicycle["wheelbase"] == car["wheelbase"] and bicycle["steering_limit"] == car["steering_limit"]
     inertia = car["wheel_inertia"][0] / car["wheel_radius"] ** 2
     mass = car["mass"] + 4 * (car["wheel_mass"] + car["carrier_mass"] + inertia) + 2 * car["knuckle_mass"]
@@ -335,7 +335,7 @@ def test_bicycle_reports_contact_and_keeps_going():
     assert motion.velocity[-1, 0, 0] > 9.0 and motion.velocity[-1, 1, 0] == 0.0
 
 
-@pytest.mark.parametrize("name", ["mjx_car", "mjx_published"])
+@pytest.mark.parametrize("name", ["articulated", "articulated_paper"])
 def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
     car, solver = numbers_of(name)
     plain = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
@@ -345,8 +345,8 @@ def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
     assert plain.body_mass.sum() == pytest.approx(1980.03, abs=0.01)
     np.testing.assert_allclose(seen.body_inertia, plain.body_inertia)
     height = cars.find_rest_pose(plain, car)[2]
-    assert height == pytest.approx({"mjx_car": 0.755, "mjx_published": 0.57}[name], abs=0.01)
-    assert name != "mjx_car" or config("bicycle")["centre_height"] == pytest.approx(height, abs=1e-3)
+    assert height == pytest.approx({"articulated": 0.755, "articulated_paper": 0.57}[name], abs=0.01)
+    assert name != "articulated" or config("bicycle")["centre_height"] == pytest.approx(height, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
 )
 def test_refuses_by_name(changes, named):
     with pytest.raises(ConfigError, match=named):
-        make("mjx_car", **changes)
+        make("articulated", **changes)
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_refuses_by_name(changes, named):
 )  # fmt: skip
 def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
     group, name = key.split(".")
-    entry = {**config("mjx_car"), group: {**config("mjx_car")[group], name: bad}}
+    entry = {**config("articulated"), group: {**config("articulated")[group], name: bad}}
     with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted (is|are) .*{wanted}"):
         cars.read_parameters(entry)
 
@@ -393,7 +393,7 @@ def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
 def test_every_number_of_a_car_has_its_bounds():
     numbers = {field.name for kind in (cars.CarParameters, cars.Solver) for field in dataclasses.fields(kind)}
     assert bounds.BOUNDS.keys() == numbers - {"algorithm", "integrator"}
-    for name in ("mjx_car", "mjx_published"):
+    for name in ("articulated", "articulated_paper"):
         cars.read_parameters(config(name))
 
 
@@ -410,7 +410,7 @@ def test_numbers_that_no_bicycle_has_are_refused(key, bad):
     make("bicycle", rear_length=0.0)
 
 
-@pytest.mark.parametrize("name", ["mjx_car", "bicycle"])
+@pytest.mark.parametrize("name", ["articulated", "bicycle"])
 def test_no_two_parts_of_a_start_share_memory(name):
     """Else a step could not be given the start to keep (`donate_argnums`)."""
     leaves = jax.tree.leaves(make(name).init(KEY, scene_for()))
@@ -420,14 +420,14 @@ def test_no_two_parts_of_a_start_share_memory(name):
 def test_refuses_a_control_step_that_is_no_multiple():
     context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 50}
     with pytest.raises(ConfigError, match="whole multiple"):
-        instantiate(config("mjx_car"), builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
+        instantiate(config("articulated"), builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
 @pytest.mark.slow
 def test_published_car_drives_and_creeps_under_its_latched_brakes():
     """The published scheme flips the brake torque every substep at a locked wheel: the car never holds."""
     scene = scene_for(speed=15.0)
-    dynamics = make("mjx_published")
+    dynamics = make("articulated_paper")
     second, body = compile_(dynamics), dynamics.init(KEY, scene)
     for _ in range(34):
         body, (_, motion) = second(scene, body, jnp.asarray(constant(brake=1.0), jnp.float32), EVERYONE)

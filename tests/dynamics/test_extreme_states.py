@@ -69,7 +69,7 @@ def test_energy_is_that_of_a_moving_car():
 @functools.cache
 def journey():
     """(actions [T, 3]) -> where a car that drives at 8 m/s ends, and its gradient: 10 control steps."""
-    dynamics, on = make("mjx_car"), jnp.array([True])
+    dynamics, on = make("articulated"), jnp.array([True])
     scene = scene_of(np.zeros((1, 2)), np.ones((1, 2)), speeds=[8.0])
 
     def drive(body, actions):

@@ -23,7 +23,7 @@ from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import mjx_backend, randomization
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
-CAR, SOLVER = numbers_of("mjx_car")
+CAR, SOLVER = numbers_of("articulated")
 COMPILED = {"physics_dt": 1 / 120, "visual": False, "brake_rows": True}
 WHEEL_BODIES, CHASSIS = [2, 3, 4, 5], 1
 
@@ -71,7 +71,7 @@ def listed(*, physics_dt: float):
 
 @functools.cache
 def several():
-    dynamics = make("mjx_car", fleet={"_target_": "test_fleet.listed"})
+    dynamics = make("articulated", fleet={"_target_": "test_fleet.listed"})
     return dynamics, compile_(dynamics), jax.jit(functools.partial(dynamics.init, KEY))
 
 
@@ -163,7 +163,7 @@ def test_a_fleet_of_the_same_drives_like_the_car():
     from test_dynamics import drive as drive_same
 
     action, scene = random_controls(3, 2, 15), scene_for(speed=np.linspace(5, 15, 8))
-    _, (one, _) = drive_same("mjx_car", scene, action)
+    _, (one, _) = drive_same("articulated", scene, action)
     _, (other, _) = drive(scene, action, body=started(scene, [CAR] * 8))
     np.testing.assert_allclose(other.qpos[..., :3], one.qpos[..., :3], atol=0.02)
     np.testing.assert_allclose(other.qvel[..., :6], one.qvel[..., :6], atol=0.1)
@@ -279,7 +279,7 @@ def test_logged_sizes_are_cut_to_the_range():
 )
 def test_a_spread_that_cannot_be_is_refused_at_build(changes, named):
     with pytest.raises(ConfigError, match=named):
-        make("mjx_car", fleet=spread(**changes))
+        make("articulated", fleet=spread(**changes))
 
 
 def test_the_reference_numbers_leave_room_for_the_shipped_spread():
@@ -307,7 +307,7 @@ def test_sizes_of_real_scenes_build_and_step(shared_data):
     path = sorted((shared_data / "womd" / "train").iterdir())[0]
     scene = jax.tree.map(jnp.asarray, pack.prepare(next(iter(reader_selection.read(path, formats))), check=check, pack=packing).scene)
     entry = load_config("task", "dynamics/fleet=sizes")["dynamics"]["fleet"]
-    dynamics = make("mjx_car", fleet=entry)
+    dynamics = make("articulated", fleet=entry)
     present = scene.agents.present
     body = jax.jit(dynamics.init)(KEY, scene)
     size = np.asarray(scene.agents.size)[np.asarray(present)]

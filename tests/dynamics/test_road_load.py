@@ -195,4 +195,4 @@ def test_brakes_distance_counts_all_that_slows():
 )
 def test_what_cannot_be_is_refused_by_name(changes, named):
     with pytest.raises(ConfigError, match=named):
-        make("mjx_car", **changes)
+        make("articulated", **changes)

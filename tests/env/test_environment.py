@@ -57,7 +57,7 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         hold=hold,
         draw_agents=draw,
         draw_weather=keep_condition,
-        others=beside,
+        traffic=beside,
         measure=functools.partial(step_metrics.compute, **config["step_metrics"]),
         judge=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
         terms=rewards.make(config["reward"]),
@@ -254,7 +254,10 @@ def test_an_action_stands_until_the_next_is_read(config):
         state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
         taken.append(float(state.previous_action[0, 0]))
     np.testing.assert_allclose(taken, [0, 0, 0, 0.3, 0.3, 0.3, 0.6], atol=1e-6)
-    for every, message in ((7, "actions.action_repeat: 7; wanted is a divisor of the 1500 control steps"), (0, "actions.action_repeat: 0; wanted")):
+    for every, message in (
+        (7, "actions.action_repeat: 7; wanted is a divisor of the 1500 control steps"),
+        (0, "actions.action_repeat: 0; wanted"),
+    ):
         with pytest.raises(ConfigError, match=message):
             environment.make_env({**config, "actions": {**config["actions"], "action_repeat": every}})
 
@@ -266,16 +269,16 @@ def test_a_step_is_an_action_with_all_its_control_steps(config):
     state, _ = env.reset(jax.random.key(0), scene)
     action = jnp.array([[0.5, 0.0, 0.0]] * 2)
     after, outcome = jax.jit(env.step)(scene, state, action)
-    control, paid, reached = jax.jit(env.transition), np.zeros(2), []
+    control, paid, goal_reached = jax.jit(env.transition), np.zeros(2), []
     for _ in range(3):
         driving = np.asarray(state.active)
         state, single = control(scene, state, action)
         paid += np.where(driving, single.reward, 0.0)
-        reached.append(bool(single.events.reached[0]))
+        reached.append(bool(single.events.goal_reached[0]))
     assert reached == [False, True, False]
     np.testing.assert_allclose(outcome.reward, paid, rtol=1e-6)
     np.testing.assert_allclose(sum(outcome.terms.values()), paid, rtol=1e-5)
-    assert outcome.events.reached.tolist() == outcome.done.tolist() == [True, False] and not outcome.over
+    assert outcome.events.goal_reached.tolist() == outcome.done.tolist() == [True, False] and not outcome.over
     jax.tree.map(np.testing.assert_array_equal, after.motion, state.motion)
     assert int(after.step) == 3 and float(outcome.facts.goal_distance[1]) == pytest.approx(float(single.facts.goal_distance[1]))
     jax.tree.map(np.testing.assert_array_equal, outcome.observation, env.observe(scene, state))
@@ -288,7 +291,7 @@ def test_a_life_that_begins_within_an_action_has_no_part_in_it(config):
     scene = scene_of([[0.0, 0.0]], [[3.345, 0.0]], speeds=[10.0])
     state, _ = env.reset(jax.random.key(0), scene)
     after, outcome = jax.jit(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
-    assert outcome.done.tolist() == outcome.events.reached.tolist() == after.active.tolist() == [True] and after.age.tolist() == [1]
+    assert outcome.done.tolist() == outcome.events.goal_reached.tolist() == after.active.tolist() == [True] and after.age.tolist() == [1]
     assert float(outcome.terms["goal"][0]) == 45.0 and float(outcome.terms["progress"][0]) == pytest.approx(2 * 10.5 / 30, abs=1e-5)
     assert not after.previous_action.any() and float(after.motion.velocity[0, 0]) == 10.0
 
@@ -338,7 +341,7 @@ def test_an_episode_may_begin_at_a_later_moment(config):
     """Starts are drawn beside the others as they are then, and it has rained until then."""
     one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), make_empty_boxes())
     moving = lambda scene, step: replace(one, position=jnp.array([[1.0, 0.0]]) * step)  # noqa: E731
-    beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.boxes.position[:1], scene.agents.goal.shape))  # noqa: E731
+    beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.traffic.position[:1], scene.agents.goal.shape))  # noqa: E731
     env, scene = build_env(config, draw=beside, beside=moving), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
     late = env.start(jax.random.key(0), scene, 60)
     assert int(late.step) == 60 and float(late.weather.rain.now_s) == pytest.approx(2.0) and float(late.agents.goal[0, 0]) == 60.0
@@ -376,9 +379,9 @@ def test_progress_sums_to_the_way_driven(env, two_cars):
 def test_collision_needs_force_and_grace(env, two_cars):
     action = jnp.array([[0.0, 0, 0], [0.0, 0, 1.0]])
     _, history = drive(env, two_cars, action, 30)
-    collided = [bool(h.events.collided[1]) for h in history]
-    assert collided.index(True) == 23, "the first 23 control steps are masked"
-    assert sum(collided) == 1
+    collision = [bool(h.events.collision[1]) for h in history]
+    assert collision.index(True) == 23, "the first 23 control steps are masked"
+    assert sum(collision) == 1
 
 
 def test_terms_beyond_the_published_ones_by_hand(env):
@@ -409,7 +412,7 @@ def test_terms_beyond_the_published_ones_by_hand(env):
 def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
     action = jnp.array([[1.0, 0, 0], [0.0, 0, 0]])
     state, history = drive(env, two_cars, action, 2)
-    assert history[0].events.fault[0] and not history[0].events.fault[1]
+    assert history[0].events.numerical_error[0] and not history[0].events.numerical_error[1]
     for leaf in jax.tree.leaves((state.motion, state.body, history[0].reward, history[0].observation, history[1].observation)):
         assert jnp.all(jnp.isfinite(leaf))
     assert not state.active[0] and state.active[1]
@@ -422,7 +425,7 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     episode = episodes.begin(env, jax.random.key(0), two_cars)
     far = episode.tally.goal_distance
     tally = episodes.run_episode_chunk(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
-    assert tally.happened.fault.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
+    assert tally.past_events.numerical_error.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
     assert float(tally.goal_distance[0]) == float(far[0]) and not tally.speed_sum.any()
     motion = replace(episode.state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
     assert step_metrics.is_finite(motion).tolist() == [False, True]
@@ -433,7 +436,7 @@ def test_edges_are_touched_by_circles(config):
     scene = scene_of([[0, 4.6]], [[50, 0]], yaws=[np.pi / 2], speeds=[3.0])
     _, history = drive(env, scene, jnp.zeros((1, 3)), 3)
     # front circle: 4.6 + 1.12 + 1.10 reaches the edge at 6 - 0.05 already in the first step
-    assert history[0].events.touched_edge[0]
+    assert history[0].events.road_edge_contact[0]
     assert history[0].facts.edge_gap[0] < 0
 
 
@@ -441,15 +444,15 @@ def test_leaving_the_box_is_a_crash(config):
     env = build_env(config)
     scene = scene_of([[95, 0]], [[0, 50]], speeds=[6.0], half_width=60, length=120)
     _, history = drive(env, scene, jnp.zeros((1, 3)), 30)
-    crashed = [bool(h.events.crashed[0]) for h in history]
-    assert crashed.index(True) == 25, "x > 100 m after 26 steps of 0.2 m"
+    out_of_bounds = [bool(h.events.out_of_bounds[0]) for h in history]
+    assert out_of_bounds.index(True) == 25, "x > 100 m after 26 steps of 0.2 m"
 
 
 def test_invincible_cars_drive_on(config):
-    env = build_env(config, ending=["fault", "reached"])
+    env = build_env(config, ending=["numerical_error", "goal_reached"])
     scene = scene_of([[0, 5.4]], [[50, 5.4]], speeds=[5.0])
     state, history = drive(env, scene, jnp.zeros((1, 3)), 20)
-    assert sum(bool(h.events.touched_edge[0]) for h in history) == 1, "noted once"
+    assert sum(bool(h.events.road_edge_contact[0]) for h in history) == 1, "noted once"
     assert state.active[0]
 
 
@@ -591,9 +594,15 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
     [
         ({"parts": None}, "spawning.sampler.parts: None; wanted are entries"),
         ({"parts": {"a": {"sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: missing"),
-        ({"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: 0; wanted is a number above 0"),
+        (
+            {"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}},
+            "spawning.sampler.parts.a.share: 0; wanted is a number above 0",
+        ),
         ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.draw._target_: 'nobody' is not in"),
-        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}}, "a.respawn_clearance_m: 5.0; it belongs"),
+        (
+            {"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}},
+            "a.respawn_clearance_m: 5.0; it belongs",
+        ),
         ({"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "shar": 3}}}, "spawning.sampler.parts.a.shar: unknown key"),
         ({"parts": {"a": None}}, "spawning.sampler.parts: {'a': None}; wanted are entries"),
         ({"shares": [1.0]}, "spawning.sampler.shares: unknown key of mixed"),
@@ -628,10 +637,10 @@ def test_respawn_starts_finished_cars_again(config):
     env = build_env(config, respawn=10.0)
     scene = scene_of([[0, 0], [40, 0]], [[6, 0], [60, 0]], speeds=[6.0, 0.0])
     state, history = drive(env, scene, jnp.zeros((2, 3)), 40)
-    assert sum(bool(h.events.reached[0]) for h in history) >= 2, "the car reaches its goal, starts again and reaches it again"
+    assert sum(bool(h.events.goal_reached[0]) for h in history) >= 2, "the car reaches its goal, starts again and reaches it again"
     assert state.active.all() and not any(bool(h.over) for h in history)
 
 
 def test_unknown_ending_is_refused():
     with pytest.raises(ConfigError, match="unknown event 'colided'; valid: fault, reached"):
-        termination.check(["fault", "reached", "colided"], where="termination")
+        termination.check(["numerical_error", "goal_reached", "colided"], where="termination")

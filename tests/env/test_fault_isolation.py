@@ -78,7 +78,7 @@ def test_one_bit_is_a_difference():
 
 
 class Faults(NamedTuple):
-    fault: np.ndarray
+    numerical_error: np.ndarray
 
 
 class Traces(NamedTuple):
@@ -97,7 +97,7 @@ def test_a_fault_that_spreads_is_seen():
     away[3:, 0, 1] = False
     yaw = np.zeros((8, 2, 4), np.float32)
 
-    def run(fault=quiet, active=away, yaw=yaw):
+    def run(numerical_error=quiet, active=away, yaw=yaw):
         traces = Traces(active, yaw, Faults(fault))
         return traces, traces._replace(active=quiet)
 

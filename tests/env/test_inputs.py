@@ -52,7 +52,7 @@ def street():
         size=jnp.array([[4.0, 2.0]]),
         kind=jnp.full((1,), ROAD_USERS.index("vehicle"), jnp.int32),
     )
-    return replace(scene, others=parked)
+    return replace(scene, traffic_log=parked)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_an_agent_with_unusable_numbers_is_absent(drive, name):
     wanted = drive(replace(scene, agents=spoil(scene.agents, "present", False)))
     jax.tree.map(np.testing.assert_array_equal, without(found), without(wanted))
     for outcome, motion, active in found[1:]:
-        assert not outcome.events.reached[BROKEN] and not active[BROKEN] and not outcome.reward[BROKEN]
+        assert not outcome.events.goal_reached[BROKEN] and not active[BROKEN] and not outcome.reward[BROKEN]
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.observation, outcome.reward, motion)))
 
 
@@ -103,8 +103,8 @@ def test_numbers_spoilt_on_the_way_are_a_fault(drive, name):
     found = drive(scene, lambda state: replace(state, agents=spoil(state.agents, *UNUSABLE[name])))
     wanted = drive(scene, lambda state: replace(state, active=state.active.at[BROKEN].set(False)))
     jax.tree.map(np.testing.assert_array_equal, without(found), without(wanted))
-    assert [bool(outcome.events.fault[BROKEN]) for outcome, _, _ in found[1:]] == [True, False, False]
-    assert not any(outcome.events.reached[BROKEN] or active[BROKEN] for outcome, _, active in found[1:])
+    assert [bool(outcome.events.numerical_error[BROKEN]) for outcome, _, _ in found[1:]] == [True, False, False]
+    assert not any(outcome.events.goal_reached[BROKEN] or active[BROKEN] for outcome, _, active in found[1:])
 
 
 @pytest.mark.parametrize(("field", "value"), [("size", jnp.nan), ("size", 0.0), ("position", jnp.nan), ("yaw", jnp.inf)])
@@ -112,7 +112,7 @@ def test_what_stands_beside_the_road_with_unusable_numbers_is_absent(drive, fiel
     scene = street()
 
     def change(field, value):
-        return replace(scene, others=replace(scene.others, **{field: jnp.full_like(getattr(scene.others, field), value)}))
+        return replace(scene, traffic_log=replace(scene.traffic_log, **{field: jnp.full_like(getattr(scene.traffic_log, field), value)}))
 
     jax.tree.map(np.testing.assert_array_equal, drive(change(field, value)), drive(change("valid", False)))
 

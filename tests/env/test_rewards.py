@@ -20,7 +20,7 @@ from scenefactory_jax.core.types import Events, Motion, RewardInput, State
 from scenefactory_jax.env import environment, rewards, termination
 
 FAR = [[50.0, 0.0]]  # a goal that is ahead and not reached
-EVENTS = ("fault", "reached", "collided", "crashed", "touched_edge")  # in the order of precedence
+EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")  # in the order of precedence
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         steer=each(0.0),
         contact_force=each(force),
         grip=each(1.0),
-        grip_use=each(0.0),
+        friction_utilization=each(0.0),
         slip=each(0.0),
     )
     return State(
@@ -52,7 +52,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         agents=scene.agents,
         weather=scene.weather,
         active=scene.agents.present,
-        happened=termination.make_empty_events(count),
+        past_events=termination.make_empty_events(count),
         age=jnp.full(count, age, jnp.int32),
         previous_action=jnp.zeros((count, 3)),
         step=jnp.int32(age),
@@ -63,7 +63,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
 def judged(parts, before, after, scene):
     """The step as the environment makes it of two moments."""
     facts = parts.measure(scene, before, after)
-    events, _ = parts.judge(facts, before.happened, before.active)
+    events, _ = parts.judge(facts, before.past_events, before.active)
     return RewardInput(scene, before, after.previous_action, after, facts, events)
 
 
@@ -219,18 +219,18 @@ def test_an_agent_has_one_new_event_a_step_the_first_in_order(parts):
     """All 32 sets of events that are true, after all 32 sets of events that have happened."""
     assert tuple(field.name for field in dataclasses.fields(Events)) == termination.EVENTS == EVENTS
     rows = np.array(list(itertools.product([False, True], repeat=10)))
-    true, happened = rows[:, :5], rows[:, 5:]
+    true, past_events = rows[:, :5], rows[:, 5:]
     events = lambda table: Events(**{name: jnp.asarray(table[:, place]) for place, name in enumerate(EVENTS)})  # noqa: E731
     scene = scene_of([[0.0, 0.0]], FAR)
     facts = judged(parts, moment(scene, [[0.0, 0.0]]), moment(scene, [[0.0, 0.0]]), scene).facts
     facts = replace(facts, events=events(true))
-    new, done = parts.judge(facts, events(happened), jnp.ones(len(rows), bool))
+    new, done = parts.judge(facts, events(past_events), jnp.ones(len(rows), bool))
     found = np.stack([getattr(new, name) for name in EVENTS], axis=1)
-    for row, (is_true, before) in enumerate(zip(true, happened, strict=True)):
+    for row, (is_true, before) in enumerate(zip(true, past_events, strict=True)):
         first = next((place for place in range(5) if is_true[place] and not before[place]), None)
         assert np.flatnonzero(found[row]).tolist() == ([] if first is None else [first])
         assert done[row] == (first is not None)
-    nobody, ended = parts.judge(facts, events(happened), jnp.zeros(len(rows), bool))
+    nobody, ended = parts.judge(facts, events(past_events), jnp.zeros(len(rows), bool))
     assert not any(leaf.any() for leaf in (*jax.tree.leaves(nobody), ended))
 
 

@@ -32,7 +32,7 @@ def numbers_of(name, **changes):
 
 
 def bound(name, *, control_dt=CONTROL, **changes):
-    timing = {"control_dt": control_dt} if name == "replay" else {}
+    timing = {"control_dt": control_dt} if name == "log_playback" else {}
     return functools.partial(getattr(traffic, name), **numbers_of(name, **changes), **timing)
 
 
@@ -54,7 +54,7 @@ def tracks_of(*rows) -> TrafficLog:
 
 
 def with_tracks(scene, *rows):
-    return replace(scene, others=tracks_of(*rows))
+    return replace(scene, traffic_log=tracks_of(*rows))
 
 
 def at(scene, name, step, **changes) -> Boxes:
@@ -85,8 +85,8 @@ def test_nobody_is_a_road_without_rows(street):
 
 
 def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
-    log = street.others
-    run = jax.jit(jax.vmap(lambda step: bound("replay", gap_s=2.0)(street, step)))
+    log = street.traffic_log
+    run = jax.jit(jax.vmap(lambda step: bound("log_playback", gap_s=2.0)(street, step)))
     trace = jax.device_get(run(jnp.arange(61)))
     for row in range(21):
         boxes = jax.tree.map(lambda leaf, row=row: leaf[3 * row], trace)
@@ -97,7 +97,7 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
         np.testing.assert_allclose(boxes.yaw[seen], log.yaw[seen, row], atol=1e-6)
         assert boxes.present[seen].all()
     # 25 Hz meets every second row at 1.9999999, 3.9999998, ...: the last row too must be met
-    others_at = jax.jit(jax.vmap(lambda step: bound("replay", control_dt=0.04)(street, step)))(5 * jnp.arange(11))
+    others_at = jax.jit(jax.vmap(lambda step: bound("log_playback", control_dt=0.04)(street, step)))(5 * jnp.arange(11))
     np.testing.assert_array_equal(others_at.position[:, 1], log.position[1, ::2])
     assert others_at.present[:, 1].all()
     third = jax.tree.map(lambda leaf: leaf[31], trace)
@@ -108,7 +108,7 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
 
 
 def test_who_is_there_and_when(street):
-    run = jax.jit(jax.vmap(lambda step: bound("replay")(street, step).present))
+    run = jax.jit(jax.vmap(lambda step: bound("log_playback")(street, step).present))
     present = np.asarray(run(jnp.arange(1500)))
     parked, mover, person, cyclist, _ = present.T
     assert parked.all(), "parked cars outlast the log"
@@ -116,20 +116,20 @@ def test_who_is_there_and_when(street):
     assert np.flatnonzero(person).tolist() == list(range(9, 25)), "rows 3 to 8"
     # seen in rows 0-3, 9-10 and 20: a gap of 0.6 s is bridged, the one of 1.0 s too; with 0.5 s neither
     assert cyclist[:61].all() and not cyclist[61:].any()
-    short = np.asarray(jax.jit(jax.vmap(lambda step: bound("replay", gap_s=0.5)(street, step).present))(jnp.arange(70)))[:, 3]
+    short = np.asarray(jax.jit(jax.vmap(lambda step: bound("log_playback", gap_s=0.5)(street, step).present))(jnp.arange(70)))[:, 3]
     assert np.flatnonzero(short).tolist() == [*range(10), *range(27, 31), 60]
 
 
 def test_kinds_rows_and_masses_are_the_configs(street):
-    assert at(street, "replay", 12, kinds=["pedestrian"]).present.tolist() == [False, False, True, False, False]
-    assert at(street, "replay", 12, kinds=list(ROAD_USERS)).present.tolist() == [True] * 5
-    np.testing.assert_array_equal(at(street, "replay", 0, start_row=4).position[:3], at(street, "replay", 12).position[:3])
-    heavy = {**numbers_of("replay")["mass_kg"], "vehicle": 1500.0}
-    assert at(street, "replay", 0, mass_kg=heavy).mass[0] == 1500.0
+    assert at(street, "log_playback", 12, kinds=["pedestrian"]).present.tolist() == [False, False, True, False, False]
+    assert at(street, "log_playback", 12, kinds=list(ROAD_USERS)).present.tolist() == [True] * 5
+    np.testing.assert_array_equal(at(street, "log_playback", 0, start_row=4).position[:3], at(street, "log_playback", 12).position[:3])
+    heavy = {**numbers_of("log_playback")["mass_kg"], "vehicle": 1500.0}
+    assert at(street, "log_playback", 0, mass_kg=heavy).mass[0] == 1500.0
     with pytest.raises(ConfigError, match=r"mass_kg: vehicle; wanted exactly vehicle, pedestrian"):
-        at(street, "replay", 0, mass_kg={"vehicle": None})
+        at(street, "log_playback", 0, mass_kg={"vehicle": None})
     with pytest.raises(ConfigError, match=r"mass_kg\.vehicle: 0.0"):
-        at(street, "replay", 0, mass_kg={**heavy, "vehicle": 0.0})
+        at(street, "log_playback", 0, mass_kg={**heavy, "vehicle": 0.0})
     with pytest.raises(ConfigError, match=r"traffic\.kinds.*horse"):
         environment.make_env(load_config("task", "dynamics=bicycle", "traffic=log_playback", "traffic.kinds=[horse]"))
 
@@ -140,7 +140,7 @@ def test_static_keeps_the_parked_where_they_stood():
     hidden = track([50.0, 0.0], valid=[False] + [True] * 20)
     person = track([60.0, 0.0], kind="pedestrian")
     scene = with_tracks(scene_of([[0, 0]], [[50, 0]]), track([20.0, 0.5], turn=0.0), creeps, drives, hidden, person)
-    first, late = at(scene, "static", 0), at(scene, "static", 900)
+    first, late = at(scene, "parked", 0), at(scene, "parked", 900)
     assert first.present.tolist() == [True, True, False, False, False]
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(late), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -150,7 +150,7 @@ def test_static_keeps_the_parked_where_they_stood():
 
 def test_padding_and_empty_logs_are_nobody():
     scene = scene_of([[0, 0]], [[50, 0]])
-    for name in ("static", "replay"):
+    for name in ("parked", "log_playback"):
         assert not at(scene, name, 5).present.any()
         blank = with_tracks(scene, track([5.0, 0.0], valid=[False] * 21))
         boxes = at(blank, name, 5)
@@ -166,7 +166,7 @@ def config():
 
 
 def test_neighbours_and_ttc_know_the_others(street, config):
-    env = build_env(config, beside=bound("replay"))
+    env = build_env(config, beside=bound("log_playback"))
     _, history = drive(env, street, jnp.zeros((1, 3)), 12)
     facts, rows = history[-1].facts, history[-1].observation["neighbours"]
     features = np.asarray(rows.features[0])[np.asarray(rows.mask[0])]
@@ -190,13 +190,13 @@ def test_neighbours_and_ttc_know_the_others(street, config):
 
 
 def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, config):
-    bare = replace(street, others=track_interpolation.make_empty_log(21))
+    bare = replace(street, traffic_log=track_interpolation.make_empty_log(21))
     ignored = build_env(config)
     for a, b in zip(jax.tree.leaves(drive(ignored, bare, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(ignored, street, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
         np.testing.assert_array_equal(a, b)
-    env = build_env(config, beside=bound("replay"))
-    shuffled = replace(street, others=jax.tree.map(lambda leaf: leaf[jnp.array([3, 0, 4, 2, 1])], street.others))
+    env = build_env(config, beside=bound("log_playback"))
+    shuffled = replace(street, traffic_log=jax.tree.map(lambda leaf: leaf[jnp.array([3, 0, 4, 2, 1])], street.traffic_log))
     for a, b in zip(jax.tree.leaves(drive(env, street, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(env, shuffled, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
         np.testing.assert_array_equal(a, b)
@@ -206,15 +206,15 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
     x = np.arange(-60, 60.1, 0.5)
     scene = scene_of(np.zeros((6, 2)), np.ones((6, 2)))
     scene = with_tracks(replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))])), *(track([p, 1.0]) for p in (-30.0, 0.0, 25.0)))
-    scene = replace(scene, boxes=at(scene, "static", 0))
+    scene = replace(scene, traffic=at(scene, "parked", 0))
     numbers = load_config("task", "spawning=random_pairs")["spawning"]["sampler"] | {"travel_max_m": 20.0}
     del numbers["_target_"]
     agents = jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers))(jax.random.split(jax.random.key(3), 20))
     starts = np.asarray(agents.position)[np.asarray(agents.present)]
-    beyond = np.maximum(np.abs(starts[:, None] - np.asarray(scene.boxes.position)) - [2.25, 0.95], 0)
+    beyond = np.maximum(np.abs(starts[:, None] - np.asarray(scene.traffic.position)) - [2.25, 0.95], 0)
     assert len(starts) > 30 and np.linalg.norm(beyond, axis=-1).min() >= 4.0
     here = replace(scene.agents, position=jnp.array([[0.0, 0.0], [12.0, 0.0], [-9.0, 0.0], [25.0, 4.0], [-40, 0], [50, 0]]))
-    clear = spawning.is_clear(here, jnp.full((6, 2), 500.0), jnp.ones(6, bool), scene.boxes, clear_m=10.0)
+    clear = spawning.is_clear(here, jnp.full((6, 2), 500.0), jnp.ones(6, bool), scene.traffic, clear_m=10.0)
     assert clear.tolist() == [False, True, True, False, True, True]
 
 
@@ -228,8 +228,8 @@ def test_a_car_that_drives_into_a_parked_one_has_collided():
     when = None
     for count in range(45):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
-        when = count if when is None and bool(outcome.events.collided[0]) else when
-        assert not outcome.events.collided[1], "the other car passes beside it"
+        when = count if when is None and bool(outcome.events.collision[0]) else when
+        assert not outcome.events.collision[1], "the other car passes beside it"
     gap = 14 - 2.25 - 2
     assert when == pytest.approx(gap / 10 * 30, abs=1.5) and not state.active[0] and state.active[1]
 
@@ -243,7 +243,7 @@ def test_a_real_car_stops_at_a_wall_and_drives_on_past_a_person():
         yaw_rate=jnp.zeros(3, f), size=jnp.array([[4.5, 1.9], [0.8, 0.8], [4.5, 1.9]], f),
         mass=jnp.array([np.inf, 80.0, np.inf], f), present=jnp.ones(3, bool),
     )  # fmt: skip
-    scene, dynamics = replace(scene_for(speed=10.0), boxes=boxes), make("mjx_car")
+    scene, dynamics = replace(scene_for(speed=10.0), traffic=boxes), make("articulated")
 
     @jax.jit
     def second(body):
@@ -290,30 +290,30 @@ def test_everybody_is_kept_or_counted(logged):
     wanted = {"absent_from_start_on": 1, "outside_box": 1, "overlaps_agent": 1}
     assert report.others_dropped == {reason: wanted.get(reason, 0) for reason in pack.OTHER_DROPS}
     assert report.agents_kept + report.others_kept + sum(report.others_dropped.values()) == len(logged.tracks)
-    assert scene.others.kind.tolist() == [0, 1, 2, 3], "nearest to the agent's start first"
-    np.testing.assert_allclose(scene.others.position[0, 10], [30 - 40, 3], atol=1e-5)
-    np.testing.assert_allclose(scene.others.size[0], [4.5, 1.9], rtol=1e-6)
-    assert scene.others.valid.sum(1).tolist() == [STEPS, STEPS, 1, STEPS]
-    scene, report = prepared(logged, others=2, others_least_m=2.0, log_from="current")
-    assert report.others_kept == 2 and report.others_dropped["over_capacity"] == 2 and scene.others.valid.shape == (2, 2)
-    np.testing.assert_allclose(scene.others.size, [[4.5, 2.0]] * 2)
-    assert len(prepared(logged, others=0).scene.others.kind) == 0
-    assert packer(others=0)(amend(logged, tracks=logged.tracks[:1]))[1].others_kept == 0
+    assert scene.traffic_log.kind.tolist() == [0, 1, 2, 3], "nearest to the agent's start first"
+    np.testing.assert_allclose(scene.traffic_log.position[0, 10], [30 - 40, 3], atol=1e-5)
+    np.testing.assert_allclose(scene.traffic_log.size[0], [4.5, 1.9], rtol=1e-6)
+    assert scene.traffic_log.valid.sum(1).tolist() == [STEPS, STEPS, 1, STEPS]
+    scene, report = prepared(logged, traffic=2, others_least_m=2.0, log_from="current")
+    assert report.others_kept == 2 and report.others_dropped["over_capacity"] == 2 and scene.traffic_log.valid.shape == (2, 2)
+    np.testing.assert_allclose(scene.traffic_log.size, [[4.5, 2.0]] * 2)
+    assert len(prepared(logged, traffic=0).scene.traffic_log.kind) == 0
+    assert packer(traffic=0)(amend(logged, tracks=logged.tracks[:1]))[1].others_kept == 0
 
 
 def test_banks_and_stacks_carry_others(tmp_path, logged):
     opened = bank_reader.write(tmp_path / "bank", [logged, amend(logged, tracks=logged.tracks[:2])], settings={})
-    full, less = prepared(logged), prepared(logged, others=1, agents=3)
+    full, less = prepared(logged), prepared(logged, traffic=1, agents=3)
     tools = {"check": checker(), "pack": packer(), "workers": 1}
     for name, leaf in columns.flatten(full.scene).items():
         np.testing.assert_array_equal(columns.flatten(bank_reader.pack_scenes(opened, [0], **tools)[0].scene)[name], leaf)
     stacked, report = bank_reader.load(opened, [1, 0, 1], capacity={}, **tools)
-    assert report.capacity["traffic"] == 4 and stacked.others.valid.any(-1).sum(1).tolist() == [1, 4, 1]
-    assert stacked.boxes.present.shape == (3, 0)
+    assert report.capacity["traffic"] == 4 and stacked.traffic_log.valid.any(-1).sum(1).tolist() == [1, 4, 1]
+    assert stacked.traffic.present.shape == (3, 0)
     cut, report = stack.stack([full.scene, less.scene], capacity={"traffic": 2})
-    assert [(c.axis, c.had, c.kept) for c in report.cuts] == [("traffic", 4, 2)] and cut.others.kind[0].tolist() == [0, 1]
+    assert [(c.axis, c.had, c.kept) for c in report.cuts] == [("traffic", 4, 2)] and cut.traffic_log.kind[0].tolist() == [0, 1]
     none, report = stack.stack([full.scene], capacity={"traffic": 0})
-    assert none.others.position.shape == (1, 0, STEPS, 2) and "traffic=0: 4 of 4" in "\n".join(stack.describe(report))
+    assert none.traffic_log.position.shape == (1, 0, STEPS, 2) and "traffic=0: 4 of 4" in "\n".join(stack.describe(report))
 
 
 def real(shared_data, count=None):
@@ -328,12 +328,12 @@ def assert_sound(packed):
     kept = np.array([one.report.others_kept for one in packed])
     assert np.median(kept) > 20 and kept.max() <= 64
     for scene, report in packed:
-        log = scene.others
+        log = scene.traffic_log
         assert report.others_kept == len(log.kind) and log.valid.any(1).all() and np.isfinite(log.position).all()
         assert sum(report.agents_dropped.values()) == report.others_kept + sum(report.others_dropped.values())
         seen = log.valid & (np.abs(log.position).max(-1) <= 100.0)
         assert seen.any(1).all() and (log.size >= 0.3 - 1e-6).all()
-    people = np.concatenate([one.scene.others.size[one.scene.others.kind == KINDS["pedestrian"]] for one in packed])
+    people = np.concatenate([one.scene.traffic_log.size[one.scene.traffic_log.kind == KINDS["pedestrian"]] for one in packed])
     assert not len(people) or np.median(people) < 1.1  # one of them may carry something
 
 
@@ -343,7 +343,7 @@ def test_real_scenes_have_others(shared_data):
     worlds, _ = stack.stack([one.scene for one in packed], capacity={})
     worlds = jax.tree.map(jnp.asarray, worlds)
     count = lambda name, step: jax.vmap(lambda scene: at(scene, name, step).present.sum())(worlds)  # noqa: E731
-    parked, first, end = count("static", 0), count("replay", 0), count("replay", 1499)
+    parked, first, end = count("parked", 0), count("log_playback", 0), count("log_playback", 1499)
     assert (first >= parked).all() and (end >= parked).all() and parked.sum() > 60
 
 

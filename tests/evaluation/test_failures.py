@@ -62,7 +62,7 @@ DRIVES = {
     "box": (drive(10, 8.0, speed=8), (50, 8), AWAY),
     "edge": (drive(-10, 15, speed=6, yaw=np.pi / 2), (50, 0), AWAY),
     "crash": (drive(60, speed=20), FAR, AWAY),
-    "fault": (tuple(np.where(TIME > 2.0, np.nan, column) for column in drive(-30, speed=4)), FAR, AWAY),
+    "numerical_error": (tuple(np.where(TIME > 2.0, np.nan, column) for column in drive(-30, speed=4)), FAR, AWAY),
     "wrong_way": (drive(40, speed=4, yaw=np.pi), FAR, AWAY),
     "wrong_way_into": (drive(40, speed=8, yaw=np.pi), FAR, parked(0.0)),
     "overshoot": (drive(-20, speed=5), (0, 5), AWAY),
@@ -93,7 +93,7 @@ def scripted(first, goal, second):
     place = jnp.tile(jnp.array([[[30.0, 8.0]]]), (1, len(TIME), 1))
     zero = jnp.zeros((1, len(TIME)))
     box = TrafficLog(place, zero, jnp.zeros_like(place), jnp.ones(zero.shape, bool), jnp.array([[4.5, 2.0]]), jnp.zeros(1, jnp.int32))
-    return replace(scene, log=log, others=box)
+    return replace(scene, log=log, traffic_log=box)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def row_of(records, name, agent=0) -> int:
         ("slower_ahead", 1, "struck"), ("head_on", 0, "struck"), ("head_on", 1, "at_fault"),
         ("head_on_off_lane", 0, "at_fault"), ("head_on_off_lane", 1, "at_fault"), ("side", 0, "at_fault"),
         ("side", 1, "struck"), ("cut_in", 0, "struck"), ("cut_in", 1, "at_fault"), ("box", 0, "at_fault"), ("edge", 0, "edge"),
-        ("crash", 0, "crash"), ("fault", 0, "fault"), ("wrong_way", 0, "wrong_way"), ("wrong_way_into", 0, "at_fault"),
+        ("crash", 0, "crash"), ("numerical_error", 0, "numerical_error"), ("wrong_way", 0, "wrong_way"), ("wrong_way_into", 0, "at_fault"),
         ("overshoot", 0, "overshoot"), ("overshoot_then_stands", 0, "overshoot"), ("circles", 0, "overshoot"), ("stuck", 0, "stuck"),
         ("stops_short", 0, "stuck"), ("late", 0, "out_of_time"), ("late", 1, "stuck"),
     ],

@@ -15,7 +15,7 @@ def records(reached, **columns):
     flat = reached.ravel()
     rows = {name: np.zeros(flat.size, kind if kind is not str else "<U8") for name, kind in agent_metrics.COLUMNS.items()}
     rows |= {"scene": np.repeat([f"s{i}" for i in range(scenes)], agents), "world": np.repeat(np.arange(scenes), agents)}
-    rows |= {"agent": np.tile(np.arange(agents), scenes), "reached": flat, "clean": flat}
+    rows |= {"agent": np.tile(np.arange(agents), scenes), "goal_reached": flat, "clean": flat}
     return rows | {name: np.asarray(value).ravel() for name, value in columns.items()}
 
 
@@ -95,9 +95,9 @@ def test_a_rate_of_all_takes_the_score_interval_of_distinct_agents():
 
 
 def test_a_mean_that_does_not_vary_has_no_interval():
-    found = hierarchical_bootstrap.summarise({0: records(np.ones((4, 5)), grip_use=np.full((4, 5), 1.42))}, bootstrap=20, seed=0)[
-        "grip_use"
-    ]
+    found = hierarchical_bootstrap.summarise(
+        {0: records(np.ones((4, 5)), friction_utilization=np.full((4, 5), 1.42))}, bootstrap=20, seed=0
+    )["friction_utilization"]
     assert agent_metrics.text(found) == "142.0 %" and found.method == agent_metrics.NONE
 
 

@@ -44,7 +44,7 @@ def reference(config):
 
     def judged(scene, before, after):
         facts = parts.measure(scene, before, after)
-        events, done = parts.judge(facts, before.happened, before.active)
+        events, done = parts.judge(facts, before.past_events, before.active)
         step = RewardInput(scene, before, after.previous_action, after, facts, events)
         return facts, events, done, {name: weight * term(step) for name, (weight, term) in parts.terms.items()}
 
@@ -69,7 +69,7 @@ def moments(scene, reference):
             state,
             motion=motion_of(place, height, velocity, yaw, np.where(rng.random(slots) < 0.1, 0.1, 1.0), rng.choice([0.0, 100.0], slots)),
             active=jnp.asarray(rng.random(slots) < 0.9) & state.agents.present,
-            happened=Events(**{name: jnp.asarray(rng.random(slots) < 0.3) & (name != "fault") for name in EVENTS}),
+            past_events=Events(**{name: jnp.asarray(rng.random(slots) < 0.3) & (name != "numerical_error") for name in EVENTS}),
             age=jnp.asarray(rng.integers(0, 60, slots), jnp.int32),
         )
         moved = (place - velocity / 30, height, velocity, yaw, np.ones(slots), np.zeros(slots))
@@ -90,7 +90,7 @@ def motion_of(place, height, velocity, yaw, upright, force) -> Motion:
         upright=upright,
         contact_force=force,
     )
-    numbers |= {name: 0 * yaw for name in ("yaw_rate", "steer", "grip", "grip_use", "slip")}
+    numbers |= {name: 0 * yaw for name in ("yaw_rate", "steer", "grip", "friction_utilization", "slip")}
     return Motion(**{name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
 
 
@@ -111,7 +111,7 @@ def agents_of(state) -> list[one.Agent]:
             contact_force=float(motion.contact_force[slot]),
             active=bool(state.active[slot]),
             age=int(state.age[slot]),
-            happened={name for name in EVENTS if bool(getattr(state.happened, name)[slot])},
+            past_events={name for name in EVENTS if bool(getattr(state.past_events, name)[slot])},
         )
         for slot in range(len(state.active))
     ]
@@ -160,7 +160,7 @@ def test_rewards_and_events_are_those_of_the_device(task, scene, reference, mome
             paid = [weight * term(own, new) for weight, term in task.terms]
             np.testing.assert_allclose(paid, [terms[name][slot] for name in config["reward"]], atol=1e-5)
             met |= {new}
-    assert met == {None, *EVENTS} - {"fault"}
+    assert met == {None, *EVENTS} - {"numerical_error"}
 
 
 def test_numpy_network_is_the_policy(task, scene, reference, moments, parameters, config):
@@ -228,11 +228,15 @@ def test_a_broken_number_ends_everybody_with_a_fault(task, scene, tmp_path, monk
     baseline_environment.drive(task.engine, whole, [np.zeros(3)] * len(whole.agents))
     rewards, over = baseline_environment.settle(task, whole, before)
     assert over and np.isfinite(rewards).all()
-    assert all(agent.happened == {"fault"} for agent in whole.agents)
+    assert all(agent.past_events == {"numerical_error"} for agent in whole.agents)
 
 
 def test_measure_gives_positive_numbers(config, scene, parameters):
-    short = {**config, "timing": {**config["timing"], "episode_s": 0.2}, "spawning": {"sampler": {"_target_": "logged"}, "respawn_clearance_m": None}}
+    short = {
+        **config,
+        "timing": {**config["timing"], "episode_s": 0.2},
+        "spawning": {"sampler": {"_target_": "logged"}, "respawn_clearance_m": None},
+    }
     result = baseline_environment.measure(short, [scene, scene], parameters, steps=8, repeats=2, seed=0)  # with restarts
     low, high = result["agent_steps_per_s_range"]
     assert 0 < low <= result["agent_steps_per_s"] <= high < np.inf
@@ -242,7 +246,9 @@ def test_measure_gives_positive_numbers(config, scene, parameters):
     assert sum(phases[name] for name in baseline_environment.PHASES) == pytest.approx(phases["whole"], rel=0.5)
 
 
-@pytest.mark.parametrize("override", ["dynamics=bicycle", "traffic=parked", "weather=storm", "+reward.own={_target_: my.term, weight: 1.0}"])
+@pytest.mark.parametrize(
+    "override", ["dynamics=bicycle", "traffic=parked", "weather=storm", "+reward.own={_target_: my.term, weight: 1.0}"]
+)
 def test_what_only_the_device_has_is_named(override):
     with pytest.raises(ConfigError, match="baseline has"):
         baseline_environment.make(sf.load_config("bench", override))

@@ -29,7 +29,7 @@ def entry_of(name, **car):
 
 @pytest.fixture(scope="module")
 def entry():
-    return entry_of("mjx_car")
+    return entry_of("articulated")
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_an_engine_against_the_brakes_does_not_creep_in_either_engine(drive, ent
 
 @pytest.mark.slow
 def test_latched_brakes_shake(drive):
-    latched = motion_laws.driver({**entry_of("mjx_car", rolling_torque=0.0), "brakes": "latched"}, slippery=0.125, width=4, **RATES)
+    latched = motion_laws.driver({**entry_of("articulated", rolling_torque=0.0), "brakes": "latched"}, slippery=0.125, width=4, **RATES)
     held, shaken = motion_laws.standing(drive, **STANDING), motion_laws.standing(latched, **STANDING)
     assert shaken["brake_rest"].max() > 10 * held["brake_rest"].max()
 
@@ -137,7 +137,7 @@ def test_the_car_rides_on_its_springs(drive, car):
 
 @pytest.mark.slow
 def test_the_published_car_rides_on_its_stops():
-    published = entry_of("mjx_published")
+    published = entry_of("articulated_paper")
     hard = motion_laws.driver(published, slippery=1.0, width=4, **RATES)
     lying = motion_laws.ride(hard, cars.read_parameters(published)[0], friction=0.9, seconds=2.0, **CLOCK)
     assert 0.03 < lying["on_springs"] < 0.06 and lying["travel_m"].min() > lying["room_m"]
@@ -281,7 +281,7 @@ def test_cases_spread_over_processes_come_back_in_order():
 def test_sizes_compose(size):
     config = load_config("validate", f"validation={size}")
     assert config["validation"]["drives"]["draw"]["count"] >= 48 and config["validation"]["settings"]["trials"]
-    assert {"mjx_car", "latched", "published", "bicycle"} == set(config["backends"])
+    assert {"articulated", "latched", "published", "bicycle"} == set(config["backends"])
 
 
 @pytest.mark.slow
@@ -295,7 +295,7 @@ def test_all_parts(tmp_path):
     )  # fmt: skip
     results = toy(tmp_path, f"parts=[{','.join(command.PARTS)}]", *small)
     text = (tmp_path / "validation.md").read_text()
-    assert list(results) == list(command.PARTS) and "is refused: dynamics.car" in text and "mjx_published" in text
+    assert list(results) == list(command.PARTS) and "is refused: dynamics.car" in text and "articulated_paper" in text
     for title in ("Extremes", "Faults", "Determinism", "What features cost"):
         assert f"## {title}" in text
     assert [row["name"] for row in results["costs"]["result"]["rows"]] == ["plain", "all of it"]

@@ -254,7 +254,7 @@ def test_metrics_count_what_happened(course):
     assert metrics["reward"] == pytest.approx(metrics["reward/paid"]) and -4.0 < metrics["reward"] < 0.0
     assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
     assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
-    assert metrics["events/reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
+    assert metrics["events/goal_reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
 
 
 @pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])

@@ -11,7 +11,9 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning.training_loop import train
 
-ROWS = [{"iteration": i, "reward": 0.5 * i, "events/reached": 0.1 * i, "loss/kl": float("nan") if i == 1 else 0.01} for i in range(1, 5)]
+ROWS = [
+    {"iteration": i, "reward": 0.5 * i, "events/goal_reached": 0.1 * i, "loss/kl": float("nan") if i == 1 else 0.01} for i in range(1, 5)
+]
 
 
 def told(folder, rows, *overrides, after=0):
@@ -75,7 +77,7 @@ def test_wandb_offline(tmp_path, monkeypatch):
                 rows.append({item.key or "/".join(item.nested_key): item.value_json for item in record.history.item})
     assert ids == {((tmp_path / "wandb.id").read_text().strip(), tmp_path.name)}
     assert [float(row["reward"]) for row in rows] == [0.5, 1.0, 1.5, 1.5, 2.0]
-    assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 3, 4] and float(rows[-1]["events/reached"]) == pytest.approx(0.4)
+    assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 3, 4] and float(rows[-1]["events/goal_reached"]) == pytest.approx(0.4)
     assert float(configs["worlds"]) == whole["worlds"]
 
 
@@ -93,7 +95,7 @@ def test_mlflow(tmp_path, monkeypatch):
     assert run.data.params["seed"] == "7" and run.data.params["reward.goal.weight"] == "45.0"
     history = {(metric.step, metric.value) for metric in client.get_metric_history(run.info.run_id, "reward")}
     assert history == {(1, 0.5), (2, 1.0), (3, 1.5), (4, 2.0)}
-    assert run.data.metrics["events/reached"] == pytest.approx(0.4)
+    assert run.data.metrics["events/goal_reached"] == pytest.approx(0.4)
 
     with (
         pytest.raises(KeyboardInterrupt),

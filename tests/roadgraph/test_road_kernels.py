@@ -21,7 +21,7 @@ ROWS = {"radius_m": 10.0, "kind_scale": 20.0}
 def scenes():
     """Two worlds with more segments than a program takes at once, the second with gaps in its tables."""
     loaded = scene_source.load_training_scenes(load_config("train", "scenes.count=2")["scenes"]).scene
-    loaded = spatial_grid.attach_grid(jax.tree.map(np.asarray, replace(loaded, cells=None)), radius_m=10.0, size_m=5.0)
+    loaded = spatial_grid.attach_grid(jax.tree.map(np.asarray, replace(loaded, road_grid=None)), radius_m=10.0, size_m=5.0)
     assert min(loaded.lanes.valid.shape[1], loaded.edges.valid.shape[1]) >= road_kernels.LOOK
     gaps = {name: np.array(getattr(loaded, name).valid) for name in ("lanes", "edges")}
     for valid in gaps.values():
@@ -94,10 +94,12 @@ def test_gathering_is_what_plain_jax_finds(scenes, cars, count):
     *_, yaw, position, active = cars
 
     def kernel(scene, position, yaw, active):
-        first, last = spatial_grid.find_cell_bounds(scene.cells, position)
+        first, last = spatial_grid.find_cell_bounds(scene.road_grid, position)
         turn = geometry.heading_vector(-yaw)
         last = jnp.where(active, last, first)
-        return road_kernels.gather_segment_blocks(scene.road, scene.cells, first, last, position, turn, count=count, **ROWS, interpret=True)
+        return road_kernels.gather_segment_blocks(
+            scene.road, scene.road_grid, first, last, position, turn, count=count, **ROWS, interpret=True
+        )
 
     features, mask = jax.vmap(kernel)(scenes, position, yaw, active)
     wanted = jax.vmap(lambda *given: queries.gather_segments(*given, count=count, **ROWS, kernels=False))(scenes, position, yaw, active)

@@ -36,7 +36,7 @@ def places(scene, seed):
     road = np.asarray(scene.road.midpoint)[np.asarray(scene.road.valid)]
     on = rng.choice(road, PLACES // 2) + rng.normal(0.0, 3.0, (PLACES // 2, 2))
     around = rng.uniform(-150.0, 150.0, (PLACES // 4, 2))
-    corners = np.asarray(scene.cells.origin) + 5.0 * rng.integers(0, scene.cells.side + 1, (PLACES // 4 - 2, 2))
+    corners = np.asarray(scene.road_grid.origin) + 5.0 * rng.integers(0, scene.road_grid.side + 1, (PLACES // 4 - 2, 2))
     return np.concatenate([on, around, corners, [[1e4, -1e4], [np.inf, 0.0]]]).astype(np.float32)
 
 
@@ -48,7 +48,7 @@ def look(count):
         zeros = jnp.zeros(agents, jnp.float32)
         motion = Motion(
             position=jnp.concatenate([position, zeros[:, None]], axis=1), velocity=jnp.zeros((agents, 3)), yaw=0.1 * jnp.arange(agents),
-            **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "grip", "grip_use", "slip"), zeros),
+            **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "grip", "friction_utilization", "slip"), zeros),
         )  # fmt: skip
         state = type("State", (), {"motion": motion, "active": jnp.ones(agents, bool)})()
         return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
@@ -62,22 +62,22 @@ def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
     for world in range(len(scenes.log.dt)):
         one = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), quick)  # noqa: B023
         position = places(one, world)
-        found, wanted = find(one, position), find(replace(one, cells=None), position)
+        found, wanted = find(one, position), find(replace(one, road_grid=None), position)
         jax.tree.map(np.testing.assert_array_equal, found, wanted)
         assert wanted.mask.any(axis=1).sum() > PLACES // 4 and not wanted.mask[-2:].any()
-        assert int(one.cells.most) < int(one.road.valid.sum())
+        assert int(one.road_grid.most) < int(one.road.valid.sum())
 
 
 def test_a_larger_radius_looks_through_all(scenes):
     narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), spatial_grid.attach_grid(scenes, radius_m=4.0, size_m=5.0))
     find, position = look(350), places(narrow, 0)
-    jax.tree.map(np.testing.assert_array_equal, find(narrow, position), find(replace(narrow, cells=None), position))
+    jax.tree.map(np.testing.assert_array_equal, find(narrow, position), find(replace(narrow, road_grid=None), position))
 
 
 def test_a_world_without_a_road_has_empty_lists(scenes):
     road = scenes.road
     bare = unchecked(type(scenes), **(vars(scenes) | {"road": unchecked(type(road), **(vars(road) | {"valid": road.valid & False}))}))
-    made = spatial_grid.attach_grid(bare, radius_m=10.0, size_m=5.0).cells
+    made = spatial_grid.attach_grid(bare, radius_m=10.0, size_m=5.0).road_grid
     assert not made.first.any() and made.most == 1
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made)
     _, listed = spatial_grid.list_segments(one, *spatial_grid.find_cell_bounds(one, jnp.zeros((3, 2))))

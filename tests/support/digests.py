@@ -41,8 +41,8 @@ FILE = Path(__file__).with_suffix(".json")
 MACHINE = "machine"  # what the bits depend on, beside the cases in the file
 NEAR = {True: 1e-6, False: 0.01}  # of means, on the machine of the record (threads divide sums), elsewhere (cars that touch part)
 WORLDS, AGENTS, STEPS, TOWNS = 4, 4, 200, 8
-BACKENDS = ("mjx_car", "mjx_published", "bicycle", "replay")
-OTHERS = ("ignore", "replay", "static")
+BACKENDS = ("articulated", "articulated_paper", "bicycle", "log_playback")
+TRAFFIC = ("none", "log_playback", "parked")
 BUSY = ("traffic=log_playback", "weather=split")
 WEATHERS = ("mixed", "puddles", "split", "onset", "winter")
 SMALL = ("experiment=smoke", "scenes=town", f"scenes.count={WORLDS}", f"scenes.pack.agents={AGENTS}", "scenes.pack.traffic=8")
@@ -145,7 +145,7 @@ def training(*overrides: str) -> Any:
 def evaluation() -> Any:
     """The per-agent table of an untrained policy."""
     config, settings = sf.load_config("train", *SMALL, "timing.episode_s=4"), sf.load_config("evaluate", "run=none")
-    play = make_episode_runner(config, scenes(), protocol="invincible", settings=settings, worlds=0, steps=0)
+    play = make_episode_runner(config, scenes(), protocol="goal_only", settings=settings, worlds=0, steps=0)
     env = sf.make(config)
     observation = env.reset(jax.random.key(0), scenes()[0])[1]
     return play(make_policy(config).init(jax.random.key(0), observation))[0]
@@ -193,7 +193,7 @@ def towns() -> Any:
 CASES: dict[str, Callable[[], Any]] = {
     **{f"environment dynamics={name}": functools.partial(environment, f"dynamics={name}", *BUSY) for name in BACKENDS},
     "environment by mjx.step": functools.partial(environment, "dynamics=articulated", "dynamics.solver.algorithm=Newton", *BUSY),
-    **{f"environment traffic={name}": functools.partial(environment, f"traffic={name}") for name in OTHERS},
+    **{f"environment traffic={name}": functools.partial(environment, f"traffic={name}") for name in TRAFFIC},
     **{f"environment weather={name}": functools.partial(environment, f"weather={name}") for name in WEATHERS},
     "training smoke": functools.partial(training, *SMALL),
     "training quick": functools.partial(training, *QUICK),

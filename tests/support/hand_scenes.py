@@ -64,5 +64,5 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     )
     return Scene(
         road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
-        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)), others=make_empty_log(steps), boxes=make_empty_boxes(),
+        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)), traffic_log=make_empty_log(steps), traffic=make_empty_boxes(),
     )

@@ -85,7 +85,20 @@ def _report_jumps(raw, limit_m_s, lines):
 
 
 def pack(
-    raw, *, scene_size_m, centre, gap_m, outline_m, agents, min_travel_m, car_size_m, start_speed, log_from, require_agents, others, others_least_m
+    raw,
+    *,
+    scene_size_m,
+    centre,
+    gap_m,
+    outline_m,
+    agents,
+    min_travel_m,
+    car_size_m,
+    start_speed,
+    log_from,
+    require_agents,
+    traffic,
+    others_least_m,
 ):
     origin, centred_on = _centre(raw, centre)
     half = scene_size_m / 2
@@ -95,7 +108,7 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, others, others_least_m)
+    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, others_least_m)
     leaves |= beside
     report = PackReport(
         name=raw.name,
@@ -107,7 +120,7 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
-        others_kept=len(beside["traffic.kind"]),
+        others_kept=len(beside["traffic_log.kind"]),
         others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
@@ -287,7 +300,7 @@ def _others(raw, agents, leaves, origin, half, first, limit, least):
     rows = _recording(tracks, raw, origin, len(tracks), first)
     rows["size"] = np.maximum(np.array([track.size[:2] for track in tracks], float).reshape(-1, 2), least)
     rows["kind"] = np.array([ROAD_USERS.index(track.kind) for track in tracks], int)
-    return {f"others.{name}": leaf for name, leaf in rows.items()}, dropped
+    return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, dropped
 
 
 def lists(midpoint, valid, origin, *, side, radius_m, size_m):

@@ -103,7 +103,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
             agents=dataclasses.replace(scene.agents, present=PRESENT),
             weather=scene.weather,
             active=PRESENT,
-            happened=blank(Events),
+            past_events=blank(Events),
             age=jnp.zeros(AGENTS, jnp.int32),
             previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
             step=jnp.asarray(step, jnp.int32),
@@ -119,7 +119,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
         )
         truncated = after.step >= episode_steps
         over = truncated | ~jnp.any(after.active)
-        events = blank(Events, reached=done)
+        events = blank(Events, goal_reached=done)
         facts = blank(StepMetrics, speed=jnp.where(state.active, 2.0, POISON))
         return after, StepResult(None, paid, {"paid": paid}, events, done, truncated, over, facts)
 

@@ -41,7 +41,7 @@ def _dressed(recording: Recording) -> Recording:
         Boxes, position=np.stack([position] * 2), elevation=zero, yaw=zero, velocity=np.zeros((2, STEPS, 2, 2)), yaw_rate=zero,
         size=np.broadcast_to([4.5, 2.0], (2, STEPS, 2, 2)), mass=zero, present=np.stack([present] * 2),
     )
-    return changed(recording, wheels=wheels, others=others)
+    return changed(recording, wheels=wheels, traffic=others)
 
 
 def changed(recording: Recording, **columns) -> Recording:

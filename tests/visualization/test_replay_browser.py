@@ -119,7 +119,12 @@ def test_numbers_are_the_recordings(opened, recording):
     for step in (0, 17, 60):
         go_to(page, step)
         at = (0, step, 1)
-        shown = {"speed": shots.speed, "goal_distance": shots.goal_distance, "slip": shots.slip, "grip_use": shots.grip_use}
+        shown = {
+            "speed": shots.speed,
+            "goal_distance": shots.goal_distance,
+            "slip": shots.slip,
+            "friction_utilization": shots.friction_utilization,
+        }
         shown |= {"throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2]}
         for name, values in shown.items():
             if page.query_selector(f"[data-array='{name}']") is None:  # all zero: not shown

@@ -76,7 +76,11 @@ def test_the_page_holds_the_recording(page, recording):
         shots = jax.tree.map(lambda leaf, i=index, end=world["steps"]: leaf[i, :end], recording.shots)
         assert world["name"] == NAMES[index] and abs(world["dt"] - 1 / HZ) < 1e-5 and world["surface"] in SURFACES
         columns = {"x": shots.position[..., 0], "speed": shots.speed, "throttle": shots.action[..., 0], "brake": shots.action[..., 2]}
-        columns |= {"goal_distance": shots.goal_distance, "contact_force": shots.contact_force, "grip_use": shots.grip_use}
+        columns |= {
+            "goal_distance": shots.goal_distance,
+            "contact_force": shots.contact_force,
+            "friction_utilization": shots.friction_utilization,
+        }
         terms = {f"term:{name}": values for name, values in shots.terms.items()}
         wheels = {f"mu:{name}": shots.wheels.mu[..., i] for i, name in enumerate(("FL", "FR", "RL", "RR"))}
         for name, values in (columns | terms | wheels).items():
@@ -98,7 +102,7 @@ def test_cars_events_and_others(page, recording):
             for begin, end in car["spans"]:
                 driven[begin : end + 1] = True
             assert (driven == active[index, :, car["slot"]]).all()
-    assert {event["name"] for event in first["events"]} >= {"reached", "touched_edge"}
+    assert {event["name"] for event in first["events"]} >= {"goal_reached", "road_edge_contact"}
     assert [car["goals"] for car in first["cars"]] == [[[0, -8.0, 0.0]], [[0, 50.0, 0.0]], [[0, 55.0, -3.0]]]
     users = [(user["spans"], user["parked"]) for user in first["traffic"]]
     assert users == [([[STEPS // 2, STEPS - 1]], False), ([[0, STEPS - 1]], True)]

@@ -31,20 +31,20 @@ def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: 
     scene = np.repeat(np.arange(scenes), agents)
     share = np.clip(success + (0.15 * rng.normal(size=scenes) if 0 < success < 1 else 0.0), 0, 1)
     reached = rng.random(n) < np.broadcast_to(share, scenes)[scene]
-    events = {name: (rng.random(n) < 0.15 * (1 - success)) for name in ("collided", "crashed", "touched_edge")}
+    events = {name: (rng.random(n) < 0.15 * (1 - success)) for name in ("collision", "out_of_bounds", "road_edge_contact")}
     ttc = np.where(rng.random(n) < 0.8, rng.gamma(3.0, 1.0, n), np.inf)
     return {
         "scene": np.array([f"scene, {i:03d}" for i in scene]), "world": scene, "seed": np.full(n, 7),
         "agent": np.tile(np.arange(agents), scenes),
-        "reached": reached, **events, "fault": np.zeros(n, bool),
-        "clean": reached & ~events["collided"] & ~events["crashed"] & ~events["touched_edge"],
+        "goal_reached": reached, **events, "numerical_error": np.zeros(n, bool),
+        "clean": reached & ~events["collision"] & ~events["out_of_bounds"] & ~events["road_edge_contact"],
         "time_s": rng.uniform(3, 50, n).astype(np.float32), "route_m": rng.uniform(10, 90, n), "start_distance_m": rng.uniform(10, 90, n),
         "end_distance_m": np.where(reached, 2.5, 20.0), "max_drac": rng.gamma(1.0, 3.0, n), "min_ttc_s": ttc,
         "mean_ttc_s": np.where(np.isfinite(ttc), np.minimum(ttc + 1, 10), 0.0), "has_ttc": np.isfinite(ttc),
-        "mean_speed": rng.uniform(1, 9, n), "max_contact_force_n": np.where(events["collided"], 900.0, 0.0),
+        "mean_speed": rng.uniform(1, 9, n), "max_contact_force_n": np.where(events["collision"], 900.0, 0.0),
         "film_mm": np.array([0.0, 0.5])[scene % 2],
         "surface": np.array(["AC", "SMA"])[scene % 2], "friction": np.array([0.86, 0.6])[scene % 2],
-        "yaw_acceleration": rng.uniform(0, 3, n), "grip_use": rng.uniform(0, 1, n),
+        "yaw_acceleration": rng.uniform(0, 3, n), "friction_utilization": rng.uniform(0, 1, n),
         "stopping_margin_m": np.where(np.isfinite(ttc), rng.uniform(-5, 30, n), np.inf),
     }  # fmt: skip
 
@@ -60,7 +60,7 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
     position = np.stack([run, np.zeros_like(run)], -1).astype(np.float32)
     active = np.ones((steps, agents), bool)
     events = {name: np.zeros((steps, agents), bool) for name in drawing.MARKS}
-    for agent, step, name in ((0, 30, "reached"), (1, 40, "collided")):
+    for agent, step, name in ((0, 30, "goal_reached"), (1, 40, "collision")):
         events[name][step, agent] = True
         active[step + 1 :, agent] = False
         position[step:, agent] = position[step, agent]
@@ -93,7 +93,7 @@ def beside(trajectory: drawing.Trajectory) -> drawing.Trajectory:
     size = np.tile([[9.0, 2.5], [1.8, 0.7], [0.8, 0.8]], (steps, 1, 1))
     present = np.ones((steps, 3), bool)
     present[steps // 2 :, 2] = False
-    return trajectory._replace(others=drawing.Others(place, np.zeros((steps, 3)), size, present))
+    return trajectory._replace(traffic=drawing.Others(place, np.zeros((steps, 3)), size, present))
 
 
 def test_others_are_drawn_where_they_are(trajectory):
@@ -101,15 +101,15 @@ def test_others_are_drawn_where_they_are(trajectory):
     empty, full = (list(video.frames([t], **film)) for t in (trajectory, beside(trajectory)))
     changed = [(a != b).any(-1) for a, b in zip(empty, full, strict=True)]
     assert changed[0].sum() > changed[-1].sum() > 50, "the person has left"
-    drawn = shapes.shapes(beside(trajectory).others, 0, np.array([True, False, True]))
+    drawn = shapes.shapes(beside(trajectory).traffic, 0, np.array([True, False, True]))
     for shape, (x, y), kind in zip(drawn, ((-30, 3), (-50, -2), (-20, -3)), ("hollow", "lens", "disc"), strict=True):
         np.testing.assert_allclose((shape.points.min(0) + shape.points.max(0)) / 2, [x, y], atol=0.2)
         assert (shape.fill == shapes.MOVING) == (kind != "hollow") and (len(shape.points) > 6) == (kind == "disc")
-    assert shapes.shapes_at_rest(beside(trajectory).others).tolist() == [True, False, True]
+    assert shapes.shapes_at_rest(beside(trajectory).traffic).tolist() == [True, False, True]
     birds_eye_figures.trajectory_figure(beside(trajectory))
     wrong = beside(trajectory)
     with pytest.raises(drawing.TrajectoryError, match=r"traffic\.yaw: shape \(61, 2\)"):
-        drawing.check(wrong._replace(others=wrong.others._replace(yaw=np.zeros((61, 2)))))
+        drawing.check(wrong._replace(traffic=wrong.traffic._replace(yaw=np.zeros((61, 2)))))
 
 
 # Tables
@@ -127,7 +127,7 @@ def test_wilson_matches_published_values(share, count, low, high):
 def test_bootstrap_matches_the_normal_interval_of_scene_means():
     """With equal scenes the rate is a mean over scenes: its interval is about 1.96 standard errors of the scenes' means."""
     records = make_records(scenes=200, agents=5, seed=3)
-    means = records["reached"].reshape(200, 5).mean(1)
+    means = records["goal_reached"].reshape(200, 5).mean(1)
     estimate = agent_metrics.summarise(records, bootstrap=4000, seed=1)["success_rate"]
     half = 1.96 * means.std() / np.sqrt(200)
     assert estimate.method == agent_metrics.BOOTSTRAP
@@ -169,7 +169,11 @@ def test_one_scene_falls_back_and_says_so():
 def test_a_metric_of_which_only_one_scene_knows_has_no_interval_from_scenes():
     records = make_records(scenes=6, agents=4)
     first = records["scene"] == records["scene"][0]
-    records |= {"reached": first & (np.arange(len(first)) % 4 < 2), "time_s": np.arange(len(first), dtype=float), "route_m": first * 99.0}
+    records |= {
+        "goal_reached": first & (np.arange(len(first)) % 4 < 2),
+        "time_s": np.arange(len(first), dtype=float),
+        "route_m": first * 99.0,
+    }
     found = agent_metrics.summarise(records, **BOOTSTRAP)
     assert (
         found["mean_time_to_goal_s"].method == agent_metrics.AGENTS and found["mean_time_to_goal_s"].low < found["mean_time_to_goal_s"].high
@@ -177,15 +181,15 @@ def test_a_metric_of_which_only_one_scene_knows_has_no_interval_from_scenes():
     assert found["clean_bend_rate"].method == agent_metrics.WILSON and found["clean_bend_rate"].count == 4
     change = agent_metrics.difference(records, records, **BOOTSTRAP)["mean_time_to_goal_s"]
     assert (change.value, change.low, change.method) == (0.0, None, agent_metrics.NONE)
-    alone = agent_metrics.summarise({**records, "reached": np.arange(len(first)) == 0}, **BOOTSTRAP)["mean_time_to_goal_s"]
+    alone = agent_metrics.summarise({**records, "goal_reached": np.arange(len(first)) == 0}, **BOOTSTRAP)["mean_time_to_goal_s"]
     assert (alone.value, alone.low, alone.count, alone.method) == (0.0, None, 1, agent_metrics.NONE)
 
 
 def test_a_share_that_is_no_rate_may_exceed_one():
     records = make_records(scenes=1, agents=8)
-    found = agent_metrics.summarise({**records, "grip_use": np.linspace(1.2, 1.6, 8)}, **BOOTSTRAP)["grip_use"]
+    found = agent_metrics.summarise({**records, "friction_utilization": np.linspace(1.2, 1.6, 8)}, **BOOTSTRAP)["friction_utilization"]
     assert found.value == pytest.approx(1.4) and found.method == agent_metrics.AGENTS and 1.2 < found.low < 1.4 < found.high < 1.6
-    same = agent_metrics.summarise({**records, "grip_use": np.full(8, 1.42)}, **BOOTSTRAP)["grip_use"]
+    same = agent_metrics.summarise({**records, "friction_utilization": np.full(8, 1.42)}, **BOOTSTRAP)["friction_utilization"]
     assert agent_metrics.text(same) == "142.0 %" and same.method == agent_metrics.NONE
 
 
@@ -195,8 +199,8 @@ def test_outcomes_are_exclusive_and_add_up():
     assert summary["clean_success_rate"].value <= summary["success_rate"].value
     names, counts = np.unique(plots.outcomes(records), return_counts=True)
     assert set(names) <= set(plots.OUTCOMES) and counts.sum() == len(records["scene"])
-    arrived = counts[np.char.startswith(names, "reached")].sum()
-    assert arrived == records["reached"].sum()
+    arrived = counts[np.char.startswith(names, "goal_reached")].sum()
+    assert arrived == records["goal_reached"].sum()
 
 
 def test_published_means_weigh_worlds_equally():
@@ -312,11 +316,11 @@ def test_a_car_is_drawn_where_it_is(trajectory):
 
 def test_finished_cars_fade_and_events_are_marked(trajectory):
     stage = video._prepare(trajectory, 240)
-    red = np.array(drawing.MARKS["collided"].colour)
+    red = np.array(drawing.MARKS["collision"].colour)
     early, late = (np.asarray(video._draw_world(stage, step, trail_s=1.0)).astype(int) for step in (39, 60))
     assert not (np.abs(early - red).max(-1) < 12).any()
     assert (np.abs(late - red).max(-1) < 12).sum() > 20
-    assert stage.counts["reached"][[29, 30, 60]].tolist() == [0, 1, 1]
+    assert stage.counts["goal_reached"][[29, 30, 60]].tolist() == [0, 1, 1]
     blue = np.abs(late - drawing.colour_of(0)).max(-1) < 12  # arrived a second ago: car, goal and number are gone
     assert not blue.any()
 
@@ -402,7 +406,7 @@ def test_every_figure_is_drawn(tmp_path, trajectory):
     first, second = make_records(success=0.3), make_records()
     summary = [agent_metrics.summarise(r, **BOOTSTRAP) for r in (first, second)]
     row = {"iteration": 0, "steps/spawned": 1e4, "reward/goal": 1.0, "reward/edge": -0.5, "loss/kl": 0.01}
-    rows = [{**row, "events/reached": i / 9} for i in range(9)]
+    rows = [{**row, "events/goal_reached": i / 9} for i in range(9)]
     figures = {
         "learning": plots.learning_figure([*rows, {"steps/spawned": 1e4, "casps": 5.0}]),
         "rates": plots.rates_figure({"a": summary[0], "b": summary[1]}),

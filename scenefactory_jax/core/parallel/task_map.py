@@ -23,7 +23,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 HERE = "spread=local scenes.workers=1 spread.timeout_s=null does without other processes"
 SERVE = (  # what a process runs, given a pipe and the path on which modules are found
     "import sys; from multiprocessing.connection import Connection; sys.path[:] = sys.argv[2:];"
-    " from scenefactory_jax.scenes import spread; spread.serve(Connection(int(sys.argv[1])))"
+    " from scenefactory_jax.core.parallel import task_map; task_map.serve(Connection(int(sys.argv[1])))"
 )
 Work = Callable[[Any], Any]
 Task = tuple[int, Any]  # an item, and its place among the items

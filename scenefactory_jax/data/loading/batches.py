@@ -175,7 +175,7 @@ def _needed(job: Callable[[], Packed], *, grid: Mapping[str, Any]) -> dict[str, 
     own = {name: int(getattr(scene, name).valid.sum()) for name in columns.ROADS}  # the stack has rounded them up
     if grid["radius_m"] is None:
         return report.capacity | own
-    made = spatial_grid.attach_grid(scene, **grid).cells
+    made = spatial_grid.attach_grid(scene, **grid).road_grid
     assert made is not None
     return report.capacity | own | {"side": made.side, "rows": made.rows.shape[-1], "most": made.most}
 

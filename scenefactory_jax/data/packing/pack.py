@@ -78,7 +78,7 @@ def pack(
     start_speed: Literal["logged", "zero"],
     log_from: Literal["start", "current"],
     require_agents: bool,
-    others: int,
+    traffic: int,
     others_least_m: float,
     outline_m: float = 2.0,
 ) -> tuple[Scene, PackReport]:
@@ -94,7 +94,7 @@ def pack(
         car_size_m: length and width of every car; null: as logged.
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
-        others: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
+        traffic: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
         others_least_m: shortest and narrowest that they may be.
         outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway); the configs of older runs do not say it.
 
@@ -102,7 +102,7 @@ def pack(
         Unpackable: no lane segment in the box, or no agent where one is required.
         ConfigError: a number that makes no sense.
     """
-    _check(scene_size_m, car_size_m, others, outline_m)
+    _check(scene_size_m, car_size_m, traffic, outline_m)
     (origin, centred_on), half = _centre(raw, centre), scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
@@ -113,7 +113,7 @@ def pack(
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _log(chosen, logs, raw, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, others_dropped = _others(raw, logs, chosen, leaves, half, first, others, others_least_m)
+    beside, others_dropped = _others(raw, logs, chosen, leaves, half, first, traffic, others_least_m)
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -124,7 +124,7 @@ def pack(
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=len(chosen),
         agents_dropped=dropped,
-        others_kept=len(beside["traffic.kind"]),
+        others_kept=len(beside["traffic_log.kind"]),
         others_dropped=others_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
@@ -139,13 +139,13 @@ def _scene(leaves: dict[str, np.ndarray]) -> Scene:
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
 
 
-def _check(scene_size_m: float, car_size_m: list[float] | None, others: int, outline_m: float) -> None:
+def _check(scene_size_m: float, car_size_m: list[float] | None, traffic: int, outline_m: float) -> None:
     """Refuse numbers that make no sense."""
     check_number(scene_size_m, where="scenes.pack.scene_size_m", above=0)
     check_number(outline_m, where="scenes.pack.outline_m", above=0)
     if car_size_m is not None and not (len(car_size_m) == 2 and min(car_size_m) > 0):
         raise ConfigError(f"scenes.pack.car_size_m: {car_size_m}; wanted are length and width, both above 0, or null")
-    check_number(others, where="scenes.pack.traffic", least=0)
+    check_number(traffic, where="scenes.pack.traffic", least=0)
 
 
 def _around(logs: Logs, origin: Float[np.ndarray, "3"]) -> Logs:
@@ -368,9 +368,9 @@ def _choose_others(
 def _others(
     raw: RawScene, logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], half: float, first: int, limit: int, least: float
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Columns of `others`, and who was left out, by reason."""
+    """Columns of `traffic_log`, and who was left out, by reason."""
     chosen, dropped = _choose_others(logs, agents, leaves, raw.current, half, limit, least)
     rows = _recording(chosen, logs, first, len(chosen))
     rows["size"] = np.maximum(logs.size[chosen, :2], least)
     rows["kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
-    return {f"others.{name}": leaf for name, leaf in rows.items()}, dropped
+    return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, dropped

@@ -81,7 +81,7 @@ def _compact(world: Leaves) -> Leaves:
         valid = world[f"{part}.valid"]
         if not valid.all():
             world = world | {name: leaf[valid] for name, leaf in world.items() if name.startswith(f"{part}.")}
-    return _rows(world, "traffic", np.flatnonzero(world["traffic.valid"].any(axis=1)))
+    return _rows(world, "traffic", np.flatnonzero(world["traffic_log.valid"].any(axis=1)))
 
 
 def _rows(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
@@ -90,7 +90,7 @@ def _rows(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
 
 
 def _count(world: Leaves, axis: str) -> int:
-    name = {"agents": "agents.present", "steps": "log.valid", "traffic": "traffic.kind"}.get(axis, f"{axis}.valid")
+    name = {"agents": "agents.present", "steps": "log.valid", "traffic": "traffic_log.kind"}.get(axis, f"{axis}.valid")
     return world[name].shape[-1]
 
 

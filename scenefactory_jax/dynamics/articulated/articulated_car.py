@@ -199,7 +199,7 @@ def _advance(
     steer, drive, brake = decode_action(car, action)
     one = jax.vmap(functools.partial(physics_step, plant), in_axes=(None if body.fleet is None else 0, 0, 0, 0))
     mass = equations_of_motion.total_mass(car)
-    near = meet.neighbours(collect_boxes(before, scene.agents.size, active, mass), scene.boxes)
+    near = meet.neighbours(collect_boxes(before, scene.agents.size, active, mass), scene.traffic)
 
     def substep(now: Body, time: Float[Array, ""]) -> tuple[Body, None]:
         touching = collect_boxes(read(plant, now), scene.agents.size, active, mass)
@@ -256,6 +256,6 @@ def read(plant: CompiledCar, body: Body) -> Motion:
         steer=body.qpos[:, plant.places.steer_q].mean(-1),
         contact_force=body.contact_force,
         grip=tyres.mu.mean(-1),
-        grip_use=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
+        friction_utilization=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
         slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
     )

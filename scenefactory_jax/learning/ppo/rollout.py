@@ -98,7 +98,7 @@ def collect_rollout(
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
-    record = SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/reached")))
+    record = SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/goal_reached")))
     return worlds, observation, lives, samples, jax.tree.map(jnp.sum, counts), record
 
 
@@ -130,7 +130,7 @@ def _tally(lives: EpisodeStats, worlds: State, outcome: StepResult) -> tuple[Epi
         "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
         "reward": total(reward, active),
-        "speed": total(outcome.facts.speed, active & ~outcome.facts.events.fault),  # a broken car's is no measurement
+        "speed": total(outcome.facts.speed, active & ~outcome.facts.events.numerical_error),  # a broken car's is no measurement
         "ended": total(ended, ended),
         "return": total(lives.returns, ended),
         "length": total(lives.steps, ended),

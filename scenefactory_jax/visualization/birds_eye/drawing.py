@@ -41,11 +41,11 @@ class Mark(NamedTuple):
 
 
 MARKS: dict[str, Mark] = {
-    "reached": Mark("goal", (0, 138, 82), "o"),
-    "collided": Mark("collision", (208, 28, 40), "*"),
-    "touched_edge": Mark("road edge", (230, 126, 0), "X"),
-    "crashed": Mark("crash", (0, 0, 0), "D"),
-    "fault": Mark("fault", (198, 0, 190), "s"),
+    "goal_reached": Mark("goal", (0, 138, 82), "o"),
+    "collision": Mark("collision", (208, 28, 40), "*"),
+    "road_edge_contact": Mark("road edge", (230, 126, 0), "X"),
+    "out_of_bounds": Mark("crash", (0, 0, 0), "D"),
+    "numerical_error": Mark("numerical_error", (198, 0, 190), "s"),
 }
 
 
@@ -69,7 +69,7 @@ class Trajectory(NamedTuple):
     control_hz: float
     title: str
     weather: str
-    others: "Others | None" = None  # None: nobody but the agents
+    traffic: "Others | None" = None  # None: nobody but the agents
 
 
 class Others(NamedTuple):
@@ -97,14 +97,18 @@ def check(trajectory: Trajectory) -> None:
     for name, shape in wanted.items():
         if np.shape(getattr(trajectory, name)) != shape:
             raise TrajectoryError(f"trajectory.{name}: shape {np.shape(getattr(trajectory, name))}; with active {t, a} it must be {shape}")
-    for name, happened in trajectory.events.items():
-        if name not in MARKS or np.shape(happened) != (t, a):
-            raise TrajectoryError(f"trajectory.events: {name!r} {np.shape(happened)}; valid are {', '.join(MARKS)}, each of shape {t, a}")
-    if trajectory.others is not None:
-        boxes = trajectory.others.present.shape[1]
+    for name, past_events in trajectory.events.items():
+        if name not in MARKS or np.shape(past_events) != (t, a):
+            raise TrajectoryError(
+                f"trajectory.events: {name!r} {np.shape(past_events)}; valid are {', '.join(MARKS)}, each of shape {t, a}"
+            )
+    if trajectory.traffic is not None:
+        boxes = trajectory.traffic.present.shape[1]
         for name, wanted in {"position": (t, boxes, 2), "yaw": (t, boxes), "size": (t, boxes, 2), "present": (t, boxes)}.items():
-            if np.shape(getattr(trajectory.others, name)) != wanted:
-                raise TrajectoryError(f"trajectory.others.{name}: shape {np.shape(getattr(trajectory.others, name))}; it must be {wanted}")
+            if np.shape(getattr(trajectory.traffic, name)) != wanted:
+                raise TrajectoryError(
+                    f"trajectory.traffic.{name}: shape {np.shape(getattr(trajectory.traffic, name))}; it must be {wanted}"
+                )
     if t == 0:
         raise TrajectoryError(f"trajectory {trajectory.title!r}: no steps, so there is nothing to draw")
 

@@ -108,7 +108,7 @@ def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_
     for spine in axes.spines.values():
         spine.set(visible=True, color=_rgb(QUIET), linewidth=0.6)
     cars = len(trajectory.present)
-    if trajectory.others is not None:
+    if trajectory.traffic is not None:
         _draw_others(axes, case, step, partner=None if case.hit is None else case.hit - cars)
     driven, since = drawing.is_moving(trajectory), max(step - round(before_s * trajectory.control_hz), 0)
     for other in np.flatnonzero(trajectory.present & (trajectory.active[: step + 1].any(axis=0))):
@@ -131,7 +131,7 @@ def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_
 
 def _draw_others(axes: Axes, case: Case, step: int, *, partner: int | None) -> None:
     """Everybody who is no agent; whom the car hit in the partner's colour."""
-    boxes = case.trajectory.others
+    boxes = case.trajectory.traffic
     assert boxes is not None
     still = traffic_shapes.shapes_at_rest(boxes)
     for shape in traffic_shapes.shapes(boxes, step, still):

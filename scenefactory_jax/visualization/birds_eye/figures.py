@@ -62,8 +62,8 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
         view = drawing.fit_view(drawing.places(trajectory), margin=12.0, smallest=50.0)
         title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
         figure, axes, scale = _stage(trajectory.scene, view, title=title)
-        if trajectory.others is not None:
-            _draw_others(axes, trajectory.others, 0, traffic_shapes.shapes_at_rest(trajectory.others))
+        if trajectory.traffic is not None:
+            _draw_others(axes, trajectory.traffic, 0, traffic_shapes.shapes_at_rest(trajectory.traffic))
         for agent in np.flatnonzero(trajectory.present).tolist():
             steps = np.flatnonzero(driven[:, agent])
             way = trajectory.position[:, agent]
@@ -78,12 +78,12 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
             _draw_goal(axes, drawing.goal_at(trajectory, last)[agent], agent, scale)
         seen = [name for name in MARKS if name in trajectory.events and (trajectory.events[name] & trajectory.present).any()]
         for name in seen:
-            if name != "reached":
+            if name != "goal_reached":
                 points = trajectory.position[trajectory.events[name] & trajectory.present]
                 look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
                 axes.plot(*points.T, color=_rgb(MARKS[name].colour), **look)
-        beside = trajectory.others is not None and bool(trajectory.others.present[0].any())
-        shown = [name for name in seen if name != "reached"]
+        beside = trajectory.traffic is not None and bool(trajectory.traffic.present[0].any())
+        shown = [name for name in seen if name != "goal_reached"]
         _legend(figure, shown, car="end (start: outline)", scene=trajectory.scene, road=False, beside=beside)
     return figure
 

@@ -30,8 +30,10 @@ def shapes_at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
     apart = np.linalg.norm(np.asarray(log.position) - np.asarray(scene.agents.position)[:, None], axis=-1)
     apart = np.where(np.asarray(log.valid), apart, np.inf)[present]
     row = int(np.argmin(apart.sum(axis=0))) if len(apart) else 0
-    position, yaw, valid = (np.asarray(leaf).swapaxes(0, 1) for leaf in (scene.others.position, scene.others.yaw, scene.others.valid))
-    whole = Others(position, yaw, np.broadcast_to(np.asarray(scene.others.size), position.shape), valid)
+    position, yaw, valid = (
+        np.asarray(leaf).swapaxes(0, 1) for leaf in (scene.traffic_log.position, scene.traffic_log.yaw, scene.traffic_log.valid)
+    )
+    whole = Others(position, yaw, np.broadcast_to(np.asarray(scene.traffic_log.size), position.shape), valid)
     return Others(*(leaf[row : row + 1] for leaf in whole)), shapes_at_rest(whole)
 
 

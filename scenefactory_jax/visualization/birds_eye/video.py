@@ -36,7 +36,7 @@ class _Stage(NamedTuple):
     way: np.ndarray  # [T, A, 2] pixels
     driven: np.ndarray  # [T, A]
     ended: np.ndarray  # [T, A] steps since the agent was last active
-    happened: list[tuple[int, int, str]]  # (step, agent, event)
+    past_events: list[tuple[int, int, str]]  # (step, agent, event)
     counts: dict[str, np.ndarray]  # event -> [T] agents so far
     names: list[Image.Image]  # an agent's number, one image each
     goals: list[Image.Image]  # the same for the fine picture
@@ -134,8 +134,8 @@ def _prepare(trajectory: Trajectory, panel: int, window: tuple[float, float, flo
     view = View(*(window or drawing.fit_view(drawing.places(trajectory), margin=9.0, smallest=50.0)), panel * _FINE)
     steps = np.arange(len(trajectory.active))[:, None]
     last = np.maximum.accumulate(np.where(trajectory.active, steps, -10_000), axis=0)
-    events = {name: happened & trajectory.present for name, happened in trajectory.events.items()}
-    happened = sorted((int(t), int(a), name) for name, where in events.items() for t, a in np.argwhere(where))
+    events = {name: past_events & trajectory.present for name, past_events in trajectory.events.items()}
+    past_events = sorted((int(t), int(a), name) for name, where in events.items() for t, a in np.argwhere(where))
     again = drawing.find_respawns(trajectory)
     counts = {n: np.cumsum(e.sum(1)) if again else np.maximum.accumulate(e, axis=0).sum(1) for n, e in events.items()}
     small, bold = max(9, panel // 44), _font(max(9, panel // 44), bold=True)
@@ -147,12 +147,12 @@ def _prepare(trajectory: Trajectory, panel: int, window: tuple[float, float, flo
         way=drawing.to_pixels(view, trajectory.position),
         driven=drawing.is_moving(trajectory),
         ended=steps - last,
-        happened=happened,
+        past_events=past_events,
         counts=counts,
         names=[_sprite(number, bold, colour) for number, colour in numbers],
         goals=[_sprite(number, _font(small * _FINE), colour) for number, colour in numbers],
         labels={name: _sprite(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
-        parked=np.zeros(0, bool) if trajectory.others is None else traffic_shapes.shapes_at_rest(trajectory.others),
+        parked=np.zeros(0, bool) if trajectory.traffic is None else traffic_shapes.shapes_at_rest(trajectory.traffic),
     )
 
 
@@ -196,8 +196,8 @@ def _draw_world(stage: _Stage, now: int, *, trail_s: float | int) -> Image.Image
     """The picture between header and footer at one step."""
     image = stage.background.copy()
     draw = ImageDraw.Draw(image)
-    if stage.trajectory.others is not None:
-        for shape in traffic_shapes.shapes(stage.trajectory.others, now, stage.parked):
+    if stage.trajectory.traffic is not None:
+        for shape in traffic_shapes.shapes(stage.trajectory.traffic, now, stage.parked):
             corners = (drawing.to_pixels(stage.view, shape.points) - 0.5).ravel().tolist()
             draw.polygon(corners, fill=shape.fill, outline=shape.outline, width=_FINE // 2)
     _draw_trails(draw, stage, now, round(trail_s * stage.trajectory.control_hz))
@@ -257,9 +257,9 @@ def _draw_car(draw: ImageDraw.ImageDraw, stage: _Stage, now: int, agent: int, sh
 def _draw_marks(draw: ImageDraw.ImageDraw, stage: _Stage, now: int) -> list[tuple[float, float, str]]:
     """Events so far: flashed when new, small afterwards (an arrival leaves nothing). Returns the flashes that want a label."""
     flashes = []
-    for step, agent, name in stage.happened:
+    for step, agent, name in stage.past_events:
         age = (now - step) / (_FLASH_S * stage.trajectory.control_hz)
-        if age < 0 or (age > 1 and name == "reached"):
+        if age < 0 or (age > 1 and name == "goal_reached"):
             continue
         x, y = (float(v) for v in stage.way[step, agent])
         size = (7.0 + 6.0 * (1 - age) if age <= 1 else 5.0) * _FINE
@@ -275,11 +275,11 @@ def draw_mark(draw: ImageDraw.ImageDraw, name: str, x: float, y: float, size: fl
     angles = np.arange(10) * np.pi / 5 - np.pi / 2
     reach = size * np.where(np.arange(10) % 2 == 0, 1.0, 0.42)
     star = np.stack([x + reach * np.cos(angles), y + reach * np.sin(angles)], axis=1).ravel().tolist()
-    if name == "reached":
+    if name == "goal_reached":
         draw.ellipse((x - size, y - size, x + size, y + size), outline=colour, width=thick)
-    elif name == "collided":
+    elif name == "collision":
         draw.polygon(star, fill=colour, outline=(255, 255, 255), width=max(thick // 4, 1))
-    elif name == "touched_edge":
+    elif name == "road_edge_contact":
         arm = 0.75 * size
         for extra, fill in ((thick, (255, 255, 255)), (0, colour)):
             for side in (-1, 1):
@@ -288,7 +288,7 @@ def draw_mark(draw: ImageDraw.ImageDraw, name: str, x: float, y: float, size: fl
         arm = 0.8 * size
         square = [x - arm, y - arm, x + arm, y - arm, x + arm, y + arm, x - arm, y + arm]
         diamond = [x, y - size, x + size, y, x, y + size, x - size, y]
-        draw.polygon(diamond if name == "crashed" else square, fill=colour, outline=(255, 255, 255), width=max(thick // 4, 1))
+        draw.polygon(diamond if name == "out_of_bounds" else square, fill=colour, outline=(255, 255, 255), width=max(thick // 4, 1))
 
 
 def _draw_header(sheet: Image.Image, left: int, top: int, panel: int, trajectory: Trajectory) -> None:
@@ -310,10 +310,10 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
     draw.text((left, top + bar // 2), clock, font=font, fill=INK, anchor="lm")
     counts = {name: int(stage.counts[name][now]) for name in MARKS if name in stage.counts}
     total, once = int(stage.trajectory.present.sum()), not drawing.find_respawns(stage.trajectory)
-    entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "fault"}
-    entries |= {"reached": f"{entries['reached']} of {total}"} if once and "reached" in entries else {}
+    entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "numerical_error"}
+    entries |= {"goal_reached": f"{entries['reached']} of {total}"} if once and "goal_reached" in entries else {}
     while sum(font.getlength(entry) + 12 for entry in entries.values()) > panel - font.getlength(clock) and len(entries) > 1:
-        others = [name for name in reversed(entries) if name != "reached"]
+        others = [name for name in reversed(entries) if name != "goal_reached"]
         del entries[next((name for name in others if not counts[name]), others[0])]
     right = left + panel
     for name, entry in reversed(entries.items()):

@@ -57,7 +57,7 @@ def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTr
         joints = scene_model.set_posture(car, shots.position, shots.yaw, shots.steer, spin)
     else:
         joints = np.asarray(shots.joints, float)
-    others = drawing.Others(*(np.asarray(getattr(shots.others, name)) for name in drawing.Others._fields))
+    others = drawing.Others(*(np.asarray(getattr(shots.traffic, name)) for name in drawing.Others._fields))
     opacity = np.where(last < 0, 0.0, np.clip(1.0 - (steps - last) / (FADE_S * hz), 0.0, 1.0))
     yaw, goal = shots.yaw[held, agents], shots.goal[held, agents]
     return ActorTrajectories(scene, joints[held, agents], yaw, active, opacity, goal, others, hz)

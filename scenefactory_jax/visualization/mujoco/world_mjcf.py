@@ -77,7 +77,7 @@ def world(
             contype=0,
             conaffinity=0,
         )
-    _add_others(model, scene.boxes, other_height_m)
+    _add_others(model, scene.traffic, other_height_m)
     return model
 
 

@@ -16,7 +16,7 @@ Summary = Mapping[str, Estimate]
 
 PROTOCOLS = {
     "strict": "any event (goal, collision, crash, road edge) ends the agent",
-    "invincible": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
+    "goal_only": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
 }
 KEY_NUMBERS = (
     "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.draw", "weather.patches",
@@ -124,7 +124,7 @@ def _section(title: str, *parts: str) -> str:
 
 def _headline(name: str, summary: Summary, records: Records) -> str:
     """The result in three sentences."""
-    reached, agents = int(np.sum(records["reached"])), len(records["scene"])
+    reached, agents = int(np.sum(records["goal_reached"])), len(records["scene"])
     scenes, worlds = len(np.unique(records["scene"])), _worlds(records)
     success, clean = summary["success_rate"], summary["clean_success_rate"]
     parts = [
@@ -138,7 +138,7 @@ def _headline(name: str, summary: Summary, records: Records) -> str:
     ]
     if scenes < 10:
         parts.append(f"With {_counted(scenes, 'scene')} the intervals are rough and rather too narrow: a hint, not a proof.")
-    if faults := int(np.sum(records["fault"])):
+    if faults := int(np.sum(records["numerical_error"])):
         parts.append(f"**{_counted(faults, 'agent')} ended by a fault of the simulation**, a bug to look into, not a driving error.")
     return " ".join(parts)
 
@@ -249,12 +249,12 @@ def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path])
 
 def _story(records: Records, row: int) -> str:
     """An agent's events in words."""
-    happened = [MARKS[event].label for event in MARKS if records[event][row]]
+    past_events = [MARKS[event].label for event in MARKS if records[event][row]]
     if "failure" in records:
         kind = failures.KINDS[str(records["failure"][row])].label
-        also = [event for event in happened if event not in kind]
+        also = [event for event in past_events if event not in kind]
         return kind + (f"; also {', '.join(also)}" if also else "")
-    return ", ".join(happened) if happened else "out of time"
+    return ", ".join(past_events) if past_events else "out of time"
 
 
 def _definitions(table: Mapping[str, Summary], measured: Sequence[str]) -> str:

@@ -48,15 +48,15 @@ def _film(case: Case, *, before_s: float) -> drawing.Trajectory:
     middle, hz = failure.moment_s * whole.control_hz, whole.control_hz
     first, last = max(round(middle - before_s * hz), 0), round(middle + _AFTER_S * hz)
     cut = lambda leaf: leaf[first:last]  # noqa: E731
-    beside = None if whole.others is None else drawing.Others(*map(cut, whole.others))
+    beside = None if whole.traffic is None else drawing.Others(*map(cut, whole.traffic))
     return whole._replace(
         position=cut(whole.position),
         yaw=cut(whole.yaw),
         speed=cut(whole.speed),
         active=cut(whole.active),
         goal=cut(whole.goal) if np.ndim(whole.goal) == 3 else whole.goal,
-        events={name: cut(happened) for name, happened in whole.events.items()},
-        others=beside,
+        events={name: cut(past_events) for name, past_events in whole.events.items()},
+        traffic=beside,
         title=f"{KINDS[failure.kind].label}: car {failure.agent}, {whole.title}",
     )
 

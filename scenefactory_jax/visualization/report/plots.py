@@ -33,7 +33,7 @@ OUTCOMES: dict[str, str] = {
     "collision": "#D55E00",
     "road edge": "#E69F00",
     "crash": "#222222",
-    "fault": "#CC79A7",
+    "numerical_error": "#CC79A7",
     "out of time": "#c4c7cb",
 }
 
@@ -174,9 +174,14 @@ def comparison_figure(
 def outcomes(records: Records) -> np.ndarray:
     """One name of `OUTCOMES` for each agent: where several events happened, arrival counts first, then the order of `OUTCOMES`."""
     result = np.full(len(records["scene"]), "out of time", dtype="<U24")
-    for name, column in (("fault", "fault"), ("crash", "crashed"), ("road edge", "touched_edge"), ("collision", "collided")):
+    for name, column in (
+        ("numerical_error", "numerical_error"),
+        ("crash", "out_of_bounds"),
+        ("road edge", "road_edge_contact"),
+        ("collision", "collision"),
+    ):
         result[np.asarray(records[column], bool)] = name
-    result[np.asarray(records["reached"], bool)] = "reached, with an event"
+    result[np.asarray(records["goal_reached"], bool)] = "reached, with an event"
     result[np.asarray(records["clean"], bool)] = "reached, no event"
     return result
 

@@ -15,7 +15,7 @@ from scenefactory_jax.visualization.report import plots, run_comparison
 from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 
 Result = Mapping[str, Any]
-LEARNING = ("events/reached", "events/collided", "events/touched_edge", "reward")
+LEARNING = ("events/goal_reached", "events/collision", "events/road_edge_contact", "reward")
 TITLES = ("Goal reached, share of ended lives", "Collision, share of ended lives", "Road edge, share of ended lives", "Reward a step")
 HEADLINE = ("success_rate", "clean_success_rate", "collision_rate")
 SHOWN = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate")

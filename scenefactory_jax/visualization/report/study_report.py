@@ -13,7 +13,7 @@ Result = Mapping[str, Any]
 
 RATES = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate", "unfinished_rate")
 SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
-          "grip_use", "stopping_margin_m")  # fmt: skip
+          "friction_utilization", "stopping_margin_m")  # fmt: skip
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background traffic", "dynamics": "Dynamics"}  # of an episode
 AS_TRAINED = "as trained"

@@ -37,7 +37,7 @@ TTC_MOST_S = 20.0  # a longer time to collision is shown as none
 # what is kept of every car at every step, and how finely
 RESOLUTION: dict[str, float] = {
     "x": 0.01, "y": 0.01, "yaw": 0.002, "speed": 0.01, "steer": 0.001, "throttle": 0.002, "turn": 0.002, "brake": 0.002, "ttc": 0.01,
-    "edge_ttc": 0.01, "goal_distance": 0.02, "grip": 0.001, "grip_use": 0.002, "slip": 0.005, "contact_force": 20.0,
+    "edge_ttc": 0.01, "goal_distance": 0.02, "grip": 0.001, "friction_utilization": 0.002, "slip": 0.005, "contact_force": 20.0,
 }  # fmt: skip
 TERM_RESOLUTION = 2e-4
 WHEELS = ("FL", "FR", "RL", "RR")  # the order of `dynamics.car.WHEELS`
@@ -148,7 +148,7 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
     columns = {
         "x": shots.position[..., 0], "y": shots.position[..., 1], "yaw": shots.yaw, "speed": shots.speed, "steer": shots.steer,
         "throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2], "ttc": _near(np.asarray(shots.ttc)),
-        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip, "grip_use": shots.grip_use,
+        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip, "friction_utilization": shots.friction_utilization,
         "slip": shots.slip, "contact_force": shots.contact_force,
     }  # fmt: skip
     finely = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
@@ -184,8 +184,8 @@ def spans(true: Bool[np.ndarray, " T"]) -> list[list[int]]:
 def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
     """What happened, in order. A car that starts again in the step of its end has left the place: the step before tells it."""
     found = []
-    for name, happened in vars(shots.events).items():
-        for step, car in np.argwhere(happened & active):
+    for name, past_events in vars(shots.events).items():
+        for step, car in np.argwhere(past_events & active):
             row = held[step, car]
             place, before = shots.position[row, car], shots.position[max(row - 1, 0), car]
             apart = np.linalg.norm(place - before) > 100.0 * max(float(shots.time_s[row] - shots.time_s[max(row - 1, 0)]), 1e-3)
@@ -196,10 +196,10 @@ def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.nda
 
 def _add_others(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[str, Any]]:
     """Everybody else who is ever there: size, kind, spans, and whether it only stands."""
-    whole = drawing.Others(*(np.asarray(getattr(shots.others, name)) for name in drawing.Others._fields))
+    whole = drawing.Others(*(np.asarray(getattr(shots.traffic, name)) for name in drawing.Others._fields))
     seen = np.flatnonzero(whole.present.any(axis=0))
     still, held = traffic_shapes.shapes_at_rest(whole), _held(whole.present)
-    kinds = np.asarray(scene.others.kind) if len(scene.others.kind) == whole.present.shape[1] else None
+    kinds = np.asarray(scene.traffic_log.kind) if len(scene.traffic_log.kind) == whole.present.shape[1] else None
     take = lambda leaf: np.stack([leaf[held[:, row], row] for row in seen]) if len(seen) else np.zeros((0, len(held)))  # noqa: E731
     for name, leaf in {"other:x": whole.position[..., 0], "other:y": whole.position[..., 1], "other:yaw": whole.yaw}.items():
         packer.add(name, take(leaf), resolution=RESOLUTION[name.removeprefix("other:")])

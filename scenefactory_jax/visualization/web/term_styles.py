@@ -25,10 +25,10 @@ BLUE, VIOLET, SKY, KHAKI, SLATE, PINK, WINE = HUES = (
 )  # fmt: skip
 # the terms of conf/reward and of `rewards`: related ones share their hue and differ in the pattern
 TERMS: dict[str, TermLook] = {
-    "goal": TermLook(MARKS["reached"].colour, spike=True),
-    "collision": TermLook(MARKS["collided"].colour, spike=True),
-    "crash": TermLook(MARKS["crashed"].colour, spike=True),
-    "road_edge": TermLook(MARKS["touched_edge"].colour, spike=True),
+    "goal": TermLook(MARKS["goal_reached"].colour, spike=True),
+    "collision": TermLook(MARKS["collision"].colour, spike=True),
+    "crash": TermLook(MARKS["out_of_bounds"].colour, spike=True),
+    "road_edge": TermLook(MARKS["road_edge_contact"].colour, spike=True),
     "progress": TermLook(BLUE),
     "speed": TermLook(BLUE, "striped"),
     "lane_keeping": TermLook(SKY),

@@ -24,7 +24,7 @@ from scenefactory_jax.data.generators.procedural.road_layout import (
 )
 from scenefactory_jax.data.generators.procedural.traffic import Car
 
-PACKAGE = "scenefactory_jax.scenes.procedural"
+PACKAGE = "scenefactory_jax.data.generators.procedural"
 CAR_WIDTH_M = 2.0  # no lane is narrower
 REDRAWS = 20  # layouts that are tried until one holds the fewest cars asked for
 
@@ -70,8 +70,8 @@ def generate(
         check_positive(value, f"generate.{name}")
 
     kind = kinds[index % len(kinds)]
-    lay_out = instantiate(blocks[kind], builtins=f"{PACKAGE}.roads", where=f"generate.blocks.{kind}")
-    find_edges = instantiate(edges, builtins=f"{PACKAGE}.surface", where="generate.edges")
+    lay_out = instantiate(blocks[kind], builtins=f"{PACKAGE}.road_segments", where=f"generate.blocks.{kind}")
+    find_edges = instantiate(edges, builtins=f"{PACKAGE}.road_edges", where="generate.edges")
     drive = instantiate(traffic, builtins=f"{PACKAGE}.traffic", where="generate.traffic")
     times = log_dt * np.arange(log_steps)
     for redraw in range(REDRAWS):

@@ -11,8 +11,8 @@ from scenefactory_jax.data.generators.town.build_network import build_network
 from scenefactory_jax.data.generators.town.cross_sections import make_class
 from scenefactory_jax.data.generators.town.road_network import Network, Street
 
-PACKAGE = "scenefactory_jax.scenes.town"
-SITES = {"intersection": "junctions", "driveway": "junctions", "roundabout": "junctions", "parking_lot": "parking"}
+PACKAGE = "scenefactory_jax.data.generators.town"
+SITES = {"intersection": "intersections", "driveway": "intersections", "roundabout": "intersections", "parking_lot": "parking_lot"}
 
 
 def draw_network(
@@ -52,14 +52,14 @@ def draw_network(
     if set(blocks) != set(SITES):
         wrong = sorted(set(blocks) ^ set(SITES))[0]
         raise ConfigError(f"{where}.blocks.{wrong}: missing or unknown; valid: {', '.join(SITES)}")
-    makers = {name: instantiate(entry, builtins=f"{PACKAGE}.plans", where=f"{where}.plans.{name}") for name, entry in layouts.items()}
+    makers = {name: instantiate(entry, builtins=f"{PACKAGE}.street_plan", where=f"{where}.plans.{name}") for name, entry in layouts.items()}
     classes = [make_class(name, rank, numbers) for rank, (name, numbers) in enumerate(streets.items(), start=1)]
     built = {
         name: instantiate(blocks[name], builtins=f"{PACKAGE}.{module}", where=f"{where}.blocks.{name}") for name, module in SITES.items()
     }
-    add_lots = instantiate(lots, builtins=f"{PACKAGE}.plans", where=f"{where}.lots")
-    numbers = instantiate(roads, builtins=f"{PACKAGE}.links", where=f"{where}.roads")()
-    choice = instantiate(junctions, builtins=f"{PACKAGE}.build", where=f"{where}.junctions")(built, numbers)
+    add_lots = instantiate(lots, builtins=f"{PACKAGE}.street_plan", where=f"{where}.lots")
+    numbers = instantiate(roads, builtins=f"{PACKAGE}.road_segments", where=f"{where}.roads")()
+    choice = instantiate(junctions, builtins=f"{PACKAGE}.build_network", where=f"{where}.junctions")(built, numbers)
     if rng.random() < motorway_share:
         return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
     kind = str(rng.choice(list(makers)))

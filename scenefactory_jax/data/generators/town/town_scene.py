@@ -17,7 +17,7 @@ from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, dra
 from scenefactory_jax.data.generators.town.traffic import TownUser
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
-PACKAGE = "scenefactory_jax.scenes.town"
+PACKAGE = "scenefactory_jax.data.generators.town"
 REDRAWS = 40  # towns that are tried until one can be built and holds the fewest cars asked for
 
 
@@ -67,7 +67,7 @@ def generate(
     numbers = {"reach_m": reach_m, "lane_spacing_m": lane_spacing_m, "line_spacing_m": line_spacing_m, "log_dt": log_dt}
     for name, value in numbers.items():
         check_positive(value, f"generate.{name}")
-    entries = {"networks": network, "surface": surface, "aprons": aprons, "signals": signals, "traffic": traffic}
+    entries = {"network_choice": network, "kerbs": surface, "driveways": aprons, "traffic_lights": signals, "traffic": traffic}
     places = ("network", "surface", "aprons", "signals", "traffic")
     built = zip(entries.items(), places, strict=True)
     parts = TownParts(*(instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{place}") for (module, entry), place in built))

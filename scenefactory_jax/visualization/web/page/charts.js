@@ -52,7 +52,7 @@ function chartsOf(world) {
       least: 1.2,
       digits: 2,
       rule: 1,
-      lines: [{ array: "grip_use", label: "", colour: "#1fa5a0" }],
+      lines: [{ array: "friction_utilization", label: "", colour: "#1fa5a0" }],
     },
     {
       title: "Wheel slip",

@@ -40,7 +40,7 @@ function label(text, left, top, pixels, colour) {
 function drawMarks() {
   for (const event of app.world.events) {
     const age = ((app.time - event.step) * app.world.dt) / FLASH_S;
-    if (age < 0 || (age > 1 && event.name === "reached")) continue;
+    if (age < 0 || (age > 1 && event.name === "goal_reached")) continue;
     const [left, top] = toScreen(event.x, event.y);
     const colour = rgb(colourOfMark(event.name));
     pen.globalAlpha = 1;
@@ -60,7 +60,7 @@ function drawMarks() {
 /** An event's shape: ring, star, cross, diamond or square. */
 function glyph(brush, name, x, y, reach, colour) {
   brush.beginPath();
-  if (name === "reached") {
+  if (name === "goal_reached") {
     brush.arc(x, y, reach * 0.8, 0, 7);
     brush.strokeStyle = colour;
     brush.lineWidth = 2.2;
@@ -68,8 +68,8 @@ function glyph(brush, name, x, y, reach, colour) {
     return;
   }
   const corners = { collided: 10, touched_edge: 4, crashed: 4, fault: 4 }[name] ?? 8;
-  const turn = name === "fault" ? Math.PI / 4 : 0;
-  if (name === "touched_edge") {
+  const turn = name === "numerical_error" ? Math.PI / 4 : 0;
+  if (name === "road_edge_contact") {
     const arm = 0.75 * reach;
     for (const side of [1, -1]) {
       brush.moveTo(x - arm, y - side * arm);
@@ -87,7 +87,7 @@ function glyph(brush, name, x, y, reach, colour) {
     return;
   }
   for (let corner = 0; corner < corners; corner++) {
-    const far = reach * 1.15 * (name === "collided" && corner % 2 ? 0.45 : 1);
+    const far = reach * 1.15 * (name === "collision" && corner % 2 ? 0.45 : 1);
     const angle = (corner / corners) * 2 * Math.PI - Math.PI / 2 + turn;
     brush[corner ? "lineTo" : "moveTo"](x + far * Math.cos(angle), y + far * Math.sin(angle));
   }

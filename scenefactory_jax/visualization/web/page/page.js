@@ -76,14 +76,14 @@ function showTime() {
 function showTally() {
   const counts = {};
   for (const { name } of counted(app.world, now())) counts[name] = (counts[name] ?? 0) + 1;
-  const names = Object.keys(replay.marks).filter((name) => name !== "fault" || counts[name]);
+  const names = Object.keys(replay.marks).filter((name) => name !== "numerical_error" || counts[name]);
   const text = names.map((name) => `${name}:${counts[name] ?? 0}`).join();
   if ($("tally").dataset.text === `${app.index}:${text}`) return;
   $("tally").dataset.text = `${app.index}:${text}`;
   $("tally").replaceChildren(
     ...names.map((name) => {
       const entry = element("span", { className: counts[name] ? "" : "none" });
-      const of = name === "reached" ? ` of ${app.world.cars.length}` : "";
+      const of = name === "goal_reached" ? ` of ${app.world.cars.length}` : "";
       entry.textContent = `${replay.marks[name].label} ${counts[name] ?? 0}${of}`;
       entry.style.setProperty("--mark", rgb(colourOfMark(name)));
       return entry;
@@ -132,7 +132,7 @@ function showFacts() {
     ["speed", number(3.6 * get("speed"), 1), "km/h"],
     ["steer", number((get("steer") * 180) / Math.PI, 1), "°"],
     ["goal", number(get("goal_distance"), 1), "m"],
-    ["grip in use", number(100 * get("grip_use"), 0), "%"],
+    ["grip in use", number(100 * get("friction_utilization"), 0), "%"],
   ];
   $("facts").replaceChildren(
     ...facts.map(([name]) => element("dt", { textContent: name })),
@@ -334,7 +334,7 @@ async function start() {
   } catch (error) {
     document
       .querySelector("main")
-      .replaceChildren(element("p", { className: "fault", textContent: `This replay cannot be read: ${error.message}` }));
+      .replaceChildren(element("p", { className: "numerical_error", textContent: `This replay cannot be read: ${error.message}` }));
     throw error;
   }
   requestAnimationFrame(tick);
