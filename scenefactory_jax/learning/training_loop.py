@@ -140,7 +140,7 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
 
 def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
     """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
-    entry = {"_target_": "make", **config["ppo"]}
+    entry = {"_target_": "make_trainer", **config["ppo"]}
     make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
     return make(env, policy, mesh=mesh)
 

@@ -314,7 +314,7 @@ def test_mistakes_are_named():
 
 @pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])
 def test_configs_build(name):
-    entry = {"_target_": "make", **configs.load_config("train", f"ppo={name}")["ppo"]}
+    entry = {"_target_": "make_trainer", **configs.load_config("train", f"ppo={name}")["ppo"]}
     trainer = instantiate(entry, builtins=train_iteration, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
     assert trainer.iterate
 
