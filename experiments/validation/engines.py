@@ -88,7 +88,7 @@ def scenes(
         )
         none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
         log = AgentLog(position=place[:, None], yaw=heading[:, None], **none)
-        alone = {"traffic": make_empty_log(1), "boxes": make_empty_boxes()}
+        alone = {"traffic_log": make_empty_log(1), "traffic": make_empty_boxes()}
         return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=make_uniform(mu, row), **alone)
 
     place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))

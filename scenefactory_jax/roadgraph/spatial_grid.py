@@ -64,7 +64,7 @@ def attach_grid(scene: Scene, *, radius_m: float, size_m: float, capacity: Mappi
         own[: len(found)] = found
     leaves = {"origin": origin.astype(np.float32), "first": first, "rows": rows}
     cells = unchecked(SpatialGrid, **leaves, side=side, size_m=float(size_m), radius_m=float(radius_m), most=sizes["most"])
-    return unchecked(Scene, **(vars(scene) | {"cells": cells}))
+    return unchecked(Scene, **(vars(scene) | {"road_grid": cells}))
 
 
 def _within(needed: Mapping[str, int], capacity: Mapping[str, int]) -> dict[str, int]:
