@@ -56,7 +56,7 @@ def measure(config: Mapping[str, Any]) -> list[dict[str, Any]]:
     Raises:
         ConfigError: a key that does not fit.
     """
-    schema.check(config, schema.BENCH)
+    schema.check(config, schema.Benchmark)
     scene_source.use_compilation_cache()
     rows = []
     alone = config["scenes"]["pack"]["agents"] == 1

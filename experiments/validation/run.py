@@ -50,7 +50,7 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown part, or a number that does not fit, by name.
     """
-    schema.check(config, schema.VALIDATE)
+    schema.check(config, schema.Validate)
     if unknown := [name for name in config["parts"] if name not in PARTS]:
         raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
     scene_source.use_compilation_cache()

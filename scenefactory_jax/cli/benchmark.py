@@ -42,11 +42,11 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key that does not fit, also one of a variant, by name.
     """
-    schema.check(config, schema.BENCH)
+    schema.check(config, schema.Benchmark)
     variants = config["variants"] or {config["name"]: {}}
     tasks = {name: changed(config, changes, where=f"variants.{name}") for name, changes in variants.items()}
     for task in tasks.values():
-        schema.check(task, schema.BENCH)
+        schema.check(task, schema.Benchmark)
     if config["baseline"] is not None:
         schema.check(config["baseline"], schema.BASELINE, where="baseline")
     scene_source.use_compilation_cache()

@@ -15,8 +15,9 @@ import jax
 import mujoco
 import numpy as np
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.cli import view as replays
+from scenefactory_jax.cli import view_schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.data.loading import scene_source
@@ -69,9 +70,7 @@ def drive(config: Mapping[str, Any]) -> Drive:
 
 def _check(config: Mapping[str, Any]) -> tuple[KeyboardResponse, View, dict[int, str]]:
     """What keys feel like, where the camera stands, and which command each key code means."""
-    schema.check(config, schema.DRIVE)
-    for group, own in {"keys": schema.DRIVE_KEYS, "feel": schema.FEEL, "view": schema.VIEW}.items():
-        schema.check(config[group], own, where=group)
+    schema.check(config, view_schema.Drive)
     if config["run"] is None and config["overrides"]:
         raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
     codes: dict[int, str] = {}

@@ -27,7 +27,7 @@ def weather(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key that does not fit, by name.
     """
-    schema.check(config, schema.WEATHER)
+    schema.check(config, schema.Friction)
     (slowest, fastest), (least, most) = (check_range(config[name], where=name) for name in ("speeds_mps", "slips"))
     grip = config["weather"]["grip"]
     tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()

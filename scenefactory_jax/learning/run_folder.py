@@ -9,9 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.instantiate import ConfigError, find_differences
+from scenefactory_jax.core.config import find_differences
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
 
 MOST = 80  # letters of a sweep's changes in the name of a folder

@@ -596,7 +596,7 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
         ({"parts": {"a": {"sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: missing"),
         (
             {"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}},
-            "spawning.sampler.parts.a.share: 0; wanted is a number above 0",
+            "spawning.sampler.parts.a.share: expected a number > 0, got 0",
         ),
         ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.draw._target_: 'nobody' is not in"),
         (
@@ -616,14 +616,14 @@ def test_mistakes_in_a_mixture_are_named(change, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("spawning.sampler.candidates=0", "spawning.sampler.candidates: 0; wanted is a number of at least 1"),
-        ("spawning.sampler.travel_min_m=-50", "spawning.sampler.travel_min_m: -50; wanted is a number of at least 0"),
-        ("spawning.sampler.travel_max_m=5", r"spawning.sampler.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
+        ("spawning.sampler.candidates=0", "spawning.sampler.candidates: expected a number >= 1, got 0"),
+        ("spawning.sampler.travel_min_m=-50", "spawning.sampler.travel_min_m: expected a number >= 0, got -50"),
+        ("spawning.sampler.travel_max_m=5", r"spawning.sampler.travel_min_m, travel_max_m: expected \[min, max\], got \[10.0, 5\]"),
         ("spawning.sampler.car_size_m=[4.0]", r"spawning.sampler.car_size_m: \[4.0\]; wanted is \[length, width\]"),
-        ("spawning.respawn_clearance_m=-1", "spawning.respawn_clearance_m: -1; wanted is a number of at least 0"),
+        ("spawning.respawn_clearance_m=-1", "spawning.respawn_clearance_m: expected a number >= 0, got -1"),
         ("+spawning.respawn_clear=4", "spawning.respawn_clear: unknown key; valid: draw, respawn_clearance_m"),
         ("~actions.action_repeat", "actions.action_repeat: missing; controls needs command, every"),
-        ("timing.episode_s=inf", "timing.episode_s: inf; wanted is a finite number above 0"),
+        ("timing.episode_s=inf", "timing.episode_s: expected a finite number > 0, got inf"),
         ("timing.episode_s=0.001", "timing.episode_s: 0.001; wanted is a control step, 0.0333333 s, or more"),
         ("termination.ending=null", "termination.ending: None is of type NoneType"),
     ],

@@ -248,5 +248,5 @@ def test_settings_are_checked_at_the_door():
     del config["failures"]["notes"]["near_m"]
     with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
         schema.check_evaluate(config)
-    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: 0; wanted is at least 1"):
+    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: expected an integer >= 1, got 0"):
         schema.check_train(configs.load_config("train", "evaluation.failures.pictures.panels=0"))
