@@ -36,6 +36,7 @@ def export(config: Mapping[str, Any]) -> Path:
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
     episodes = {named(what, folder): result_file.read_evaluated(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
+    configs.print_outside_targets(trained.config, trained.folder)
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config

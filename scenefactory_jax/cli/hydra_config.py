@@ -154,11 +154,16 @@ def _explain(name: str, error: Exception) -> str:
 
 
 def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
-    """Reads the config of a run's folder as `core.config.read` does; with `trust`, prints the functions outside of the package that it names."""
+    """Reads the config of a run's folder as `core.config.read` does, and prints the functions outside of the package that it names."""
     config = run_config.read(path, trust=trust)
-    if found := trusted_targets.find_outside_targets(config):
-        print(f"{Path(path) / FILE}: trusted, and runs {', '.join(f'{target} ({place})' for place, target in found.items())}", flush=True)
+    print_outside_targets(config, path)
     return config
+
+
+def print_outside_targets(config: Mapping[str, Any], folder: Path) -> None:
+    """Prints the functions outside of the package that a trusted config names."""
+    if found := trusted_targets.find_outside_targets(config):
+        print(f"{Path(folder) / FILE}: trusted, and runs {', '.join(f'{target} ({key})' for key, target in found.items())}", flush=True)
 
 
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
