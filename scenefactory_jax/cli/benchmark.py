@@ -33,8 +33,8 @@ FILE = "bench.json"
 ASIDE = ("out", "resume", "variants", "baseline", "name")  # keys of a bench that change nothing about a row
 
 
-def bench(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure a config (`load("bench", "experiment=paper", ...)`) or each of its variants; medians over `repeats`.
+def benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Measure a config (`load_config("benchmark", "experiment=paper", ...)`) or each of its variants; medians over `repeats`.
 
     Returns:
         The rows, which are also printed and, with `out`, written there as bench.json and throughput.md.
@@ -53,7 +53,7 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
     out = None if config["out"] is None else Path(config["out"])
     before = _kept(out) if config["resume"] else {"rows": [], "baseline": None}
-    result = {"command": configs.format_command("bench"), "versions": versions, "rows": [], "baseline": None}
+    result = {"command": configs.format_command("benchmark"), "versions": versions, "rows": [], "baseline": None}
 
     def scenes_of(task: Mapping[str, Any]) -> scene_source.Scenes:
         source = result_file.digest(task["scenes"])

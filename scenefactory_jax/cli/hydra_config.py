@@ -25,8 +25,6 @@ from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import FILE, find_commit, format_command, read_values, versions, write  # noqa: F401
 from scenefactory_jax.core.instantiate import ConfigError
 
-COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
-COMMANDS += ("weather", "export")
 # Keys whose values are lists of overrides
 LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined", r"protocol\.settings")
 
@@ -35,9 +33,21 @@ def find_conf() -> Path:
     """The folder of the configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
-        if (candidate / "train.yaml").is_file():
+        if (candidate / "command" / "train.yaml").is_file():
             return candidate
     raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
+
+
+def find_config_name(name: str) -> str:
+    """Returns the path of a config below `conf/`, without its suffix: `command/train`; of the environment alone, `task/environment`.
+
+    Raises:
+        ConfigError: no such command.
+    """
+    known = {path.stem: f"command/{path.stem}" for path in sorted((find_conf() / "command").glob("*.yaml"))} | {"task": "task/environment"}
+    if name not in known:
+        raise ConfigError(f"config: expected one of {', '.join(known)}, got {name!r}")
+    return known[name]
 
 
 def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
@@ -85,9 +95,7 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     Raises:
         ConfigError: see `load`.
     """
-    known = sorted(path.stem for path in find_conf().glob("*.yaml"))
-    if name not in known:
-        raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
+    find_config_name(name)
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
@@ -118,7 +126,7 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(find_conf()), version_base="1.3"):
-        return hydra_compose(name, overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
+        return hydra_compose(find_config_name(name), overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
 
 
 def to_dict(config: Any) -> dict[str, Any]:

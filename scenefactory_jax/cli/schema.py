@@ -161,8 +161,8 @@ class Benchmark(Task):
 
 
 @dataclass(frozen=True)
-class Friction:
-    """The command `weather`."""
+class Physics:
+    """The command `physics`."""
 
     out: str
     weather: Group

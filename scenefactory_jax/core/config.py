@@ -91,9 +91,13 @@ def _version(name: str) -> str:
 def format_command(name: str) -> str:
     """Formats how this process was called, for reports, without the folders that it wrote to."""
     arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
-    program, _, command = sys.argv[0].rpartition(" ")  # as `__main__` leaves it
-    from_command_line = command == name and "scenefactory_jax" in Path(program).parts
-    return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if from_command_line else f"{name}(config)"
+    program, _, command = sys.argv[0].rpartition(" ")  # as `cli/entry.py` leaves it
+    parts = Path(program).with_suffix("").parts
+    if command == name and "scenefactory_jax" in parts:
+        return f"python -m scenefactory_jax {shlex.join([name, *arguments])}"
+    if command == name and "experiments" in parts:
+        return f"python -m {'.'.join(parts[parts.index('experiments') :])} {shlex.join(arguments)}".strip()
+    return f"{name}(config)"
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
