@@ -1,7 +1,7 @@
 """Command line -> hydra -> one function of `run/`.
 
-    python -m scenefactory_jax train experiment=demo scenes.count=16
-    python -m scenefactory_jax train -m weather=dry,mixed seed=0,1,2
+python -m scenefactory_jax train experiment=demo scenes.count=16
+python -m scenefactory_jax train -m weather=dry,mixed seed=0,1,2
 """
 
 import importlib
@@ -40,8 +40,6 @@ commands: {", ".join(configs.COMMANDS)}
 
 
 MODULES = {
-    "train": "scenefactory_jax.learning.training_loop",
-    "evaluate": "scenefactory_jax.evaluation.protocols",
     "replay": "scenefactory_jax.cli.view",
     "bench": "scenefactory_jax.cli.benchmark",
     "weather": "scenefactory_jax.cli.physics",
@@ -125,7 +123,9 @@ def _job(command: str, varied: set[str]):
         try:
             settings = configs.to_dict(config)
             if command == "train" and varied and settings["out"] is None:
-                settings["out"] = str(module.train_folder.fresh(settings["name"], configs.format_changes(varied)))
+                from scenefactory_jax.learning import run_folder
+
+                settings["out"] = str(run_folder.make_folder_name(settings["name"], configs.format_changes(varied)))
             getattr(module, command)(settings)
         except BrokenPipeError:
             raise

@@ -46,7 +46,7 @@ def shapes_at_rest(traffic: TrafficBoxes) -> Bool[np.ndarray, " O"]:
     return moved.max(axis=0, initial=0.0) < STILL_M
 
 
-def shapes(others: TrafficBoxes, step: int, still: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
+def shapes(traffic: TrafficBoxes, step: int, still: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
     """What to draw at a step, bottom first; `still` as `parked` tells it."""
     for row in np.flatnonzero(traffic.present[step]):
         size = traffic.size[step, row]
