@@ -30,10 +30,10 @@ from scenefactory_jax.env.environment import EnvParts, assemble
 from scenefactory_jax.env.environment import make_env as make
 
 if TYPE_CHECKING:
+    from scenefactory_jax.cli.evaluate import evaluate
+    from scenefactory_jax.cli.train import train
     from scenefactory_jax.cli.view import replay
-    from scenefactory_jax.evaluation.protocols import evaluate
     from scenefactory_jax.learning.policy_io import load_policy
-    from scenefactory_jax.learning.training_loop import train
 
 __version__ = "0.1.0"
 __all__ = ["ConfigError", "EnvParts", "__version__", "apply_overrides", "assemble", "evaluate", "load_config", "load_policy", "load_scenes"]
@@ -59,8 +59,8 @@ def read(path: Path | str) -> Iterator[RawScene | str]:
 def __getattr__(name: str) -> Any:
     """What loads checkpoints and reports is imported when it is first used: that takes a second."""
     places = {
-        "train": "learning.training_loop",
-        "evaluate": "evaluation.protocols",
+        "train": "cli.train",
+        "evaluate": "cli.evaluate",
         "replay": "cli.view",
         "load_policy": "learning.policy_io",
     }

@@ -10,7 +10,7 @@ import jax
 from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
-from scenefactory_jax.cli import error_messages, schema
+from scenefactory_jax.cli import error_messages
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import instantiate
@@ -23,13 +23,13 @@ from scenefactory_jax.learning.ppo import train_iteration as ppo
 from scenefactory_jax.loggers import metrics_csv
 
 OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
+MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | int]], None] | None]
 
 
 class Prepared(NamedTuple):
     """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
 
-    `scenes`: those to train on, before `scenes.take`; None: read anew. `examiners`: protocol -> `evaluate.make_examiner`, for evaluations
-    while training; None: the config's own.
+    `scenes`: those to train on, before `scenes.take`; None: read anew.
     """
 
     env: Env
@@ -37,7 +37,6 @@ class Prepared(NamedTuple):
     mesh: Mesh | None
     trainer: ppo.Trainer
     scenes: scene_source.Scenes | None = None
-    examiners: Mapping[str, Callable] | None = None
 
 
 class Run(NamedTuple):
@@ -61,34 +60,36 @@ def prepare(config: Mapping[str, Any]) -> Prepared:
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 
 
-def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
+def train(
+    config: dict[str, Any],
+    *,
+    on_iteration: OnIteration | None = None,
+    prepared: Prepared | None = None,
+    make_callback: MakeCallback | None = None,
+    finish: Callable[[Path], Any] | None = None,
+) -> Run:
     """Train as a config says (`load("train", ...)`).
 
     Args:
         on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
             donated to the next iteration: copy what is to outlive the call.
         prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
+        make_callback: (folder, iteration after which the run goes on or None) -> function of (parameters, metrics row) that is called
+            after each iteration, or None.
+        finish: called with the folder after the last iteration, before the folder's lock is released.
 
     Raises:
         ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
     """
-    schema.check_train(config)
-    if config["evaluation"]["enable"]:
-        scene_source.check_heldout(config["scenes"])
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
     with run_folder.open_run_folder(config) as (folder, resume):
-        state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
-        if config["evaluation"]["enable"]:
-            if scene_source.has_heldout(config["scenes"]):
-                from scenefactory_jax.evaluation.protocols import after_training
-
-                after_training(config, folder)
-            else:
-                print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
+        state = _trained(config, folder, prepared, watching, on_iteration, make_callback, resume=resume)
+        if finish is not None:
+            finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
 
 
@@ -98,6 +99,7 @@ def _trained(
     prepared: Prepared,
     watching: Mapping[str, loggers.Logger],
     on_iteration: OnIteration | None,
+    make_callback: MakeCallback | None,
     *,
     resume: bool,
 ) -> ppo.TrainState:
@@ -109,8 +111,9 @@ def _trained(
             state = checkpoint.restore(folder / "checkpoints", state)
             print(f"resumed at iteration {int(state.iteration)}", flush=True)
         configs.write(folder, config)
-        watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
-        callbacks = [c for c in (watch, on_iteration) if c]
+        callback = make_callback and make_callback(folder, int(state.iteration) if resume else None)
+        on_parameters = callback and (lambda state, row: callback(ppo.parameters_of(state), row))
+        callbacks = [c for c in (on_parameters, on_iteration) if c]
         return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
 
 
@@ -143,23 +146,6 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
     entry = {"_target_": "make_trainer", **config["ppo"]}
     make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
     return make(env, policy, mesh=mesh)
-
-
-def _make_watch(
-    config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
-) -> OnIteration | None:
-    """Held-out evaluation every so many iterations or at those that are listed, if the config asks for it."""
-    every = config["evaluation"]["every"]
-    if not every or (examiners is None and not config["evaluation"]["enable"]):
-        return None
-    from scenefactory_jax.evaluation.protocols import make_watch
-
-    watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
-
-    def due(iteration: int | float) -> bool:
-        return iteration in every if isinstance(every, list) else iteration % every == 0
-
-    return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
 
 
 def _loop(

@@ -8,15 +8,16 @@ from support.scene_documents import checker, document, packer, straight, thing, 
 from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli.benchmark import bench
 from scenefactory_jax.cli.convert import convert
+from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.render import render
 from scenefactory_jax.cli.scenes import scenes
+from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import batches, scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation.protocols import evaluate
-from scenefactory_jax.learning.training_loop import make_policy, make_trainer, train
+from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
 HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this process
 COMMANDS = {"train": train, "bench": bench, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}

@@ -23,9 +23,11 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli import render as rendering
 from scenefactory_jax.cli.convert import convert
+from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
 from scenefactory_jax.cli.export import export, named
 from scenefactory_jax.cli.render import render
 from scenefactory_jax.cli.scenes import scenes
+from scenefactory_jax.cli.train import train
 from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
@@ -33,9 +35,8 @@ from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import agent_metrics, circumstances, failures
-from scenefactory_jax.evaluation.protocols import evaluate
 from scenefactory_jax.learning import checkpoint, interrupt, policy_io, run_folder
-from scenefactory_jax.learning.training_loop import make_policy, make_trainer, train
+from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.mujoco import offscreen_renderer
 from scenefactory_jax.visualization.report import evaluation_files
@@ -348,9 +349,7 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
     assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
     assert named("unseen", whole.folder) == "unseen"
     assert evaluation_files.title("mine", asked) == "mine: evaluation on towns.bank"
-    assert evaluation_files.format_rerun_command(
-        asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")
-    ) == (
+    assert format_rerun_command(asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")) == (
         "python -m scenefactory_jax evaluate run=mine protocol=recorded trust=true scenes.path=/data/towns.bank"
         " 'overrides=[\"dynamics=bicycle\"]' seed=7"
     )

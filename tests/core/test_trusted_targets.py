@@ -8,11 +8,11 @@ import yaml
 import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config, view
 from scenefactory_jax.cli.compare import _read
+from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.export import export
 from scenefactory_jax.cli.view import load_run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation.protocols import evaluate
 from scenefactory_jax.learning import policy_io, run_folder
 from scenefactory_jax.visualization.report import policy_card
 
