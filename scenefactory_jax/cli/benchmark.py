@@ -154,7 +154,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
     def act(level: str) -> PhaseTimes:
-        start = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+        start = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
         run = phase_timing.make_acting_phase(level, parts, env, steps=horizon)
         return phase_timing.time_phase(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
 

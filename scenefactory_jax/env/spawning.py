@@ -76,7 +76,7 @@ def _check(numbers: Mapping[str, Any], *, where: str) -> None:
 
 def find_usable(agents: Agents) -> Bool[Array, " A"]:
     """Whether each agent has finite starts, speeds, goals and routes, and a length and width above 0."""
-    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route
+    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route_length
     return is_finite(numbers) & jnp.all(agents.size > 0, axis=1)
 
 
@@ -141,7 +141,7 @@ def along_log(
         speed=moving * pick(safe_norm(read(log.velocity, row))),
         size=cars.size,
         goal=jnp.where(present[:, None], cars.goal, 0.0),
-        route=pick(whole - read(travelled, row)),
+        route_length=pick(whole - read(travelled, row)),
         present=present,
     )
 
@@ -190,7 +190,7 @@ def random_pairs(
         speed=jnp.zeros(slots, jnp.float32),
         size=size,
         goal=pick(goal),
-        route=pick(travel),
+        route_length=pick(travel),
         present=present,
     )
 

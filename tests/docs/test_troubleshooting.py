@@ -23,7 +23,7 @@ from scenefactory_jax.learning.training_loop import train
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
 CALL = "python -m scenefactory_jax "
-OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.facts.speed - 100.0)\n"
+OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.metrics.speed - 100.0)\n"
 ELSEWHERE = re.compile(r"JAX_PLATFORMS=cuda")  # what a process decides when it starts
 
 pytestmark = pytest.mark.usefixtures("quickly")

@@ -168,7 +168,7 @@ def config():
 def test_neighbours_and_ttc_know_the_others(street, config):
     env = build_env(config, beside=bound("log_playback"))
     _, history = drive(env, street, jnp.zeros((1, 3)), 12)
-    facts, rows = history[-1].facts, history[-1].observation["neighbours"]
+    metrics, rows = history[-1].metrics, history[-1].observation["neighbours"]
     features = np.asarray(rows.features[0])[np.asarray(rows.mask[0])]
     x = 6.0 * 0.4  # where the car is after 12 steps
     where = {"parked": (20 - x, 0.5), "overtaking": (-10 + 8 * 0.4 - x, 3.5), "person": (5 - x, -4 + 1.2 * 0.4)}
@@ -184,9 +184,9 @@ def test_neighbours_and_ttc_know_the_others(street, config):
     # circles of 1.1 m and 1.045 m, the nearest pair 1.12 m and 1.3 m before the centres: only their own lines meet
     reach, side = 1.1 + 0.55 * 1.9, 0.5
     ahead = 20 - x - 1.12 - min(1.3, 4.5 / 2 - 0.8 * 0.55 * 1.9) - np.sqrt(reach**2 - side**2)
-    assert float(facts.ttc[0]) == pytest.approx(ahead / 6.0, rel=1e-4)
+    assert float(metrics.ttc[0]) == pytest.approx(ahead / 6.0, rel=1e-4)
     assert features[order.index("parked"), 6] == pytest.approx(ahead / 6.0 / 10.0, rel=1e-4)
-    assert float(facts.drac[0]) > 0.9 and CIRCLES["spacing_limit_m"] == 1.3
+    assert float(metrics.drac[0]) > 0.9 and CIRCLES["spacing_limit_m"] == 1.3
 
 
 def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, config):
@@ -224,7 +224,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
 def test_a_car_that_drives_into_a_parked_one_has_collided():
     env = environment.make_env(load_config("task", "dynamics=bicycle", "traffic=parked", "observations=small"))
     scene = with_tracks(scene_of([[0, 0], [0, 4]], [[50, 0], [50, 4]], speeds=[10.0, 10.0], half_width=9.0), track([14.0, 0.3]))
-    state, step = env.start(jax.random.key(0), scene), jax.jit(env.transition)
+    state, step = env.init_state(jax.random.key(0), scene), jax.jit(env.control_step)
     when = None
     for count in range(45):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))

@@ -206,11 +206,11 @@ def counted(env: Env):
     """The environment, and how often its transition was traced."""
     traces = []
 
-    def transition(scene, state, action):
+    def control_step(scene, state, action):
         traces.append(1)
-        return env.transition(scene, state, action)
+        return env.control_step(scene, state, action)
 
-    return env._replace(transition=transition), traces
+    return env._replace(control_step=control_step), traces
 
 
 @pytest.fixture(scope="module")
@@ -260,8 +260,8 @@ def test_metrics_count_what_happened(course):
 @pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
 def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
-    env, policy, stage = probe(life=life, episode_steps=length)._replace(hold=3), late_fusion.make(**SMALL), scenes(2, 1)
-    worlds = jax.vmap(env.start)(jax.random.split(jax.random.key(0), 2), stage)
+    env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
+    worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
     seen = jax.vmap(env.observe)(stage, worlds)
     parameters = policy.init(jax.random.key(1), seen)
     begin = (stage, worlds, seen, rollout.make_empty_episode_stats(worlds), jax.random.key(2))
@@ -282,7 +282,7 @@ def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length
 
 
 def test_worlds_begin_where_an_action_is_read():
-    env = probe(life=5, episode_steps=12)._replace(hold=3)
+    env = probe(life=5, episode_steps=12)._replace(action_repeat=3)
     trainer = train_iteration.make_trainer(env, late_fusion.make(**SMALL), **{**NUMBERS, "stagger_episodes": True, "episode_steps": 12})
     steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
     assert set(steps.tolist()) == {0, 3, 6, 9}

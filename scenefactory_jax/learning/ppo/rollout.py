@@ -63,7 +63,7 @@ def collect_rollout(
 ) -> tuple[State, Observation, EpisodeStats, Sample, Tally, SceneStats]:
     """Act `horizon` times in `W` worlds; a world that is over starts afresh, from a fresh key, before it is observed.
 
-    An action stands for `env.hold` control steps.
+    An action stands for `env.action_repeat` control steps.
 
     Args:
         axis: of the devices that share the worlds, see `across`.
@@ -80,8 +80,8 @@ def collect_rollout(
         mean, log_std, value = policy.apply(parameters, observation)
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(sharding.world_keys(action_key, len(mean), axis))
         action = mean + jnp.exp(log_std) * noise
-        control = lambda worlds: jax.vmap(env.transition)(scenes, worlds, action)  # noqa: E731
-        after, lives, outcome, counts = environment.repeat_action(control, worlds, lives, hold=env.hold, note=_tally)
+        control = lambda worlds: jax.vmap(env.control_step)(scenes, worlds, action)  # noqa: E731
+        after, lives, outcome, counts = environment.repeat_action(control, worlds, lives, action_repeat=env.action_repeat, note=_tally)
         sample = Sample(
             observation=observation,
             action=action,
@@ -90,11 +90,11 @@ def collect_rollout(
             value=value,
             active=worlds.active,
             reward=outcome.reward,
-            done=outcome.done,
+            done=outcome.terminated,
             truncated=environment.find_truncated_agents(outcome, worlds.active),
         )
-        fresh = jax.vmap(env.start)(sharding.world_keys(start_key, len(outcome.over), axis), scenes)
-        worlds = tree_where(outcome.over, fresh, after)
+        fresh = jax.vmap(env.init_state)(sharding.world_keys(start_key, len(outcome.world_done), axis), scenes)
+        worlds = tree_where(outcome.world_done, fresh, after)
         return (worlds, jax.vmap(env.observe)(scenes, worlds), lives), (sample, counts)
 
     (worlds, observation, lives), (samples, counts) = jax.lax.scan(step, (worlds, observation, lives), jax.random.split(key, horizon))
@@ -123,19 +123,19 @@ def _tally(lives: EpisodeStats, worlds: State, outcome: StepResult) -> tuple[Epi
         return jnp.sum(jnp.where(where, x, 0), axis=1, dtype=jnp.float32)
 
     active = worlds.active
-    ended = active & (outcome.done | outcome.truncated[:, None])
+    ended = active & (outcome.terminated | outcome.truncated[:, None])
     reward = jnp.where(active, outcome.reward, 0.0)
     lives = EpisodeStats(lives.returns + reward, lives.steps + active)
     counts = {
         "spawned": jnp.sum(worlds.agents.present, axis=1, dtype=jnp.int32),
         "active": total(active, active),
         "reward": total(reward, active),
-        "speed": total(outcome.facts.speed, active & ~outcome.facts.events.numerical_error),  # a broken car's is no measurement
+        "speed": total(outcome.metrics.speed, active & ~outcome.metrics.events.numerical_error),  # a broken car's is no measurement
         "ended": total(ended, ended),
         "return": total(lives.returns, ended),
         "length": total(lives.steps, ended),
         **{f"reward/{name}": total(term, active) for name, term in outcome.terms.items()},
         **{f"events/{name}": total(event, active) for name, event in vars(outcome.events).items()},
     }
-    gone = ended | outcome.over[:, None]
+    gone = ended | outcome.world_done[:, None]
     return EpisodeStats(jnp.where(gone, 0.0, lives.returns), jnp.where(gone, 0.0, lives.steps)), counts

@@ -90,8 +90,8 @@ def make_trainer(
     """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
 
     Args:
-        horizon, epochs, minibatches: actions of a rollout (`env.hold` control steps each), passes over it, gradient steps in each.
-        sample_fraction: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
+        horizon, epochs, minibatches: actions of a rollout (`env.action_repeat` control steps each), passes, gradient steps in each.
+        sample_fraction: share of a rollout's samples that an epoch visits, active agents first. The others carry no weight:
             a larger share than the active one costs only time, a smaller one leaves out random active samples.
         permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
         learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
@@ -118,7 +118,7 @@ def make_trainer(
     rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_half_life)
     passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
     learn = functools.partial(update.update_epochs, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
-    start = functools.partial(_start, env=env, phases=episode_steps // env.hold if stagger_episodes else 1)
+    start = functools.partial(_start, env=env, phases=episode_steps // env.action_repeat if stagger_episodes else 1)
     act = functools.partial(rollout.collect_rollout, env, policy, horizon=horizon, axis=axis)
     prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
     size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_fraction=sample_fraction)
@@ -186,7 +186,7 @@ def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[
 
     def one(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         phase_key, start_key = jax.random.split(key)
-        world = env.start(start_key, scene, env.hold * jax.random.randint(phase_key, (), 0, phases))
+        world = env.init_state(start_key, scene, env.action_repeat * jax.random.randint(phase_key, (), 0, phases))
         return world, env.observe(scene, world)
 
     return jax.vmap(one)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
