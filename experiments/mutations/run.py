@@ -52,7 +52,7 @@ MUTATIONS = (
     Mutation("events", "collisions count during the grace steps", "env/step_metrics.py",
              "& (after.steps_since_spawn >= collision_grace_steps)", "", "env/test_rewards.py"),
     Mutation("GAE", "advantages flow through slots without an agent", "learning/ppo/gae.py",
-             "cut = done | ~active", "cut = done", "learning/test_ppo.py"),
+             "cut = terminated | ~active", "cut = terminated", "learning/test_ppo.py"),
     Mutation("GAE", "a world that runs out of time counts as a failure", "learning/ppo/gae.py",
              "(truncated & ~cut)", "(truncated & cut)", "learning/test_ppo.py"),
     Mutation("PPO", "the clipped value loss takes the smaller error", "learning/ppo/loss.py",

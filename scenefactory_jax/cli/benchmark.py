@@ -21,9 +21,8 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import phase_timing
+from scenefactory_jax.learning import phase_timing, rollout
 from scenefactory_jax.learning.phase_timing import PhaseTimes
-from scenefactory_jax.learning.ppo import rollout
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.visualization.report import throughput_report as report
 
@@ -199,17 +198,14 @@ def _learn(
     policy = make_policy(config)
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
-    whole = phase_timing.time_phase(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
+    whole = phase_timing.time_phase(trainer.train_iteration, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
     state, metrics = whole.left
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
-        now, seen, lives = carry
-        acted = rollout.collect_rollout(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
-        return acted[:3], acted[3]
+        return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=config["ppo"]["horizon"])[:2]
 
     def roll() -> PhaseTimes:
-        begin = (state.worlds, state.observation, state.lives)
         given = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731
-        return phase_timing.time_phase(collect, begin, given, warmup=warmup, repeats=repeats)
+        return phase_timing.time_phase(collect, state.worlds, given, warmup=warmup, repeats=repeats)
 
     return whole, {name: float(value) for name, value in jax.device_get(metrics).items()}, roll

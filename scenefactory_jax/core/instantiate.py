@@ -15,9 +15,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-
-class ConfigError(ValueError):
-    """A config entry that cannot be used; the message names the key, the value and what would be valid."""
+from scenefactory_jax.core.schema import ConfigError
 
 
 def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:

@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from scenefactory_jax import loggers
 from scenefactory_jax.cli import error_messages, schema
 from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import schema as core_schema
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.types import Env, Policy, Scene
@@ -19,10 +20,12 @@ from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import checkpoint, interrupt, run_folder
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration as ppo
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.ppo.train_iteration import make_trainer as make_ppo_trainer
+from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
-OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
+OnIteration = Callable[[TrainState, Mapping[str, float | int]], None]
 
 
 class Prepared(NamedTuple):
@@ -35,7 +38,7 @@ class Prepared(NamedTuple):
     env: Env
     policy: Policy
     mesh: Mesh | None
-    trainer: ppo.Trainer
+    trainer: Trainer
     scenes: scene_source.Scenes | None = None
     examiners: Mapping[str, Callable] | None = None
 
@@ -47,7 +50,7 @@ class Run(NamedTuple):
     config: dict[str, Any]
     env: Env
     policy: Policy
-    state: ppo.TrainState
+    state: TrainState
     metrics: list[dict[str, float]]
 
 
@@ -100,7 +103,7 @@ def _trained(
     on_iteration: OnIteration | None,
     *,
     resume: bool,
-) -> ppo.TrainState:
+) -> TrainState:
     """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
     trainer = prepared.trainer
     with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
@@ -138,11 +141,10 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
     return instantiate(config["policy"], builtins=late_fusion, where="policy")()
 
 
-def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
-    """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
-    entry = {"_target_": "make_trainer", **config["ppo"]}
-    make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
-    return make(env, policy, mesh=mesh)
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
+    """Builds PPO for a config, on one device or on a mesh (`sharding.make_mesh`)."""
+    numbers = core_schema.read(config["ppo"], PPOConfig, where="ppo")
+    return make_ppo_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
 
 
 def _make_watch(
@@ -159,13 +161,13 @@ def _make_watch(
     def due(iteration: int | float) -> bool:
         return iteration in every if isinstance(every, list) else iteration % every == 0
 
-    return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
+    return lambda state, row: watch(get_policy_parameters(state), row) if due(row["iteration"]) else None
 
 
 def _loop(
     config,
     folder: Path,
-    trainer: ppo.Trainer,
+    trainer: Trainer,
     worlds,
     state,
     flow: stream.SceneStream | None,
@@ -192,7 +194,7 @@ def _loop(
             state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
             seconds = time.monotonic() - before
             spent += seconds / 60
-            row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
+            row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
             note(row)
@@ -212,17 +214,17 @@ def _loop(
 
 
 def step(
-    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
-) -> tuple[ppo.TrainState, Scene, dict[str, float | int]]:
+    trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
+) -> tuple[TrainState, Scene, dict[str, float | int]]:
     """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
     if flow is None:
-        state, metrics = trainer.iterate(state, worlds)
+        state, metrics = trainer.train_iteration(state, worlds)
         return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
     if not first:
-        state, worlds = flow.exchange(trainer.swap, state, worlds)
-    state, metrics = trainer.iterate(state, worlds)
+        state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
+    state, metrics = trainer.train_iteration(state, worlds)
     flow.draw()  # while the devices work
-    metrics, record = jax.device_get((metrics, state.record))
+    metrics, record = jax.device_get((metrics, state.scene_stats))
     return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
 
 

@@ -28,7 +28,7 @@ UNUSABLE = {
     "start inf": ("position", jnp.inf),
     "yaw nan": ("yaw", jnp.nan),
     "speed inf": ("speed", jnp.inf),
-    "route nan": ("route", jnp.nan),
+    "route nan": ("route_length", jnp.nan),
 }
 
 

@@ -9,7 +9,12 @@ import types
 import jax
 import jax.numpy as jnp
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.types import Env, Events, Motion, Scene, State, StepMetrics, StepResult
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.trainer import Trainer
 from scenefactory_jax.weather.friction import make_uniform
 
 AGENTS = 3
@@ -30,15 +35,14 @@ NUMBERS = dict(
     learning_rate_half_life=None,
     gamma=0.9,
     gae_lambda=0.95,
-    clip=0.2,
+    clip_eps=0.2,
     value_clip=0.2,
-    entropy=0.0,
-    value=1.0,
+    ent_coef=0.0,
+    vf_coef=1.0,
     max_grad_norm=1.0,
-    normalise_advantage=True,
+    normalize_advantages=True,
     stagger_episodes=False,
-    average=None,
-    episode_steps=1000,
+    parameter_ema_decay=None,
     shards=None,
 )
 
@@ -68,6 +72,16 @@ def blank(cls, **known):
         return jnp.zeros(shape, next((d for d in (jnp.float32, jnp.int32, bool) if jnp.dtype(d).name in kind.dtypes), bool))
 
     return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
+
+
+def ppo_config(**changes) -> PPOConfig:
+    """The numbers above with changes, checked."""
+    return schema.read({**NUMBERS, **changes}, PPOConfig, where="ppo")
+
+
+def make_trainer(env: Env, *, episode_steps: int = 1000, mesh=None, **changes) -> Trainer:
+    """PPO with those numbers and the small network."""
+    return train_iteration.make_trainer(env, late_fusion.make(**SMALL), ppo_config(**changes), episode_steps=episode_steps, mesh=mesh)
 
 
 def scenes(worlds: int, task: int = 5) -> Scene:

@@ -4,10 +4,10 @@
         scenes = flow.scenes()                                # for all worlds, on their devices
         for iteration in range(iterations):
             if iteration:
-                state, scenes = flow.exchange(trainer.swap, state, scenes)
-            state, metrics = trainer.iterate(state, scenes)
+                state, scenes = flow.exchange(trainer.replace_scenes, state, scenes)
+            state, metrics = trainer.train_iteration(state, scenes)
             flow.draw()                                       # while the devices work
-            flow.note(*jax.device_get((state.record.episodes, state.record.successes)))
+            flow.note(*jax.device_get((state.scene_stats.episodes, state.scene_stats.successes)))
 
 What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
 state, it makes a resumed run the unbroken one, bit for bit.
