@@ -43,7 +43,7 @@ def check(ending: Any, *, where: str) -> None:
         if name not in EVENTS:
             raise ConfigError(f"{where}.ending: unknown event {name!r}; valid: {', '.join(EVENTS)}")
     if "numerical_error" not in ending or "goal_reached" not in ending:
-        raise ConfigError(f"{where}.ending: {ending} must hold 'fault' and 'reached': a broken or a finished car cannot drive on")
+        raise ConfigError(f"{where}.ending: {ending} must hold 'numerical_error' and 'goal_reached'")
 
 
 def make_empty_events(agents: int) -> Events:

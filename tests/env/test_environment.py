@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.gliding import CIRCLES, build_env, drive, jitted
 from support.hand_scenes import road_of, scene_of
 
 import scenefactory_jax
@@ -13,60 +14,15 @@ from scenefactory_jax.core import geometry
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
-from scenefactory_jax.core.types import Dynamics, Motion, RewardInput
-from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, surrogate_safety, termination, traffic
+from scenefactory_jax.core.types import RewardInput
+from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, surrogate_safety, termination
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.roadgraph import queries
-from scenefactory_jax.weather.road_condition import keep_condition
-
-CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
-
-
-def glide() -> Dynamics:
-    """Cars that keep their velocity; action 0 steers the speed directly. Throttle above 0.99 breaks the car (NaN)."""
-
-    def init(key, scene):
-        a = scene.agents
-        return {"p": a.position, "yaw": a.yaw, "v": a.speed, "force": jnp.zeros_like(a.speed)}
-
-    def advance(scene, body, action, active):
-        v = jnp.where(active, body["v"] + action[:, 0], body["v"])
-        v = jnp.where(action[:, 0] > 0.99, jnp.nan, v)
-        p = body["p"] + jnp.where(active, v / 30, 0.0)[:, None] * geometry.heading_vector(body["yaw"])
-        return {**body, "p": p, "v": v, "force": jnp.where(action[:, 2] > 0.5, 100.0, 0.0)}
-
-    def read(body):
-        zero = jnp.zeros_like(body["v"])
-        flat = lambda xy, z: jnp.concatenate([xy, z[:, None]], axis=1)  # noqa: E731
-        velocity = body["v"][:, None] * geometry.heading_vector(body["yaw"])
-        place, speed = flat(body["p"], zero + 0.6), flat(velocity, zero)
-        return Motion(place, speed, body["yaw"], zero, zero + 1, zero, body["force"], zero + 1, zero, zero)
-
-    return Dynamics(init, advance, read)
 
 
 @pytest.fixture(scope="module")
 def config():
     return scenefactory_jax.load_config("task")
-
-
-def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.no_traffic, hold=1):
-    parts = environment.EnvParts(
-        dynamics=glide(),
-        map_action=actions.separate_pedals,
-        action_repeat=hold,
-        sample_agents=draw,
-        sample_weather=keep_condition,
-        traffic=beside,
-        compute_metrics=functools.partial(step_metrics.compute, **config["step_metrics"]),
-        evaluate_termination=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
-        terms=rewards.make(config["reward"]),
-        groups=observations.make({**config["observations"], "road": {**config["observations"]["road"], "count": 40}}),
-        episode_steps=steps,
-        control_dt=1 / 30,
-        respawn_clearance_m=respawn,
-    )
-    return environment.assemble(parts)
 
 
 # ---- geometry and conflicts ----
@@ -236,7 +192,7 @@ def test_controls_are_what_dynamics_and_rewards_are_given(config):
     def speed_after(entry):
         env = environment.make_env({**own, "actions": {"command": entry, "action_repeat": 1}})
         state, _ = env.reset(jax.random.key(0), scene)
-        state, _ = jax.jit(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
+        state, _ = jitted(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
         return float(geometry.safe_norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
 
     rolled, braked = speed_after({"_target_": "separate_pedals"}), speed_after({"_target_": "one_pedal"})
@@ -249,7 +205,7 @@ def test_an_action_stands_until_the_next_is_read(config):
     env = build_env(config, hold=3)
     scene = scene_of([[0.0, 0.0]], [[90.0, 0.0]])
     state, _ = env.reset(jax.random.key(0), scene)
-    step, taken = jax.jit(env.control_step), []
+    step, taken = jitted(env.control_step), []
     for throttle in range(7):
         state, _ = step(scene, state, jnp.array([[0.1 * throttle, 0.0, 0.0]]))
         taken.append(float(state.previous_action[0, 0]))
@@ -268,8 +224,8 @@ def test_a_step_is_an_action_with_all_its_control_steps(config):
     scene = scene_of([[0.0, 0.0], [0.0, 9.0]], [[3.4, 0.0], [90.0, 9.0]], speeds=[10.0, 10.0])
     state, _ = env.reset(jax.random.key(0), scene)
     action = jnp.array([[0.5, 0.0, 0.0]] * 2)
-    after, outcome = jax.jit(env.step)(scene, state, action)
-    control, paid, reached = jax.jit(env.control_step), np.zeros(2), []
+    after, outcome = jitted(env.step)(scene, state, action)
+    control, paid, reached = jitted(env.control_step), np.zeros(2), []
     for _ in range(3):
         driving = np.asarray(state.active)
         state, single = control(scene, state, action)
@@ -290,7 +246,7 @@ def test_a_life_that_begins_within_an_action_has_no_part_in_it(config):
     env = build_env(config, hold=2, respawn=10.0)
     scene = scene_of([[0.0, 0.0]], [[3.345, 0.0]], speeds=[10.0])
     state, _ = env.reset(jax.random.key(0), scene)
-    after, outcome = jax.jit(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
+    after, outcome = jitted(env.step)(scene, state, jnp.array([[0.5, 0.0, 0.0]]))
     assert outcome.terminated.tolist() == outcome.events.goal_reached.tolist() == after.active.tolist() == [True]
     assert after.steps_since_spawn.tolist() == [1]
     assert float(outcome.terms["goal"][0]) == 45.0 and float(outcome.terms["progress"][0]) == pytest.approx(2 * 10.5 / 30, abs=1e-5)
@@ -347,16 +303,6 @@ def test_an_episode_may_begin_at_a_later_moment(config):
     late = env.init_state(jax.random.key(0), scene, 60)
     assert int(late.step) == 60 and float(late.weather.rain.now_s) == pytest.approx(2.0) and float(late.agents.goal[0, 0]) == 60.0
     assert float(env.init_state(jax.random.key(0), scene).agents.goal[0, 0]) == 0.0
-
-
-def drive(env, scene, action, steps, key=0):
-    state, _ = env.reset(jax.random.key(key), scene)
-    step = jax.jit(env.step)
-    history = []
-    for _ in range(steps):
-        state, outcome = step(scene, state, action)
-        history.append(outcome)
-    return state, history
 
 
 def test_goal_ends_a_car_once_and_pays_once(env, two_cars):
@@ -599,7 +545,7 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
             {"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}},
             "spawning.sampler.parts.a.share: 0; wanted is a number above 0",
         ),
-        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.draw._target_: 'nobody' is not in"),
+        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.sampler._target_: 'nobody' is not in"),
         (
             {"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}},
             "a.respawn_clearance_m: 5.0; it belongs",
@@ -622,8 +568,8 @@ def test_mistakes_in_a_mixture_are_named(change, message):
         ("spawning.sampler.travel_max_m=5", r"spawning.sampler.travel_min_m, travel_max_m: \[10.0, 5\]; wanted is \[least, most\]"),
         ("spawning.sampler.car_size_m=[4.0]", r"spawning.sampler.car_size_m: \[4.0\]; wanted is \[length, width\]"),
         ("spawning.respawn_clearance_m=-1", "spawning.respawn_clearance_m: -1; wanted is a number of at least 0"),
-        ("+spawning.respawn_clear=4", "spawning.respawn_clear: unknown key; valid: draw, respawn_clearance_m"),
-        ("~actions.action_repeat", "actions.action_repeat: missing; controls needs command, every"),
+        ("+spawning.respawn_clear=4", "spawning.respawn_clear: unknown key; valid: sampler, respawn_clearance_m"),
+        ("~actions.action_repeat", "actions.action_repeat: missing; actions needs command, action_repeat"),
         ("timing.episode_s=inf", "timing.episode_s: inf; wanted is a finite number above 0"),
         ("timing.episode_s=0.001", "timing.episode_s: 0.001; wanted is a control step, 0.0333333 s, or more"),
         ("termination.ending=null", "termination.ending: None is of type NoneType"),
@@ -643,5 +589,5 @@ def test_respawn_starts_finished_cars_again(config):
 
 
 def test_unknown_ending_is_refused():
-    with pytest.raises(ConfigError, match="unknown event 'colided'; valid: fault, reached"):
+    with pytest.raises(ConfigError, match="unknown event 'colided'; valid: numerical_error, goal_reached"):
         termination.check(["numerical_error", "goal_reached", "colided"], where="termination")

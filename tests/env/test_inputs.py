@@ -178,7 +178,7 @@ def test_scenes_that_do_not_fit_are_refused_by_name(env, given, change, message)
 )
 def test_actions_that_do_not_fit_are_refused_by_name(env, given, action, message):
     scene, state, _ = given
-    for name in ("step", "transition"):
+    for name in ("step", "control_step"):
         with pytest.raises(ValueError, match=f"env.{name}: {message}"):
             jax.eval_shape(getattr(env, name), scene, state, action)
     worlds = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((2, *leaf.shape), leaf.dtype), (scene, state, jnp.zeros((1, 3))))
