@@ -116,10 +116,10 @@ def gather(agents: Sequence[Agent], *, circles: Mapping[str, float]) -> Crowd:
     )
 
 
-def _circles(agent: Agent, *, radius_share: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
+def _circles(agent: Agent, *, radius_fraction: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
     """Centres [3, 2] of the three circles along a car's axis, and their radius."""
     length, width = agent.size.tolist()
-    radius = max(radius_floor_m, radius_share * width)
+    radius = max(radius_floor_m, radius_fraction * width)
     spacing = min(spacing_limit_m, max(0.0, 0.5 * length - 0.8 * radius))
     ahead = spacing * _heading(agent.yaw)
     return np.array([agent.position + ahead, agent.position, agent.position - ahead]), radius
@@ -231,7 +231,7 @@ def measure(
     height_min_m: float,
     scene_size_m: float,
     max_start_distance_m: float,
-    stray_ratio: float,
+    max_start_distance_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
     idle_speed_mps: float,
@@ -250,7 +250,7 @@ def measure(
     has_lane = len(place.lanes.kind) > 0
     edge_gap, edge_ttc = _edges(place.edges, agent, crowd, edge_half_width_m, edge_range_m)
     fell = agent.upright < upright_min or agent.elevation < height_min_m
-    lost = distance_from_start > max(max_start_distance_m, stray_ratio * agent.route)
+    lost = distance_from_start > max(max_start_distance_m, max_start_distance_ratio * agent.route)
     events = {
         "numerical_error": False,
         "goal_reached": math.hypot(*to_goal) <= goal_radius_m,
@@ -330,10 +330,10 @@ def progress(metrics: Facts, new: str | None, *, limit_m: float) -> float:
     return min(max(metrics.progress, -limit_m), limit_m)
 
 
-def lane_keeping(metrics: Facts, new: str | None, *, sigma_m: float, heading_share: float) -> float:
+def lane_keeping(metrics: Facts, new: str | None, *, sigma_m: float, heading_fraction: float) -> float:
     """Near the lane's centre and along it."""
     near = math.exp(-((metrics.lane_offset / sigma_m) ** 2))
-    return near * (1 - heading_share + heading_share * max(metrics.lane_alignment, 0.0)) if metrics.has_lane else 0.0
+    return near * (1 - heading_fraction + heading_fraction * max(metrics.lane_alignment, 0.0)) if metrics.has_lane else 0.0
 
 
 def off_lane(metrics: Facts, new: str | None) -> float:

@@ -163,7 +163,7 @@ def make(config: Mapping[str, Any]) -> Task:
     _refuse(config)
     bound = functools.partial(instantiate, builtins=one)
     entries = {name: entry for name, entry in config["observations"].items() if entry is not None}
-    groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
+    groups = {name: bound(_without_kernels(entry), where=f"observations.{name}") for name, entry in entries.items()}
     terms = []
     for name, entry in config["reward"].items():
         if entry is not None:
@@ -197,12 +197,12 @@ def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
 def _refuse(config: Mapping[str, Any]) -> None:
     """Name what only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
-    if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
+    if not dynamics["_target_"].endswith("articulated_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
-        raise ConfigError(f"controls: {config['actions']}; the baseline has pedals, read at every control step")
-    if config["traffic"]["_target_"] != "ignore":
-        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has ignore")
+        raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
+    if config["traffic"]["_target_"] != "no_traffic":
+        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has no_traffic")
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":

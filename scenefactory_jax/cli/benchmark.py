@@ -159,7 +159,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
 
     if scope == "training":
         whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
-        spawned, active = metrics["steps/spawned"], metrics["share/active"]
+        spawned, active = metrics["steps/spawned"], metrics["active_fraction"]
     else:
         whole, roll, active = act(SCOPES[scope]), None, None
         spawned = int(whole.left[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded

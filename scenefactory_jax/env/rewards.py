@@ -29,10 +29,10 @@ def progress(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     return jnp.clip(step.metrics.progress, -limit_m, limit_m)
 
 
-def lane_keeping(step: RewardInput, *, sigma_m: float, heading_share: float) -> Float[Array, " A"]:
+def lane_keeping(step: RewardInput, *, sigma_m: float, heading_fraction: float) -> Float[Array, " A"]:
     """exp(-(offset/sigma)^2) [(1 - share) + share max(0, cos heading error)] (arXiv:2605.08528, Table 7); 0 where there is no lane."""
     near = jnp.exp(-((step.metrics.lane_offset / sigma_m) ** 2))
-    aligned = (1 - heading_share) + heading_share * jnp.maximum(step.metrics.lane_alignment, 0.0)
+    aligned = (1 - heading_fraction) + heading_fraction * jnp.maximum(step.metrics.lane_alignment, 0.0)
     return jnp.where(step.metrics.has_lane, near * aligned, 0.0)
 
 

@@ -30,7 +30,7 @@ def compute(
     height_min_m: float,
     scene_size_m: float,
     max_start_distance_m: float,
-    stray_ratio: float,
+    max_start_distance_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
     idle_speed_mps: float,
@@ -63,7 +63,7 @@ def compute(
         "height_min_m": height_min_m,
         "scene_size_m": scene_size_m,
         "max_start_distance_m": max_start_distance_m,
-        "stray_ratio": stray_ratio,
+        "max_start_distance_ratio": max_start_distance_ratio,
     }
     events = Events(
         numerical_error=broken,
@@ -109,12 +109,12 @@ def _has_crashed(
     height_min_m,
     scene_size_m,
     max_start_distance_m,
-    stray_ratio,
+    max_start_distance_ratio,
 ) -> Bool[Array, " A"]:
     """Tipped over or fallen, outside the scene, or further from the start than any way to the goal asks for."""
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * scene_size_m
-    return fell | outside | (distance_from_start > jnp.maximum(max_start_distance_m, stray_ratio * agents.route_length))
+    return fell | outside | (distance_from_start > jnp.maximum(max_start_distance_m, max_start_distance_ratio * agents.route_length))
 
 
 def _measure_lane(scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]) -> dict[str, Array]:

@@ -143,8 +143,8 @@ def compute_rollout_metrics(counts: Counts) -> dict[str, Float[Array, ""]]:
     """Computes the metrics of a rollout that do not depend on the algorithm.
 
     `reward` and `reward/...`: mean per step of an active agent. `events/...`: new events per episode of an agent that ended, by event or by
-    time limit; `count/...`: their number. `life/...`: undiscounted return and steps of these episodes. `share/active`: active steps as a
-    fraction of the steps of spawned slots; `steps/...`: of this rollout. `speed`: m/s.
+    time limit; `count/...`: their number. `episode/...`: undiscounted return and steps of these episodes. `active_fraction`: active steps
+    among the steps of spawned slots; `steps/...`: of this rollout. `speed`: m/s.
     """
     steps, ends = jnp.maximum(counts["active"], 1.0), jnp.maximum(counts["ended"], 1.0)
     spawned = counts["spawned"].astype(jnp.float32)
@@ -154,10 +154,10 @@ def compute_rollout_metrics(counts: Counts) -> dict[str, Float[Array, ""]]:
         metrics[f"count/{name}"] = counts[f"events/{name}"]
     return {
         **metrics,
-        "life/return": counts["return"] / ends,
-        "life/steps": counts["length"] / ends,
-        "count/lives": counts["ended"],
-        "share/active": counts["active"] / jnp.maximum(spawned, 1.0),
+        "episode/return": counts["return"] / ends,
+        "episode/steps": counts["length"] / ends,
+        "count/episodes": counts["ended"],
+        "active_fraction": counts["active"] / jnp.maximum(spawned, 1.0),
         "steps/spawned": spawned,
         "steps/active": counts["active"],
         "speed": counts["speed"] / steps,

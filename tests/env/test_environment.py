@@ -528,7 +528,7 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
     x = np.arange(-60, 60.1, 0.5)
     scene = scene_of(np.zeros((4, 2)), np.ones((4, 2)), speeds=4 * [3.0])
     scene = replace(scene, lanes=road_of([(2, np.stack([x, 0 * x], -1))], capacity=300))
-    entry = scenefactory_jax.load_config("task", "spawning=mixed", "spawning.sampler.parts.random.share=1.5")["spawning"]["sampler"]
+    entry = scenefactory_jax.load_config("task", "spawning=mixed", "spawning.sampler.parts.random.weight=1.5")["spawning"]["sampler"]
     agents = jax.jit(jax.vmap(lambda key: spawning.make(entry)(key, scene)))(jax.random.split(jax.random.key(0), 400))
     recorded = (agents.position == scene.agents.position).all(axis=(1, 2))
     assert abs(recorded.mean() - 0.25) < 0.07 and not agents.speed.any()
@@ -540,19 +540,19 @@ def test_a_mixture_draws_each_part_as_often_as_its_share():
     ("change", "message"),
     [
         ({"parts": None}, "spawning.sampler.parts: None; wanted are entries"),
-        ({"parts": {"a": {"sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.share: missing"),
+        ({"parts": {"a": {"sampler": {"_target_": "logged"}}}}, "spawning.sampler.parts.a.weight: missing"),
         (
-            {"parts": {"a": {"share": 0.0, "sampler": {"_target_": "logged"}}}},
-            "spawning.sampler.parts.a.share: 0; wanted is a number above 0",
+            {"parts": {"a": {"weight": 0.0, "sampler": {"_target_": "logged"}}}},
+            "spawning.sampler.parts.a.weight: 0; wanted is a number above 0",
         ),
-        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.sampler._target_: 'nobody' is not in"),
+        ({"parts": {"a": {"weight": 1, "sampler": {"_target_": "nobody"}}}}, "spawning.sampler.parts.a.sampler._target_: 'nobody' is not in"),
         (
-            {"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}},
+            {"parts": {"a": {"weight": 1, "sampler": {"_target_": "logged"}, "respawn_clearance_m": 5.0}}},
             "a.respawn_clearance_m: 5.0; it belongs",
         ),
-        ({"parts": {"a": {"share": 1, "sampler": {"_target_": "logged"}, "shar": 3}}}, "spawning.sampler.parts.a.shar: unknown key"),
+        ({"parts": {"a": {"weight": 1, "sampler": {"_target_": "logged"}, "weigt": 3}}}, "spawning.sampler.parts.a.weigt: unknown key"),
         ({"parts": {"a": None}}, "spawning.sampler.parts: {'a': None}; wanted are entries"),
-        ({"shares": [1.0]}, "spawning.sampler.shares: unknown key of mixed"),
+        ({"weights": [1.0]}, "spawning.sampler.weights: unknown key of mixed"),
     ],
 )
 def test_mistakes_in_a_mixture_are_named(change, message):

@@ -241,10 +241,10 @@ def test_metrics_count_what_happened(course):
     trainer, _ = course
     _, history = run(trainer, scenes(WORLDS), 2)
     metrics = {name: float(value) for name, value in history[-1].items()}
-    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["share/active"] == 1.0
+    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["active_fraction"] == 1.0
     assert metrics["reward"] == pytest.approx(metrics["reward/paid"]) and -4.0 < metrics["reward"] < 0.0
-    assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
-    assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
+    assert metrics["count/episodes"] == 16 * WORLDS * 2 / 4 and metrics["episode/steps"] == 4.0  # worlds end before the agents do
+    assert metrics["episode/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
     assert metrics["events/goal_reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
 
 

@@ -10,7 +10,7 @@ from scenefactory_jax.core.types import Dynamics, Motion
 from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, termination, traffic
 from scenefactory_jax.weather.road_condition import keep_condition
 
-CIRCLES = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
+CIRCLES = {"radius_fraction": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
 
 
 def glide() -> Dynamics:
