@@ -116,15 +116,15 @@ def _own(config: Mapping[str, Any], scenes: scene_source.Scenes, actions: np.nda
     def step(held: Any, carry: Any) -> tuple[Any, Any]:
         states, given, key = carry
         start_key, key = jax.random.split(key)
-        after, outcome = jax.vmap(env.transition)(held, states, given)
-        fresh = jax.vmap(env.start)(jax.random.split(start_key, len(given)), held)
-        states = tree_where(outcome.over, fresh, after)
+        after, outcome = jax.vmap(env.control_step)(held, states, given)
+        fresh = jax.vmap(env.init_state)(jax.random.split(start_key, len(given)), held)
+        states = tree_where(outcome.world_done, fresh, after)
         return (states, given, key), (
             jax.vmap(lambda scene, state: flatten_observation(env.observe(scene, state)))(held, states),
             outcome.reward,
         )
 
-    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), len(actions)), held)
+    states = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(config["seed"]), len(actions)), held)
     return step, held, (states, jnp.asarray(actions), jax.random.key(config["seed"]))
 
 

@@ -1,7 +1,7 @@
 """One agent's share of a control step in plain numpy: what it sees, what its policy answers, what happened to it and what it earns.
 
 The published task a second time, as one would write it without vectorising: `baseline` loops over agents and worlds. The definitions are
-those of `observations`, `facts`, `ends`, `rewards` and `policy.late_fusion`, whose docstrings say why; the tests hold the two together.
+those of `observations`, `metrics`, `ends`, `rewards` and `policy.late_fusion`, whose docstrings say why; the tests hold the two together.
 Arrays are float32, as on the device. Sets have as many rows as the agent sees, without padding.
 """
 
@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.geometry import SMALLEST
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import SURFACES, Road, Scene
-from scenefactory_jax.env.surrogate_safety import SMALLEST
 from scenefactory_jax.env.termination import EVENTS
 
 Observation = dict[str, np.ndarray]
@@ -116,10 +116,10 @@ def gather(agents: Sequence[Agent], *, circles: Mapping[str, float]) -> Crowd:
     )
 
 
-def _circles(agent: Agent, *, radius_share: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
+def _circles(agent: Agent, *, radius_fraction: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
     """Centres [3, 2] of the three circles along a car's axis, and their radius."""
     length, width = agent.size.tolist()
-    radius = max(radius_floor_m, radius_share * width)
+    radius = max(radius_floor_m, radius_fraction * width)
     spacing = min(spacing_limit_m, max(0.0, 0.5 * length - 0.8 * radius))
     ahead = spacing * _heading(agent.yaw)
     return np.array([agent.position + ahead, agent.position, agent.position - ahead]), radius
@@ -211,7 +211,7 @@ def _collision_times(agent: Agent, crowd: Crowd) -> Float[np.ndarray, " N"]:
     return time
 
 
-# ---- facts and ends
+# ---- metrics and ends
 
 
 def measure(
@@ -231,7 +231,7 @@ def measure(
     height_min_m: float,
     scene_size_m: float,
     max_start_distance_m: float,
-    stray_ratio: float,
+    max_start_distance_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
     idle_speed_mps: float,
@@ -250,7 +250,7 @@ def measure(
     has_lane = len(place.lanes.kind) > 0
     edge_gap, edge_ttc = _edges(place.edges, agent, crowd, edge_half_width_m, edge_range_m)
     fell = agent.upright < upright_min or agent.elevation < height_min_m
-    lost = distance_from_start > max(max_start_distance_m, stray_ratio * agent.route)
+    lost = distance_from_start > max(max_start_distance_m, max_start_distance_ratio * agent.route)
     events = {
         "numerical_error": False,
         "goal_reached": math.hypot(*to_goal) <= goal_radius_m,
@@ -306,59 +306,59 @@ def _edges(edges: Segments, agent: Agent, crowd: Crowd, half_width_m: float, ran
     return nearest, float(np.where(seen & (gap <= 0), 0.0, time).min())
 
 
-def judge(agent: Agent, facts: Facts, *, ending: list[str]) -> str | None:
+def judge(agent: Agent, metrics: Facts, *, ending: list[str]) -> str | None:
     """The step's new event, which the agent remembers; it leaves the stage if that is an ending one."""
-    new = next((name for name in EVENTS if facts.events[name] and name not in agent.past_events), None)
+    new = next((name for name in EVENTS if metrics.events[name] and name not in agent.past_events), None)
     if new is not None:
         agent.past_events.add(new)
         agent.active = new not in ending
     return new
 
 
-# ---- reward terms, one for each built-in target that reads facts and events
+# ---- reward terms, one for each built-in target that reads metrics and events
 
 
-def event(facts: Facts, new: str | None, *, name: str) -> float:
+def event(metrics: Facts, new: str | None, *, name: str) -> float:
     """1 in the step in which the named event is new."""
     if name not in EVENTS:
         raise ConfigError(f"reward: unknown event {name!r}; valid: {', '.join(EVENTS)}")
     return float(new == name)
 
 
-def progress(facts: Facts, new: str | None, *, limit_m: float) -> float:
+def progress(metrics: Facts, new: str | None, *, limit_m: float) -> float:
     """Metres along the lane, clamped."""
-    return min(max(facts.progress, -limit_m), limit_m)
+    return min(max(metrics.progress, -limit_m), limit_m)
 
 
-def lane_keeping(facts: Facts, new: str | None, *, sigma_m: float, heading_share: float) -> float:
+def lane_keeping(metrics: Facts, new: str | None, *, sigma_m: float, heading_fraction: float) -> float:
     """Near the lane's centre and along it."""
-    near = math.exp(-((facts.lane_offset / sigma_m) ** 2))
-    return near * (1 - heading_share + heading_share * max(facts.lane_alignment, 0.0)) if facts.has_lane else 0.0
+    near = math.exp(-((metrics.lane_offset / sigma_m) ** 2))
+    return near * (1 - heading_fraction + heading_fraction * max(metrics.lane_alignment, 0.0)) if metrics.has_lane else 0.0
 
 
-def off_lane(facts: Facts, new: str | None) -> float:
+def off_lane(metrics: Facts, new: str | None) -> float:
     """1 while off the lane."""
-    return float(facts.off_lane)
+    return float(metrics.off_lane)
 
 
-def idle(facts: Facts, new: str | None) -> float:
+def idle(metrics: Facts, new: str | None) -> float:
     """1 while the car stands or creeps."""
-    return float(facts.idle)
+    return float(metrics.idle)
 
 
-def ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
+def ttc(metrics: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
     """Closeness to a collision with another car."""
-    return limit if facts.ttc < floor_s else min(alpha_s / max(facts.ttc, SMALLEST), limit)
+    return limit if metrics.ttc < floor_s else min(alpha_s / max(metrics.ttc, SMALLEST), limit)
 
 
-def edge_ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
+def edge_ttc(metrics: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
     """The same for the road edge ahead."""
-    return limit if facts.edge_ttc < floor_s else min(alpha_s / max(facts.edge_ttc, SMALLEST), limit)
+    return limit if metrics.edge_ttc < floor_s else min(alpha_s / max(metrics.edge_ttc, SMALLEST), limit)
 
 
-def speed(facts: Facts, new: str | None, *, limit_mps: float) -> float:
+def speed(metrics: Facts, new: str | None, *, limit_mps: float) -> float:
     """Speed as a share of a limit."""
-    return min(facts.speed / limit_mps, 1.0)
+    return min(metrics.speed / limit_mps, 1.0)
 
 
 # ---- the policy

@@ -2,8 +2,8 @@
 
 What a careful researcher would write for one machine without an accelerator, as the yardstick of a speed-up: one world after the other,
 each with all its cars in one C model (`oracle.meeting`, with the solver settings of the config), and for every agent in turn the
-observation, facts, reward, ends and both towers of the policy in numpy (`baseline_agent`). Work that a loop has no need for is left out:
-padding, absent slots, facts that no reward reads, and friction where the weather does not change.
+observation, metrics, reward, ends and both towers of the policy in numpy (`baseline_agent`). Work that a loop has no need for is left out:
+padding, absent slots, metrics that no reward reads, and friction where the weather does not change.
 
 It acts, as a rollout does, with actions drawn as PPO draws them. Learning is not in it: a learner that goes through the agents one by one
 would only make the ratio larger.
@@ -41,7 +41,7 @@ from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment as device
 
-PHASES = ("policy", "physics", "facts + rewards + ends", "restart", "observation")
+PHASES = ("policy", "physics", "metrics + rewards + ends", "restart", "observation")
 
 
 class Engine(NamedTuple):
@@ -144,7 +144,7 @@ def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGK
         before = [agent.position for agent in world.agents]
         with timed("physics"):
             drive(task.engine, world, actions)
-        with timed("facts + rewards + ends"):
+        with timed("metrics + rewards + ends"):
             _, over = settle(task, world, before)
         with timed("restart"):
             if over:
@@ -155,7 +155,7 @@ def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGK
 
 
 def make(config: Mapping[str, Any]) -> Task:
-    """The parts of a config that has timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
+    """The parts of a config that has timing, controls, dynamics, weather, spawn, others, metrics, ends, reward and observe.
 
     Raises:
         ConfigError: a part that exists for the vectorised environment only, by name.
@@ -163,7 +163,7 @@ def make(config: Mapping[str, Any]) -> Task:
     _refuse(config)
     bound = functools.partial(instantiate, builtins=one)
     entries = {name: entry for name, entry in config["observations"].items() if entry is not None}
-    groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
+    groups = {name: bound(_without_kernels(entry), where=f"observations.{name}") for name, entry in entries.items()}
     terms = []
     for name, entry in config["reward"].items():
         if entry is not None:
@@ -174,8 +174,8 @@ def make(config: Mapping[str, Any]) -> Task:
 
     def draw(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Any, Any]:
         agents_key, weather_key, _ = jax.random.split(key, 3)  # the draws of `world.make`
-        weather = parts.draw_weather(weather_key, scene)
-        return parts.draw_agents(agents_key, scene), weather, grip(weather, jnp.zeros((1, 2)), jnp.zeros(1))[0]
+        weather = parts.sample_weather(weather_key, scene)
+        return parts.sample_agents(agents_key, scene), weather, grip(weather, jnp.zeros((1, 2)), jnp.zeros(1))[0]
 
     return Task(
         engine=_engine(config),
@@ -197,12 +197,12 @@ def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
 def _refuse(config: Mapping[str, Any]) -> None:
     """Name what only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
-    if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
+    if not dynamics["_target_"].endswith("articulated_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
-        raise ConfigError(f"controls: {config['actions']}; the baseline has pedals, read at every control step")
-    if config["traffic"]["_target_"] != "ignore":
-        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has ignore")
+        raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
+    if config["traffic"]["_target_"] != "no_traffic":
+        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has no_traffic")
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":
@@ -243,7 +243,7 @@ def start(task: Task, scene: Scene, key: PRNGKeyArray) -> World:
             start=drawn.position[slot],
             goal=drawn.goal[slot],
             size=drawn.size[slot],
-            route=float(drawn.route[slot]),
+            route=float(drawn.route_length[slot]),
             position=drawn.position[slot],
             elevation=float(task.engine.still[2]),
             velocity=np.zeros(2, np.float32),
@@ -313,9 +313,9 @@ def settle(task: Task, world: World, before: Sequence[Float[np.ndarray, "2"]]) -
         if not agent.active:
             rewards.append(0.0)
             continue
-        facts = task.measure(world.place, agent, crowd, position)
-        new = task.judge(agent, facts)
-        rewards.append(sum(weight * term(facts, new) for weight, term in task.terms))
+        metrics = task.measure(world.place, agent, crowd, position)
+        new = task.judge(agent, metrics)
+        rewards.append(sum(weight * term(metrics, new) for weight, term in task.terms))
     return rewards, world.step >= task.episode_steps or not any(agent.active for agent in world.agents)
 
 

@@ -21,9 +21,8 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import phase_timing
+from scenefactory_jax.learning import phase_timing, rollout
 from scenefactory_jax.learning.phase_timing import PhaseTimes
-from scenefactory_jax.learning.ppo import rollout
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.visualization.report import throughput_report as report
 
@@ -154,13 +153,13 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
     def act(level: str) -> PhaseTimes:
-        start = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+        start = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
         run = phase_timing.make_acting_phase(level, parts, env, steps=horizon)
         return phase_timing.time_phase(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
 
     if scope == "training":
         whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
-        spawned, active = metrics["steps/spawned"], metrics["share/active"]
+        spawned, active = metrics["steps/spawned"], metrics["active_fraction"]
     else:
         whole, roll, active = act(SCOPES[scope]), None, None
         spawned = int(whole.left[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded
@@ -199,17 +198,14 @@ def _learn(
     policy = make_policy(config)
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
-    whole = phase_timing.time_phase(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
+    whole = phase_timing.time_phase(trainer.train_iteration, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
     state, metrics = whole.left
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
-        now, seen, lives = carry
-        acted = rollout.collect_rollout(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
-        return acted[:3], acted[3]
+        return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=config["ppo"]["horizon"])[:2]
 
     def roll() -> PhaseTimes:
-        begin = (state.worlds, state.observation, state.lives)
         given = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731
-        return phase_timing.time_phase(collect, begin, given, warmup=warmup, repeats=repeats)
+        return phase_timing.time_phase(collect, state.worlds, given, warmup=warmup, repeats=repeats)
 
     return whole, {name: float(value) for name, value in jax.device_get(metrics).items()}, roll

@@ -93,5 +93,5 @@ def _row(scene) -> list[str]:
     """Agents, segments, metres of lane and edge, and the agents' mean route."""
     metres = lambda road: f"{2 * float(np.sum(road.half_length[road.valid])):.0f}"  # noqa: E731
     present = np.asarray(scene.agents.present)
-    route = f"{np.mean(scene.agents.route[present]):.0f}" if present.any() else ""
+    route = f"{np.mean(scene.agents.route_length[present]):.0f}" if present.any() else ""
     return [str(present.sum()), str(int(scene.road.valid.sum())), metres(scene.lanes), metres(scene.edges), route]

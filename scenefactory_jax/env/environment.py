@@ -1,4 +1,4 @@
-"""Env for ONE world, made of dynamics, spawn, weather, others, facts, ends, rewards and observations.
+"""Env for ONE world, made of dynamics, spawn, weather, others, metrics, termination, rewards and observations.
 
 `make(config)` binds the parts' numbers; `assemble` joins parts that are already bound, for whoever composes an environment in Python. Both
 give pure functions to put under one's own `jit`, `vmap` and `scan`.
@@ -62,13 +62,13 @@ class EnvParts(NamedTuple):
     """What an environment is made of, every part bound to its numbers."""
 
     dynamics: Dynamics
-    command: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
-    hold: int  # control steps from one action to the next
-    draw_agents: Callable[[PRNGKeyArray, Scene], Agents]
-    draw_weather: Callable[[PRNGKeyArray, Scene], Weather]
+    map_action: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
+    action_repeat: int  # control steps from one action to the next
+    sample_agents: Callable[[PRNGKeyArray, Scene], Agents]
+    sample_weather: Callable[[PRNGKeyArray, Scene], Weather]
     traffic: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> everybody who is no agent
-    measure: Callable[[Scene, State, State], StepMetrics]
-    judge: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
+    compute_metrics: Callable[[Scene, State, State], StepMetrics]
+    evaluate_termination: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
     terms: Mapping[str, tuple[float, rewards.Term]]
     groups: Mapping[str, observations.Group]
     episode_steps: int  # control steps after which a world is truncated
@@ -88,7 +88,7 @@ def make_env(config: Mapping[str, Any]) -> Env:
 
 
 def make_parts(config: Mapping[str, Any]) -> EnvParts:
-    """The parts of a config with the groups timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
+    """The parts of a config with the groups timing, controls, dynamics, weather, spawn, others, metrics, termination, reward and observe.
 
     Raises:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
@@ -110,13 +110,13 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     termination.check(config["termination"].get("ending", []), where="termination")
     return EnvParts(
         dynamics=dynamics,
-        command=instantiate(config["actions"]["command"], builtins="scenefactory_jax.env.actions", where="actions.command"),
-        hold=_hold(config),
-        draw_agents=spawning.make(config["spawning"]["sampler"]),
-        draw_weather=road_condition.make(config["weather"]),
+        map_action=instantiate(config["actions"]["command"], builtins="scenefactory_jax.env.actions", where="actions.command"),
+        action_repeat=_read_action_repeat(config),
+        sample_agents=spawning.make(config["spawning"]["sampler"]),
+        sample_weather=road_condition.make(config["weather"]),
         traffic=instantiate(config["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context),
-        measure=bound({"_target_": "compute", **config["step_metrics"]}, where="step_metrics"),
-        judge=instantiate(
+        compute_metrics=bound({"_target_": "compute", **config["step_metrics"]}, where="step_metrics"),
+        evaluate_termination=instantiate(
             {"_target_": "evaluate", **config["termination"]}, builtins="scenefactory_jax.env.termination", where="termination"
         ),
         terms=rewards.make(config["reward"], **context),
@@ -127,13 +127,13 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     )
 
 
-def _hold(config: Mapping[str, Any]) -> int:
-    """Control steps from one action to the next; episodes hold a whole number of actions."""
-    hold, steps = config["actions"]["action_repeat"], episode_steps(config["timing"])
-    check_type(hold, int, where="actions.action_repeat")
-    if hold < 1 or steps % hold:
-        raise ConfigError(f"actions.action_repeat: {hold}; wanted is a divisor of the {steps} control steps of an episode")
-    return hold
+def _read_action_repeat(config: Mapping[str, Any]) -> int:
+    """Control steps from one action to the next; an episode has a whole number of actions."""
+    action_repeat, steps = config["actions"]["action_repeat"], episode_steps(config["timing"])
+    check_type(action_repeat, int, where="actions.action_repeat")
+    if action_repeat < 1 or steps % action_repeat:
+        raise ConfigError(f"actions.action_repeat: {action_repeat}; wanted is a divisor of the {steps} control steps of an episode")
+    return action_repeat
 
 
 def assemble(parts: EnvParts) -> Env:
@@ -141,30 +141,30 @@ def assemble(parts: EnvParts) -> Env:
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         (scene,) = _checked("env.reset", scene)
-        state = _start(parts, key, scene)
+        state = _init_state(parts, key, scene)
         # copies: nothing in the state is anybody else's, so that a step may be given it to keep (`donate_argnums`)
         return jax.tree.map(jnp.copy, state), _observe(parts, scene, state)
 
-    def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
-        (scene,) = _checked("env.start", scene)
-        return _start(parts, key, scene, step)
+    def init_state(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+        (scene,) = _checked("env.init_state", scene)
+        return _init_state(parts, key, scene, step)
 
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         scene, state, action = _checked("env.step", scene, state, action)
-        control = functools.partial(_transition, parts, scene, action=action)
-        state, _, outcome, _ = repeat_action(control, state, hold=parts.hold)
+        control = functools.partial(_control_step, parts, scene, action=action)
+        state, _, outcome, _ = repeat_action(control, state, action_repeat=parts.action_repeat)
         return state, replace(outcome, observation=_observe(parts, scene, state))
 
-    def transition(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
-        return _transition(parts, *_checked("env.transition", scene, state, action))
+    def control_step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
+        return _control_step(parts, *_checked("env.control_step", scene, state, action))
 
     def observe(scene: Scene, state: State) -> Observation:
         return _observe(parts, *_checked("env.observe", scene, state))
 
-    def now(scene: Scene, state: State) -> Scene:
-        return _now(parts, *_checked("env.now", scene, state))
+    def current_scene(scene: Scene, state: State) -> Scene:
+        return _scene_at(parts, *_checked("env.current_scene", scene, state))
 
-    return Env(reset, step, start, transition, observe, now, parts.hold)
+    return Env(reset, step, init_state, control_step, observe, current_scene, parts.action_repeat)
 
 
 def _checked(where: str, scene: Scene, *others: Any) -> tuple[Any, ...]:
@@ -190,7 +190,7 @@ def repeat_action(
     state: State,
     noted: Any = None,
     *,
-    hold: int,
+    action_repeat: int,
     note: Callable[[Any, State, StepResult], tuple[Any, Any]] = lambda *_: (None, None),
 ) -> tuple[State, Any, StepResult, Any]:
     """All control steps that one action stands for, of one world or of many.
@@ -213,39 +213,39 @@ def repeat_action(
             "reward": jnp.where(taking, outcome.reward, 0.0),
             "terms": {name: jnp.where(taking, term, 0.0) for name, term in outcome.terms.items()},
             "events": jax.tree.map(lambda new: new & taking, outcome.events),
-            "done": outcome.done & taking,
+            "terminated": outcome.terminated & taking,
         }
         noted, numbers = note(noted, before, outcome)
-        clock = {"truncated": outcome.truncated, "over": outcome.over}
-        return (after, noted, taking & ~outcome.done), (own, taking, outcome.facts, clock, numbers)
+        clock = {"truncated": outcome.truncated, "world_done": outcome.world_done}
+        return (after, noted, taking & ~outcome.terminated), (own, taking, outcome.metrics, clock, numbers)
 
     # unrolled, a single step is no loop in the program
-    (state, noted, _), each = jax.lax.scan(body, (state, noted, state.active), None, length=hold, unroll=hold == 1)
-    own, took, facts, clock, numbers = each
+    (state, noted, _), each = jax.lax.scan(body, (state, noted, state.active), None, length=action_repeat, unroll=action_repeat == 1)
+    own, took, metrics, clock, numbers = each
     own, numbers = jax.tree.map(lambda leaf: leaf.any(0) if leaf.dtype == bool else leaf.sum(0), (own, numbers))
     drove = jnp.maximum(took.sum(0) - 1, 0)[None]
-    facts = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], facts)
+    metrics = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, drove, axis=0)[0], metrics)
     clock = {name: leaf[-1] for name, leaf in clock.items()}
-    return state, noted, unchecked(StepResult, observation=None, facts=facts, **own, **clock), numbers
+    return state, noted, unchecked(StepResult, observation=None, metrics=metrics, **own, **clock), numbers
 
 
 def find_truncated_agents(outcome: StepResult, active: Bool[Array, "*W A"]) -> Bool[Array, "*W A"]:
     """Who drove before an action, of one world or of many, and was still driving when the time was up."""
-    return outcome.truncated[..., None] & active & ~outcome.done
+    return outcome.truncated[..., None] & active & ~outcome.terminated
 
 
-def _now(parts: EnvParts, scene: Scene, state: State) -> Scene:
+def _scene_at(parts: EnvParts, scene: Scene, state: State) -> Scene:
     """The scene as it is at a state's moment: this episode's agents and weather, and the others where they are."""
     return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic(scene, state.step))
 
 
-def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
+def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
     """A fresh episode, or one whose clock is already at a later control step: rain and the others are as they are then."""
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
     scene = replace(scene, traffic=parts.traffic(scene, step))
-    agents = spawning.admit_cars(parts.draw_agents(agents_key, scene))
-    weather = rain.advance_rain(parts.draw_weather(weather_key, scene), dt=parts.control_dt * step)
+    agents = spawning.admit_cars(parts.sample_agents(agents_key, scene))
+    weather = rain.advance_rain(parts.sample_weather(weather_key, scene), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
     count, motion = agents.present.shape[0], parts.dynamics.read(body)
     agents = replace(agents, present=agents.present & is_finite(motion))
@@ -256,7 +256,7 @@ def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""
         weather=weather,
         active=agents.present,
         past_events=termination.make_empty_events(count),
-        age=jnp.zeros(count, jnp.int32),
+        steps_since_spawn=jnp.zeros(count, jnp.int32),
         previous_action=jnp.zeros((count, 3), jnp.float32),
         step=step,
         key=key,
@@ -264,14 +264,14 @@ def _start(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""
     return to_strong_type(state)
 
 
-def _transition(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
+def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
     """One control step, without the observation."""
-    scene = _now(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
-    action = jnp.where(state.active[:, None], _command(parts, state, action), 0.0)
+    scene = _scene_at(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
+    action = jnp.where(state.active[:, None], _map_action(parts, state, action), 0.0)
     after = _advance(parts.dynamics, scene, state, action)
-    scene = _now(parts, scene, after)
-    measured, after = _restore_non_finite(parts.measure(scene, state, after), state, after)
-    events, done = parts.judge(measured, state.past_events, state.active)
+    scene = _scene_at(parts, scene, after)
+    measured, after = _restore_non_finite(parts.compute_metrics(scene, state, after), state, after)
+    events, done = parts.evaluate_termination(measured, state.past_events, state.active)
     after = replace(after, active=state.active & ~done, past_events=jax.tree.map(jnp.logical_or, state.past_events, events))
     reward, terms = rewards.sum_terms(RewardInput(scene, state, after.previous_action, after, measured, events), parts.terms)
     truncated = after.step >= parts.episode_steps
@@ -279,18 +279,18 @@ def _transition(parts: EnvParts, scene: Scene, state: State, action: Float[Array
         over = truncated | ~jnp.any(after.active)
     else:
         over = truncated
-        after = _respawn(parts.dynamics, parts.draw_agents, scene, after, clear_m=parts.respawn_clearance_m)
+        after = _respawn(parts.dynamics, parts.sample_agents, scene, after, clear_m=parts.respawn_clearance_m)
     return to_strong_type(after), StepResult(None, reward, terms, events, done, truncated, over, measured)
 
 
 def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
-    return observations.observe(_now(parts, scene, state), state, parts.groups)
+    return observations.observe(_scene_at(parts, scene, state), state, parts.groups)
 
 
-def _command(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+def _map_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """Throttle, steer and brake in this step: what the action means, or what stands since the last one that was read."""
-    fresh = jnp.clip(parts.command(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
-    return fresh if parts.hold == 1 else jnp.where(state.step % parts.hold == 0, fresh, state.previous_action)
+    fresh = jnp.clip(parts.map_action(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
+    return fresh if parts.action_repeat == 1 else jnp.where(state.step % parts.action_repeat == 0, fresh, state.previous_action)
 
 
 def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
@@ -300,7 +300,7 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
         body=body,
         motion=dynamics.read(body),
         weather=scene.weather,
-        age=state.age + state.active.astype(jnp.int32),
+        steps_since_spawn=state.steps_since_spawn + state.active.astype(jnp.int32),
         previous_action=action,
         step=state.step + 1,
     )
@@ -321,10 +321,10 @@ def _finite(value: Array) -> Array:
     return value if value.dtype == bool else jnp.where(jnp.isnan(value), 0.0, value)
 
 
-def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
+def _respawn(dynamics: Dynamics, sample_agents: Callable, scene: Scene, state: State, *, clear_m: float) -> State:
     """Start finished agents again at a fresh draw, where there is room; the others wait off stage."""
     draw_key, key, body_key = jax.random.split(state.key, 3)
-    fresh = spawning.admit_cars(draw_agents(draw_key, scene))
+    fresh = spawning.admit_cars(sample_agents(draw_key, scene))
     body = dynamics.init(body_key, replace(scene, agents=fresh))
     waiting = ~state.active & fresh.present & is_finite(dynamics.read(body))
     clear = spawning.is_clear(fresh, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
@@ -338,7 +338,7 @@ def _respawn(dynamics: Dynamics, draw_agents: Callable, scene: Scene, state: Sta
         agents=agents,
         active=state.active | begins,
         past_events=tree_where(begins, termination.make_empty_events(count), state.past_events),
-        age=jnp.where(begins, 0, state.age),
+        steps_since_spawn=jnp.where(begins, 0, state.steps_since_spawn),
         previous_action=jnp.where(begins[:, None], 0.0, state.previous_action),
         key=key,
     )

@@ -26,34 +26,34 @@ def event(step: RewardInput, *, name: str) -> Float[Array, " A"]:
 
 def progress(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """Metres along the nearest lane towards the goal, clamped to one step's plausible way (arXiv:2605.08528, Table 7, route progress)."""
-    return jnp.clip(step.facts.progress, -limit_m, limit_m)
+    return jnp.clip(step.metrics.progress, -limit_m, limit_m)
 
 
-def lane_keeping(step: RewardInput, *, sigma_m: float, heading_share: float) -> Float[Array, " A"]:
+def lane_keeping(step: RewardInput, *, sigma_m: float, heading_fraction: float) -> Float[Array, " A"]:
     """exp(-(offset/sigma)^2) [(1 - share) + share max(0, cos heading error)] (arXiv:2605.08528, Table 7); 0 where there is no lane."""
-    near = jnp.exp(-((step.facts.lane_offset / sigma_m) ** 2))
-    aligned = (1 - heading_share) + heading_share * jnp.maximum(step.facts.lane_alignment, 0.0)
-    return jnp.where(step.facts.has_lane, near * aligned, 0.0)
+    near = jnp.exp(-((step.metrics.lane_offset / sigma_m) ** 2))
+    aligned = (1 - heading_fraction) + heading_fraction * jnp.maximum(step.metrics.lane_alignment, 0.0)
+    return jnp.where(step.metrics.has_lane, near * aligned, 0.0)
 
 
 def off_lane(step: RewardInput) -> Float[Array, " A"]:
     """1 while the car is off its lane (arXiv:2605.08528, Table 7, off-road)."""
-    return step.facts.off_lane.astype(jnp.float32)
+    return step.metrics.off_lane.astype(jnp.float32)
 
 
 def idle(step: RewardInput) -> Float[Array, " A"]:
     """1 while the car stands or creeps."""
-    return step.facts.idle.astype(jnp.float32)
+    return step.metrics.idle.astype(jnp.float32)
 
 
 def ttc(step: RewardInput, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
     """Closeness to a collision with another car: min(alpha / TTC, limit), and the limit below the floor (arXiv:2605.08528, Table 7)."""
-    return _urgency(step.facts.ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
+    return _urgency(step.metrics.ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 
 def edge_ttc(step: RewardInput, *, alpha_s: float, limit: float, floor_s: float) -> Float[Array, " A"]:
     """The same for the road edge ahead."""
-    return _urgency(step.facts.edge_ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
+    return _urgency(step.metrics.edge_ttc, alpha_s=alpha_s, limit=limit, floor_s=floor_s)
 
 
 def low_clearance(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
@@ -61,12 +61,12 @@ def low_clearance(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
 
     TTC says little of a car that follows another at its own speed a hand's breadth behind it.
     """
-    return _closeness(step.facts.gap, limit_m)
+    return _closeness(step.metrics.clearance, limit_m)
 
 
 def edge_clearance(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
     """The same for the nearest road edge, in any direction."""
-    return _closeness(step.facts.edge_gap, limit_m)
+    return _closeness(step.metrics.edge_clearance, limit_m)
 
 
 def stopping(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
@@ -75,17 +75,17 @@ def stopping(step: RewardInput, *, limit_m: float) -> Float[Array, " A"]:
 
     It grows with every metre per second too many and with every bit of friction too few long before TTC does.
     """
-    return jnp.clip(-step.facts.stopping_margin / limit_m, 0.0, 1.0)
+    return jnp.clip(-step.metrics.stopping_margin / limit_m, 0.0, 1.0)
 
 
 def wrong_way(step: RewardInput) -> Float[Array, " A"]:
     """How far the car points against the direction of its nearest lane: 1 against the traffic, 0 across it, with it, and without lanes."""
-    return jnp.maximum(-step.facts.lane_heading, 0.0)
+    return jnp.maximum(-step.metrics.lane_heading, 0.0)
 
 
 def speed(step: RewardInput, *, limit_mps: float) -> Float[Array, " A"]:
     """Speed as a share of a limit, clamped to 1: the optional bonus of the published code, off by default."""
-    return jnp.clip(step.facts.speed / limit_mps, 0.0, 1.0)
+    return jnp.clip(step.metrics.speed / limit_mps, 0.0, 1.0)
 
 
 def action_rate(step: RewardInput) -> Float[Array, " A"]:

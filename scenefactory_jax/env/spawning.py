@@ -67,7 +67,7 @@ def _check(numbers: Mapping[str, Any], *, where: str) -> None:
     for name, least in LEAST.items():
         if name in numbers:
             check_number(numbers[name], where=f"{where}.{name}", least=least)
-    check_fraction(numbers.get("standing_share", 0.0), where=f"{where}.standing_share")
+    check_fraction(numbers.get("standing_fraction", 0.0), where=f"{where}.standing_fraction")
     if len(numbers.get("car_size_m", (4.0, 2.0))) != 2:
         raise ConfigError(f"{where}.car_size_m: {numbers['car_size_m']}; wanted is [length, width]")
     if "travel_max_m" in numbers:
@@ -76,7 +76,7 @@ def _check(numbers: Mapping[str, Any], *, where: str) -> None:
 
 def find_usable(agents: Agents) -> Bool[Array, " A"]:
     """Whether each agent has finite starts, speeds, goals and routes, and a length and width above 0."""
-    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route
+    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route_length
     return is_finite(numbers) & jnp.all(agents.size > 0, axis=1)
 
 
@@ -111,7 +111,7 @@ def logged_from_rest(key: PRNGKeyArray, scene: Scene) -> Agents:
 
 
 def along_log(
-    key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_share: float
+    key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_fraction: float
 ) -> Agents:
     """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
 
@@ -134,14 +134,14 @@ def along_log(
     goals = jnp.broadcast_to(cars.goal[:, None], start.shape)
     chosen, present = _choose(start, goals, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
     pick = functools.partial(_pick, chosen=chosen, present=present)
-    moving = ~jax.random.bernoulli(rest_key, standing_share)
+    moving = ~jax.random.bernoulli(rest_key, standing_fraction)
     return Agents(
         position=pick(start),
         yaw=pick(read(log.yaw, row)),
         speed=moving * pick(safe_norm(read(log.velocity, row))),
         size=cars.size,
         goal=jnp.where(present[:, None], cars.goal, 0.0),
-        route=pick(whole - read(travelled, row)),
+        route_length=pick(whole - read(travelled, row)),
         present=present,
     )
 
@@ -190,7 +190,7 @@ def random_pairs(
         speed=jnp.zeros(slots, jnp.float32),
         size=size,
         goal=pick(goal),
-        route=pick(travel),
+        route_length=pick(travel),
         present=present,
     )
 

@@ -30,7 +30,7 @@ def compute(
     height_min_m: float,
     scene_size_m: float,
     max_start_distance_m: float,
-    stray_ratio: float,
+    max_start_distance_ratio: float,
     off_lane_lateral_m: float,
     off_lane_distance_m: float,
     idle_speed_mps: float,
@@ -56,34 +56,34 @@ def compute(
     speed, to_goal = safe_norm(velocity), after.agents.goal - position
     edges = {"half_width_m": edge_half_width_m, "range_m": edge_range_m, "kernels": kernels}
     beside = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
-    lane, edge_gap = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
+    lane, edge_clearance = _measure_lane(scene, before, beside.lane, motion, to_goal), beside.edge - edge_radius_m
     distance_from_start = safe_norm(position - after.agents.position)
     limits = {
         "upright_min": upright_min,
         "height_min_m": height_min_m,
         "scene_size_m": scene_size_m,
         "max_start_distance_m": max_start_distance_m,
-        "stray_ratio": stray_ratio,
+        "max_start_distance_ratio": max_start_distance_ratio,
     }
     events = Events(
         numerical_error=broken,
         goal_reached=safe_norm(to_goal) <= goal_radius_m,
-        collision=(motion.contact_force >= collision_force_n) & (after.age >= collision_grace_steps),
+        collision=(motion.contact_force >= collision_force_n) & (after.steps_since_spawn >= collision_grace_steps),
         out_of_bounds=_has_crashed(motion, after.agents, distance_from_start, **limits),
-        road_edge_contact=edge_gap <= 0,
+        road_edge_contact=edge_clearance <= 0,
     )
     return StepMetrics(
         speed=speed,
         goal_distance=safe_norm(to_goal),
         **lane,
         ttc=surrogate_safety.minimum_over_pairs(pairs.ttc, everyone.present),
-        gap=surrogate_safety.minimum_over_pairs(pairs.gap, everyone.present),
-        stopping_margin=surrogate_safety.minimum_over_pairs(pairs.ahead, everyone.present) - _stopping(speed, motion.grip, gravity_mps2),
+        clearance=surrogate_safety.minimum_over_pairs(pairs.gap, everyone.present),
+        stopping_margin=surrogate_safety.minimum_over_pairs(pairs.ahead, everyone.present) - _stopping(speed, motion.mu, gravity_mps2),
         edge_ttc=beside.edge_ttc,
-        edge_gap=edge_gap,
+        edge_clearance=edge_clearance,
         drac=jnp.max(jnp.where(everyone.present[None], pairs.drac, 0.0), axis=1),
         distance_from_start=distance_from_start,
-        **{name: getattr(motion, name) for name in ("contact_force", "grip", "friction_utilization", "slip")},
+        **{name: getattr(motion, name) for name in ("contact_force", "mu", "friction_utilization", "slip")},
         off_lane=lane["has_lane"] & ((lane["lane_offset"] > off_lane_lateral_m) | (lane["lane_distance"] > off_lane_distance_m)),
         idle=speed < idle_speed_mps,
         events=events,
@@ -109,12 +109,12 @@ def _has_crashed(
     height_min_m,
     scene_size_m,
     max_start_distance_m,
-    stray_ratio,
+    max_start_distance_ratio,
 ) -> Bool[Array, " A"]:
     """Tipped over or fallen, outside the scene, or further from the start than any way to the goal asks for."""
     fell = (motion.upright < upright_min) | (motion.position[:, 2] < height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * scene_size_m
-    return fell | outside | (distance_from_start > jnp.maximum(max_start_distance_m, stray_ratio * agents.route))
+    return fell | outside | (distance_from_start > jnp.maximum(max_start_distance_m, max_start_distance_ratio * agents.route_length))
 
 
 def _measure_lane(scene: Scene, before: State, row: Int[Array, " A"], motion: Motion, to_goal: Float[Array, "A 2"]) -> dict[str, Array]:

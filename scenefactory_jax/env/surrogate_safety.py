@@ -5,11 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import is_finite
 from scenefactory_jax.core.types import Boxes, Motion
-
-SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
 
 
 class RoadUsers(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which facts end an agent, and which events are new."""
+"""Which metrics end an agent, and which events are new."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +12,9 @@ from scenefactory_jax.core.types import Events, StepMetrics
 EVENTS = tuple(field.name for field in dataclasses.fields(Events))
 
 
-def evaluate(facts: StepMetrics, past_events: Events, active: Bool[Array, " A"], *, ending: list[str]) -> tuple[Events, Bool[Array, " A"]]:
+def evaluate(
+    metrics: StepMetrics, past_events: Events, active: Bool[Array, " A"], *, ending: list[str]
+) -> tuple[Events, Bool[Array, " A"]]:
     """New events of this step and the agents that they end.
 
     An event is new once in an agent's life. If several are new in one step, the first in the order of `EVENTS` counts (the paper's events
@@ -22,7 +24,7 @@ def evaluate(facts: StepMetrics, past_events: Events, active: Bool[Array, " A"],
     taken = jnp.zeros_like(active)
     new = {}
     for name in EVENTS:
-        new[name] = getattr(facts.events, name) & ~getattr(past_events, name) & active & ~taken
+        new[name] = getattr(metrics.events, name) & ~getattr(past_events, name) & active & ~taken
         taken = taken | new[name]
     done = jnp.zeros_like(active)
     for name in ending:
@@ -41,7 +43,7 @@ def check(ending: Any, *, where: str) -> None:
         if name not in EVENTS:
             raise ConfigError(f"{where}.ending: unknown event {name!r}; valid: {', '.join(EVENTS)}")
     if "numerical_error" not in ending or "goal_reached" not in ending:
-        raise ConfigError(f"{where}.ending: {ending} must hold 'fault' and 'reached': a broken or a finished car cannot drive on")
+        raise ConfigError(f"{where}.ending: {ending} must hold 'numerical_error' and 'goal_reached'")
 
 
 def make_empty_events(agents: int) -> Events:

@@ -11,7 +11,7 @@ from scenefactory_jax.core import config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Policy, Scene
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, initial_parameters
+from scenefactory_jax.learning import checkpoint, trainer
 from scenefactory_jax.learning.training_loop import make_policy
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
@@ -55,7 +55,7 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
     key = jax.random.key(config["seed"])
     seen = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
     blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
-    return initial_parameters.draw_parameters(key, make_policy(config), blank)
+    return trainer.init_parameters(key, make_policy(config), blank)
 
 
 def find(run: str | Path) -> Path:

@@ -1,6 +1,8 @@
 """`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
 
 import contextlib
+import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,19 +12,21 @@ import jax
 from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
-from scenefactory_jax.cli import error_messages
-from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core import config as configs
+from scenefactory_jax.core import schema, sharding
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import checkpoint, interrupt, run_folder
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration as ppo
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.ppo.train_iteration import make_trainer as make_ppo_trainer
+from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
-OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
+LOG = logging.getLogger(__name__)
+OnIteration = Callable[[TrainState, Mapping[str, float | int]], None]
 MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | int]], None] | None]
 
 
@@ -35,7 +39,7 @@ class Prepared(NamedTuple):
     env: Env
     policy: Policy
     mesh: Mesh | None
-    trainer: ppo.Trainer
+    trainer: Trainer
     scenes: scene_source.Scenes | None = None
 
 
@@ -46,7 +50,7 @@ class Run(NamedTuple):
     config: dict[str, Any]
     env: Env
     policy: Policy
-    state: ppo.TrainState
+    state: TrainState
     metrics: list[dict[str, float]]
 
 
@@ -102,17 +106,17 @@ def _trained(
     make_callback: MakeCallback | None,
     *,
     resume: bool,
-) -> ppo.TrainState:
+) -> TrainState:
     """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
     trainer = prepared.trainer
     with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
-            print(f"resumed at iteration {int(state.iteration)}", flush=True)
+            LOG.info(f"resumed at iteration {int(state.iteration)}")
         configs.write(folder, config)
         callback = make_callback and make_callback(folder, int(state.iteration) if resume else None)
-        on_parameters = callback and (lambda state, row: callback(ppo.parameters_of(state), row))
+        on_parameters = callback and (lambda state, row: callback(get_policy_parameters(state), row))
         callbacks = [c for c in (on_parameters, on_iteration) if c]
         return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
 
@@ -126,13 +130,13 @@ def _scenes(
         given = prepared.scenes
         loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
         worlds, chosen = scene_source.assign_scenes(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
-        print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
+        LOG.info(f"run {folder}\n{loaded.account}\n{chosen}")
         yield worlds, None
         return
     before = checkpoint.restore_host(folder / "checkpoints") if resume else None
     with stream.open_stream(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
-        print(f"run {folder}", flush=True)
+        LOG.info(f"run {folder}")
         yield worlds, flow
 
 
@@ -141,17 +145,16 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
     return instantiate(config["policy"], builtins=late_fusion, where="policy")()
 
 
-def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
-    """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
-    entry = {"_target_": "make_trainer", **config["ppo"]}
-    make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
-    return make(env, policy, mesh=mesh)
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
+    """Builds PPO for a config, on one device or on a mesh (`sharding.make_mesh`)."""
+    numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
+    return make_ppo_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
 
 
 def _loop(
     config,
     folder: Path,
-    trainer: ppo.Trainer,
+    trainer: Trainer,
     worlds,
     state,
     flow: stream.SceneStream | None,
@@ -178,12 +181,12 @@ def _loop(
             state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
             seconds = time.monotonic() - before
             spent += seconds / 60
-            row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
+            row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
             note(row)
             show(iteration, describe(row))
-            error_messages.check_finite(row)
+            check_finite(row)
             for callback in callbacks:
                 callback(state, row)
             late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
@@ -197,18 +200,38 @@ def _loop(
     return state
 
 
+def check_finite(row: Mapping[str, float | int]) -> None:
+    """Checks that the iteration could learn: a reward term that is not finite may have made every minibatch unusable.
+
+    A car whose state is not finite ends as `numerical_error`; then single minibatches are left out (`ppo/skipped`), which is no error.
+
+    Args:
+        row: metrics of an iteration.
+
+    Raises:
+        ConfigError: naming the terms.
+    """
+    terms = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
+    if terms and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
+        values = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in terms)
+        raise ConfigError(
+            f"{values} in iteration {row['iteration']}, so no minibatch could be learnt from;"
+            " look for a division by zero, or a log or root below zero, or leave it out: ~" + terms[0].replace("/", ".")
+        )
+
+
 def step(
-    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
-) -> tuple[ppo.TrainState, Scene, dict[str, float | int]]:
+    trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
+) -> tuple[TrainState, Scene, dict[str, float | int]]:
     """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
     if flow is None:
-        state, metrics = trainer.iterate(state, worlds)
+        state, metrics = trainer.train_iteration(state, worlds)
         return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
     if not first:
-        state, worlds = flow.exchange(trainer.swap, state, worlds)
-    state, metrics = trainer.iterate(state, worlds)
+        state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
+    state, metrics = trainer.train_iteration(state, worlds)
     flow.draw()  # while the devices work
-    metrics, record = jax.device_get((metrics, state.record))
+    metrics, record = jax.device_get((metrics, state.scene_stats))
     return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
 
 

@@ -114,7 +114,7 @@ def test_a_step_is_all_control_steps_of_an_action():
     action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
     after, moment = jax.jit(functools.partial(episodes.step_worlds, held.env))(held.scenes, episode, action)
     scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
-    step, paid = jax.jit(held.env.transition), 0.0
+    step, paid = jax.jit(held.env.control_step), 0.0
     for _ in range(3):
         driving = state.active
         state, outcome = step(scene, state, action)

@@ -109,7 +109,7 @@ def test_the_ten_lines_of_python_run(quickly):
     found = {}
     exec(code.replace('"experiment=demo", "weather=mixed"', '"experiment=smoke", "weather=mixed"'), found)
     outcome = found["outcome"]
-    assert outcome.reward.shape == outcome.facts.ttc.shape == (4, 4) and np.isfinite(outcome.reward).all()
+    assert outcome.reward.shape == outcome.metrics.ttc.shape == (4, 4) and np.isfinite(outcome.reward).all()
 
 
 def test_the_python_of_the_library_page_runs(quickly):

@@ -23,7 +23,7 @@ from scenefactory_jax.learning.training_loop import train
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
 CALL = "python -m scenefactory_jax "
-OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.facts.speed - 100.0)\n"
+OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.metrics.speed - 100.0)\n"
 ELSEWHERE = re.compile(r"JAX_PLATFORMS=cuda")  # what a process decides when it starts
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -114,9 +114,9 @@ def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkey
 def test_a_car_that_breaks_does_not_end_training():
     broken = {"iteration": 3, "reward/haste": float("nan"), "ppo/skipped": 4.0, "ppo/gradient_norm": 0.0}
     with pytest.raises(ConfigError, match=r"reward\.haste: nan in iteration 3"):
-        error_messages.check_finite(broken)
+        training_loop.check_finite(broken)
     for sound in ({"reward/haste": 1.0}, {"ppo/skipped": 0.0}, {"ppo/gradient_norm": 0.3}):  # it learnt, or no term is at fault
-        error_messages.check_finite({**broken, **sound})
+        training_loop.check_finite({**broken, **sound})
 
 
 def test_an_error_of_our_own_keeps_its_traceback():

@@ -137,7 +137,7 @@ def training(*overrides: str) -> Any:
     trainer, worlds = make_trainer(config, sf.make(config), make_policy(config)), scenes().scene
     state, rows = trainer.init(jax.random.key(0), worlds), []
     for _ in range(3):
-        state, row = trainer.iterate(state, worlds)
+        state, row = trainer.train_iteration(state, worlds)
         rows.append(jax.device_get(row))
     return rows, state.parameters
 

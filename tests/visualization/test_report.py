@@ -446,7 +446,7 @@ def test_report_says_what_happened(tmp_path):
     text = path.read_text()
     assert f"**{records['strict']['reached'].sum()} of 72 cars reached their goal" in text
     assert "![Four worlds](../a%20film.gif)" in text
-    for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip` | 0.15 |", "evaluate run=X", "scene, 00"):
+    for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip_eps` | 0.15 |", "evaluate run=X", "scene, 00"):
         assert part in text, part
     assert "nan" not in text.lower() and "None" not in text
     lines = [line for line in text.splitlines() if line.startswith("|")]

@@ -232,7 +232,7 @@ def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     middle, half = np.asarray(scene.lanes.midpoint)[rows], (scene.lanes.half_length[:, None] * scene.lanes.direction)[rows]
     lanes = shapely.MultiLineString([[m - h, m + h] for m, h in zip(middle, np.asarray(half), strict=True)])
     apart = lambda points: shapely.distance(lanes, shapely.points(points))  # noqa: E731
-    assert laid.present.all() and (laid.surface == ICE).all() and (laid.follows == 0.5).all()
+    assert laid.present.all() and (laid.surface == ICE).all() and (laid.open_road_film_fraction == 0.5).all()
     assert 0.1 <= laid.film_mm.min() < 0.15 and 0.35 < laid.film_mm.max() <= 0.4
     vertices = np.asarray(laid.vertices, float)
     if name == "circles":
@@ -310,7 +310,7 @@ def test_every_option_resets_steps_and_traces_once(option):
     for _ in range(3):
         states, outcome = step(scenes, states, jnp.zeros((6, 2, 3)))
     assert len(traces) == 1 and seen["weather"].shape == (6, 2, 4)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.facts.grip, outcome.observation, states.weather)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.metrics.mu, outcome.observation, states.weather)))
     np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
     later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(states.weather)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
@@ -336,7 +336,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     for _ in range(30):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
         tokens.append(outcome.observation["weather"])
-        friction.append(outcome.facts.grip)
+        friction.append(outcome.metrics.mu)
     tokens, film, friction = np.array(tokens), 0.1 + 0.3 * np.arange(1, 31) / 30, np.array(friction)
     wet = np.array([4.0 * step / 30 for step in range(1, 31)]) < 1.9  # the bearings' drag takes little of 4 m/s
     np.testing.assert_allclose(tokens[:, 1, 0], film, atol=1e-5)
