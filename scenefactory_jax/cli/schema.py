@@ -135,6 +135,15 @@ class Compare:
 
 
 @dataclass(frozen=True)
+class Baseline:
+    """Size of the measurement of the unvectorised baseline."""
+
+    worlds: Count
+    steps: Count
+    repeats: Count
+
+
+@dataclass(frozen=True)
 class Benchmark(Task):
     """The command `benchmark`; `iterations`, `minutes` and `evaluation` are not read, so that experiments apply."""
 
@@ -154,7 +163,7 @@ class Benchmark(Task):
     policy: Group
     ppo: Group
     stream: Group | None
-    baseline: Group | None
+    baseline: Baseline | None
     iterations: Any
     minutes: Any
     evaluation: Any
