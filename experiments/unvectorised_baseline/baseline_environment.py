@@ -84,7 +84,7 @@ def measure(
     """Time the loop on a few worlds; one repeat goes unmeasured before the others.
 
     Args:
-        config: as `bench` has it (`load("bench", ...)`).
+        config: as `bench` has it (`load("benchmark", ...)`).
         scenes: one world each, not stacked.
         parameters: of the policy, as `Policy.init` makes them.
         steps: control steps of every world in a repeat.

@@ -119,8 +119,8 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
     for one in OverridesParser.create().parse_overrides([quote_override(override) for override in overrides]):
         if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
             key, entry = one.key_or_group, next(iter(held))
-            way = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
-            raise ConfigError(f"{key}={{}}: changes nothing, for mappings are merged; {way}")
+            hint = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
+            raise ConfigError(f"{key}={{}}: mappings are merged, so an empty one changes nothing; {hint}")
 
 
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
@@ -137,7 +137,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 def _explain(name: str, error: Exception) -> str:
     """Hydra's message, and the keys that the place in question has."""
     text = str(error) + (f" ({error.__cause__})" if error.__cause__ else "")
-    text = " ".join(text.split())
+    text = " ".join(text.split()).replace("In 'command/", "In '")
     if "provider=hydra.searchpath" not in text:  # the user has named no folder: where ours lie is no news
         text = text.partition(" Config search path:")[0]
     if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
@@ -249,7 +249,7 @@ def as_overrides(flags: argparse.Namespace) -> list[str]:
     """
     for word in flags.overrides:
         if "=" not in word and not word.startswith("~"):
-            raise ConfigError(f"{word}: no setting; write {word}=VALUE, or ~{word} to remove it")
+            raise ConfigError(f"{word}: expected {word}=VALUE, or ~{word} to remove it")
     own = [word for word in flags.overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath=")]
     return own if flags.config_dir is None else [*own, f"hydra.searchpath=['file://{Path(flags.config_dir).resolve()}']"]
 

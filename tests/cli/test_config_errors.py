@@ -6,7 +6,7 @@ import pytest
 from support.scene_documents import checker, document, packer, straight, thing, written
 
 from scenefactory_jax.cli import hydra_config, schema
-from scenefactory_jax.cli.benchmark import bench
+from scenefactory_jax.cli.benchmark import benchmark
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.render import render
@@ -20,7 +20,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
 HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this process
-COMMANDS = {"train": train, "bench": bench, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
+COMMANDS = {"train": train, "benchmark": benchmark, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
 
 
 def refused(command, *overrides):
@@ -157,7 +157,7 @@ def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message
 
 
 def test_an_unknown_config_is_named():
-    with pytest.raises(ConfigError, match=r"no config 'fly'; valid: bench, compare, convert, drive, evaluate, .*train"):
+    with pytest.raises(ConfigError, match=r"config: expected one of benchmark, compare, convert, .*train.*, got 'fly'"):
         hydra_config.load_config("fly")
 
 
@@ -189,7 +189,7 @@ def test_an_unknown_config_is_named():
         ("train", "scenes.heldout.seed=abc", "scenes.heldout.seed: expected an integer >= 0, got 'abc'"),
         ("train", "scenes.path=3", "scenes.path: expected a text or null, got 3"),
         ("train", "scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
-        ("bench", "repeats=0", "repeats: expected an integer >= 1, got 0"),
+        ("benchmark", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("render", "index=first", "index: expected an integer >= 0, got 'first'"),
         ("scenes", "limit=few", "limit: expected an integer >= 0, got 'few'"),
         ("convert", "source=3", "source: expected a text or null, got 3"),
@@ -208,7 +208,7 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("ppo.horizon=long", "ppo.horizon: expected an integer, got 'long'"),
+        ("ppo.horizon=long", "ppo.horizon: expected an integer >= 1, got 'long'"),
         ("ppo.gamma=1.5", "ppo.gamma: expected a number >= 0 and <= 1, got 1.5"),
         ("policy.trunk=wide", "policy.trunk: expected a list, each an integer, got 'wide'"),
         ("policy.activation=gelu", "policy.activation: expected"),
