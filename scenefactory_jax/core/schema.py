@@ -8,8 +8,8 @@
     timing = schema.read(config["timing"], Timing, where="timing")    # an instance; ConfigError names the first key that does not fit
     schema.check(config["timing"], Timing, where="timing")            # the same, when the mapping is used as it is
 
-A field may be another dataclass, `T | None`, `Literal[...]`, `list[T]`, `tuple[T, ...]` or `dict[str, T]` of these. Parameters of a function
-that `_target_` selects are checked by the same annotations (`instantiate`), `Bounds` included.
+A field may be another dataclass, `T | None`, `Literal[...]`, `list[T]`, `tuple[T, ...]` or `dict[str, T]` of these.
+Parameters of a function that `_target_` selects are checked by the same annotations (`instantiate`), `Bounds` included.
 """
 
 import dataclasses
@@ -124,9 +124,9 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
     if bounds is not None and not all(math.isfinite(number) and number in bounds for number in numbers):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     if isinstance(value, (list, tuple)) and (items := _item_hints(options)):
-        for item in value:
-            read_value(item, items[0], where=where)
-    return value
+        hints = items if len(items) == len(value) and Ellipsis not in items else items[:1] * len(value)
+        return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
+    return float(value) if _is_number(value) and float in options and int not in options else value
 
 
 def _split(hint: Any) -> tuple[Any, Bounds | None]:
