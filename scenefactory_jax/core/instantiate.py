@@ -71,14 +71,19 @@ def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str)
 
 def list_functions(module: types.ModuleType) -> list[str]:
     """Public functions that a module defines itself."""
-    own = [n for n, f in vars(module).items() if inspect.isfunction(f) and inspect.unwrap(f).__module__ == module.__name__]
+    own = [n for n, f in vars(module).items() if inspect.isfunction(f) and _is_defined_in(f, module)]
     return sorted(n for n in own if not n.startswith("_"))
 
 
 def _is_own(function: Callable[..., Any], module: types.ModuleType) -> bool:
-    """Whether a module of the package defines the function itself; modules of others may gather theirs as they like."""
-    package = __name__.partition(".")[0]
-    return module.__name__.partition(".")[0] != package or getattr(inspect.unwrap(function), "__module__", None) == module.__name__
+    """Whether a module of scenefactory_jax defines the function itself; modules of others may import theirs from anywhere."""
+    return module.__name__.partition(".")[0] != __name__.partition(".")[0] or _is_defined_in(function, module)
+
+
+def _is_defined_in(function: Callable[..., Any], module: types.ModuleType) -> bool:
+    """Whether a function is defined in a module, or in a module of a package."""
+    place = getattr(inspect.unwrap(function), "__module__", None) or ""
+    return place == module.__name__ or (hasattr(module, "__path__") and place.startswith(f"{module.__name__}."))
 
 
 def check_type(value: Any, hint: Any, *, where: str) -> None:

@@ -60,7 +60,7 @@ def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
 
 
 def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
-    @observations.bound_observation(observations.SHARE, observations.ANY)
+    @observations.bound_observation(observations.FRACTION, observations.ANY)
     def mine(scene, state, *, scale: float):
         return scale * jnp.array([[0.25, 30.0, -4.0]])
 

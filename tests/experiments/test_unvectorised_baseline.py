@@ -151,10 +151,10 @@ def test_rewards_and_events_are_those_of_the_device(task, scene, reference, mome
         crowd = one.gather(agents, circles=task.circles)
         for slot in np.flatnonzero(after.active):
             agent = agents[slot]
-            own = task.measure(place, agent, crowd, np.asarray(before.motion.position)[slot, :2])
+            own = task.compute_metrics(place, agent, crowd, np.asarray(before.motion.position)[slot, :2])
             for name in set(own._fields) - {"events"}:
                 np.testing.assert_allclose(getattr(own, name), getattr(metrics, name)[slot], atol=1e-4, rtol=1e-4, err_msg=name)
-            new = task.judge(agent, own)
+            new = task.evaluate_termination(agent, own)
             assert new == next((name for name in EVENTS if getattr(events, name)[slot]), None)
             assert agent.active == (not done[slot])
             paid = [weight * term(own, new) for weight, term in task.terms]

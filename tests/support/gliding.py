@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.core import geometry
+from scenefactory_jax.core import geometry, schema
 from scenefactory_jax.core.types import Dynamics, Motion
 from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, termination, traffic
 from scenefactory_jax.weather.road_condition import keep_condition
@@ -37,6 +37,7 @@ def glide() -> Dynamics:
 
 
 def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.no_traffic, hold=1):
+    metrics = schema.read(config["step_metrics"], step_metrics.StepMetricsConfig)
     parts = environment.EnvParts(
         dynamics=glide(),
         map_action=actions.separate_pedals,
@@ -44,7 +45,7 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         sample_agents=draw,
         sample_weather=keep_condition,
         traffic=beside,
-        compute_metrics=functools.partial(step_metrics.compute, **config["step_metrics"]),
+        compute_metrics=functools.partial(step_metrics.compute, config=metrics),
         evaluate_termination=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
         terms=rewards.make(config["reward"]),
         groups=observations.make({**config["observations"], "road": {**config["observations"]["road"], "count": 40}}),
