@@ -225,7 +225,7 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
     """Composes the environment with one other setting, or with another policy; a study needs the same ones many times."""
-    return load_config("train", "experiment=null", override) if override.startswith("policy=") else load_config("task", override)
+    return load_config("train", "~experiment", override) if override.startswith("policy=") else load_config("task", override)
 
 
 def quote_override(override: str) -> str:

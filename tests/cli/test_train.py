@@ -92,7 +92,7 @@ def test_metrics_have_a_row_an_iteration_and_a_column_a_term(whole):
     for row in rows:
         assert row["reward"] == pytest.approx(sum(row[name] for name in terms), abs=1e-5)
         assert row["casps"] == pytest.approx(row["steps/spawned"] / row["seconds"])
-    spawned = int(np.asarray(whole.state.worlds.agents.present).sum()) * whole.config["ppo"]["horizon"]
+    spawned = int(np.asarray(whole.state.worlds.state.agents.present).sum()) * whole.config["ppo"]["horizon"]
     assert [row["steps/total"] for row in rows] == [spawned * n for n in (1, 2, 3, 4)]
     judged = metrics_csv.read(whole.folder, metrics_csv.EVALUATIONS)
     assert [row["iteration"] for row in judged] == [2, 4] and all(0 <= row["strict/success_rate/value"] <= 1 for row in judged)
@@ -302,7 +302,7 @@ def test_other_settings_of_a_run(whole, tmp_path):
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
         "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
-        "protocol.termination=[perhaps]": r"protocol\.termination: \['perhaps'\]; valid: one or more of goal_only, strict",
+        "protocol.termination=[perhaps]": r"protocol\.termination: expected one or more of goal_only, strict, got \['perhaps'\]",
     }.items():
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
@@ -356,7 +356,7 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
 
 
 def test_a_damaged_config_is_named(tmp_path):
-    for content, message in {"": "holds no config of a run", "- 1": "holds no config", "a: [1": "damaged: while parsing"}.items():
+    for content, message in {"": "expected the config of a run, got ", "- 1": "holds no config", "a: [1": "damaged: while parsing"}.items():
         (tmp_path / "config.yaml").write_text(content)
         with pytest.raises(ConfigError, match=message):
             evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
