@@ -626,7 +626,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load_config("train", "scenes=womd")["scenes"]["pack"]
     told = circumstances.describe(judged[0])
     assert told["Starts"] == ("as recorded, from rest" if name == "paper" else "as recorded, at the recorded speed")
-    assert (told["Weather"], told["Background traffic"]) == ("AC 0 mm", "none") and told["Dynamics"].startswith("`mjx_car`")
+    assert (told["Weather"], told["Background traffic"]) == ("AC 0 mm", "none") and told["Dynamics"].startswith("`articulated")
 
 
 def test_episodes_are_described():
