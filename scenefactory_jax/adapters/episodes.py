@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+import scenefactory_jax
 from scenefactory_jax.adapters import bounds, flatten_observation
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Scene, State
@@ -85,9 +85,9 @@ def make_pool(
         ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
     """
     if config is None:
-        config = configs.load_config("train", *([ALONE] if alone else []), *overrides)
+        config = scenefactory_jax.load_config("train", *([ALONE] if alone else []), *overrides)
     elif overrides:
-        config = configs.apply_overrides(config, overrides)
+        config = scenefactory_jax.apply_overrides(config, overrides)
     if not lives and config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(
             f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null"

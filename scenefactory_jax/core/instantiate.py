@@ -131,15 +131,3 @@ def check_range(span: Sequence[float | int], *, where: str, least: float | None 
     if least is not None and span[0] < least:
         raise ConfigError(f"{where}: expected [min, max] with min >= {least:g}, got {list(span)}")
     return span[0], span[1]
-
-
-def find_differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
-    """Dotted keys of which two configs have different values -> both; None, or a group as a whole, where one of them has no such key."""
-    found = {}
-    for key in {**before, **now}:
-        held, wanted = before.get(key), now.get(key)
-        if isinstance(held, Mapping) and isinstance(wanted, Mapping):
-            found |= find_differences(held, wanted, f"{prefix}{key}.")
-        elif held != wanted:
-            found[f"{prefix}{key}"] = held, wanted
-    return found

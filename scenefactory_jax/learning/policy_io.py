@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Policy, Scene
 from scenefactory_jax.env import environment

@@ -1,6 +1,8 @@
 """`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
 
 import contextlib
+import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,11 +12,9 @@ import jax
 from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
-from scenefactory_jax.cli import error_messages, schema
-from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core import schema as core_schema
-from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core import config as configs
+from scenefactory_jax.core import schema, sharding
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
@@ -25,14 +25,15 @@ from scenefactory_jax.learning.ppo.train_iteration import make_trainer as make_p
 from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
+LOG = logging.getLogger(__name__)
 OnIteration = Callable[[TrainState, Mapping[str, float | int]], None]
+MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | int]], None] | None]
 
 
 class Prepared(NamedTuple):
     """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
 
-    `scenes`: those to train on, before `scenes.take`; None: read anew. `examiners`: protocol -> `evaluate.make_examiner`, for evaluations
-    while training; None: the config's own.
+    `scenes`: those to train on, before `scenes.take`; None: read anew.
     """
 
     env: Env
@@ -40,7 +41,6 @@ class Prepared(NamedTuple):
     mesh: Mesh | None
     trainer: Trainer
     scenes: scene_source.Scenes | None = None
-    examiners: Mapping[str, Callable] | None = None
 
 
 class Run(NamedTuple):
@@ -64,34 +64,36 @@ def prepare(config: Mapping[str, Any]) -> Prepared:
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 
 
-def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
+def train(
+    config: dict[str, Any],
+    *,
+    on_iteration: OnIteration | None = None,
+    prepared: Prepared | None = None,
+    make_callback: MakeCallback | None = None,
+    finish: Callable[[Path], Any] | None = None,
+) -> Run:
     """Train as a config says (`load("train", ...)`).
 
     Args:
         on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
             donated to the next iteration: copy what is to outlive the call.
         prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
+        make_callback: (folder, iteration after which the run goes on or None) -> function of (parameters, metrics row) that is called
+            after each iteration, or None.
+        finish: called with the folder after the last iteration, before the folder's lock is released.
 
     Raises:
         ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
     """
-    schema.check_train(config)
-    if config["evaluation"]["enable"]:
-        scene_source.check_heldout(config["scenes"])
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
     with run_folder.open_run_folder(config) as (folder, resume):
-        state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
-        if config["evaluation"]["enable"]:
-            if scene_source.has_heldout(config["scenes"]):
-                from scenefactory_jax.evaluation.protocols import after_training
-
-                after_training(config, folder)
-            else:
-                print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
+        state = _trained(config, folder, prepared, watching, on_iteration, make_callback, resume=resume)
+        if finish is not None:
+            finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
 
 
@@ -101,6 +103,7 @@ def _trained(
     prepared: Prepared,
     watching: Mapping[str, loggers.Logger],
     on_iteration: OnIteration | None,
+    make_callback: MakeCallback | None,
     *,
     resume: bool,
 ) -> TrainState:
@@ -110,10 +113,11 @@ def _trained(
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
-            print(f"resumed at iteration {int(state.iteration)}", flush=True)
+            LOG.info(f"resumed at iteration {int(state.iteration)}")
         configs.write(folder, config)
-        watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
-        callbacks = [c for c in (watch, on_iteration) if c]
+        callback = make_callback and make_callback(folder, int(state.iteration) if resume else None)
+        on_parameters = callback and (lambda state, row: callback(get_policy_parameters(state), row))
+        callbacks = [c for c in (on_parameters, on_iteration) if c]
         return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
 
 
@@ -126,13 +130,13 @@ def _scenes(
         given = prepared.scenes
         loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
         worlds, chosen = scene_source.assign_scenes(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
-        print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
+        LOG.info(f"run {folder}\n{loaded.account}\n{chosen}")
         yield worlds, None
         return
     before = checkpoint.restore_host(folder / "checkpoints") if resume else None
     with stream.open_stream(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
-        print(f"run {folder}", flush=True)
+        LOG.info(f"run {folder}")
         yield worlds, flow
 
 
@@ -143,25 +147,8 @@ def make_policy(config: Mapping[str, Any]) -> Policy:
 
 def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
     """Builds PPO for a config, on one device or on a mesh (`sharding.make_mesh`)."""
-    numbers = core_schema.read(config["ppo"], PPOConfig, where="ppo")
+    numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
     return make_ppo_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
-
-
-def _make_watch(
-    config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
-) -> OnIteration | None:
-    """Held-out evaluation every so many iterations or at those that are listed, if the config asks for it."""
-    every = config["evaluation"]["every"]
-    if not every or (examiners is None and not config["evaluation"]["enable"]):
-        return None
-    from scenefactory_jax.evaluation.protocols import make_watch
-
-    watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
-
-    def due(iteration: int | float) -> bool:
-        return iteration in every if isinstance(every, list) else iteration % every == 0
-
-    return lambda state, row: watch(get_policy_parameters(state), row) if due(row["iteration"]) else None
 
 
 def _loop(
@@ -199,7 +186,7 @@ def _loop(
             file.add(row)
             note(row)
             show(iteration, describe(row))
-            error_messages.check_finite(row)
+            check_finite(row)
             for callback in callbacks:
                 callback(state, row)
             late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
@@ -211,6 +198,26 @@ def _loop(
             if late:
                 break
     return state
+
+
+def check_finite(row: Mapping[str, float | int]) -> None:
+    """Checks that the iteration could learn: a reward term that is not finite may have made every minibatch unusable.
+
+    A car whose state is not finite ends as `numerical_error`; then single minibatches are left out (`ppo/skipped`), which is no error.
+
+    Args:
+        row: metrics of an iteration.
+
+    Raises:
+        ConfigError: naming the terms.
+    """
+    terms = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
+    if terms and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
+        values = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in terms)
+        raise ConfigError(
+            f"{values} in iteration {row['iteration']}, so no minibatch could be learnt from;"
+            " look for a division by zero, or a log or root below zero, or leave it out: ~" + terms[0].replace("/", ".")
+        )
 
 
 def step(

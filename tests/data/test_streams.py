@@ -301,7 +301,7 @@ def test_room_for_more_changes_no_look_up():
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
         (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
-        (["stream.share=1.5"], r"stream\.share: 1\.5; wanted is a number from 0 to 1"),
+        (["stream.share=1.5"], r"stream\.share: expected a number >= 0 and <= 1, got 1\.5"),
         (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
         (["stream.excess=drop"], r"stream\.excess: 'drop'"),
         (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),

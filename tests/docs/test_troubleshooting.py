@@ -114,9 +114,9 @@ def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkey
 def test_a_car_that_breaks_does_not_end_training():
     broken = {"iteration": 3, "reward/haste": float("nan"), "ppo/skipped": 4.0, "ppo/gradient_norm": 0.0}
     with pytest.raises(ConfigError, match=r"reward\.haste: nan in iteration 3"):
-        error_messages.check_finite(broken)
+        training_loop.check_finite(broken)
     for sound in ({"reward/haste": 1.0}, {"ppo/skipped": 0.0}, {"ppo/gradient_norm": 0.3}):  # it learnt, or no term is at fault
-        error_messages.check_finite({**broken, **sound})
+        training_loop.check_finite({**broken, **sound})
 
 
 def test_an_error_of_our_own_keeps_its_traceback():

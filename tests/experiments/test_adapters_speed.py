@@ -31,5 +31,5 @@ def test_every_adapter_that_is_installed_is_measured_beside_the_packages_own(tmp
     kept = json.loads((tmp_path / "adapters.json").read_text())["rows"]
     assert [row["name"] for row in kept] == [row["name"] for row in rows]
     assert f"| Brax | 3 x 1 | scanned | {rows[[row['name'] for row in rows].index('Brax')]['per_s']:,.0f} (" in capsys.readouterr().out
-    with pytest.raises(ConfigError, match="repeats: 0; wanted is at least 1"):
+    with pytest.raises(ConfigError, match="repeats: expected an integer >= 1, got 0"):
         adapters(hydra_config.load_config("bench", *lean, "repeats=0"))
