@@ -85,7 +85,7 @@ def measure(
     """Measures the loop on a few worlds, after one repeat for warming up.
 
     Args:
-        config: as `bench` has it (`load("bench", ...)`).
+        config: as `bench` has it (`load("benchmark", ...)`).
         scenes: one world each, not stacked.
         parameters: of the policy, as `Policy.init` makes them.
         steps: control steps of every world in a repeat.

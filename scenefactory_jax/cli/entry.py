@@ -58,8 +58,8 @@ def _run(name: str, function: Function, arguments: Sequence[str], about: str) ->
     elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
         varied = _check(name, configs.as_overrides(flags), sweeps=flags.multirun)
     sys.argv = [f"{sys.argv[0]} {name}", *map(configs.quote_override, arguments)]
-    path = flags.config_name or configs.find_config_name(name)
-    hydra.main(version_base="1.3", config_path=str(configs.find_conf()), config_name=path)(_make_job(name, function, varied))()
+    folder = str(configs.find_conf() / "command")
+    hydra.main(version_base="1.3", config_path=folder, config_name=flags.config_name or name)(_make_job(name, function, varied))()
 
 
 def _format_help(name: str, overrides: Sequence[str], about: str) -> str:

@@ -12,11 +12,14 @@ import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser  # as `hydra.main` reads its arguments
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType
+from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException, HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -38,16 +41,27 @@ def find_conf() -> Path:
     raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
 
 
-def find_config_name(name: str) -> str:
-    """Returns the path of a config below `conf/`, without its suffix: `command/train`; of the environment alone, `task/environment`.
+class ConfSearchPath(SearchPathPlugin):
+    """Adds `conf/` to the search path: primary configs lie in `conf/command`, all groups beside it."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        search_path.append("scenefactory_jax", f"file://{find_conf()}")
+
+
+Plugins.instance().register(ConfSearchPath)
+
+
+def find_config(name: str) -> Path:
+    """Returns the file of a command's config, or of the environment alone (`task`).
 
     Raises:
         ConfigError: no such command.
     """
-    known = {path.stem: f"command/{path.stem}" for path in sorted((find_conf() / "command").glob("*.yaml"))} | {"task": "task/environment"}
-    if name not in known:
-        raise ConfigError(f"config: expected one of {', '.join(known)}, got {name!r}")
-    return known[name]
+    files = {file.stem: file for file in sorted((find_conf() / "command").glob("*.yaml"))}
+    files["task"] = find_conf() / "task" / "environment.yaml"
+    if name not in files:
+        raise ConfigError(f"config: expected one of {', '.join(files)}, got {name!r}")
+    return files[name]
 
 
 def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
@@ -95,7 +109,7 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     Raises:
         ConfigError: see `load`.
     """
-    find_config_name(name)
+    find_config(name)
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
@@ -119,14 +133,15 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
     for one in OverridesParser.create().parse_overrides([quote_override(override) for override in overrides]):
         if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
             key, entry = one.key_or_group, next(iter(held))
-            way = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
-            raise ConfigError(f"{key}={{}}: changes nothing, for mappings are merged; {way}")
+            hint = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
+            raise ConfigError(f"{key}={{}}: mappings are merged, so an empty one changes nothing; {hint}")
 
 
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(find_conf()), version_base="1.3"):
-        return hydra_compose(find_config_name(name), overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
+    folder, path = (find_conf(), "task/environment") if name == "task" else (find_conf() / "command", name)
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        return hydra_compose(path, overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -209,8 +224,8 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
 
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
-    """The environment with one other setting, or with a policy that judges beside it; a study asks for the same ones again and again."""
-    return load_config("task", f"+{override}" if override.startswith("policy=") else override)
+    """Composes the environment with one other setting, or with another policy; a study needs the same ones many times."""
+    return load_config("train", "experiment=null", override) if override.startswith("policy=") else load_config("task", override)
 
 
 def quote_override(override: str) -> str:
@@ -249,7 +264,7 @@ def as_overrides(flags: argparse.Namespace) -> list[str]:
     """
     for word in flags.overrides:
         if "=" not in word and not word.startswith("~"):
-            raise ConfigError(f"{word}: no setting; write {word}=VALUE, or ~{word} to remove it")
+            raise ConfigError(f"{word}: expected {word}=VALUE, or ~{word} to remove it")
     own = [word for word in flags.overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath=")]
     return own if flags.config_dir is None else [*own, f"hydra.searchpath=['file://{Path(flags.config_dir).resolve()}']"]
 

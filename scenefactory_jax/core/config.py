@@ -40,7 +40,7 @@ def read_values(path: Path) -> dict[str, Any]:
     """
     file = Path(path) / FILE
     if not file.is_file():
-        raise ConfigError(f"{path}: {FILE} not found; expected a folder that `train` wrote")
+        raise ConfigError(f"{FILE} not found in {path}; expected a folder that `train` or `export` wrote")
     try:
         config = yaml.safe_load(file.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -92,7 +92,7 @@ def format_command(name: str) -> str:
     """Formats how this process was called, for reports, without the folders that it wrote to."""
     arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
     program, _, command = sys.argv[0].rpartition(" ")  # as `cli/entry.py` leaves it
-    parts = Path(program).with_suffix("").parts
+    parts = Path(program.removesuffix(".py")).parts
     if command == name and "scenefactory_jax" in parts:
         return f"python -m scenefactory_jax {shlex.join([name, *arguments])}"
     if command == name and "experiments" in parts:

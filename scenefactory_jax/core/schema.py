@@ -96,7 +96,7 @@ def check_names(config: Mapping[str, Any], valid: list[str], *, where: str, requ
     if unknown := [key for key in config if key not in valid]:
         raise ConfigError(f"{_join(where, unknown[0])}: unknown key; valid: {', '.join(sorted(valid)) or 'none'}")
     if missing := [key for key in required if key not in config]:
-        raise ConfigError(f"{_join(where, missing[0])}: missing; {where or 'the command'} needs {', '.join(sorted(valid))}")
+        raise ConfigError(f"{_join(where, missing[0])}: missing; {where or 'the config'} needs {', '.join(sorted(valid))}")
 
 
 def _join(where: str, key: Any) -> str:

@@ -69,8 +69,8 @@ def find(run: str | Path) -> Path:
     shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
     if str(run) in shipped:
         return shipped[str(run)]
-    known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
-    raise ConfigError(f"run={run}: {configs.FILE} not found; expected a folder that `train` wrote{known}")
+    bundled = f", or a bundled policy: {', '.join(shipped)}" if shipped else ""
+    raise ConfigError(f"run: {configs.FILE} not found in {run}; expected a folder that `train` or `export` wrote{bundled}")
 
 
 def is_bundled(folder: Path) -> bool:

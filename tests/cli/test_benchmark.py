@@ -24,7 +24,7 @@ VARIANTS = {"training": {}, "environment": {"scope": "environment"}, "physics": 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Every scope once."""
-    folder = tmp_path_factory.mktemp("bench")
+    folder = tmp_path_factory.mktemp("benchmark")
     with quick_compilation():
         return folder, command.benchmark({**load_config("benchmark", *SMALL, f"out={folder}"), "variants": VARIANTS})
 

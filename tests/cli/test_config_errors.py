@@ -6,7 +6,7 @@ import pytest
 from support.scene_documents import checker, document, packer, straight, thing, written
 
 from scenefactory_jax.cli import hydra_config, schema
-from scenefactory_jax.cli.benchmark import bench
+from scenefactory_jax.cli.benchmark import benchmark
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.render import render
@@ -20,7 +20,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
 HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this process
-COMMANDS = {"train": train, "bench": bench, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
+COMMANDS = {"train": train, "benchmark": benchmark, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
 
 
 def refused(command, *overrides):
@@ -157,7 +157,7 @@ def test_an_unknown_key_or_option_is_named_with_the_valid_ones(override, message
 
 
 def test_an_unknown_config_is_named():
-    with pytest.raises(ConfigError, match=r"no config 'fly'; valid: bench, compare, convert, drive, evaluate, .*train"):
+    with pytest.raises(ConfigError, match=r"config: expected one of benchmark, compare, convert, .*train.*, got 'fly'"):
         hydra_config.load_config("fly")
 
 
@@ -189,7 +189,7 @@ def test_an_unknown_config_is_named():
         ("train", "scenes.heldout.seed=abc", "scenes.heldout.seed: expected an integer >= 0, got 'abc'"),
         ("train", "scenes.path=3", "scenes.path: expected a text or null, got 3"),
         ("train", "scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
-        ("bench", "repeats=0", "repeats: expected an integer >= 1, got 0"),
+        ("benchmark", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("render", "index=first", "index: expected an integer >= 0, got 'first'"),
         ("scenes", "limit=few", "limit: expected an integer >= 0, got 'few'"),
         ("convert", "source=3", "source: expected a text or null, got 3"),
@@ -208,22 +208,22 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("ppo.horizon=long", "ppo.horizon: expected an integer, got 'long'"),
+        ("ppo.horizon=long", "ppo.horizon: expected an integer >= 1, got 'long'"),
         ("ppo.gamma=1.5", "ppo.gamma: expected a number >= 0 and <= 1, got 1.5"),
         ("policy.trunk=wide", "policy.trunk: expected a list, each an integer, got 'wide'"),
         ("policy.activation=gelu", "policy.activation: expected"),
-        ("step_metrics.scene_size_m=abc", "step_metrics.scene_size_m: expected a number, got 'abc'"),
+        ("step_metrics.scene_size_m=abc", "step_metrics.scene_size_m: expected a number > 0, got 'abc'"),
         ("reward.goal.weight=big", "reward.goal.weight: expected a number, got 'big'"),
         ("~reward.goal.weight", "reward.goal.weight: missing"),
-        ("observations.road.count=many", "observations.road.count: expected an integer, got 'many'"),
+        ("observations.road.count=many", "observations.road.count: expected an integer >= 1, got 'many'"),
         ("timing.control_hz=0", "timing.control_hz: expected a number > 0, got 0"),
-        ("timing.episode_s=long", "timing.episode_s: expected a number, got 'long'"),
-        ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: expected a number or null, got 'near'"),
+        ("timing.episode_s=long", "timing.episode_s: expected a number > 0, got 'long'"),
+        ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: expected a number >= 0 or null, got 'near'"),
         ("dynamics.wheelbase=long", "dynamics.wheelbase: expected a number, got 'long'"),
         ("weather.grip.mode=sticky", "weather.grip.mode: expected"),
         (
             "termination.ending=[goal_reached,bored]",
-            "termination.ending: unknown event 'bored'; valid: ",
+            "termination.ending: expected a list, each one of numerical_error, goal_reached, ",
         ),
     ],
 )
@@ -237,7 +237,7 @@ def test_a_wrong_value_of_a_part_is_named(override, message):
 def test_a_config_from_python_is_checked_too(tmp_path):
     settings = hydra_config.load_config("train", "experiment=smoke")
     schema.check_train(settings | {"out": tmp_path})  # a path is as good as its text
-    with pytest.raises(ConfigError, match="worlds: missing; the command needs actions, .*, worlds"):
+    with pytest.raises(ConfigError, match="worlds: missing; the config needs actions, .*, worlds"):
         schema.check_train({name: value for name, value in settings.items() if name != "worlds"})
-    with pytest.raises(ConfigError, match="group 'reward' is missing; an environment needs timing, actions"):
+    with pytest.raises(ConfigError, match="reward: missing; the config needs actions, "):
         environment.make_env({name: value for name, value in settings.items() if name != "reward"})

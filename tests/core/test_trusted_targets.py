@@ -97,7 +97,7 @@ def test_whatever_a_training_can_choose_may_be_named():
     groups = [group for group in whole if (hydra_config.find_conf() / group).is_dir()]
     files = [file for group in groups for file in (hydra_config.find_conf() / group).rglob("*.yaml")]
     assert {"dynamics", "reward", "observations", "scenes", "policy", "loggers", "weather"} <= set(groups) and len(files) > 40
-    for name in [*files, hydra_config.find_conf() / "formats.yaml"]:
+    for name in [*files, hydra_config.find_conf() / "formats/base.yaml"]:
         assert trusted_targets.find_outside_targets(yaml.safe_load(name.read_text()) or {}) == {}, name
 
 

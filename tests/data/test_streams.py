@@ -381,4 +381,4 @@ def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
     assert table[0] == "| shuffled | 4 of 64 | 0.2 | 9 | 1,900 | 5.0 % of `in memory` | 12.3 | 4,096 | 3 and 1 |"
     assert "of `in memory`" not in table[1] and throughput_report.streaming_table({"rows": [row]}) == ""
     with pytest.raises(ConfigError, match=r"stream: scenes are exchanged while training; scope=physics has stream=none"):
-        streaming.measure(hydra_config.load_config("bench", "stream=shuffled", "scope=physics"), mesh=None)
+        streaming.measure(hydra_config.load_config("benchmark", "stream=shuffled", "scope=physics"), mesh=None)

@@ -14,11 +14,13 @@ from omegaconf import OmegaConf
 from support.running import ROOT, shell, smoke
 
 import scenefactory_jax.__main__ as command_line
-from scenefactory_jax.cli import error_messages, hydra_config, schema
+from scenefactory_jax.cli import error_messages, hydra_config
+from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.learning.training_loop import train
+from scenefactory_jax.evaluation import settings
+from scenefactory_jax.learning import training_loop
 
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
@@ -47,8 +49,8 @@ def place(tmp_path_factory):
 @pytest.fixture
 def lacking(monkeypatch):
     """A machine without the extras and with too little memory, whatever this one has."""
-    found = schema.importlib.util.find_spec
-    monkeypatch.setattr(schema.importlib.util, "find_spec", lambda name, *rest: None if name == "imageio_ffmpeg" else found(name, *rest))
+    found = settings.importlib.util.find_spec
+    monkeypatch.setattr(settings.importlib.util, "find_spec", lambda name, *rest: None if name == "imageio_ffmpeg" else found(name, *rest))
     for name in ("ray", "gymnasium"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "scenefactory_jax.adapters.gymnasium", raising=False)
@@ -57,7 +59,7 @@ def lacking(monkeypatch):
     def short_of_memory(scenes, worlds, **rest):
         return assign(scenes, worlds, **rest) if worlds < 10_000 else jnp.zeros((10**15,), jnp.uint8)
 
-    monkeypatch.setattr(scene_source, "assign", short_of_memory)
+    monkeypatch.setattr(scene_source, "assign_scenes", short_of_memory)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
 

@@ -24,7 +24,7 @@ MOMENTS, SECONDS = 16, 1.0
 
 @pytest.fixture(scope="module")
 def config():
-    return sf.load_config("bench", *SMALL, *NETWORK)
+    return sf.load_config("benchmark", *SMALL, *NETWORK)
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +251,7 @@ def test_measure_gives_positive_numbers(config, scene, parameters):
 )
 def test_what_only_the_device_has_is_named(override):
     with pytest.raises(ConfigError, match="baseline has"):
-        baseline_environment.make(sf.load_config("bench", override))
+        baseline_environment.make(sf.load_config("benchmark", override))
 
 
 def test_another_policy_is_named(config, scene):

@@ -176,7 +176,7 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["run=nowhere"], "run=nowhere: config.yaml not found"),
+        (["run=nowhere"], "config.yaml not found in nowhere"),
         (["run=nowhere", "dynamics=bicycle"], "dynamics: decided by the run nowhere; to change it: overrides='[dynamics=...]'"),
         (["overrides=[weather=wet]"], "overrides: ['weather=wet'] without a run"),
         (["out=."], "out: . is a folder; give the page's own name, such as replay.html"),
