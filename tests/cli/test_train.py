@@ -176,7 +176,7 @@ def test_what_does_not_go_on_changes_nothing(whole, tmp_path):
     before = contents(tmp_path / "run")
     for overrides, message in {
         ("resume=true", "policy.trunk=[32]"): r"policy\.trunk=\[32\] \(the run has \[16\]\)",
-        ("resume=true", "seed=5"): r"; seed=5 \(the run has 0\): .* goes on as it began",
+        ("resume=true", "seed=5"): r"; seed=5 \(the run has 0\): .* keeps its settings",
         ("seed=5",): "holds a run already",
     }.items():
         with pytest.raises(ConfigError, match=message):
