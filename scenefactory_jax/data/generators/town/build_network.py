@@ -116,7 +116,8 @@ def _junction(rng: np.random.Generator, plan: Plan, node: int, edges: list[int],
         arms.append(Arm(_yaw(plan, edge, node) + skew, street, street.forward, street.forward))
     if place.kind == "driveway":
         return choice.driveway(rng, place.place, arms, "yield")
-    if max(arm.leaving for arm in arms) <= 2 and max(arm.street.rank for arm in arms) > 0 and rng.random() < choice.roundabout_share:
+    narrow = max(arm.leaving for arm in arms) <= 2 and max(arm.street.rank for arm in arms) > 0
+    if place.kind == "roundabout" or (narrow and rng.random() < choice.roundabout_share):
         return choice.roundabout(rng, place.place, [arm._replace(leaving=1, entering=1) for arm in arms], "yield")
     control = _control(rng, arms, choice)
     if control == "signal":

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.data.generators.procedural.road_layout import BROKEN_WHITE, DOUBLE_YELLOW, SOLID_YELLOW, check_range, draw
-from scenefactory_jax.data.generators.town.bounds import fill
-from scenefactory_jax.data.generators.town.road_network import Street
+from scenefactory_jax.data.generators.ranges import check_range, draw, fill
+from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, DOUBLE_YELLOW, SOLID_YELLOW, Street
 
 NARROWEST_M = 2.6  # lane
 
@@ -48,7 +47,7 @@ def draw_street(rng: np.random.Generator, kind: StreetClass) -> Street:
     limit = draw(rng, kind.speed_limit_mps, f"{kind.name}.speed_limit_mps")
     chance = rng.random(3)
     median = draw(rng, kind.median_m, f"{kind.name}.median_m")
-    lines = (DOUBLE_YELLOW, SOLID_YELLOW) if lanes > 1 or kind.rank > 1 else (DOUBLE_YELLOW, SOLID_YELLOW, BROKEN_WHITE + 3)
+    lines = (DOUBLE_YELLOW, SOLID_YELLOW) if lanes > 1 or kind.rank > 1 else (DOUBLE_YELLOW, SOLID_YELLOW, BROKEN_YELLOW)
     return Street(
         forward=lanes,
         backward=lanes,

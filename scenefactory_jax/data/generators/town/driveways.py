@@ -5,7 +5,7 @@ import shapely
 from scipy.spatial import KDTree
 
 from scenefactory_jax.data.generators.curves import Points, arc_length
-from scenefactory_jax.data.generators.procedural.road_layout import check_range, draw
+from scenefactory_jax.data.generators.ranges import check_range, draw
 from scenefactory_jax.data.generators.town.lane_paths import change_to_right
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, Spot
 

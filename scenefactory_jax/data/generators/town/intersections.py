@@ -10,8 +10,8 @@ from jaxtyping import Float
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import LANE_BIKE
 from scenefactory_jax.data.generators.curves import FINE_M, Points, connect, curvature, heading, wrap_angle
-from scenefactory_jax.data.generators.procedural.road_layout import Line, check_range, draw
-from scenefactory_jax.data.generators.town.road_network import SOLID_WHITE, Block, Crosswalk, Lane, Port, Stop, Street
+from scenefactory_jax.data.generators.ranges import check_range, draw
+from scenefactory_jax.data.generators.town.road_network import SOLID_WHITE, Block, Crosswalk, Lane, Line, Port, Stop, Street
 
 Control = Literal["signal", "all_way_stop", "two_way_stop", "yield"]
 STRAIGHT_ON = np.radians(40.0)  # a movement that turns by less goes straight on

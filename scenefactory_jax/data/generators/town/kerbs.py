@@ -4,9 +4,10 @@ import shapely
 from shapely.geometry.polygon import orient
 
 from scenefactory_jax.data.generators.curves import Points
-from scenefactory_jax.data.generators.procedural.road_edges import SIMPLIFY_M
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive
+from scenefactory_jax.data.generators.ranges import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
+
+SIMPLIFY_M = 0.03  # how far a simplified edge may lie from the boundary
 
 
 def boundary(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import Points, arc_length
-from scenefactory_jax.data.generators.procedural.road_layout import draw
+from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.road_network import CHANGING, WALKING, Network
 
 STEP_M = 0.5  # between the points of a path

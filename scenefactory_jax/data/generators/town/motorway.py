@@ -7,8 +7,8 @@ import shapely
 
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, integrate
-from scenefactory_jax.data.generators.procedural.road_layout import DOUBLE_YELLOW, draw
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Block, Joint, Lane, Network, Port, Street, assemble
+from scenefactory_jax.data.generators.ranges import draw
+from scenefactory_jax.data.generators.town.road_network import DOUBLE_YELLOW, ON_ROAD, Block, Joint, Lane, Network, Port, Street, assemble
 from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, lay_road, shift_line, stack_lines
 
 

@@ -5,7 +5,7 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import FINE_M, connect, heading
-from scenefactory_jax.data.generators.procedural.road_layout import draw
+from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.intersections import find_paved_area
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Block, Lane, Port, Spot, Street
 

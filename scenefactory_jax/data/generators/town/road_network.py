@@ -13,9 +13,8 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_STREET
 from scenefactory_jax.data.generators.curves import Points
-from scenefactory_jax.data.generators.procedural.road_layout import Line
 
-SOLID_WHITE, SOLID_DOUBLE_WHITE, BROKEN_YELLOW = 7, 8, 9  # WOMD map element ids; the others are in procedural.layout
+BROKEN_WHITE, SOLID_WHITE, BROKEN_YELLOW, SOLID_YELLOW, DOUBLE_YELLOW = 6, 7, 9, 11, 12  # WOMD map element ids
 ON_ROAD, MERGING, CHANGING = 60, 20, 5  # right of way of lanes outside junctions: higher goes first
 WALKING = 90
 
@@ -44,6 +43,13 @@ class Lane(NamedTuple):
     rank: int  # right of way where it meets another
     kind: int = LANE_STREET
     control: int | None = None  # index into the stops: cars wait at the lane's start
+
+
+class Line(NamedTuple):
+    """A painted line."""
+
+    kind: int
+    points: Points
 
 
 class Stop(NamedTuple):

@@ -9,8 +9,19 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_BIKE, LANE_STREET
 from scenefactory_jax.data.generators.curves import Curve, Points, arc_length, connect, tangents, wrap_angle
-from scenefactory_jax.data.generators.procedural.road_layout import BROKEN_WHITE, SOLID_YELLOW, Line
-from scenefactory_jax.data.generators.town.road_network import MERGING, ON_ROAD, SOLID_WHITE, Block, Lane, Port, Spot, Street
+from scenefactory_jax.data.generators.town.road_network import (
+    BROKEN_WHITE,
+    MERGING,
+    ON_ROAD,
+    SOLID_WHITE,
+    SOLID_YELLOW,
+    Block,
+    Lane,
+    Line,
+    Port,
+    Spot,
+    Street,
+)
 
 CURVED = np.radians(20.0)  # a road that turns by more is called a curve
 SHORTEST_M = 6.0  # of a lane before and behind a taper

@@ -8,12 +8,11 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET, RoadUser
 from scenefactory_jax.data.generators.curves import Points, arc_length
-from scenefactory_jax.data.generators.procedural.road_layout import draw
+from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, change_to_right, draw_path, make_path, offset_path, walk
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network
 
 LOT_MPS = 5.0  # lanes with lower limits are those of parking lots and driveways
-MIDDLE_SHARE = 0.35  # of the town's half side: where the first car starts, for one near the middle records the log
 LATEST = 0.7  # share of the log after which nobody sets out to cross a road
 
 
@@ -32,6 +31,7 @@ class DrivingNumbers(NamedTuple):
     """Cars, how their drivers differ and what they allow themselves."""
 
     size_m: list[list[float]]  # ranges of length, width and height
+    first_start_m: float  # maximum distance of the first car from the middle, along each axis
     start_gap_m: float  # between cars as traffic begins to settle
     arriving_share: float  # of the cars that come in later
     lot_share: float  # how likely a car starts in a parking lot, per metre of lane
@@ -99,7 +99,7 @@ def draw_cars(
         place = points[min(row, len(points) - 1)]
         gap = driving.start_gap_m + size[0] / 2
         where = _passes(rng, network.lanes[lane], row, times) if network.lanes[lane].kind == LANE_FREEWAY else place
-        near = reach if found else MIDDLE_SHARE * reach
+        near = reach if found else driving.first_start_m
         if not later and (np.abs(where).max() > near or any(np.hypot(*(place - other)) < gap for other in places)):
             continue
         begin = float(arc_length(points[: row + 1])[-1])

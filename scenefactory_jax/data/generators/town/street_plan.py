@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.generators.curves import heading
-from scenefactory_jax.data.generators.procedural.road_layout import check_range, draw
+from scenefactory_jax.data.generators.ranges import check_range, draw
 from scenefactory_jax.data.generators.town.cross_sections import StreetClass, draw_street
 from scenefactory_jax.data.generators.town.road_network import Street
 
@@ -24,7 +24,7 @@ BEYOND_M = 15.0  # that roads go on beyond the square with kerbs: none crosses t
 class Node(NamedTuple):
     """A junction, a driveway, a parking lot, or a place beyond the town to which a street leads."""
 
-    kind: Literal["junction", "outlet", "driveway", "lot"]
+    kind: Literal["junction", "roundabout", "outlet", "driveway", "lot"]
     place: Place
 
 
@@ -52,11 +52,27 @@ class Plan(NamedTuple):
         return [index for index, edge in enumerate(self.edges) if node in (edge.a, edge.b)]
 
 
+def street(
+    rng: np.random.Generator, reach: float, classes: Sequence[StreetClass], *, offset_m: float, turn_deg: list[float]
+) -> Plan:
+    """Draws one street through the middle of the town, with one bend.
+
+    Args:
+        offset_m: maximum distance of the bend from the middle, along each axis.
+        turn_deg: range of the angle by which the street turns, to either side.
+    """
+    corner = rng.uniform(-offset_m, offset_m, 2)
+    yaw, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]) * np.radians(draw(rng, turn_deg, "street.turn_deg"))
+    nodes = [Node("outlet", _outside(corner, angle, reach, least=45.0)) for angle in (yaw + np.pi, yaw + turn)]
+    return Plan(nodes, [Edge(0, 1, draw_street(rng, classes[int(rng.integers(len(classes)))]), (corner,))])
+
+
 def star(
     rng: np.random.Generator,
     reach: float,
     classes: Sequence[StreetClass],
     *,
+    roundabout: bool,
     arms: list[int],
     offset_m: float,
     skew_deg: float,
@@ -65,6 +81,7 @@ def star(
     """One junction, and streets that lead out of the town.
 
     Args:
+        roundabout: the junction is a roundabout; else its kind is drawn.
         arms: fewest and most.
         offset_m: how far the junction may lie from the town's middle.
         skew_deg: how far an arm may turn from its place in a regular star; those of three and four arms are a street's two halves.
@@ -77,7 +94,7 @@ def star(
     yaws = first + {3: np.array([0.0, 0.5, 1.0]), 4: np.array([0.0, 0.5, 1.0, 1.5])}.get(count, 2 / count * np.arange(count)) * np.pi
     yaws = yaws + np.radians(rng.uniform(-skew_deg, skew_deg, count))
     main, cross = (draw_street(rng, classes[int(rng.integers(len(classes)))]) for _ in range(2))
-    nodes, edges = [Node("junction", centre)], []
+    nodes, edges = [Node("roundabout" if roundabout else "junction", centre)], []
     for index, yaw in enumerate(yaws):
         street = main if index % 2 == 0 else cross
         nodes.append(Node("outlet", _outside(centre, yaw, reach, least=60.0)))

@@ -49,9 +49,9 @@ class Town(NamedTuple):
     sdc: int  # of the actors
 
 
-def draw_town(rng: np.random.Generator, reach: float, parts: TownParts, log: Log) -> Town | None:
+def draw_town(rng: np.random.Generator, kind: str | None, reach: float, parts: TownParts, log: Log) -> Town | None:
     """A town; None where its plan cannot be built or too few cars move."""
-    drawn = parts.network(rng, reach)
+    drawn = parts.network(rng, reach, kind)
     if drawn is None:
         return None
     kind, network = drawn

@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneErro
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive
+from scenefactory_jax.data.generators.ranges import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, draw_town
 from scenefactory_jax.data.generators.town.traffic import TownUser
@@ -25,6 +25,7 @@ def generate(
     seed: int,
     index: int,
     *,
+    kinds: list[str] | None,
     reach_m: float,
     network: Mapping[str, Any],
     surface: Mapping[str, Any],
@@ -46,6 +47,7 @@ def generate(
     `sdc` is one of the moving cars near it.
 
     Args:
+        kinds: plans of `network.plans`, or "motorway", that take turns; None: drawn.
         reach_m: half side of the square within which there are kerbs; roads go on to its border and beyond.
         network: entry for the roads, `(rng, reach) -> kind, Network`, or None where what was drawn cannot be built.
         surface: entry for the kerbs, `(network, reach) -> outer, islands, surface`.
@@ -73,8 +75,9 @@ def generate(
     parts = TownParts(*(instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{place}") for (module, entry), place in built))
     times = log_dt * np.arange(log_steps)
     log = Log(times, log_current, warm_s, sdc_m, sight_m, travel_m=traffic["travel_m"][0], least=traffic["cars"][0])
+    kind = kinds[index % len(kinds)] if kinds else None
     for redraw in range(REDRAWS):
-        town = draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), reach_m, parts, log)
+        town = draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), kind, reach_m, parts, log)
         if town is not None:
             return _scene(town, log, seed, index, lane_spacing_m, line_spacing_m)
     raise SceneError(f"generate.traffic.cars: {REDRAWS} towns held fewer than {log.least} moving cars; ask for fewer")

@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.generators.curves import Points, arc_length, heading
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive, check_range, draw
+from scenefactory_jax.data.generators.ranges import check_positive, check_range, draw, fill
 from scenefactory_jax.data.generators.town import road_users
-from scenefactory_jax.data.generators.town.bounds import fill
 from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
 from scenefactory_jax.data.generators.town.path_conflicts import find_conflicts

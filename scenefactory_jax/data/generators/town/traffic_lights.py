@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive, draw
+from scenefactory_jax.data.generators.ranges import check_positive, draw
 from scenefactory_jax.data.generators.town.road_network import Network
 
 STATE = {name: index for index, name in enumerate(LIGHT_STATES)}
