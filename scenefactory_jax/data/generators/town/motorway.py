@@ -14,8 +14,8 @@ from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, 
 
 def motorway(
     rng: np.random.Generator,
-    reach: float,
     *,
+    length_m: float,
     lanes: list[int],
     lane_width_m: float,
     median_m: list[float],
@@ -35,6 +35,7 @@ def motorway(
     """Two carriageways side by side; a joining ramp adds a lane that drops further on, a leaving one takes a lane that was added.
 
     Args:
+        length_m: of both carriageways; fast cars that reach the town within the log start far outside.
         lanes: fewest and most of a carriageway.
         bend_radius_m: the sharpest.
         offset_m: how far the motorway may pass from the town's middle.
@@ -46,7 +47,7 @@ def motorway(
     count = int(rng.integers(lanes[0], lanes[1] + 1))
     limit = draw(rng, speed_limit_mps, "motorway.speed_limit_mps", low=5.0)
     street = Street(count, count, lane_width_m, draw(rng, median_m, "motorway.median_m"), limit, 3, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)
-    half = 3.0 * reach  # cars are fast: those that reach the town within a log start far out
+    half = length_m / 2
     steps = round(half / FINE_M)
     yaw, bend = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(-1, 1)) / bend_radius_m
     middle = rng.uniform(-offset_m, offset_m, 2)

@@ -34,7 +34,7 @@ def draw_network(
     Args:
         kind: name of a plan, or "motorway"; None: drawn.
         plans: entries for the towns' streets, `(rng, reach, classes) -> Plan` or None, each as likely as the others.
-        motorway: entry for `(rng, reach) -> Network`.
+        motorway: entry for `(rng) -> Network`.
         motorway_share: of scenes that are a motorway.
         streets: name -> numbers of a class of streets (`streets.StreetClass`), the least important first.
         driveway: lane width and speed limit.
@@ -66,7 +66,7 @@ def draw_network(
     numbers = instantiate(roads, builtins=f"{PACKAGE}.road_segments", where=f"{where}.roads")()
     choice = instantiate(junctions, builtins=f"{PACKAGE}.build_network", where=f"{where}.junctions")(built, numbers)
     if kind == "motorway" or (kind is None and rng.random() < motorway_share):
-        return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng, reach)
+        return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{where}.motorway")(rng)
     kind = kind or str(rng.choice(list(makers)))
     lane = Street(1, 1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
     plan = makers[kind](rng, reach, classes)
