@@ -39,7 +39,7 @@ def check_positive(value: float, name: str) -> None:
 
 
 def fill(kind: Callable[..., Group], numbers: Mapping[str, Any], where: str, **known: Any) -> Group:
-    """Makes a named tuple from a mapping with its keys; ranges must ascend, fractions (`*_share`) must lie in [0, 1].
+    """Makes a named tuple from a mapping with its keys; ranges must ascend, fractions (`*_fraction`) must lie in [0, 1].
 
     Args:
         kind: a NamedTuple.
@@ -58,7 +58,7 @@ def fill(kind: Callable[..., Group], numbers: Mapping[str, Any], where: str, **k
         if hints[name] in (list[float], list[int]):
             check_range(value, f"{where}.{name}")
         values = value if isinstance(value, Sequence) else [value]
-        if name.endswith("_share") and not all(0 <= number <= 1 for number in values):
+        if name.endswith("_fraction") and not all(0 <= number <= 1 for number in values):
             raise ConfigError(f"{where}.{name}: expected a number in [0, 1], got {value!r}")
     fixed = {name: tuple(value) for name, value in numbers.items() if typing.get_origin(hints[name]) is tuple}
     return kind(**(known | dict(numbers) | fixed))
