@@ -290,8 +290,8 @@ def follow(begin, speed, seconds, *, ways=None, ranks=(ON_ROAD, ON_ROAD), gate=(
     straight = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
     ways = ways or (straight, straight)
     paths = [
-        lane_paths.make_path([lane_paths.PathPiece(way, 15.0, rank, None, 0)], limit_fraction=1.0, lateral=2.0, braking=2.0)._replace(gates=gate)
-        for way, rank in zip(ways, ranks, strict=True)
+        lane_paths.make_path([piece], limit_fraction=1.0, lateral=2.0, braking=2.0)._replace(gates=gate)
+        for piece in (lane_paths.PathPiece(way, 15.0, rank, None, 0) for way, rank in zip(ways, ranks, strict=True))
     ]
     users = driver_model.Users(np.full(2, 4.0), np.full(2, 2.0), np.array(begin), np.array(speed), np.full(2, -np.inf))
     table, zones = path_conflicts.find_conflicts(paths, users.width)

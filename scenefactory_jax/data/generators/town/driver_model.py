@@ -197,7 +197,7 @@ def _give_way(
     rows = np.flatnonzero(near & present[zones.first] & present[zones.second] & (rear[zones.second] < zones.second_end))
     if not len(rows):
         return brake
-    first, second, along, rank, distance = (column[rows] for column in (zones.first, zones.second, zones.along, zones.rank, to_zone))
+    first, second, along, rank, distance = zones.first[rows], zones.second[rows], zones.along[rows], zones.rank[rows], to_zone[rows]
     second_distance = zones.second_start[rows] - front[second]
     inside = second_distance <= 0
     stopped = line[second] < second_distance  # the second waits for a light or a sign before the zone
