@@ -80,7 +80,9 @@ def test_edges_are_unbroken_and_keep_their_distance_from_every_lane(scenes):
         kind = scene.metadata["kind"]
         if kind != "motorway":
             arms = sum(not lane.exit for lane in lanes_of(scene))
-            assert len(outer) == {"t_intersection": 3, "intersection": 4, "roundabout": len(outer)}.get(kind, 2) and len(outer) <= max(arms, 2)
+            assert len(outer) == {"t_intersection": 3, "intersection": 4, "roundabout": len(outer)}.get(kind, 2) and len(outer) <= max(
+                arms, 2
+            )
             assert len(islands) == (kind == "roundabout") and all(np.allclose(island.xyz[0], island.xyz[-1]) for island in islands)
         edges = shapely.MultiLineString([road.xyz[:, :2] for road in scene.roads if road.kind in EDGES])
         for lane in lanes_of(scene):
