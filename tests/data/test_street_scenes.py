@@ -1,4 +1,4 @@
-"""Laws of the small generated scenes of `scenes=streets`; those that towns have, too, are in test_town.py."""
+"""Laws of the small generated scenes of `scenes=streets`; the laws of all generated scenes are in test_town.py."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_kinds_take_turns(scenes):
         assert kind in found
 
 
-def test_same_seed_same_scene_whatever_came_before(scenes):
+def test_a_scene_depends_on_its_seed_and_index_alone(scenes):
     again = generator()(5, 13)
     for road, other in zip(again.roads, scenes[13].roads, strict=True):
         np.testing.assert_array_equal(road.xyz, other.xyz)
@@ -154,7 +154,7 @@ def test_bad_numbers_are_refused_by_name(changes, named):
 
 
 def test_the_preset_changes_only_what_the_town_has():
-    """A key that `streets` overrides exists in `town`: hydra adds an unknown one without a word."""
+    """Every key that `streets` overrides exists in `town`; hydra adds unknown keys silently."""
     town = hydra_config.load_config("scenes", "scenes=town")["scenes"]["generate"]
 
     def unknown(mine, theirs, path=""):

@@ -1,4 +1,4 @@
-"""Laws of towns: lanes connect and go on, nobody touches anybody or a kerb, lights and signs and right of way are obeyed."""
+"""Laws of towns: lanes connect, road users touch neither each other nor kerbs, and obey lights, signs and right of way."""
 
 from pathlib import Path
 
@@ -69,7 +69,7 @@ def movers(scene, kind="vehicle"):
     return [t for t in scene.tracks if t.kind == kind and np.ptp(t.xyz[t.valid, :2], axis=0).max() > 0.5]
 
 
-def test_same_seed_same_bits_whatever_came_before(scenes):
+def test_a_scene_depends_on_its_seed_and_index_alone(scenes):
     again = generator()(8, 5)
     other = scenes[5]
     assert again.name == other.name and again.metadata == other.metadata and again.sdc == other.sdc
@@ -105,7 +105,7 @@ def test_lanes_connect(scenes):
             assert all(lane.id in lanes[i].exit for i in lane.entry)
 
 
-def test_neighbours_are_beside_one_another(scenes):
+def test_neighbours_are_beside_each_other(scenes):
     for scene in scenes:
         lanes = lanes_of(scene)
         for lane in lanes:
@@ -129,7 +129,7 @@ def test_roads_go_on_beyond_the_box(scenes):
                     assert np.abs(lane.xyz[end, :2] - centre).max() > 100.0, f"{scene.name}: lane {lane.id} ends within the box"
 
 
-def test_nobody_overlaps_at_any_step(scenes):
+def test_road_users_never_overlap(scenes):
     for scene in scenes:
         for step in range(0, len(scene.times), 3):
             here = [track for track in scene.tracks if track.valid[step]]
@@ -146,7 +146,7 @@ def test_cars_cross_no_edge(scenes):
             assert not shapely.intersects(edges, boxes(track, np.flatnonzero(track.valid)[::2])).any(), f"{scene.name}, track {track.id}"
 
 
-def test_reds_are_obeyed_and_somebody_waits_for_them(scenes):
+def test_cars_wait_at_red_lights(scenes):
     passed_green = waited = 0
     for scene in scenes:
         lanes = lanes_of(scene)
@@ -207,7 +207,7 @@ def test_speeds_and_accelerations_are_within_bounds(scenes):
 
 
 def test_traffic_is_there_and_interacts(scenes):
-    """Cars everywhere, some that stop and go on, some that change lanes, people and cyclists."""
+    """Cars that stop and go on, cars that change lanes, pedestrians and cyclists."""
     stopped = changed = 0
     for scene in scenes:
         assert len(movers(scene)) >= TRAFFIC["cars"][0] and scene.tracks[scene.sdc].valid.all()
@@ -324,7 +324,7 @@ def test_a_car_stops_at_a_red_light_and_goes_when_it_is_green():
 
 
 def test_the_lower_rank_waits_where_ways_cross():
-    """Both would be at the crossing at once; whoever has the right of way does not slow down."""
+    """Both would be at the crossing at once; the car with the right of way does not slow down."""
     east = np.stack([np.arange(-60.0, 60.0, 0.5), np.zeros(240)], -1)
     for ranks, winner in (((5, 1), 0), ((1, 5), 1)):
         motion = follow([0.0, 0.0], [9.0, 9.0], 16.0, ways=(east, east[:, ::-1].copy()), ranks=ranks)
@@ -344,7 +344,7 @@ def test_turns_use_every_lane():
     assert {turn.kind for turn in turns if turn.source == (0, 0)} == {"left"}
 
 
-def test_realism_tells_sets_apart(scenes):
+def test_realism_separates_different_sets(scenes):
     half, other = (distribution_distance.collect(part, scene_size_m=200.0) for part in (scenes[::2], scenes[1::2]))
     same = distribution_distance.compare(half, half)
     assert distribution_distance.mean_distance(same) == 0.0 and all(one is None or one.wasserstein == 0.0 for one in same.values())
