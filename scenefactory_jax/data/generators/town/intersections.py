@@ -47,7 +47,7 @@ class Mouth(NamedTuple):
         """Place at distances from the centre along the arm and to its left, looking away from the junction."""
         return self.centre + along * heading(self.arm.yaw) + across * heading(self.arm.yaw + np.pi / 2)
 
-    def slot(self, slot: float, *, entering: bool) -> Place:
+    def slot(self, slot: int | float, *, entering: bool) -> Place:
         """Place where a slot meets the junction; slots at half numbers are lines between lanes."""
         beside = self.arm.street.median / 2 + (slot + 0.5) * self.arm.street.width
         return self.at(self.distance, beside if entering else -beside)
@@ -252,7 +252,7 @@ def _stops(mouth: Mouth, control: Control, phases: Sequence[frozenset[int]], hig
 
 def _is_straight(source: Arm, target: Arm) -> bool:
     """Checks whether the way from one arm to another goes straight on."""
-    return abs(wrap_angle(target.yaw - source.yaw - np.pi)) < STRAIGHT_RAD
+    return bool(abs(wrap_angle(target.yaw - source.yaw - np.pi)) < STRAIGHT_RAD)
 
 
 def _has_cycle_lane(source: Arm, target: Arm) -> bool:
@@ -260,13 +260,13 @@ def _has_cycle_lane(source: Arm, target: Arm) -> bool:
     return _is_straight(source, target) and min(source.street.bike, target.street.bike, source.entering, target.leaving) > 0
 
 
-def _middle(mouths: Sequence[Mouth], depth: float) -> list[shapely.Geometry]:
+def _middle(mouths: Sequence[Mouth], depth: float) -> Sequence[shapely.Geometry]:
     """Computes the paved surface between the arms: between two opposite arms, else from the centre to the port of the arm."""
     surface = lambda mouth, near: shapely.Polygon(mouth.corners(near, mouth.distance + 0.05))  # noqa: E731
     near = [surface(mouth, max(0.0, mouth.distance - depth)) for mouth in mouths]
     pairs = [(a, b) for a in range(len(mouths)) for b in range(a) if _is_straight(mouths[b].arm, mouths[a].arm)]
     joined = [shapely.convex_hull(shapely.union(near[a], near[b])) for a, b in pairs]
-    return joined + [surface(mouth, 0.0) for mouth in mouths if not any(mouth.index in pair for pair in pairs)]
+    return [*joined, *(surface(mouth, 0.0) for mouth in mouths if not any(mouth.index in pair for pair in pairs))]
 
 
 def _crosswalk(mouth: Mouth, distance: float, depth: float) -> Crosswalk:
