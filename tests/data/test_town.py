@@ -168,7 +168,7 @@ def test_cars_wait_at_red_lights(scenes):
 
 
 def test_conflicting_lights_are_never_green_together():
-    street = Street(2, 2, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
+    street = Street(2, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
     arms = [Arm(yaw, street, 2, 2) for yaw in (0.0, 1.6, 3.1, 4.7)]
     numbers = {key: value for key, value in NETWORK["blocks"]["intersection"].items() if key != "_target_"}
     block = intersection(np.random.default_rng(0), np.zeros(2), arms, "signal", **numbers)
@@ -335,8 +335,8 @@ def test_the_lower_rank_waits_where_ways_cross():
 
 
 def test_turns_use_every_lane():
-    street = Street(3, 3, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
-    small = street._replace(forward=1, backward=1)
+    street = Street(3, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
+    small = street._replace(lanes=1)
     arms = [Arm(0.0, street, 3, 4, "left"), Arm(1.6, small, 1, 1), Arm(3.1, street, 3, 3), Arm(4.7, small, 1, 2, "right")]
     turns = find_turns(arms)
     assert {turn.source for turn in turns} == {(a, i) for a, arm in enumerate(arms) for i in range(arm.entering)}

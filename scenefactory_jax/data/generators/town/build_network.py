@@ -47,7 +47,7 @@ def build_network(
         edges = sorted(plan.edges_at(index), key=lambda edge: _yaw(plan, edge, index) % (2 * np.pi))
         street, yaw = plan.edges[edges[0]].street, _yaw(plan, edges[0], index)
         if node.kind == "outlet":
-            no_lanes = ((),) * street.forward
+            no_lanes = ((),) * street.lanes
             ends[index, edges[0]] = Port(node.place, yaw, street, no_lanes, no_lanes)
             continue
         block = (
@@ -83,7 +83,7 @@ def _junction(rng: np.random.Generator, plan: Plan, index: int, edges: list[int]
     arms = []
     for edge in edges:
         street, turn = plan.edges[edge].street, rng.uniform(-skew, skew)
-        arms.append(Arm(_yaw(plan, edge, index) + turn, street, street.forward, street.forward))
+        arms.append(Arm(_yaw(plan, edge, index) + turn, street, street.lanes, street.lanes))
     if node.kind == "driveway":
         return makers.driveway(rng, node.place, arms, "yield")
     narrow = max(arm.leaving for arm in arms) <= 2 and max(arm.street.rank for arm in arms) > 0

@@ -50,7 +50,7 @@ def motorway(
     count = draw_count(rng, lanes)
     limit = draw(rng, speed_limit_mps, "motorway.speed_limit_mps", low=5.0)
     median = draw(rng, median_m, "motorway.median_m")
-    street = Street(count, count, lane_width_m, median, limit, RANK, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)
+    street = Street(count, lane_width_m, median, limit, RANK, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)
     half = length_m / 2
     yaw, bend = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(-1, 1)) / bend_radius_m
     middle = rng.uniform(-offset_m, offset_m, 2)
@@ -81,7 +81,7 @@ def motorway(
 
 def _carriageway(curve: Curve, street: Street, numbers: RoadDimensions, join: int | None, leave: int | None) -> Block:
     """Builds one direction with its lanes on the right of the curve, and a port for each ramp at the given points of the curve."""
-    count, last = street.forward, len(curve[0]) - 1
+    count, last = street.lanes, len(curve[0]) - 1
     stretches = []  # first point, last point, lanes at the start, lanes at the end
     at = 0
     if join is not None:

@@ -73,7 +73,7 @@ def draw_network(
     if kind == "motorway" or (kind is None and rng.random() < motorway_fraction):
         return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{WHERE}.motorway")(rng)
     kind = kind or str(rng.choice(list(make)))
-    lane = Street(1, 1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
+    lane = Street(1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
     plan = make[kind](rng, reach, classes)
     network = None if plan is None else build_network(rng, add_lots(rng, plan, reach, lane), makers, dimensions, numbers)
     return None if network is None else (kind, network)

@@ -22,8 +22,7 @@ WALKING, ON_ROAD, MERGING, CHANGING = 90, 60, 20, 5  # right of way outside of j
 class Street(NamedTuple):
     """Cross-section of a road, apart from lanes that are gained or dropped."""
 
-    forward: int  # lanes from its first end to its second
-    backward: int
+    lanes: int  # per direction
     width: float  # of a lane, m
     median: float  # width between the directions, m; 0: a painted line
     limit: float  # m/s

@@ -73,23 +73,19 @@ def connect_ports(first: Port, second: Port, via: list[Pose], numbers: RoadDimen
     Args:
         via: poses of the middle line where bends begin and end, in the order from the first port to the second.
     """
-    middle = _middle_line(first, second, via)
     street = first.street
-    points, yaw = middle
-    back = (points[::-1], yaw[::-1] + np.pi)
-    ways = [
+    points, yaw = _middle_line(first, second, via)
+    ahead, back = (
         build_carriageway(curve, len(a.leaving), len(b.entering), street, numbers, side=b.side, controlled=b.controlled)
-        for curve, a, b in ((middle, first, second), (back, second, first))
-        if a.leaving
-    ]
-    both = len(first.leaving) > 0 and len(second.leaving) > 0
-    lines = [Line(street.centre_line, points)] if both and street.median == 0 else []
+        for curve, a, b in (((points, yaw), first, second), ((points[::-1], yaw[::-1] + np.pi), second, first))
+    )
+    lines = [Line(street.centre_line, points)] if street.median == 0 else []
     kind = "curve" if np.ptp(yaw) > CURVE_RAD else "straight"
     changes = [len(b.entering) - len(a.leaving) for a, b in ((first, second), (second, first))]
     kind = "lane_drop" if min(changes) < 0 else "lane_gain" if max(changes) > 0 else kind
-    block = combine(kind, ways)
-    islands = [_median(points, street, numbers)] if both and street.median > 2 * numbers.shoulder_m + 0.5 else []
-    return block._replace(lines=[*block.lines, *lines], islands=islands, ports=_ports(first, second, ways))
+    block = combine(kind, [ahead, back])
+    islands = [_median(points, street, numbers)] if street.median > 2 * numbers.shoulder_m + 0.5 else []
+    return block._replace(lines=[*block.lines, *lines], islands=islands, ports=_ports(first, second, ahead, back))
 
 
 def combine(kind: str, ways: list[Carriageway]) -> Block:
@@ -104,21 +100,15 @@ def combine(kind: str, ways: list[Carriageway]) -> Block:
     return Block(kind, lanes, follows, beside, lines, [way.area for way in ways], spots=[spot for way in ways for spot in way.spots])
 
 
-def _ports(first: Port, second: Port, ways: list[Carriageway]) -> list[Port]:
-    """Computes the ports of the road, which face those it connects."""
-    sides = [(ways[0], 0) if first.leaving else None, None]  # carriageway of each direction and the number of its first lane
-    if second.leaving:
-        sides[1] = (ways[-1], len(ways[0].lanes) if first.leaving else 0)
-    starts, ends, cycles = ([], []), ([], []), ([], [])
-    for direction, side in enumerate(sides):
-        if side is not None:
-            way, base = side
-            starts[direction].extend((lane + base,) for lane in way.start)
-            ends[direction].extend((lane + base,) for lane in way.end)
-            cycles[direction].extend(lane + base for lane in way.cycles)
+def _ports(first: Port, second: Port, ahead: Carriageway, back: Carriageway) -> list[Port]:
+    """Computes the ports of the road, which face those it connects; the lanes of `back` are numbered after those of `ahead`."""
+    base = len(ahead.lanes)
+    starts, back_starts = tuple((i,) for i in ahead.start), tuple((i + base,) for i in back.start)
+    ends, back_ends = tuple((i,) for i in ahead.end), tuple((i + base,) for i in back.end)
+    cycles, back_cycles = ahead.cycles, tuple(i + base for i in back.cycles)
     return [
-        Port(port.place, port.yaw + np.pi, first.street, tuple(ends[into]), tuple(starts[out]), tuple(cycles[into]), tuple(cycles[out]))
-        for port, out, into in ((first, 0, 1), (second, 1, 0))
+        Port(first.place, first.yaw + np.pi, first.street, back_ends, starts, back_cycles, cycles),
+        Port(second.place, second.yaw + np.pi, first.street, ends, back_starts, cycles, back_cycles),
     ]
 
 
@@ -186,7 +176,7 @@ def build_carriageway(
     if street.bike:
         lanes.append(Lane(shift_line(curve, outer + street.bike / 2), street.bike, street.limit, ON_ROAD, LANE_BIKE))
     parking = _parking_width(place, street, numbers)
-    area = _paved_area(curve, street, outer + street.bike + parking + numbers.shoulder_m, numbers.shoulder_m)
+    area = _paved_area(curve, outer + street.bike + parking + numbers.shoulder_m)
     spots = _parking_spaces(curve, place, outer + street.bike + parking / 2, numbers) if parking.any() else []
     lines = _lines(curve, place, sections, outer, street, numbers, controlled=controlled)
     return Carriageway(lanes, follows, beside, lines, area, spots, start, end, cycles)
@@ -218,13 +208,12 @@ def _parking_width(place: Float[np.ndarray, " N"], street: Street, numbers: Road
     return street.parking * np.clip((near - numbers.spot_margin_m + 3.0) / 3.0, 0.0, 1.0)
 
 
-def _paved_area(curve: Curve, street: Street, outer: Float[np.ndarray, " N"], shoulder: float) -> shapely.Polygon:
+def _paved_area(curve: Curve, outer: Float[np.ndarray, " N"]) -> shapely.Polygon:
     """Computes the paved surface from the middle of the road to the kerb."""
     rows = np.unique(np.append(np.arange(0, len(outer), 4), len(outer) - 1))
     thinned = curve[0][rows], curve[1][rows]
     kerb = shift_line(thinned, outer[rows])
-    # 5 cm beyond the middle, so that the areas of both directions overlap
-    inner = shift_line(thinned, -0.05 if street.forward and street.backward else -shoulder)
+    inner = shift_line(thinned, -0.05)  # so that the areas of both directions overlap
     return shapely.Polygon(np.concatenate([inner, kerb[::-1]]))
 
 

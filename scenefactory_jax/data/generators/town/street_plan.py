@@ -84,8 +84,7 @@ def draw_street(rng: np.random.Generator, classes: Sequence[StreetClass]) -> Str
     median = draw(rng, kind.median_m, f"{kind.name}.median_m")
     lines = (DOUBLE_YELLOW, SOLID_YELLOW) if lanes > 1 or kind.rank > 1 else (DOUBLE_YELLOW, SOLID_YELLOW, BROKEN_YELLOW)
     return Street(
-        forward=lanes,
-        backward=lanes,
+        lanes=lanes,
         width=width,
         median=median if chance[0] < kind.median_fraction else 0.0,
         limit=limit,
