@@ -20,12 +20,11 @@ LAST_CROSSING = 0.7  # fraction of the log after which no pedestrian starts to c
 
 
 class SimulatedUser(NamedTuple):
-    """A road user before the simulation; fields as in `driver_model.Users`."""
+    """A road user at the start of its path; fields as in `driver_model.Users`."""
 
     kind: RoadUser
     size: tuple[float, float, float]
     path: Path
-    begin: float
     speed: float
     enters: float
 
@@ -107,7 +106,7 @@ def draw_cars(
         if not later:
             places.append(place)
         speed = float(path.speed[0] * rng.uniform(0.6, 1.0))
-        cars.append(SimulatedUser("vehicle", size, path, 0.0, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
+        cars.append(SimulatedUser("vehicle", size, path, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
     return cars
 
 
@@ -164,7 +163,7 @@ def draw_cyclists(
         if path is not None:
             speed = draw(rng, cyclists.speed_mps, "traffic.cyclists.speed_mps")
             path = path._replace(speed=np.minimum(path.speed, speed))
-            users.append(SimulatedUser("cyclist", cyclists.size_m, path, 0.0, speed, -np.inf))
+            users.append(SimulatedUser("cyclist", cyclists.size_m, path, speed, -np.inf))
     return users
 
 
@@ -185,7 +184,7 @@ def draw_crossers(
         gate = (before, len(network.stops) + index) if crosswalk.junction in network.phases else None
         path = walk(np.stack([ends[0] - before * ahead, ends[1] + after * ahead]) + side, speed, crosswalk=gate)
         enters = float(rng.uniform(times[0], LAST_CROSSING * times[-1]))
-        users.append(SimulatedUser("pedestrian", people.size_m, path, 0.0, speed, enters))
+        users.append(SimulatedUser("pedestrian", people.size_m, path, speed, enters))
     return users
 
 

@@ -101,7 +101,7 @@ def _simulate(
     if not users:
         return []
     paths = [user.path for user in users]
-    columns = zip(*((user.size[0], user.size[1], user.begin, user.speed, user.enters) for user in users), strict=True)
+    columns = zip(*((user.size[0], user.size[1], 0.0, user.speed, user.enters) for user in users), strict=True)
     states = Users(*(np.array(column, float) for column in columns))
     table, zones = find_conflicts(paths, states.width)
     motion = simulate(paths, states, table, zones, gates.state, times, parameters)
