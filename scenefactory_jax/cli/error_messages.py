@@ -1,14 +1,11 @@
 """What goes wrong past the door, in the user's words: no device, too little memory, weights that do not fit, a reward that is no number."""
 
-import math
 import re
 from collections.abc import Mapping
 from typing import Any
 
 import flax.errors
 import jax
-
-from scenefactory_jax.core.instantiate import ConfigError
 
 
 def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
@@ -31,26 +28,6 @@ def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
             " and for an NVIDIA GPU `pip install 'scenefactory_jax[cuda]'`"
         )
     return None
-
-
-def check_finite(row: Mapping[str, float | int]) -> None:
-    """Refuse to go on where a reward term is no number and nothing was learnt: hours of it would leave the policy as it was.
-
-    A car that breaks is no such case: it ends as a fault, and the minibatch that holds it may be left out (`ppo/skipped`).
-
-    Args:
-        row: an iteration's metrics.
-
-    Raises:
-        ConfigError: naming the terms.
-    """
-    broken = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
-    if broken and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
-        named = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in broken)
-        raise ConfigError(
-            f"{named} in iteration {row['iteration']}, so no minibatch could be learnt from;"
-            " look for a division by zero, or a log or root below zero, or leave it out: ~" + broken[0].replace("/", ".")
-        )
 
 
 def _memory(text: str, config: Mapping[str, Any]) -> str:

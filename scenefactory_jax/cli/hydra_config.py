@@ -4,11 +4,7 @@ import argparse
 import copy
 import functools
 import re
-import shlex
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence, Set
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,32 +20,34 @@ from hydra.errors import ConfigCompositionException, HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from scenefactory_jax.core import atomic_file, trusted_targets
+from scenefactory_jax.core import config as run_config
+from scenefactory_jax.core import trusted_targets
+from scenefactory_jax.core.config import FILE, find_commit, format_command, read_values, versions, write  # noqa: F401
 from scenefactory_jax.core.instantiate import ConfigError
 
-COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
-COMMANDS += ("weather", "export")
 # Keys whose values are lists of overrides
 LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined", r"protocol\.settings")
-FILE = "config.yaml"  # of a run's folder
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
-
-
-def format_command(name: str) -> str:
-    """How the process was called, for reports; where the files went is nobody else's business."""
-    arguments = [argument for argument in sys.argv[1:] if not argument.startswith(("out=", "hydra."))]
-    program, _, called = sys.argv[0].rpartition(" ")  # as `__main__` leaves it
-    ours = called == name and "scenefactory_jax" in Path(program).parts
-    return f"python -m scenefactory_jax {shlex.join([name, *arguments])}" if ours else f"{name}(config)"
 
 
 def find_conf() -> Path:
     """The folder of the configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
-        if (candidate / "train.yaml").is_file():
+        if (candidate / "command" / "train.yaml").is_file():
             return candidate
     raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
+
+
+def find_config_name(name: str) -> str:
+    """Returns the path of a config below `conf/`, without its suffix: `command/train`; of the environment alone, `task/environment`.
+
+    Raises:
+        ConfigError: no such command.
+    """
+    known = {path.stem: f"command/{path.stem}" for path in sorted((find_conf() / "command").glob("*.yaml"))} | {"task": "task/environment"}
+    if name not in known:
+        raise ConfigError(f"config: expected one of {', '.join(known)}, got {name!r}")
+    return known[name]
 
 
 def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
@@ -97,9 +95,7 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     Raises:
         ConfigError: see `load`.
     """
-    known = sorted(path.stem for path in find_conf().glob("*.yaml"))
-    if name not in known:
-        raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
+    find_config_name(name)
     try:
         opened = _compose(name, overrides, whole=whole)
         if not whole:
@@ -123,14 +119,14 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
     for one in OverridesParser.create().parse_overrides([quote_override(override) for override in overrides]):
         if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
             key, entry = one.key_or_group, next(iter(held))
-            way = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
-            raise ConfigError(f"{key}={{}}: changes nothing, for mappings are merged; {way}")
+            hint = f"to empty it: ~{key} +{key}={{}}; to drop one entry: {key}.{entry}=null"
+            raise ConfigError(f"{key}={{}}: mappings are merged, so an empty one changes nothing; {hint}")
 
 
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(find_conf()), version_base="1.3"):
-        return hydra_compose(name, overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
+        return hydra_compose(find_config_name(name), overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -141,7 +137,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 def _explain(name: str, error: Exception) -> str:
     """Hydra's message, and the keys that the place in question has."""
     text = str(error) + (f" ({error.__cause__})" if error.__cause__ else "")
-    text = " ".join(text.split())
+    text = " ".join(text.split()).replace("In 'command/", "In '")
     if "provider=hydra.searchpath" not in text:  # the user has named no folder: where ours lie is no news
         text = text.partition(" Config search path:")[0]
     if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
@@ -166,35 +162,16 @@ def _explain(name: str, error: Exception) -> str:
 
 
 def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
-    """The config that a run was made with (`config.yaml` of its folder), to build from.
-
-    Args:
-        trust: whether it may name functions outside of the package (`run/targets.py`); they are printed.
-
-    Raises:
-        ConfigError: no such run, naming the folder; a file that holds no config; or one that names such functions without `trust`.
-    """
-    found = read_values(path)
-    trusted_targets.check_targets(found, Path(path) / FILE, trust=trust)
-    return found
+    """Reads the config of a run's folder as `core.config.read` does, and prints the functions outside of the package that it names."""
+    config = run_config.read(path, trust=trust)
+    print_outside_targets(config, path)
+    return config
 
 
-def read_values(path: Path) -> dict[str, Any]:
-    """What a run's `config.yaml` says, to compare or to show: nothing may be built from it, for its targets are not checked.
-
-    Raises:
-        ConfigError: no such run, naming the folder; or a file that holds no config.
-    """
-    file = Path(path) / FILE
-    if not file.is_file():
-        raise ConfigError(f"{path} is no run: it has no {FILE}; give the folder that `train` wrote")
-    try:
-        found = yaml.safe_load(file.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: damaged: {' '.join(str(error).split())}; restore it from a copy") from None
-    if not isinstance(found, dict):
-        raise ConfigError(f"{file}: holds no config of a run; restore it from a copy")
-    return found
+def print_outside_targets(config: Mapping[str, Any], folder: Path) -> None:
+    """Prints the functions outside of the package that a trusted config names."""
+    if found := trusted_targets.find_outside_targets(config):
+        print(f"{Path(folder) / FILE}: trusted, and runs {', '.join(f'{target} ({key})' for key, target in found.items())}", flush=True)
 
 
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -236,44 +213,6 @@ def _task(override: str) -> dict[str, Any]:
     return load_config("task", f"+{override}" if override.startswith("policy=") else override)
 
 
-def write(path: Path, config: Mapping[str, Any]) -> None:
-    """Keep a run's config, and the commit and the versions it ran with, beside its results."""
-    Path(path).mkdir(parents=True, exist_ok=True)
-    with atomic_file.write_atomically(Path(path) / FILE) as half:  # a run without its config is lost
-        half.write_text(yaml.safe_dump(dict(config), sort_keys=False))
-    (Path(path) / "versions.yaml").write_text(yaml.safe_dump({"commit": find_commit(), **versions()}, sort_keys=False))
-
-
-def versions() -> dict[str, str]:
-    """Versions of this package and of what its numbers depend on, and the device."""
-    import jax
-
-    import scenefactory_jax
-
-    found = {"scenefactory_jax": scenefactory_jax.__version__} | {name: _version(name) for name in PACKAGES}
-    device = jax.devices()[0]
-    return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
-
-
-def find_commit() -> str:
-    """The commit that runs, as `git describe` says it; the package's version where there is no git."""
-    import scenefactory_jax
-
-    place = Path(scenefactory_jax.__file__).resolve().parent
-    asked = ["git", "-C", str(place), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(asked, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return f"version {scenefactory_jax.__version__}"
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
 def quote_override(override: str) -> str:
     """An override as Hydra's grammar wants it: `overrides=[dynamics=bicycle,weather=wet]` with its entries quoted, for it takes no bare `=`
     inside a list, and the condition of `filter=vehicles >= 8` as one text."""
@@ -310,7 +249,7 @@ def as_overrides(flags: argparse.Namespace) -> list[str]:
     """
     for word in flags.overrides:
         if "=" not in word and not word.startswith("~"):
-            raise ConfigError(f"{word}: no setting; write {word}=VALUE, or ~{word} to remove it")
+            raise ConfigError(f"{word}: expected {word}=VALUE, or ~{word} to remove it")
     own = [word for word in flags.overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath=")]
     return own if flags.config_dir is None else [*own, f"hydra.searchpath=['file://{Path(flags.config_dir).resolve()}']"]
 

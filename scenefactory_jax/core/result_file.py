@@ -1,4 +1,4 @@
-"""Results on the disk: JSON, written whole or not at all, with a digest of the settings that made it; and the records of evaluations."""
+"""Results on the disk: JSON, written whole or not at all, with a digest of the settings that made it."""
 
 import hashlib
 import json
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.core import atomic_file
-from scenefactory_jax.evaluation import agent_metrics
 
 JUDGED = "judged.json"  # what an evaluation was asked for, beside its records
 # All that an evaluation writes to its folder
@@ -72,13 +71,3 @@ def begin(folder: Path, judged: Mapping[str, Any]) -> None:
 def read_evaluated(folder: Path) -> dict[str, Any]:
     """What `begin` noted; nothing of an evaluation that did not yet."""
     return read(folder / JUDGED) if (folder / JUDGED).is_file() else {"scenes": None, "overrides": []}
-
-
-def records(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Protocol -> records of the trained policy's agents, of what an evaluation wrote to a folder; empty where none did.
-
-    Raises:
-        RecordsError: a file that holds something else.
-    """
-    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    return {name: agent_metrics.read_csv(path) for name, path in files.items() if not name.endswith("-untrained")}

@@ -18,21 +18,18 @@ PARTS += ("data.formats", "data.packing", "data.generators", "data.loading.sampl
 SHOWN = 3  # targets in a message
 
 
-def check_targets(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
-    """Refuse a config of a folder that names code outside of the package; with `trust`, print what it names instead.
+def check_targets(config: Mapping[str, Any], file: Path) -> None:
+    """Checks that the config in a folder names no code outside of the package.
 
     Raises:
         ConfigError: naming the file, the key and the target.
     """
     if not (found := find_outside_targets(config)):
         return
-    if trust:
-        print(f"{file}: trusted, and runs {', '.join(f'{target} ({place})' for place, target in found.items())}", flush=True)
-        return
-    told = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
+    shown = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
     more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     raise ConfigError(
-        f"{file}: {told}{more}: outside of {PACKAGE}, so loading it would run other code;"
+        f"{file}: {shown}{more}: outside of {PACKAGE}, so loading it would run other code;"
         " read that code first, then allow it: trust=true (in Python trust=True)"
     )
 

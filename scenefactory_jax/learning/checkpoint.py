@@ -27,7 +27,7 @@ from jaxtyping import Array
 
 from scenefactory_jax.core.instantiate import ConfigError
 
-LEARNT, AVERAGED, REST = "parameters", "averaged", "rest"  # apart, so that an evaluation reads no more than it needs
+LEARNT, AVERAGED, REST = "parameters", "ema_parameters", "rest"  # apart, so that an evaluation reads no more than it needs
 PREFIX = {LEARNT: LEARNT, AVERAGED: AVERAGED, REST: ""}  # of the names of their arrays in a train state
 FILE = "policy.npz"  # in place of checkpoints: what a policy learnt, alone
 HOST = "host"  # what the loop around the train state carries

@@ -6,6 +6,7 @@ next one there is nothing that could be saved.
 """
 
 import contextlib
+import logging
 import os
 import signal
 import stat
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
+LOG = logging.getLogger(__name__)
 STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows has no SIGHUP
 
 
@@ -36,7 +38,7 @@ def defer_interrupt() -> Iterator[Callable[[], int | None]]:
         if signal.Signals(number).name == "SIGHUP":
             _let_go_of_the_terminal()
         if not asked:
-            print("stopping after this iteration; Ctrl-C (once more) stops at once", flush=True)
+            LOG.info("stopping after this iteration; Ctrl-C (once more) stops at once")
         asked.append(number)
 
     for one in heard:
@@ -60,5 +62,5 @@ def _let_go_of_the_terminal() -> None:
 
 def end(folder: Path, iteration: int, number: int) -> NoReturn:
     """Say how the run goes on, and end it; the exception carries the signal's number."""
-    print(f"stopped at iteration {iteration}; goes on with the same settings and out={folder} resume=true", flush=True)
+    LOG.info(f"stopped at iteration {iteration}; goes on with the same settings and out={folder} resume=true")
     raise KeyboardInterrupt(number)

@@ -40,7 +40,7 @@ def control_steps(config: Mapping[str, Any]) -> int:
 
 
 def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:
-    """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
+    """`steps` control steps of all worlds, a multiple of `env.action_repeat`, with random actions, up to and with one of `ACTING`.
 
     Returns:
         A function of the worlds' state, their scenes and a key, for `jit`: the state afterwards, and a number that all went into.
@@ -49,7 +49,8 @@ def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> R
 
     def moved(scene: Scene, state: State, action: Array) -> State:
         state = replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt))
-        return replace(state, body=parts.dynamics.advance(env.now(scene, state), state.body, action, state.active), step=state.step + 1)
+        body = parts.dynamics.advance(env.current_scene(scene, state), state.body, action, state.active)
+        return replace(state, body=body, step=state.step + 1)
 
     def step(scenes: Scene, worlds: State, key: PRNGKeyArray) -> tuple[State, Array]:
         action_key, start_key = jax.random.split(key)
@@ -58,20 +59,20 @@ def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> R
         def control(worlds: State, _: None) -> tuple[State, tuple[Array, Array]]:
             if not depth:
                 return jax.vmap(moved)(scenes, worlds, action), (jnp.zeros(len(worlds.step), bool), jnp.float32(0.0))
-            after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
-            return after, (outcome.over, outcome.reward.sum())
+            after, outcome = jax.vmap(env.control_step)(scenes, worlds, action)
+            return after, (outcome.world_done, outcome.reward.sum())
 
-        after, (over, told) = jax.lax.scan(control, worlds, None, length=env.hold, unroll=env.hold == 1)
+        after, (over, told) = jax.lax.scan(control, worlds, None, length=env.action_repeat, unroll=env.action_repeat == 1)
         told = told.sum()
         if depth > 1:
-            after = tree_where(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
+            after = tree_where(over[-1], jax.vmap(env.init_state)(jax.random.split(start_key, len(worlds.step)), scenes), after)
         if depth > 2:
             seen = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # a learner would keep it: it is written out
             told += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
         return after, told
 
     def run(worlds: State, scenes: Scene, key: PRNGKeyArray) -> tuple[State, Array]:
-        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps // env.hold))
+        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps // env.action_repeat))
         return worlds, told.sum()
 
     return run

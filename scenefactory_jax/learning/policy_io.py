@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Policy, Scene
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, initial_parameters
+from scenefactory_jax.learning import checkpoint, trainer
 from scenefactory_jax.learning.training_loop import make_policy
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
@@ -55,7 +55,7 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
     key = jax.random.key(config["seed"])
     seen = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
     blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
-    return initial_parameters.draw_parameters(key, make_policy(config), blank)
+    return trainer.init_parameters(key, make_policy(config), blank)
 
 
 def find(run: str | Path) -> Path:
@@ -69,8 +69,8 @@ def find(run: str | Path) -> Path:
     shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
     if str(run) in shipped:
         return shipped[str(run)]
-    known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
-    raise ConfigError(f"{run} is no run: it has no {configs.FILE}; give the folder that `train` wrote{known}")
+    bundled = f", or a bundled policy: {', '.join(shipped)}" if shipped else ""
+    raise ConfigError(f"run: {configs.FILE} not found in {run}; expected a folder that `train` or `export` wrote{bundled}")
 
 
 def is_bundled(folder: Path) -> bool:

@@ -3,17 +3,20 @@
 import contextlib
 import datetime
 import itertools
+import logging
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.instantiate import ConfigError, find_differences
+from scenefactory_jax.core.config import find_differences
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
 
+LOG = logging.getLogger(__name__)
 MOST = 80  # letters of a sweep's changes in the name of a folder
 # What may be another when a run goes on, and all below it: nothing that was learnt rests on it
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
@@ -79,7 +82,7 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
         raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
     _check_same(folder, config)
     if last is None:
-        print(f"{folder} has no checkpoint to go on from: the run begins anew", flush=True)
+        LOG.info(f"{folder} has no checkpoint to go on from: the run begins anew")
     return last is not None
 
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.loggers import Add, Logger, Row, identity
-from scenefactory_jax.visualization.report.evaluation_report import flatten
 
 PARAMETERS = 100  # that one request may carry
 

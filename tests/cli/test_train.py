@@ -23,9 +23,11 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli import render as rendering
 from scenefactory_jax.cli.convert import convert
+from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
 from scenefactory_jax.cli.export import export, named
 from scenefactory_jax.cli.render import render
 from scenefactory_jax.cli.scenes import scenes
+from scenefactory_jax.cli.train import train
 from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
@@ -33,9 +35,8 @@ from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import agent_metrics, circumstances, failures
-from scenefactory_jax.evaluation.protocols import evaluate
 from scenefactory_jax.learning import checkpoint, interrupt, policy_io, run_folder
-from scenefactory_jax.learning.training_loop import make_policy, make_trainer, train
+from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.mujoco import offscreen_renderer
 from scenefactory_jax.visualization.report import evaluation_files
@@ -272,7 +273,7 @@ def told(report: Path):
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
-    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.ends=[goal_only]"]))
+    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.termination=[goal_only]"]))
     assert set(first.records) == {"strict", "goal_only"} and set(second.records) == {"goal_only"} and first.report.is_file()
     for again, protocol in ((second, "goal_only"), (whole, "strict")):  # strict: what training itself wrote
         assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
@@ -291,9 +292,9 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
 def test_other_settings_of_a_run(whole, tmp_path):
     short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
-    changed = judged(whole, tmp_path / "short", *small, "protocol.ends=[goal_only]", short)
+    changed = judged(whole, tmp_path / "short", *small, "protocol.termination=[goal_only]", short)
     assert set(changed.records) == {"goal_only"} and changed.records["goal_only"]["time_s"].max() <= 1.0
-    assert told(changed.report) == {**asked(whole, None, *small, "protocol.ends=[goal_only]", short), "out": None}
+    assert told(changed.report) == {**asked(whole, None, *small, "protocol.termination=[goal_only]", short), "out": None}
     assert changed.report.read_text().startswith("# smoke: evaluation on scenes not seen in training\n")
     assert (tmp_path / "short" / "video.gif").is_file()
     assert hydra_config.read(whole.folder)["timing"]["episode_s"] == 2
@@ -301,11 +302,11 @@ def test_other_settings_of_a_run(whole, tmp_path):
         "overrides=[timing.episode=1]": "timing.episode: the run has no 'episode' there; valid: control_hz, episode_s, physics_hz",
         "overrides=[wether=wet]": "the run has no 'wether' there; valid: .*weather",
         "overrides=[weather=foggy]": "Could not find 'weather/foggy' Available options in 'weather': base .* dry .* mixed .* wet",
-        "protocol.ends=[perhaps]": r"protocol\.ends: \['perhaps'\]; valid: one or more of goal_only, strict",
+        "protocol.termination=[perhaps]": r"protocol\.termination: \['perhaps'\]; valid: one or more of goal_only, strict",
     }.items():
         with pytest.raises(ConfigError, match=message):
             judged(whole, tmp_path / "bad", override)
-    with pytest.raises(ConfigError, match=r"is no run: it has no config\.yaml"):
+    with pytest.raises(ConfigError, match=r"config\.yaml not found in"):
         evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
 
 
@@ -329,11 +330,11 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     assert trained.folder == kept and trained.config["observations"] == whole.config["observations"]
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
     again = evaluate(
-        hydra_config.load_config("evaluate", "run=handy", "protocol.ends=[strict]", "video.enable=false", "failures.pictures.enable=false")
+        hydra_config.load_config("evaluate", "run=handy", "protocol.termination=[strict]", "video.enable=false", "failures.pictures.enable=false")
     )
     assert again.folder == Path("runs/handy/evaluation")
     assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
-    with pytest.raises(ConfigError, match=r"hand is no run: .*, or one of the package's own: handy"):
+    with pytest.raises(ConfigError, match=r"not found in hand; .*, or a bundled policy: handy"):
         scenefactory_jax.load_policy("hand")
     with pytest.raises(ConfigError, match=r"card\.judged\.nothing: \S+ holds no records of agents; give a folder that `evaluate` wrote"):
         export(hydra_config.load_config("export", "run=handy", f"out={tmp_path / 'other'}", f"card.judged={{nothing: {tmp_path}}}"))
@@ -348,9 +349,7 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
     assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
     assert named("unseen", whole.folder) == "unseen"
     assert evaluation_files.title("mine", asked) == "mine: evaluation on towns.bank"
-    assert evaluation_files.format_rerun_command(
-        asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")
-    ) == (
+    assert format_rerun_command(asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")) == (
         "python -m scenefactory_jax evaluate run=mine protocol=recorded trust=true scenes.path=/data/towns.bank"
         " 'overrides=[\"dynamics=bicycle\"]' seed=7"
     )
@@ -476,7 +475,7 @@ def test_help_lists_the_commands(monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         command_line.main()
     printed = capsys.readouterr().out
-    assert stopped.value.code == 0 and all(f"\n  {name} " in printed for name in hydra_config.COMMANDS)
+    assert stopped.value.code == 0 and all(f"\n  {name} " in printed for name in command_line.COMMANDS)
 
 
 def test_an_interrupted_command_ends_as_shells_expect(monkeypatch, interruptible, tmp_path):
@@ -506,29 +505,29 @@ def test_a_wrong_value_ends_as_one_line():
     words = ["run=/nowhere", "overrides=[dynamics=bicycle,weather=wet]"]  # a list that Hydra alone would not read
     done = shell(ROOT, "evaluate", *words, timeout=120, JAX_PLATFORMS="cpu")
     assert done.returncode == 2 and not done.stdout and "Traceback" not in done.stderr
-    wanted = "give the folder that `train` wrote, or one of the package's own: town"
-    assert done.stderr == f"error: /nowhere is no run: it has no config.yaml; {wanted}\n"
+    expected = "expected a folder that `train` or `export` wrote, or a bundled policy: town"
+    assert done.stderr == f"error: run: config.yaml not found in /nowhere; {expected}\n"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "worlds=many"], "error: worlds: 'many' is of type str, wanted int"),
+        (["train", "worlds=many"], "error: worlds: expected an integer, got 'many'"),
         (["train", "scenes.path=/nowhere", "experiment=smoke"], "error: /nowhere: no such file or folder"),
         (["evaluate"], "error: run: missing; give run=..., as `evaluate --help` describes it"),
-        (["train", "seed"], "error: seed: no setting; write seed=VALUE"),
-        (["train", "reward={}"], "error: reward={}: changes nothing, for mappings are merged; to empty it: ~reward +reward={}"),
+        (["train", "seed"], "error: seed: expected seed=VALUE, or ~seed to remove it"),
+        (["train", "reward={}"], "error: reward={}: mappings are merged, so an empty one changes nothing; to empty it: ~reward +reward={}"),
         (["train", "--foo"], "error: unrecognized arguments: --foo; --hydra-help describes the flags"),
         (["train", "--cfg", "jobs"], "error: argument --cfg/-c: invalid choice: 'jobs'"),
-        (["train", "--resolve"], "error: --resolve: goes with --cfg job"),
-        (["evaluate", "run=/nowhere"], "error: /nowhere is no run"),
+        (["train", "--resolve"], "error: --resolve: expected --cfg job beside it"),
+        (["evaluate", "run=/nowhere"], "error: run: config.yaml not found in /nowhere"),
         (["convert", "source=/nowhere"], "error: out: missing"),
         (["convert", "source=/nowhere", "out=x"], "error: /nowhere: no such file or folder"),
         (["train", "experiment=smoke", f"out={'x' * 300}"], "xxx: File name too long"),
         (["train", "loggers=[tensorbord]"], "error: loggers: unknown option 'tensorbord'; valid: mlflow, tensorboard, wandb"),
         (["train", "-m", "ppo.horizn=3,4", "seed=interval(0,1)"], "error: ppo.horizn: unknown key 'horizn'; ppo has: "),
-        (["evaluate", "-m", "run=runs/mine", "seed=1,2"], "error: out: the jobs of this sweep would write to one folder"),
-        (["drive-away"], "unknown command 'drive-away'; valid: train, evaluate"),
+        (["evaluate", "-m", "run=runs/mine", "seed=1,2"], "error: out: expected a folder for each job of this sweep"),
+        (["drive-away"], "error: command: expected one of train, evaluate"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsys, tmp_path):
@@ -536,7 +535,7 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
 
     def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
+        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name.rpartition("/")[2], *arguments[1:])))
 
     monkeypatch.setattr("hydra.main", composing)
     with pytest.raises(SystemExit) as stopped:
@@ -590,7 +589,7 @@ def test_every_way_to_spread_work_builds(name):
 @pytest.mark.parametrize("name", names("suite"))
 def test_what_a_suite_says_counts(name):
     said = {key: value for key, value in OmegaConf.load(hydra_config.find_conf() / "suite" / f"{name}.yaml").items() if key != "defaults"}
-    found = hydra_config.load_config("bench", f"suite={name}")
+    found = hydra_config.load_config("benchmark", f"suite={name}")
     assert said["variants"].keys() <= found["variants"].keys()
     assert {key: found[key] for key in said if key != "variants"} == {key: said[key] for key in said if key != "variants"}
 
@@ -612,7 +611,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     if name == "trained":
         assert judged == runs
         return
-    own = ("observations", "actions", "termination")  # what the policy learnt to see and to do; how agents end is `protocol.ends`
+    own = ("observations", "actions", "termination")  # what the policy learnt to see and to do; how agents end is `protocol.termination`
     for group in set(environment.GROUPS) - set(own):
         assert judged[0][group] == judged[1][group], group
     assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load_config("train", "scenes=womd")["scenes"]["pack"]
@@ -635,4 +634,4 @@ def test_episodes_are_described():
 @pytest.mark.parametrize("name", names("experiment"))
 def test_every_experiment_builds(name):
     builds(hydra_config.load_config("train", f"experiment={name}"))
-    assert hydra_config.load_config("bench", f"experiment={name}")["ppo"] == hydra_config.load_config("train", f"experiment={name}")["ppo"]
+    assert hydra_config.load_config("benchmark", f"experiment={name}")["ppo"] == hydra_config.load_config("train", f"experiment={name}")["ppo"]
