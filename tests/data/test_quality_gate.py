@@ -17,10 +17,10 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.generators.town import town_scene
 from scenefactory_jax.roadgraph import lane_topology
 
-QUALITY = hydra_config.load_config("quality")["quality"]
+QUALITY = hydra_config.load_config("scenes")["quality"]
 STREETS = hydra_config.load_config("scenes")["scenes"]["generate"]
 RULES = quality_gate.make(QUALITY["rules"])
-rebuild = instantiate(hydra_config.load_config("quality")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
+rebuild = instantiate(hydra_config.load_config("scenes")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
 LOG = 91
 ALONG = np.arange(0.0, 121.0)
 

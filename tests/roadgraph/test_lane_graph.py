@@ -15,7 +15,7 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.generators.town import town_scene
 from scenefactory_jax.roadgraph import lane_graph, lane_topology, routes
 
-NUMBERS = hydra_config.load_config("quality")["lanes"]
+NUMBERS = hydra_config.load_config("scenes")["lanes"]
 STREETS = hydra_config.load_config("scenes")["scenes"]["generate"]
 KINDS = len(STREETS["kinds"])
 

@@ -2,10 +2,12 @@
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.core.schema import ConfigError, Fraction
 from scenefactory_jax.data.generators.curves import heading, wrap_angle
 from scenefactory_jax.data.generators.town.intersections import OPPOSITE, Arm, Control
 from scenefactory_jax.data.generators.town.road_network import Block, Joint, Network, Port, assemble
@@ -25,16 +27,21 @@ class BlockMakers(NamedTuple):
     parking_lot: Callable[..., Block]
 
 
-class JunctionNumbers(NamedTuple):
+@dataclass(frozen=True)
+class JunctionNumbers:
     """Numbers of the config from which junctions are drawn."""
 
-    roundabout_fraction: float  # of junctions that can be one
-    signal_fraction: tuple[float, ...]  # by the rank of the second street at a junction
-    all_way_fraction: float  # of junctions without lights that have stop signs on all arms
-    bay_fraction: float  # of arms at lights that gain a lane on the way in
-    drop_fraction: float  # of arms at lights that drop a lane on the way out
+    roundabout_fraction: Fraction  # of junctions that can be one
+    signal_fraction: list[Fraction]  # by the rank of the second street at a junction
+    all_way_fraction: Fraction  # of junctions without lights that have stop signs on all arms
+    bay_fraction: Fraction  # of arms at lights that gain a lane on the way in
+    drop_fraction: Fraction  # of arms at lights that drop a lane on the way out
     bay_room_m: float  # length of street that a gained lane needs
     skew_deg: float  # maximum angle between an arm and the straight way to the next junction
+
+    def __post_init__(self) -> None:
+        if not self.signal_fraction:
+            raise ConfigError("signal_fraction: expected one number or more, got []")
 
 
 def build_network(

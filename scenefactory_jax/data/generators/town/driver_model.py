@@ -5,11 +5,13 @@ microscopic simulations", 2000). A road user that has to give way goes if the co
 would be there at the same time. Otherwise it stops before the stretch, or follows the other where the paths run together.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from scenefactory_jax.core.schema import Positive
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path
 from scenefactory_jax.data.generators.town.path_conflicts import ROW_M, PathProjections, Zones, stack_columns
 from scenefactory_jax.data.generators.town.traffic_lights import CLOSED, CLOSING, SIGN
@@ -31,19 +33,20 @@ class Users(NamedTuple):
     enters: Float[np.ndarray, " N"]  # earliest time, s; a road user enters when there is room
 
 
-class DriverParameters(NamedTuple):
+@dataclass(frozen=True)
+class DriverParameters:
     """Parameters of the driver model, SI units."""
 
-    acceleration: float
-    braking: float  # comfortable
-    max_braking: float
-    headway_s: float
-    gap_m: float  # between standing cars
-    line_gap_m: float  # to a stop line or a stretch where the driver gives way
-    margin_s: float  # between two road users on a crossing stretch
-    merge_s: float  # headway that a road user with the right of way must have behind a merging one
-    stop_sign_s: float  # standing time at a stop sign
-    min_look_ahead_m: float  # distance within which meeting paths matter
+    acceleration: Positive
+    braking: Positive  # comfortable
+    max_braking: Positive
+    headway_s: Positive
+    gap_m: Positive  # between standing cars
+    line_gap_m: Positive  # to a stop line or a stretch where the driver gives way
+    margin_s: Positive  # between two road users on a crossing stretch
+    merge_s: Positive  # headway that a road user with the right of way must have behind a merging one
+    stop_sign_s: Positive  # standing time at a stop sign
+    min_look_ahead_m: Positive  # distance within which meeting paths matter
 
 
 class Motion(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.schema import ConfigError, Fraction, Positive
 from scenefactory_jax.core.types import LANE_BIKE
 from scenefactory_jax.data.generators.curves import FINE_M, Points, connect, curvature, heading, wrap_angle
 from scenefactory_jax.data.generators.ranges import check_range, draw
@@ -79,9 +79,9 @@ def intersection(
     control: Control,
     *,
     corner_radius_m: list[float],
-    turn_radius_m: float,
+    turn_radius_m: Positive,
     crosswalk_m: list[float],
-    crosswalk_fraction: float,
+    crosswalk_fraction: Fraction,
 ) -> Block:
     """Builds an intersection, large enough for turns with a minimum radius.
 
@@ -297,7 +297,7 @@ def roundabout(
     ring_width_m: list[float],
     split_deg: float,
     crosswalk_m: list[float],
-    crosswalk_fraction: float,
+    crosswalk_fraction: Fraction,
 ) -> Block:
     """Builds a ring with one lane, driven counter-clockwise; traffic on the ring goes first.
 

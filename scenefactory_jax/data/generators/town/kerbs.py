@@ -3,8 +3,8 @@
 import shapely
 from shapely.geometry.polygon import orient
 
+from scenefactory_jax.core.schema import Positive
 from scenefactory_jax.data.generators.curves import Points
-from scenefactory_jax.data.generators.ranges import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
 
 SIMPLIFY_M = 0.03  # maximum distance of a simplified edge from the boundary
@@ -12,7 +12,7 @@ MIN_EDGE_M = 1.0
 
 
 def boundary(
-    network: Network, reach: float, *, rounding_m: float, island_m2: float, block_m2: float, spacing_m: float
+    network: Network, reach: float, *, rounding_m: Positive, island_m2: float, block_m2: float, spacing_m: Positive
 ) -> tuple[list[Points], list[Points], shapely.Geometry]:
     """Computes road edges within the square of half side `reach`, with the paved surface on their left.
 
@@ -24,12 +24,7 @@ def boundary(
 
     Returns:
         Outer edges, edges of islands and medians, and the surface.
-
-    Raises:
-        ConfigError: a number that is not above zero.
     """
-    check_positive(rounding_m, "kerbs.rounding_m")
-    check_positive(spacing_m, "kerbs.spacing_m")
     paved = shapely.union_all([area if shapely.is_valid(area) else shapely.buffer(area, 0.0) for area in network.areas])
     paved = paved.simplify(SIMPLIFY_M).buffer(rounding_m, quad_segs=8).buffer(-rounding_m, quad_segs=8)
     solid = []

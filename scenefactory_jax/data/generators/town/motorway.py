@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import shapely
 
+from scenefactory_jax.core.schema import Fraction, Positive
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, integrate
 from scenefactory_jax.data.generators.ranges import draw, draw_count
@@ -18,18 +19,18 @@ RAMP_LEAD_M, RAMP_EASING_M = 5.0, 30.0  # of the bend of a ramp
 def motorway(
     rng: np.random.Generator,
     *,
-    length_m: float,
+    length_m: Positive,
     lanes: list[int],
     lane_width_m: float,
     median_m: list[float],
     speed_limit_mps: list[float],
-    bend_radius_m: float,
+    bend_radius_m: Positive,
     offset_m: float,
     join_m: list[float],
     leave_m: list[float],
     auxiliary_m: list[float],
     taper_m: float,
-    ramp_fraction: float,
+    ramp_fraction: Fraction,
     ramp_turn_deg: list[float],
     ramp_radius_m: float,
     ramp_limit_mps: float,

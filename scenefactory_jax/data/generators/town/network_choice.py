@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
-from scenefactory_jax.data.generators.ranges import check_range, fill
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.schema import ConfigError, Fraction
+from scenefactory_jax.data.generators.ranges import check_range, read_group
 from scenefactory_jax.data.generators.town.build_network import BlockMakers, JunctionNumbers, build_network
 from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, Network, Street
 from scenefactory_jax.data.generators.town.road_segments import RoadDimensions
@@ -24,7 +25,7 @@ def draw_network(
     *,
     plans: Mapping[str, Any],
     motorway: Mapping[str, Any],
-    motorway_fraction: float,
+    motorway_fraction: Fraction,
     streets: Mapping[str, Mapping[str, Any] | None],
     driveway: Mapping[str, float],
     lots: Mapping[str, Any],
@@ -67,9 +68,7 @@ def draw_network(
         }
     )
     add_lots = instantiate(lots, builtins=f"{PACKAGE}.street_plan", where=f"{WHERE}.lots")
-    dimensions, numbers = fill(RoadDimensions, roads, f"{WHERE}.roads"), fill(JunctionNumbers, junctions, f"{WHERE}.junctions")
-    if not numbers.signal_fraction:
-        raise ConfigError(f"{WHERE}.junctions.signal_fraction: expected one number or more, got []")
+    dimensions, numbers = read_group(roads, RoadDimensions, f"{WHERE}.roads"), read_group(junctions, JunctionNumbers, f"{WHERE}.junctions")
     if kind == "motorway" or (kind is None and rng.random() < motorway_fraction):
         return "motorway", instantiate(motorway, builtins=f"{PACKAGE}.motorway", where=f"{WHERE}.motorway")(rng)
     kind = kind or str(rng.choice(list(make)))
@@ -82,7 +81,7 @@ def draw_network(
 def _make_class(name: str, rank: int, numbers: Mapping[str, Any]) -> StreetClass:
     """Makes a class of streets from its config entry; at junctions a higher rank goes first."""
     where = f"{WHERE}.streets.{name}"
-    street_class = fill(StreetClass, numbers, where, name=name, rank=rank)
+    street_class = read_group({"name": name, "rank": rank, **numbers}, StreetClass, where)
     check_range(street_class.lanes, f"{where}.lanes", low=1.0)
     check_range(street_class.lane_width_m, f"{where}.lane_width_m", low=MIN_LANE_WIDTH_M)
     check_range(street_class.speed_limit_mps, f"{where}.speed_limit_mps", low=1.0)

@@ -1,6 +1,7 @@
 """Builds roads between ports: straight or curved, with lanes gained before a junction and dropped behind one."""
 
 import itertools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +42,8 @@ MIN_PARKING_ROAD_M = 40.0  # length of a road with parking spaces
 Pose = tuple[Float[np.ndarray, " 2"], float]
 
 
-class RoadDimensions(NamedTuple):
+@dataclass(frozen=True)
+class RoadDimensions:
     """Dimensions of all roads of a town."""
 
     bay_m: float  # length of a gained lane before a junction

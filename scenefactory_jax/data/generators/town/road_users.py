@@ -1,11 +1,13 @@
 """Draws the road users of a town and their paths: cars, cyclists, pedestrians."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
+from scenefactory_jax.core.schema import Fraction
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET, RoadUser
 from scenefactory_jax.data.generators.curves import FINE_M, Points, arc_length, interpolate, right_normals
 from scenefactory_jax.data.generators.ranges import draw, draw_count
@@ -29,35 +31,38 @@ class SimulatedUser(NamedTuple):
     enters: float
 
 
-class DrivingNumbers(NamedTuple):
+@dataclass(frozen=True)
+class DrivingNumbers:
     """Numbers of the cars and their drivers."""
 
     size_m: list[list[float]]  # ranges of length, width and height
     max_first_start_m: float  # maximum distance of the first car from the middle, along each axis
     start_gap_m: float  # between cars at the start of the warm-up
-    arriving_fraction: float  # of the cars that enter later
-    parking_lot_fraction: float  # density of starts in parking lots over that on streets
+    arriving_fraction: Fraction  # of the cars that enter later
+    parking_lot_fraction: Fraction  # density of starts in parking lots over that on streets
     speed_limit_fraction: list[float]  # that drivers keep to
     lateral_mps2: float  # maximum in bends
     braking_mps2: float  # before bends
-    lane_change_fraction: float  # probability of a lane change on a lane that is long enough
+    lane_change_fraction: Fraction  # probability of a lane change on a lane that is long enough
     lane_change_m: list[float]  # length of a lane change
 
 
-class CyclistNumbers(NamedTuple):
+@dataclass(frozen=True)
+class CyclistNumbers:
     """Numbers of the cyclists."""
 
     count: list[int]
-    size_m: tuple[float, float, float]  # length, width, height
+    size_m: list[float]  # length, width, height
     speed_mps: list[float]
 
 
-class PedestrianNumbers(NamedTuple):
+@dataclass(frozen=True)
+class PedestrianNumbers:
     """Numbers of the pedestrians: crossers use crosswalks, strollers walk along kerbs."""
 
     crossers: list[int]
     strollers: list[int]
-    size_m: tuple[float, float, float]  # length, width, height
+    size_m: list[float]  # length, width, height
     speed_mps: list[float]
     pavement_m: list[float]  # distance from the kerb
 
@@ -65,7 +70,12 @@ class PedestrianNumbers(NamedTuple):
 def draw_size(rng: np.random.Generator, size_m: list[list[float]]) -> tuple[float, float, float]:
     """Draws length, width and height of a car from their ranges, all at the same fraction of the range."""
     fraction = rng.beta(2.0, 3.0)
-    length, width, height = (low + fraction * (high - low) for low, high in size_m)
+    return to_size([low + fraction * (high - low) for low, high in size_m])
+
+
+def to_size(size_m: list[float]) -> tuple[float, float, float]:
+    """Returns length, width and height from a list."""
+    length, width, height = size_m
     return length, width, height
 
 
@@ -163,7 +173,7 @@ def draw_cyclists(
         if path is not None:
             speed = draw(rng, cyclists.speed_mps, "traffic.cyclists.speed_mps")
             path = path._replace(speed=np.minimum(path.speed, speed))
-            users.append(SimulatedUser("cyclist", cyclists.size_m, path, speed, -np.inf))
+            users.append(SimulatedUser("cyclist", to_size(cyclists.size_m), path, speed, -np.inf))
     return users
 
 
@@ -184,7 +194,7 @@ def draw_crossers(
         gate = (before, len(network.stops) + index) if crosswalk.junction in network.phases else None
         path = walk(np.stack([ends[0] - before * ahead, ends[1] + after * ahead]) + side, speed, crosswalk=gate)
         enters = float(rng.uniform(times[0], LAST_CROSSING * times[-1]))
-        users.append(SimulatedUser("pedestrian", people.size_m, path, speed, enters))
+        users.append(SimulatedUser("pedestrian", to_size(people.size_m), path, speed, enters))
     return users
 
 

@@ -2,13 +2,14 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.schema import ConfigError, Fraction
 from scenefactory_jax.data.generators.curves import heading
 from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count
 from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, DOUBLE_YELLOW, SOLID_YELLOW, Street
@@ -19,7 +20,8 @@ CLEARANCE_M = 24.0  # between the middle of a street and a parking lot beside it
 BEYOND_M = 15.0  # length of road beyond the square with kerbs, so that no kerb crosses the end of a road
 
 
-class StreetClass(NamedTuple):
+@dataclass(frozen=True)
+class StreetClass:
     """Ranges and fractions from which the streets of a class are drawn."""
 
     name: str
@@ -28,10 +30,10 @@ class StreetClass(NamedTuple):
     lane_width_m: list[float]
     speed_limit_mps: list[float]
     median_m: list[float]
-    median_fraction: float
-    bike_fraction: float
+    median_fraction: Fraction
+    bike_fraction: Fraction
     bike_width_m: float
-    parking_fraction: float
+    parking_fraction: Fraction
     parking_width_m: float
 
 
@@ -168,7 +170,7 @@ def grid(
     offset_m: float,
     jitter_m: float,
     shear_deg: float,
-    keep_fraction: float,
+    keep_fraction: Fraction,
     inset_m: float,
 ) -> Plan | None:
     """Draws a grid of streets with gaps; None if the middle crossing lies outside of the square.
@@ -265,7 +267,7 @@ def add_lots(
     *,
     max_count: int,
     size_m: list[float],
-    fraction: float,
+    fraction: Fraction,
     room_m: float,
 ) -> Plan:
     """Adds parking lots behind driveways to the straight streets of a plan, where there is room.

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number, instantiate
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
+from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
-from scenefactory_jax.data.generators.ranges import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, draw_town
 from scenefactory_jax.data.generators.town.traffic import TownUser
@@ -26,20 +26,20 @@ def generate(
     index: int,
     *,
     kinds: list[str] | None,
-    reach_m: float,
+    reach_m: Positive,
     network: Mapping[str, Any],
     kerbs: Mapping[str, Any],
     driveways: Mapping[str, Any],
     traffic_lights: Mapping[str, Any],
     traffic: Mapping[str, Any],
-    lane_spacing_m: float,
-    line_spacing_m: float,
+    lane_spacing_m: Positive,
+    line_spacing_m: Positive,
     log_steps: int,
     log_current: int,
-    log_dt: float,
-    warmup_s: float,
-    max_sdc_distance_m: float,
-    sensor_range_m: float,
+    log_dt: Positive,
+    warmup_s: NonNegative,
+    max_sdc_distance_m: Positive,
+    sensor_range_m: Positive,
 ) -> RawScene:
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
@@ -67,10 +67,6 @@ def generate(
         raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
     if not 0 <= log_current < log_steps - 1:
         raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
-    check_number(warmup_s, where="generate.warmup_s", least=0)
-    numbers = {"reach_m": reach_m, "lane_spacing_m": lane_spacing_m, "line_spacing_m": line_spacing_m, "log_dt": log_dt}
-    for name, value in numbers.items():
-        check_positive(value, f"generate.{name}")
     modules = {"network": "network_choice"}  # of other entries: of the same name
     entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
     parts = TownParts(

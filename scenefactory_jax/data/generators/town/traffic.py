@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.generators.curves import Points, arc_length, heading, interpolate
-from scenefactory_jax.data.generators.ranges import check_positive, check_range, draw, draw_count, fill
+from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count, read_group
 from scenefactory_jax.data.generators.town import road_users
 from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
@@ -76,12 +76,10 @@ def populate(
     """
     for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_fraction, "parked_fraction")):
         check_range(span, f"traffic.{name}")
-    parameters = fill(DriverParameters, driver, "traffic.driver")
-    for name, value in parameters._asdict().items():
-        check_positive(value, f"traffic.driver.{name}")
-    drive = fill(road_users.DrivingNumbers, driving, "traffic.driving")
-    walk = fill(road_users.PedestrianNumbers, pedestrians, "traffic.pedestrians")
-    cycle = fill(road_users.CyclistNumbers, cyclists, "traffic.cyclists")
+    parameters = read_group(driver, DriverParameters, "traffic.driver")
+    drive = read_group(driving, road_users.DrivingNumbers, "traffic.driving")
+    walk = read_group(pedestrians, road_users.PedestrianNumbers, "traffic.pedestrians")
+    cycle = read_group(cyclists, road_users.CyclistNumbers, "traffic.cyclists")
     simulated = [
         *road_users.draw_cars(rng, network, draw_count(rng, cars), times, reach, drive),
         *road_users.draw_cyclists(rng, network, times, reach, drive, cycle),
@@ -89,7 +87,11 @@ def populate(
     ]
     strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), walk)
     parked = _park(rng, network, draw(rng, parked_fraction, "traffic.parked_fraction"), drive.size_m, times)
-    users = [*_simulate(simulated, gates, times, parameters), *(_stroll(*stroll, walk.size_m, times) for stroll in strolls), *parked]
+    users = [
+        *_simulate(simulated, gates, times, parameters),
+        *(_stroll(*stroll, road_users.to_size(walk.size_m), times) for stroll in strolls),
+        *parked,
+    ]
     users = [_limit_travel(user, times, travel_m[1]) for user in users]
     return separate_users([user for user in users if user.kind != "vehicle" or _is_on_road(user, surface, reach)])
 

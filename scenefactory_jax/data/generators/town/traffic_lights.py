@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES
-from scenefactory_jax.data.generators.ranges import check_positive, draw
+from scenefactory_jax.core.schema import Positive
+from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.road_network import Network
 
 LIGHTS = {False: ("go", "caution", "stop"), True: ("arrow_go", "arrow_caution", "arrow_stop")}  # by whether it is an arrow
@@ -28,7 +29,7 @@ def draw_gates(
     green_s: list[float],
     yellow_s: list[float],
     clear_s: list[float],
-    walk_mps: float,
+    walk_mps: Positive,
 ) -> Gates:
     """Draws a cycle for every junction with lights, with a random start.
 
@@ -39,7 +40,6 @@ def draw_gates(
     Raises:
         ConfigError: a number out of range.
     """
-    check_positive(walk_mps, "generate.traffic_lights.walk_mps")
     state = np.full((len(network.stops) + len(network.crosswalks), len(times)), OPEN)
     light = np.full(state.shape, -1)
     for index, stop in enumerate(network.stops):
