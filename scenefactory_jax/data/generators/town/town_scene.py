@@ -1,7 +1,7 @@
 """Generates a random town in the form of a logged scene."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -13,12 +13,47 @@ from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
 from scenefactory_jax.data.generators.town.road_network import Network
-from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, draw_town
-from scenefactory_jax.data.generators.town.traffic import TownUser
+from scenefactory_jax.data.generators.town.traffic import TownUser, add_warmup, measure_travel
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.data.generators.town"
 MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
+MAX_TRAFFIC_REDRAWS = 3  # on one network
+
+
+class TownParts(NamedTuple):
+    """Functions that build a town, bound to their numbers; see `generate`."""
+
+    network: Callable[..., tuple[str, Network] | None]
+    kerbs: Callable[..., tuple[list[Points], list[Points], object]]
+    driveways: Callable[..., tuple[list[Points], list]]
+    gates: Callable[..., Gates]
+    traffic: Callable[..., list[TownUser]]
+
+
+class Log(NamedTuple):
+    """Numbers of the log; see `generate`."""
+
+    times: Float[np.ndarray, " L"]
+    current: int
+    warmup_s: float
+    max_sdc_distance_m: float
+    sensor_range_m: float
+    min_travel_m: float  # of a moving car, from the current step on
+    min_cars: int  # moving cars within the sensor range
+
+
+class Town(NamedTuple):
+    """A road network with its surroundings and its traffic."""
+
+    kind: str
+    network: Network
+    outer: list[Points]
+    islands: list[Points]
+    driveways: list[Points]
+    gates: Gates
+    users: list[TownUser]
+    sdc: int  # index into users
 
 
 def generate(
@@ -76,10 +111,50 @@ def generate(
     log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, traffic["travel_m"][0], traffic["cars"][0])
     kind = kinds[index % len(kinds)] if kinds else None
     for redraw in range(MAX_REDRAWS):
-        town = draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), kind, reach_m, parts, log)
+        town = _draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), kind, reach_m, parts, log)
         if town is not None:
             return _to_scene(town, log, seed, index, lane_spacing_m, line_spacing_m)
     raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
+
+
+def _draw_town(rng: np.random.Generator, kind: str | None, reach: float, parts: TownParts, log: Log) -> Town | None:
+    """Draws a town; None if its plan cannot be built or too few cars move."""
+    drawn = parts.network(rng, reach, kind)
+    if drawn is None:
+        return None
+    kind, network = drawn
+    outer, islands, surface = parts.kerbs(network, reach)
+    pavements = [] if kind == "motorway" else outer
+    driveways, spots = parts.driveways(rng, network, pavements, surface)
+    network = network._replace(spots=[*network.spots, *spots])
+    times = add_warmup(log.times, log.warmup_s)
+    gates = parts.gates(rng, network, times)
+    for _ in range(MAX_TRAFFIC_REDRAWS):
+        recorded = _record(rng, parts.traffic(rng, network, pavements, surface, reach, times, gates), log)
+        if recorded is not None:
+            return Town(kind, network, outer, islands, driveways, gates, *recorded)
+    return None
+
+
+def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[list[TownUser], int] | None:
+    """Chooses the recording car near the middle and limits the log to its sensor range.
+
+    Returns:
+        The users in range and the index of the recording car; None if too few cars move.
+    """
+    now, logs = log.current, [user.since(-len(log.times)) for user in users]
+    moving = [i for i, u in enumerate(logs) if u.kind == "vehicle" and u.valid[now] and measure_travel(u, now) > log.min_travel_m]
+    near = [i for i in moving if np.abs(logs[i].position[now]).max() <= log.max_sdc_distance_m and logs[i].valid[: now + 1].all()]
+    near = [i for i in near if logs[i].valid.all()] or near
+    if not near:
+        return None
+    sdc = int(rng.choice(near))
+    origin = logs[sdc].position
+    if sum(np.linalg.norm(logs[i].position[now] - origin[now]) <= log.sensor_range_m for i in moving) < log.min_cars:
+        return None
+    logs = [u._replace(valid=u.valid & (np.linalg.norm(u.position - origin, axis=1) <= log.sensor_range_m)) for u in logs]
+    kept = [i for i, user in enumerate(logs) if user.valid.any()]
+    return [logs[i] for i in kept], kept.index(sdc)
 
 
 def _to_scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, line_spacing: float) -> RawScene:
