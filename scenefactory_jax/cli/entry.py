@@ -1,6 +1,6 @@
 """Runs a command from its arguments: composes the config, calls one function, and ends user errors as one line with exit code 2.
 
-    entry.run("validate", validate)    # in a program: the arguments are those of the process
+entry.run("validate", validate)    # in a program: the arguments are those of the process
 """
 
 import os
@@ -58,8 +58,8 @@ def _run(name: str, function: Function, arguments: Sequence[str], about: str) ->
     elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
         varied = _check(name, configs.as_overrides(flags), sweeps=flags.multirun)
     sys.argv = [f"{sys.argv[0]} {name}", *map(configs.quote_override, arguments)]
-    path = flags.config_name or configs.find_config_name(name)
-    hydra.main(version_base="1.3", config_path=str(configs.find_conf()), config_name=path)(_make_job(name, function, varied))()
+    folder = str(configs.find_conf() / "command")
+    hydra.main(version_base="1.3", config_path=folder, config_name=flags.config_name or name)(_make_job(name, function, varied))()
 
 
 def _format_help(name: str, overrides: Sequence[str], about: str) -> str:

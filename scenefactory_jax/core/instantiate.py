@@ -1,9 +1,9 @@
-"""A config entry -> a function with its numbers bound.
+"""Binds the numbers of a config entry to the function that its `_target_` names: the one extension mechanism.
 
-The one extension mechanism. An entry is a mapping with `_target_` and numbers: `{_target_: my_terms.jerk, limit: 3.0}`. A target without a
-dot is looked up among the built-ins of a module, a dotted one is imported; of the package's own modules only what they define counts, not
-what they import. The numbers must be the function's keyword-only parameters, all
-of them, with the annotated types: a misspelt, missing or mistyped key fails here, by name, with what would be valid.
+    reward.jerk: {_target_: my_terms.jerk, weight: -0.1, limit: 3.0}
+
+A target without a dot is a public function of a given module. A dotted target is imported; of a module of this package, only functions that
+it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`).
 """
 
 import functools
@@ -19,19 +19,19 @@ from scenefactory_jax.core.schema import Bounds, ConfigError, Fraction, check_na
 
 
 def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
-    """Bind the numbers of `entry` to the function that `_target_` names.
+    """Returns the function that `_target_` names with the numbers of `entry` bound.
 
     Args:
         entry: mapping with `_target_`, and a value for every keyword-only parameter of the target.
-        builtins: module in which a target without a dot is looked up.
-        where: the entry's place in the config, for messages ("reward.progress").
+        builtins: module of targets without a dot.
+        where: key of the entry, for messages ("reward.progress").
         context: values that the program supplies to targets that declare them (time steps, grip): they need no key.
 
     Raises:
         ConfigError: no or unknown target, an unknown or missing key, a value of the wrong type.
     """
     if not isinstance(entry, Mapping) or "_target_" not in entry:
-        raise ConfigError(f"{where}: {entry!r} is no entry; write a mapping with `_target_` and its numbers")
+        raise ConfigError(f"{where}: expected a mapping with `_target_` and its numbers, got {entry!r}")
     function = resolve_target(entry["_target_"], builtins=builtins, where=where)
     parameters = {p.name: p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY}
     numbers = {key: value for key, value in entry.items() if key != "_target_"}
@@ -46,14 +46,14 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
 
 
 def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
-    """The function that `target` names: a public one of `builtins`, or a dotted path to import.
+    """Finds the function that `target` names: a public one of `builtins`, or a dotted path.
 
     Raises:
-        ConfigError: no such function, or one that a module of the package only imports.
+        ConfigError: no such function, or one that a module of this package only imports.
     """
     module = importlib.import_module(builtins) if isinstance(builtins, str) else builtins
     if not isinstance(target, str) or not all(map(str.isidentifier, target.split("."))):
-        raise ConfigError(f"{where}._target_: {target!r} is no name of a function")
+        raise ConfigError(f"{where}._target_: expected the name of a function, got {target!r}")
     if "." in target:
         path, name = target.rsplit(".", 1)
         try:
@@ -65,18 +65,18 @@ def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str)
     function = getattr(module, name, None)
     if not callable(function) or name.startswith("_") or not _is_own(function, module):
         valid = ", ".join(list_functions(module))
-        raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path of your own")
+        raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path")
     return function
 
 
 def list_functions(module: types.ModuleType) -> list[str]:
-    """Public functions that a module defines itself."""
+    """Lists the public functions that a module defines itself."""
     own = [n for n, f in vars(module).items() if inspect.isfunction(f) and _is_defined_in(f, module)]
     return sorted(n for n in own if not n.startswith("_"))
 
 
 def _is_own(function: Callable[..., Any], module: types.ModuleType) -> bool:
-    """Whether a module of scenefactory_jax defines the function itself; modules of others may import theirs from anywhere."""
+    """Whether the module defines the function itself; true for modules outside of this package."""
     return module.__name__.partition(".")[0] != __name__.partition(".")[0] or _is_defined_in(function, module)
 
 

@@ -80,7 +80,7 @@ def said(command, folder, monkeypatch, capsys) -> str:
     monkeypatch.setattr(sys, "argv", ["scenefactory_jax", *arguments])
 
     def composing(*, config_name, **options):  # Hydra's own sets up logging anew, which closes the streams that pytest captures
-        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name.rpartition("/")[2], *arguments[1:])))
+        return lambda job: lambda: job(OmegaConf.create(hydra_config.load_config(config_name, *arguments[1:])))
 
     monkeypatch.setattr("hydra.main", composing)
     try:
