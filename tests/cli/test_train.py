@@ -570,7 +570,7 @@ def builds(whole_config):
     if scene_source.has_heldout(whole_config["scenes"]):
         instantiate(
             whole_config["scenes"]["generate"],
-            builtins="scenefactory_jax.data.generators.procedural.procedural_scene",
+            builtins="scenefactory_jax.data.generators.town.town_scene",
             where="scenes.generate",
         )
 
