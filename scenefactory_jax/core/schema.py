@@ -120,13 +120,14 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
             return {key: read_value(item, items[1], where=_join(where, key)) for key, item in value.items()}
     if not _fits(value, plain):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
-    numbers = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_number(number)]
+    numbers: list[Any] = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_number(number)]
     if bounds is not None and not all(math.isfinite(number) and number in bounds for number in numbers):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     if isinstance(value, (list, tuple)) and (items := _item_hints(options)):
         hints = items if len(items) == len(value) and Ellipsis not in items else items[:1] * len(value)
         return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
-    return float(value) if _is_number(value) and float in options and int not in options else value
+    as_float = isinstance(value, int) and not isinstance(value, bool) and float in options and int not in options
+    return float(value) if as_float else value
 
 
 def _split(hint: Any) -> tuple[Any, Bounds | None]:
