@@ -1,7 +1,7 @@
 """Command line: one function of `cli/` for each command.
 
-    python -m scenefactory_jax train experiment=demo scenes.count=16
-    python -m scenefactory_jax train -m weather=dry,mixed seed=0,1,2
+python -m scenefactory_jax train experiment=demo scenes.count=16
+python -m scenefactory_jax train -m weather=dry,mixed seed=0,1,2
 """
 
 import importlib

@@ -89,9 +89,7 @@ def _read(folder: Path) -> ReadRun:
     config, metrics = configs.read_values(folder), metrics_csv.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
-    settings = {
-        key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")
-    }
+    settings = {key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
     return ReadRun(folder, config, settings, metrics, read_records(folder))
 
 

@@ -1,6 +1,6 @@
 """Runs a command from its arguments: composes the config, calls one function, and ends user errors as one line with exit code 2.
 
-    entry.run("validate", validate)    # in a program: the arguments are those of the process
+entry.run("validate", validate)    # in a program: the arguments are those of the process
 """
 
 import os

@@ -1,4 +1,4 @@
-"""What goes wrong past the door, in the user's words: no device, too little memory, weights that do not fit, a reward that is no number."""
+"""Explains errors of the machine and of libraries: no device, too little memory, weights that do not fit."""
 
 import re
 from collections.abc import Mapping
@@ -9,19 +9,19 @@ import jax
 
 
 def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
-    """One line for an error of the machine or of a library below, with the way out; None for anything else, whose traceback is of use.
+    """Explains an error of the machine or of a library in one line, with a remedy; None for any other error.
 
     Args:
-        error: what a command raised.
-        config: the command's.
+        error: of a command.
+        config: of the command.
     """
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return _memory(text, config)
     if isinstance(error, flax.errors.ScopeParamShapeError):
-        name, place, wanted, held = re.findall(r'"([^"]+)"|shape (\([^)]*\))', text)[:4]
-        where = f"{place[0].strip('/')}/{name[0]} {held[1]}, this config wants {wanted[1]}"
-        return f"run={config.get('run')}: has weights {where}; `observe` and `policy` must be as they were in training"
+        name, place, expected, got = re.findall(r'"([^"]+)"|shape (\([^)]*\))', text)[:4]
+        weights = f"{place[0].strip('/')}/{name[0]}: expected shape {expected[1]}, got {got[1]}"
+        return f"run={config.get('run')}: weights {weights}; `observations` and `policy` must be those of the training"
     if isinstance(error, AssertionError | RuntimeError) and (platform := _without_device()):
         return (
             f"no device: JAX_PLATFORMS={platform} asks for one that JAX does not find here; unset it to use what there is,"

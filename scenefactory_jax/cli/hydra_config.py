@@ -1,4 +1,4 @@
-"""Hydra configs -> plain dicts. Hydra decides nothing but configuration; past this door there are only mappings."""
+"""Composes configs with Hydra and returns plain dicts; the rest of the package knows only mappings."""
 
 import argparse
 import copy
@@ -33,12 +33,12 @@ LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.exami
 
 
 def find_conf() -> Path:
-    """The folder of the configs: inside the installed package, or beside it in a checkout."""
+    """Returns the folder of the configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "command" / "train.yaml").is_file():
             return candidate
-    raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
+    raise ConfigError(f"conf/ not found in {package} or beside it; reinstall scenefactory_jax")
 
 
 class ConfSearchPath(SearchPathPlugin):
@@ -65,23 +65,23 @@ def find_config(name: str) -> Path:
 
 
 def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
-    """A command's config as a plain dict: `load("train", "experiment=demo", "worlds=8")`.
+    """Composes the config of a command: `load_config("train", "experiment=demo", "worlds=8")`.
 
     Args:
-        name: a top-level config: one of COMMANDS, or task (the environment alone).
+        name: a command, or `task` (the environment alone).
         overrides: as on the command line.
 
     Raises:
-        ConfigError: an unknown config, key or option, naming it and what would be valid.
+        ConfigError: an unknown config, key or option, with the valid ones.
     """
     return to_dict(_open(name, overrides))
 
 
 def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`load`, and which option of each group was chosen; a value that must be given shows as `???`.
+    """Composes a config, and returns the chosen option of each group with it; missing values are `???`.
 
     Raises:
-        ConfigError: see `load`.
+        ConfigError: see `load_config`.
     """
     opened = _open(name, overrides, whole=True)
     choices = {group: chosen for group, chosen in opened.hydra.runtime.choices.items() if not group.startswith("hydra/")}
@@ -90,24 +90,24 @@ def load_with_choices(name: str, *overrides: str) -> tuple[dict[str, Any], dict[
 
 
 def load_each(name: str, *overrides: str, key: str, values: Sequence[Any]) -> list[dict[str, Any]]:
-    """`load` for each value of one key, at the cost of one.
+    """Composes a config once and returns it for each value of one key; references to the key follow.
 
     Raises:
-        ConfigError: see `load`.
+        ConfigError: see `load_config`.
     """
     opened = _open(name, overrides)
     found = []
     for value in values:
         OmegaConf.update(opened, key, value)
-        found.append(to_dict(opened))  # what refers to the key follows it
+        found.append(to_dict(opened))
     return found
 
 
 def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
-    """A composed config whose references are not followed yet, but can be; `whole`: with Hydra's own part, and values may be missing.
+    """Composes a config without resolving references; `whole`: with Hydra's own part and missing values.
 
     Raises:
-        ConfigError: see `load`.
+        ConfigError: see `load_config`.
     """
     find_config(name)
     try:
@@ -125,10 +125,10 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
 
 
 def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
-    """Refuse `reward={}`: mappings are merged, so an empty one changes nothing.
+    """Refuses `reward={}`: mappings are merged, so an empty one changes nothing.
 
     Raises:
-        ConfigError: with what empties a mapping, and what drops one of its entries.
+        ConfigError: with the override that empties the mapping.
     """
     for one in OverridesParser.create().parse_overrides([quote_override(override) for override in overrides]):
         if one.type == OverrideType.CHANGE and one.value() == {} and (held := OmegaConf.select(opened, one.key_or_group)):
@@ -145,15 +145,15 @@ def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """An OmegaConf config with everything resolved, as dicts and lists."""
+    """Resolves an OmegaConf config to dicts and lists."""
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # pyright: ignore[reportReturnType]
 
 
 def _explain(name: str, error: Exception) -> str:
-    """Hydra's message, and the keys that the place in question has."""
+    """Explains an error of Hydra, with the valid keys or options."""
     text = str(error) + (f" ({error.__cause__})" if error.__cause__ else "")
     text = " ".join(text.split())
-    if "provider=hydra.searchpath" not in text:  # the user has named no folder: where ours lie is no news
+    if "provider=hydra.searchpath" not in text:  # without folders of the user, the search path is of no use
         text = text.partition(" Config search path:")[0]
     if missing := re.search(r"Could not load '(.+)/([^/']+)'", text):
         group, option = missing.groups()
@@ -166,7 +166,7 @@ def _explain(name: str, error: Exception) -> str:
     try:
         node: Any = to_dict(_compose(name, []))
     except (ConfigCompositionException, HydraException, OmegaConfBaseException):
-        return text  # the config itself is at fault
+        return text  # the config itself is wrong
     for depth, key in enumerate(path):
         if not isinstance(node, Mapping) or key not in node:
             where = ".".join(path[:depth]) or "the top level"
@@ -190,10 +190,10 @@ def print_outside_targets(config: Mapping[str, Any], folder: Path) -> None:
 
 
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A run's config with other settings: `dynamics=bicycle` replaces a whole group of the environment, `timing.episode_s=20` one number.
+    """Changes a run's config: `dynamics=bicycle` replaces a group of the environment, `timing.episode_s=20` one value.
 
-    A run's config holds values, no references: what follows another key in `conf/` (`observations.road.kernels` follows `step_metrics.kernels`) does
-    not follow here, and a whole group comes with what the default environment says of such keys, not the run's.
+    A run's config has no references. A key that refers to another key in `conf/` (`observations.road.kernels`) keeps its value here, and
+    a replaced group takes the values of the default environment for such keys.
 
     Raises:
         ConfigError: no such group, option or key in the run's config, with the valid ones.
@@ -203,7 +203,7 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
         path, separator, value = override.partition("=")
         *parents, last = path.split(".")
         if not separator:
-            raise ConfigError(f"overrides: {override!r} is no setting; write key=value")
+            raise ConfigError(f"overrides: expected key=value, got {override!r}")
         if not parents and (find_conf() / last).is_dir():
             *outer, inner = last.split("/")  # `dynamics/fleet=spread`: a group within a group
             fresh, node = copy.deepcopy(_task(override)), result
@@ -225,12 +225,12 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
     """Composes the environment with one other setting, or with another policy; a study needs the same ones many times."""
-    return load_config("train", "experiment=null", override) if override.startswith("policy=") else load_config("task", override)
+    return load_config("train", "~experiment", override) if override.startswith("policy=") else load_config("task", override)
 
 
 def quote_override(override: str) -> str:
-    """An override as Hydra's grammar wants it: `overrides=[dynamics=bicycle,weather=wet]` with its entries quoted, for it takes no bare `=`
-    inside a list, and the condition of `filter=vehicles >= 8` as one text."""
+    """Quotes an override for Hydra's grammar: the entries of `overrides=[dynamics=bicycle,weather=wet]` and the condition of
+    `filter=vehicles >= 8`, which contain `=`."""
     if condition := re.fullmatch(r"filter=(?!null$)([^'\"].*)", override, re.DOTALL):
         escaped = condition.group(1).replace("'", "\\'")
         return f"filter='{escaped}'"
@@ -241,10 +241,10 @@ def quote_override(override: str) -> str:
 
 
 def parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
-    """Command-line arguments as Hydra reads them: its flags with their values, and `overrides`.
+    """Parses command-line arguments as Hydra does: its flags with their values, and `overrides`.
 
     Raises:
-        ConfigError: a flag that Hydra does not have, or a value that the flag does not take.
+        ConfigError: an unknown flag, or a wrong value of one.
     """
     parser = get_args_parser()
 
@@ -256,11 +256,12 @@ def parse_flags(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def as_overrides(flags: argparse.Namespace) -> list[str]:
-    """The settings among the arguments, without those of Hydra's own part; `hydra.searchpath` and `--config-dir` say where options of one's
-    own lie.
+    """Returns the overrides among the arguments, without those of `hydra`.
+
+    `hydra.searchpath` and `--config-dir`, folders of the user's options, are kept.
 
     Raises:
-        ConfigError: an argument that is no setting.
+        ConfigError: an argument that is not an override.
     """
     for word in flags.overrides:
         if "=" not in word and not word.startswith("~"):
@@ -270,10 +271,10 @@ def as_overrides(flags: argparse.Namespace) -> list[str]:
 
 
 def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
-    """The overrides of a sweep's first job, those left out that only a sweeper understands (`interval(0, 1)`), and the keys that vary.
+    """Returns the overrides of the first job of a sweep, without those of a sweeper (`interval(0, 1)`), and the keys that vary.
 
     Raises:
-        ConfigError: an override that is none.
+        ConfigError: an argument that is not an override.
     """
     try:
         parsed = OverridesParser.create().parse_overrides([quote_override(override) for override in overrides])
@@ -285,5 +286,5 @@ def sweep(overrides: Sequence[str]) -> tuple[list[str], set[str]]:
 
 
 def format_changes(varied: Set[str]) -> list[str]:
-    """The overrides of the present job of a sweep whose keys vary, but its name, which its folder has anyway."""
+    """Returns the overrides of the current job of a sweep whose keys vary, without `name`, which is in the folder's name."""
     return [word for word in HydraConfig.get().overrides.task if word.partition("=")[0].lstrip("+~") in varied - {"name"}]

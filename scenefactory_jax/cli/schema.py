@@ -1,4 +1,7 @@
-"""Schemas of the commands' configs, checked before scenes are read and before anything compiles. Groups whose entries have a `_target_` are mappings here; the functions that they select check them."""
+"""Schemas of the commands' configs, checked before scenes are read and before anything compiles.
+
+Groups whose entries have a `_target_` are mappings here; the functions that they select check them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

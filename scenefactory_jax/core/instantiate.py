@@ -2,8 +2,8 @@
 
     reward.jerk: {_target_: my_terms.jerk, weight: -0.1, limit: 3.0}
 
-A target without a dot is a public function of a given module. A dotted target is imported; a module of this package offers only functions that
-it defines itself. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`).
+A target without a dot is a public function of a given module. A dotted target is imported; of a module of this package, only functions that
+it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`).
 """
 
 import functools

@@ -34,7 +34,7 @@ def check_targets(config: Mapping[str, Any], file: Path) -> None:
 
 
 def find_outside_targets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """ Finds key -> target, for each `_target_` at any depth outside of the modules in PARTS.
+    """Finds key -> target, for each `_target_` at any depth outside of the modules in PARTS.
 
     A name without a dot is inside: it is looked up in a module of this package.
     """

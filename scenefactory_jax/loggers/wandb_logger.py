@@ -13,8 +13,8 @@ from scenefactory_jax.loggers import Add, Logger, Row, identity
 def make(*, project: str, entity: str | None, group: str | None, mode: Literal["online", "offline", "disabled"] | None) -> Logger:
     """Logs to a W&B run with the name of the run folder and the config.
 
-    A resumed run keeps its id (offline: upload with `wandb sync --append`). Rows are drawn over `iteration`, not over the step of W&B, which
-    cannot go back: iterations that a resumed run repeats are shown twice.
+    A resumed run keeps its id (offline: upload with `wandb sync --append`). Rows are drawn over `iteration`, not over
+    the step of W&B, which cannot go back. Iterations that a resumed run repeats are shown twice.
 
     Args:
         project, entity, group: of the run; None: W&B's default, or its environment variables.

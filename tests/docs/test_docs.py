@@ -62,7 +62,7 @@ def test_the_task_page_has_the_numbers_of_the_configs(quickly):
         assert f"| `{name}` | {' | '.join(shown)} |".replace("|  |", "| |") in page
     widths = []
     for experiment in ("published", "quick", "demo"):
-        settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=procedural", "scenes.count=1", "dynamics=bicycle")
+        settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=streets", "scenes.count=1", "dynamics=bicycle")
         scene = sf.load_scenes(settings["scenes"])[0]
         _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
         widths.append(max(columns.stop for columns in layout(seen).values()))
