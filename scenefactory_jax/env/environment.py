@@ -128,7 +128,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         ConfigError: naming the entry and key that does not fit, with the valid ones.
     """
     read = schema.read({name: config[name] for name in GROUPS if name in config}, EnvConfig)
-    context = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
+    context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
     mu = friction.make(config["weather"]["grip"])
     package = __name__.rpartition(".")[0]
     return EnvParts(

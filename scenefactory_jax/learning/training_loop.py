@@ -1,4 +1,4 @@
-"""`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
+"""Trains a policy: scenes, an environment and an algorithm -> a run folder with checkpoints and metrics."""
 
 import contextlib
 import logging
@@ -31,9 +31,9 @@ MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | 
 
 
 class Prepared(NamedTuple):
-    """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
+    """What runs share that differ only in seed, scenes or budget, so that they compile once.
 
-    `scenes`: those to train on, before `scenes.take`; None: read anew.
+    `scenes`: to train on, before `scenes.take`; None: they are read again.
     """
 
     env: Env
@@ -44,7 +44,7 @@ class Prepared(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What `train` hands back in Python."""
+    """The result of `train`."""
 
     folder: Path
     config: dict[str, Any]
@@ -55,7 +55,7 @@ class Run(NamedTuple):
 
 
 def prepare(config: Mapping[str, Any]) -> Prepared:
-    """Environment, policy and trainer of a config.
+    """Builds environment, policy and trainer of a config.
 
     Raises:
         ConfigError: a key that does not fit, by name.
@@ -72,20 +72,20 @@ def train(
     make_callback: MakeCallback | None = None,
     finish: Callable[[Path], Any] | None = None,
 ) -> Run:
-    """Train as a config says (`load("train", ...)`).
+    """Trains as a config says (`load_config("train", ...)`).
 
     Args:
         on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
             donated to the next iteration: copy what is to outlive the call.
-        prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
-        make_callback: (folder, iteration after which the run goes on or None) -> function of (parameters, metrics row) that is called
-            after each iteration, or None.
+        prepared: `prepare` of a config with the same environment, policy, algorithm and devices; None: this config's.
+        make_callback: (folder, iteration that the run resumes at or None) -> function of (parameters, metrics row) to call after each
+            iteration, or None.
         finish: called with the folder after the last iteration, before the folder's lock is released.
 
     Raises:
         ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, after the iteration ended and its checkpoint is written.
     """
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
@@ -107,7 +107,7 @@ def _trained(
     *,
     resume: bool,
 ) -> TrainState:
-    """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
+    """Trains to the last iteration. The config is written after scenes and checkpoint are read, so that a failed start leaves none."""
     trainer = prepared.trainer
     with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
@@ -125,7 +125,7 @@ def _trained(
 def _scenes(
     config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
 ) -> Iterator[tuple[Scene, stream.SceneStream | None]]:
-    """The scenes of all worlds on their devices, and where others come from, if they do not stay."""
+    """Loads the scenes of all worlds onto their devices; the second value is the stream of further scenes, if there is one."""
     if config["stream"] is None:
         given = prepared.scenes
         loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
@@ -141,7 +141,7 @@ def _scenes(
 
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
-    """The policy of a config's `policy` entry."""
+    """Builds the policy of a config's `policy` entry."""
     return instantiate(config["policy"], builtins=late_fusion, where="policy")()
 
 
@@ -163,16 +163,16 @@ def _loop(
     resume: bool,
     callbacks: list[OnIteration],
 ):
-    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
+    """Iterates until `iterations` or `minutes` is reached; every row is written to metrics.csv before the next iteration starts.
 
-    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. A signal to stop ends it after
-    the iteration that it fell into, with a checkpoint.
+    `minutes` counts iterations, compilation included, not checkpoints or evaluations. A signal ends the loop after the current iteration,
+    with a checkpoint.
     """
     first, total = int(state.iteration), config["iterations"]
     file = metrics_csv.MetricsFile(folder, resume_at=first if resume else None)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
-        interrupt.defer_interrupt() as asked,
+        interrupt.defer_interrupt() as get_signal,
         loggers.open_loggers(watching, folder, config, after=first if resume else 0) as note,
         metrics_csv.progress(total, enable=config["progress"], start=first) as show,
     ):
@@ -189,7 +189,7 @@ def _loop(
             check_finite(row)
             for callback in callbacks:
                 callback(state, row)
-            late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
+            late, stop = config["minutes"] is not None and spent >= config["minutes"], get_signal()
             if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
                 host = None if flow is None else flow.state()
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
@@ -223,20 +223,20 @@ def check_finite(row: Mapping[str, float | int]) -> None:
 def step(
     trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
 ) -> tuple[TrainState, Scene, dict[str, float | int]]:
-    """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
+    """Makes one iteration, with the stream's next scenes in some worlds if there is a stream; gives its metrics on the host."""
     if flow is None:
         state, metrics = trainer.train_iteration(state, worlds)
         return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
     if not first:
         state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
     state, metrics = trainer.train_iteration(state, worlds)
-    flow.draw()  # while the devices work
+    flow.draw()  # while the devices compute
     metrics, record = jax.device_get((metrics, state.scene_stats))
     return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
 
 
 def describe(row: Mapping[str, float | int]) -> str:
-    """One line on how training stands."""
+    """Describes a row of metrics in one line."""
     names = {"goal_reached": "goal", "collision": "collision", "road_edge_contact": "edge", "out_of_bounds": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
     return f"{rates} | {row['casps']:,.0f} steps/s"

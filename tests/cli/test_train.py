@@ -176,7 +176,7 @@ def test_what_does_not_go_on_changes_nothing(whole, tmp_path):
     before = contents(tmp_path / "run")
     for overrides, message in {
         ("resume=true", "policy.trunk=[32]"): r"policy\.trunk=\[32\] \(the run has \[16\]\)",
-        ("resume=true", "seed=5"): r"; seed=5 \(the run has 0\): .* goes on as it began",
+        ("resume=true", "seed=5"): r"; seed=5 \(the run has 0\): .* keeps its settings",
         ("seed=5",): "holds a run already",
     }.items():
         with pytest.raises(ConfigError, match=message):
@@ -570,7 +570,7 @@ def builds(whole_config):
     if scene_source.has_heldout(whole_config["scenes"]):
         instantiate(
             whole_config["scenes"]["generate"],
-            builtins="scenefactory_jax.data.generators.procedural.procedural_scene",
+            builtins="scenefactory_jax.data.generators.town.town_scene",
             where="scenes.generate",
         )
 

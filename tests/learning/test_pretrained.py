@@ -25,7 +25,7 @@ def test_a_policy_is_small_and_told_about(folder):
 def test_a_policy_learnt_on_generated_scenes(folder):
     scenes = hydra_config.read(folder)["scenes"]
     assert scenes["path"] is None and scenes["heldout"]["path"] is None
-    assert scenes["generate"]["_target_"].startswith("scenefactory_jax.scenes.") and scenes["seed"] != scenes["heldout"]["seed"]
+    assert scenes["generate"]["_target_"].startswith("scenefactory_jax.data.generators.") and scenes["seed"] != scenes["heldout"]["seed"]
 
 
 def test_town_drives_where_it_has_never_been(tmp_path, quickly):

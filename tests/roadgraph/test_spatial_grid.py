@@ -18,10 +18,10 @@ WOMD = SHARED / "womd" / "test"
 PLACES = 256
 
 
-@pytest.fixture(scope="module", params=["procedural", "womd"])
+@pytest.fixture(scope="module", params=["streets", "womd"])
 def scenes(request):
     """Stacked scenes without cells."""
-    overrides = ["scenes.count=3", "scenes.cells.radius_m=null"]
+    overrides = ["scenes.count=3", "scenes.generate.kinds=[intersection]", "scenes.cells.radius_m=null"]
     if request.param == "womd":
         if not WOMD.is_dir():
             pytest.skip(f"no data at {WOMD}")

@@ -221,8 +221,8 @@ def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
         ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
     """
     if not _has_generator(config):
-        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
-    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
+        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=streets")
+    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="scenes.generate")
 
 
 def make_readers(config: Mapping[str, Any]) -> dict[str, Any]:
