@@ -1,5 +1,6 @@
 """`scenes op=simulate`: some seconds of every scene, as a check that it can be simulated at all."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,8 @@ from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import agent_metrics
+
+LOG = logging.getLogger(__name__)
 
 MEANING = {
     "cars": "agents",
@@ -49,11 +52,11 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
         for place, index in enumerate(range(begin, min(begin + size, len(loaded)))):
             found[loaded.names[index]] = {name: int(counts[name][place]) for name in MEANING}
     bad = {name: row for name, row in found.items() if any(row[key] for key in list(MEANING)[1:])}
-    print(agent_metrics.grid(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()]))
+    LOG.info(agent_metrics.grid(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()]))
     total = {key: sum(row[key] for row in found.values()) for key in MEANING}
     for key, meaning in MEANING.items():
-        print(f"{key}: {total[key]} {meaning}")
-    print(f"{len(found)} scenes, {steps} steps each; {len(found) - len(bad)} without any of these", flush=True)
+        LOG.info(f"{key}: {total[key]} {meaning}")
+    LOG.info(f"{len(found)} scenes, {steps} steps each; {len(found) - len(bad)} without any of these")
     return found
 
 
