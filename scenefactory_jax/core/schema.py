@@ -19,7 +19,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar
 
 T = TypeVar("T")
 
@@ -109,7 +109,7 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
     Raises:
         ConfigError: naming `where`, what is expected and the value.
     """
-    value = os.fspath(value) if isinstance(value, os.PathLike) else value
+    value = os.fspath(typing.cast(Any, value)) if isinstance(value, os.PathLike) else value
     plain, bounds = _split(hint)
     options = typing.get_args(plain) if typing.get_origin(plain) in (typing.Union, types.UnionType) else (plain,)
     for option in options:
@@ -144,7 +144,7 @@ def _item_hints(options: tuple[Any, ...]) -> tuple[Any, ...]:
     return next((typing.get_args(option) for option in options if typing.get_origin(option) in (list, tuple)), ())
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float | int]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
