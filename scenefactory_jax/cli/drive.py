@@ -15,7 +15,7 @@ import jax
 import mujoco
 import numpy as np
 
-from scenefactory_jax.cli import view as replays
+from scenefactory_jax.cli import replay as replays
 from scenefactory_jax.cli import view_schema
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError

@@ -127,7 +127,7 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
         hints = items if len(items) == len(value) and Ellipsis not in items else items[:1] * len(value)
         return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
     as_float = isinstance(value, int) and not isinstance(value, bool) and float in options and int not in options
-    return float(value) if as_float else value
+    return float(typing.cast(int, value)) if as_float else value
 
 
 def _split(hint: Any) -> tuple[Any, Bounds | None]:

@@ -26,9 +26,9 @@ from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
 from scenefactory_jax.cli.export import export, named
 from scenefactory_jax.cli.render import render
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
-from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.bank import bank_reader

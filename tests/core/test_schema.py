@@ -30,7 +30,8 @@ class Whole:
             raise ConfigError(f"pair: expected [min, max], got {list(self.pair)}")
 
 
-GOOD = {"count": 3, "share": None, "sizes": [1, 2.5], "pair": [0, 1], "parts": {"x": {"limit_m": 1}}, "part": None, "entry": {"_target_": "f"}}
+GOOD = {"count": 3, "share": None, "sizes": [1, 2.5], "pair": [0, 1], "parts": {"x": {"limit_m": 1}}, "part": None}
+GOOD["entry"] = {"_target_": "f"}
 
 
 def test_a_mapping_becomes_an_instance_with_its_parts():

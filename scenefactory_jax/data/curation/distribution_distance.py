@@ -63,7 +63,7 @@ def measure(raw: RawScene, *, scene_size_m: float) -> Samples:
     """Samples of every quantity in one scene.
 
     Args:
-        scene_size_m: side of the square in which things count, around the recording car at the current step, or the mean of the road points.
+        scene_size_m: side of the square in which things count, around the recording car at the current step, or the mean road point.
     """
     centre = _centre(raw)
     inside = lambda points: np.abs(points[:, :2] - centre).max(axis=1) <= scene_size_m / 2  # noqa: E731
