@@ -59,10 +59,10 @@ def write(folder: Path, reference: str, sets: Mapping[str, Samples], *, scene_si
     picture = plots.save(figure(reference, sets), folder / "realism.png")
     scenes = ", ".join(f"{name}: {len(samples['vehicles'])}" for name, samples in sets.items())
     words = (
-        f"Scenes: {scenes}. Everything within {scene_size_m:g} m by {scene_size_m:g} m around the recording car. KS is the largest difference"
-        " between two distribution functions (0: the same, 1: nothing in common), W the earth mover's distance in standard deviations, both from "
-        f"{reference}; the mean is over the quantities that both sets have. In the figure all histograms have the same area and the "
-        "outermost bars hold what lies beyond."
+        f"Scenes: {scenes}. Everything within {scene_size_m:g} m by {scene_size_m:g} m around the recording car. KS is the largest"
+        " difference between two distribution functions (0: the same, 1: nothing in common), W the earth mover's distance in standard"
+        f" deviations, both from {reference}; the mean is over the quantities that both sets have. In the figure all histograms have the"
+        " same area and the outermost bars hold what lies beyond."
     )
     lines = ["# Scenes compared", f"`{command}`", words, table(reference, sets), f"![Distributions]({picture.name})"]
     path = folder / "realism.md"
