@@ -89,7 +89,7 @@ class Patches:
     radius: Float[Array, " N"]
     surface: Int[Array, " N"]  # index into SURFACES
     film_mm: Float[Array, " N"]
-    follows: Float[Array, " N"]  # share of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
+    open_road_film_fraction: Float[Array, " N"]  # fraction of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
     present: Bool[Array, " N"]
 
 

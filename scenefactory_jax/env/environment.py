@@ -49,7 +49,7 @@ KEYS = {  # of the groups that no one function takes
     "timing": ("physics_hz", "control_hz", "episode_s"),
     "actions": ("command", "action_repeat"),
     "spawning": ("sampler", "respawn_clearance_m"),
-    "weather": ("draw", "grip", "patches", "rain"),
+    "weather": ("sampler", "friction", "patches", "rain"),
 }
 
 
@@ -104,8 +104,8 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     if clear_m is not None:
         check_number(clear_m, where="spawning.respawn_clearance_m", least=0.0)
     context = {"physics_dt": 1.0 / timing["physics_hz"], "control_dt": 1.0 / timing["control_hz"]}
-    grip = friction.make(config["weather"]["grip"])
-    dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", grip=grip, **context)()
+    compute_mu = friction.make(config["weather"]["friction"])
+    dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", friction=compute_mu, **context)()
     bound = functools.partial(instantiate, builtins="scenefactory_jax.env.step_metrics")
     termination.check(config["termination"].get("ending", []), where="termination")
     return EnvParts(
