@@ -16,6 +16,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
 from scenefactory_jax.core.types import AgentLog, Agents, Dynamics, Road, Scene, Weather
 from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.weather.friction import make_uniform
 
@@ -54,7 +55,7 @@ def grip(
 def dynamics(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, slippery: float, friction_min: float) -> Dynamics:
     """The backend of a config, on roads whose friction the cases say."""
     road = functools.partial(grip, slippery=slippery, friction_min=friction_min)
-    context = {"grip": road, "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
+    context = {"friction": road, "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
     return instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
@@ -157,14 +158,14 @@ def drive_c(
     """
     car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
-    rig = mujoco_c.simulate_one(car, dataclasses.replace(solver, algorithm="Newton"), **settings)
-    still, substeps = cars.find_rest_pose(rig.model, car), round(physics_hz / control_hz)
+    rig = mujoco_c.make_one(car, dataclasses.replace(solver, algorithm="newton"), **settings)
+    still, substeps = models.find_rest_pose(rig.model, car), round(physics_hz / control_hz)
     mu = wheel_friction(jnp.asarray(cases.friction), jnp.asarray(cases.pattern), slippery=slippery, friction_min=friction_min)
     mu = friction_scale * np.asarray(mu, np.float64)
     paths = []
     for index, speed in enumerate(cases.speed.astype(float)):
         mujoco_c.place(rig, still, np.zeros((1, 2)), np.zeros(1), np.array([speed + nudge]))
-        path = mujoco_c.drive(rig, cases.controls[index, :, None].astype(float), mu[index, None], substeps=substeps)
+        path = mujoco_c.simulate_placed(rig, cases.controls[index, :, None].astype(float), mu[index, None], substeps=substeps)
         paths.append([*(column[:, None] for column in path), np.zeros(len(path.qpos))])
     return Run(*(np.array(column) for column in zip(*paths, strict=True)))
 
@@ -188,16 +189,16 @@ def meet_c(
     """
     car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
-    newton = dataclasses.replace(solver, algorithm="Newton")
+    newton = dataclasses.replace(solver, algorithm="newton")
     rig = mujoco_c.make_encounter(car, newton, touch(entry, impedance=impedance), **settings)
-    still, substeps = cars.find_rest_pose(mujoco_c.simulate_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
+    still, substeps = models.find_rest_pose(mujoco_c.make_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
     paths, first = [], []
     for index in range(len(cases.kind)):
         position, yaw, speed = (x[index].astype(float) for x in (cases.position, cases.yaw, cases.speed))
         mujoco_c.place(rig, still, position, yaw, speed + nudge)
         mu = np.full((2, 4), float(cases.friction[index]))
         story = mujoco_c.simulate_encounter(rig, cases.controls[index].astype(float), mu, substeps=substeps)
-        paths.append([*story.path, story.contact_force])
+        paths.append([*story.trajectory, story.contact_force])
         first.append(story.first_contact_s)
     return Run(*(np.array(column) for column in zip(*paths, strict=True))), np.array(first)
 

@@ -71,7 +71,7 @@ def patches(
         circle of the dry one, m. `split`: for ice on the left, on the right and on no side the yaw [3, T] and the way aside.
     """
     context = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
-    road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.friction")
     backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
     run = motion_laws.tracer(backend, control_hz=control_hz, width=6)
     size = motion_laws.footprint(entry)

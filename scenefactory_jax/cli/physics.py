@@ -29,8 +29,8 @@ def weather(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     schema.check(config, schema.WEATHER)
     (slowest, fastest), (least, most) = (check_range(config[name], where=name) for name in ("speeds_mps", "slips"))
-    grip = config["weather"]["grip"]
-    tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()
+    grip = config["weather"]["friction"]
+    tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.friction.tyre")()
     slips, reference = {"static": grip["slip_static"], "dynamic": grip["slip_dynamic"]}, grip["reference_speed"]
 
     def friction(surface: str, speed: Any, film_mm: Any, slip: Any) -> np.ndarray:

@@ -28,7 +28,7 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import SURFACES, Motion, Observation, Scene, SetObservation, State
 from scenefactory_jax.env import surrogate_safety
 from scenefactory_jax.roadgraph import queries
-from scenefactory_jax.weather.patches import condition_at
+from scenefactory_jax.weather.patches import read_condition
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | SetObservation]
 
@@ -73,7 +73,7 @@ def weather(scene: Scene, state: State, *, film_scale_mm: float, surfaces: list[
     """
     if unknown := [name for name in surfaces if name not in SURFACES]:
         raise ConfigError(f"observations.weather.surfaces: {unknown[0]!r}; valid: {', '.join(SURFACES)}")
-    film_mm, surface = condition_at(state.weather, state.motion.position[:, :2])
+    film_mm, surface = read_condition(state.weather, state.motion.position[:, :2])
     listed = jnp.array([SURFACES.index(name) for name in surfaces], jnp.int32)
     one_hot = (surface[:, None] == listed).astype(jnp.float32)
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)

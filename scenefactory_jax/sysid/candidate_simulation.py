@@ -119,7 +119,7 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         crew = jax.tree.map(lambda leaf: leaf[None], own)
         scene = replace(empty, agents=replace(empty.agents, speed=plan.speed[index][None]))
-        return articulated_car.make_dynamics(plant._replace(vary=lambda key, scene: crew), meet, grip), scene
+        return articulated_car.make_dynamics(plant._replace(sample=lambda key, scene: crew), meet, grip), scene
 
     def driver(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]:
         backend, scene = bound(row, index, plan)
@@ -242,7 +242,7 @@ def _ground(car: CarParameters) -> Scene:
 
 def _seen(backend: Dynamics, plant: articulated_car.CompiledCar, body: Any) -> CandidatePath:
     """Of the only car."""
-    motion, at = backend.read(body), plant.places
+    motion, at = backend.read(body), plant.addresses
     return CandidatePath(
         position=motion.position[0, :2],
         yaw=motion.yaw[0],

@@ -219,7 +219,7 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
         ("timing.episode_s=long", "timing.episode_s: 'long' is of type str, wanted float"),
         ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: 'near' is of type str, wanted float | None"),
         ("dynamics.wheelbase=long", "dynamics.wheelbase: 'long' is of type str, wanted float"),
-        ("weather.grip.mode=sticky", "weather.grip.mode: 'sticky'"),
+        ("weather.friction.mode=sticky", "weather.friction.mode: 'sticky'"),
         (
             "termination.ending=[fault,reached,bored]",
             "termination.ending: unknown event 'bored'; valid: fault, reached, collided, crashed, road_edge_contact",

@@ -289,7 +289,7 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
 
 
 def test_other_settings_of_a_run(whole, tmp_path):
-    short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
+    short = "overrides=[timing.episode_s=1, weather.friction.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
     changed = judged(whole, tmp_path / "short", *small, "protocol.ends=[goal_only]", short)
     assert set(changed.records) == {"goal_only"} and changed.records["goal_only"]["time_s"].max() <= 1.0

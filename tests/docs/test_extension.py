@@ -75,7 +75,7 @@ BACKEND = """
             nothing = jnp.zeros(len(body.place), jnp.float32)
             flat = lambda xy, z: jnp.concatenate([xy, jnp.full_like(xy[:, :1], z)], axis=1)
             names = ("yaw", "yaw_rate", "steer", "contact_force", "friction_utilization", "slip")
-            rest = dict.fromkeys(names, nothing) | {"upright": nothing + 1, "grip": nothing + 1}
+            rest = dict.fromkeys(names, nothing) | {"upright": nothing + 1, "friction": nothing + 1}
             return Motion(position=flat(body.place, height_m), velocity=flat(body.velocity, 0.0), **rest)
 
         return Dynamics(init, advance, read)

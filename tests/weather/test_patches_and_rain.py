@@ -29,7 +29,7 @@ OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml"
 DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
 inside = jax.jit(patches.contains_points)
-COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "follows": 0.5}
+COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "open_road_film_fraction": 0.5}
 LAYOUTS = {
     "circles": {"count": 40, "radius_m": [0.5, 3.0], "scatter_m": 1.5, **COVER},
     "polygons": {"count": 40, "corners": 7, "radius_m": [1.0, 4.0], "scatter_m": 1.5, **COVER},
@@ -106,7 +106,7 @@ def test_repeated_vertices_and_absent_patches_change_nothing():
     np.testing.assert_array_equal(inside(patches.join_patches(doubled), points), alone)
     hidden = patch([[0.0, 0.0]], radius=50.0, surface=SNOW, film=9.0, present=False)
     for with_hidden in (on(*shapes, hidden), on(hidden, *shapes)):
-        for got, wanted in zip(patches.condition_at(with_hidden, points), patches.condition_at(on(*shapes), points), strict=True):
+        for got, wanted in zip(patches.read_condition(with_hidden, points), patches.read_condition(on(*shapes), points), strict=True):
             np.testing.assert_array_equal(got, wanted)
 
 
@@ -114,16 +114,16 @@ def test_the_last_patch_counts_and_films_follow_the_open_road():
     low = patch([[0, 0]], radius=2.0, surface=ICE, film=0.1)
     high = patch([[2, 0]], radius=2.0, surface=SNOW, film=0.2, follows=0.5)
     points = jnp.array([[-1.0, 0.0], [1.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
-    film, surface = patches.condition_at(on(low, high, film=0.4, surface=1), points)
+    film, surface = patches.read_condition(on(low, high, film=0.4, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.4, 0.4, 0.4], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, SNOW, SNOW, 1])
-    film, surface = patches.condition_at(on(high, low, film=0.8, surface=1), points)
+    film, surface = patches.read_condition(on(high, low, film=0.8, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.1, 0.6, 0.8], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, ICE, SNOW, 1])
 
 
 def test_no_patches_cost_nothing():
-    operations = jax.make_jaxpr(functools.partial(patches.condition_at, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
+    operations = jax.make_jaxpr(functools.partial(patches.read_condition, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
     assert {operation.primitive.name for operation in operations} <= {"broadcast_in_dim", "jit", "pjit"}
     assert patches.join_patches([DRY.patches, patch([[0, 0]])]).vertices.shape == (1, 1, 2)
 
@@ -142,7 +142,7 @@ def test_drawn_areas_are_the_patches():
 
 
 def test_dry_surfaces_have_their_textbook_friction():
-    grip = instantiate.instantiate(scenefactory_jax.load_config("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(scenefactory_jax.load_config("task")["weather"]["friction"], builtins=friction_model, where="weather.friction")
     wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
     spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
@@ -150,11 +150,11 @@ def test_dry_surfaces_have_their_textbook_friction():
 
 
 def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
-    entry = scenefactory_jax.load_config("task")["weather"]["grip"]
+    entry = scenefactory_jax.load_config("task")["weather"]["friction"]
     condition = on(patch([[0, 5]], radius=5.0, surface=0, film=0.5), film=0.3)
     wheels = jnp.array([[[1.3, 1.0], [1.3, -1.0], [-1.3, 1.0], [-1.3, -1.0]]])
     for mode, wet, damp in (("static", 0.8595, 0.9594), ("dynamic", 0.6770, 0.8302), ("speed", 0.8595, 0.9594)):
-        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.grip")
+        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.friction")
         np.testing.assert_allclose(grip(condition, wheels, jnp.full((1, 4), 13.89)), [[wet, damp, wet, damp]], atol=1e-4)
 
 
@@ -232,7 +232,7 @@ def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     middle, half = np.asarray(scene.lanes.midpoint)[rows], (scene.lanes.half_length[:, None] * scene.lanes.direction)[rows]
     lanes = shapely.MultiLineString([[m - h, m + h] for m, h in zip(middle, np.asarray(half), strict=True)])
     apart = lambda points: shapely.distance(lanes, shapely.points(points))  # noqa: E731
-    assert laid.present.all() and (laid.surface == ICE).all() and (laid.follows == 0.5).all()
+    assert laid.present.all() and (laid.surface == ICE).all() and (laid.open_road_film_fraction == 0.5).all()
     assert 0.1 <= laid.film_mm.min() < 0.15 and 0.35 < laid.film_mm.max() <= 0.4
     vertices = np.asarray(laid.vertices, float)
     if name == "circles":
@@ -271,9 +271,9 @@ def test_chance_and_the_open_roads_surface():
 
 
 SHAPES = [
-    {"circle": [1.0, 2.0], "radius": 3, "surface": "ICE", "film_mm": 0.0, "follows": 0.0},
-    {"polygon": [[0, 0], [4, 0], [0, 4]], "surface": None, "film_mm": 0.5, "follows": 1.0},
-    {"strip": [[20, 0], [30, 0]], "width": 2.0, "surface": "SNOW", "film_mm": 0.0, "follows": 0.0},
+    {"circle": [1.0, 2.0], "radius": 3, "surface": "ICE", "film_mm": 0.0, "open_road_film_fraction": 0.0},
+    {"polygon": [[0, 0], [4, 0], [0, 4]], "surface": None, "film_mm": 0.5, "open_road_film_fraction": 1.0},
+    {"strip": [[20, 0], [30, 0]], "width": 2.0, "surface": "SNOW", "film_mm": 0.0, "open_road_film_fraction": 0.0},
 ]
 
 
@@ -323,7 +323,7 @@ def test_every_option_resets_steps_and_traces_once(option):
         np.testing.assert_array_equal(getattr(states.weather.patches, name), leaf)
 
 
-PUDDLE = "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, follows: 1.0}]}"
+PUDDLE = "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, open_road_film_fraction: 1.0}]}"
 COURSE = "weather.rain={_target_: schedule, time_s: [0.0, 1.0], film_mm: [0.1, 0.4]}"
 
 
@@ -345,7 +345,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     assert tokens[-1, 0, 0] == pytest.approx(0.4, abs=1e-5)
     assert (np.diff(friction[:, 1]) < 0).all() and friction[0, 0] != friction[0, 1] and friction[-1, 0] == pytest.approx(friction[-1, 1])
     # the weather moves on before the dynamics read it: the step to 1 s drives on the film of 1 s
-    grip = instantiate.instantiate(config_of()["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(config_of()["weather"]["friction"], builtins=friction_model, where="weather.friction")
     assert friction[-1, 1] == pytest.approx(float(grip(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
 
 

@@ -24,7 +24,7 @@ def write(folder: Path, found: Mapping[str, Any]) -> Path:
     reference = found["reference"]
     words = (
         f"Friction coefficient of a tyre at {reference['speed_mps']:g} m/s, before a contact's own floor: at slip "
-        f"{reference['slips']['static']:g} (static, which the simulation uses unless `weather.grip.mode` says otherwise) and, in brackets, "
+        f"{reference['slips']['static']:g} (static, which the simulation uses unless `weather.friction.mode` says otherwise) and, in brackets, "
         f"{reference['slips']['dynamic']:g} (dynamic). Water films across, in mm. Zero: the tyre floats."
     )
     lines = ["# Friction on wet roads", f"`{found['command']}`", words, table(found)]
