@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
+from scenefactory_jax.cli import view_schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
@@ -62,8 +63,7 @@ def replay(config: Mapping[str, Any]) -> Path:
 
 def _check(config: Mapping[str, Any]) -> None:
     """What would otherwise fail only after the drive."""
-    schema.check(config, schema.REPLAY)
-    schema.check(config["film"], schema.FILM, where="film")
+    schema.check(config, view_schema.Replay)
     out = Path(config["out"])
     if out.is_dir():
         raise ConfigError(f"out: {out} is a folder; give the page's own name, such as {out / 'replay.html'}")
@@ -133,7 +133,7 @@ def select_policy(config: Mapping[str, Any], settings: Mapping[str, Any], *, slo
 
 def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> RecordedWorlds:
     """The first usable scenes; no more is read than they take."""
-    schema.check_scenes(config)
+    scene_source.check_config(config)
     parts = scene_source.make_readers(config)
     packed: list[Packed] = []
     posts: list[replay_data.RoadPosts] = []

@@ -5,6 +5,7 @@ from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.types import Road
 
+SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as zero
 CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 
@@ -61,7 +62,7 @@ def cover_with_circles(
     yaw: Float[Array, " A"],
     size: Float[Array, "A 2"],
     *,
-    radius_share: float,
+    radius_fraction: float,
     radius_floor_m: float,
     spacing_limit_m: float,
 ) -> tuple[Float[Array, "A 3 2"], Float[Array, " A"]]:
@@ -71,7 +72,7 @@ def cover_with_circles(
     TTC (1.10 m and 1.12 m for the 4 x 2 m car with share 0.55 and limit half a wheelbase).
     """
     length, width = size[:, 0], size[:, 1]
-    radius = jnp.maximum(radius_floor_m, radius_share * width)
+    radius = jnp.maximum(radius_floor_m, radius_fraction * width)
     spacing = jnp.minimum(spacing_limit_m, jnp.maximum(0.0, 0.5 * length - 0.8 * radius))
     along = spacing[:, None] * jnp.array([1.0, 0.0, -1.0], jnp.float32)
     centres = position[:, None, :] + along[..., None] * heading_vector(yaw)[:, None, :]

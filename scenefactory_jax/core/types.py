@@ -49,7 +49,7 @@ class Agents:
     speed: Float[Array, " A"]
     size: Float[Array, "A 2"]  # length, width
     goal: Float[Array, "A 2"]
-    route: Float[Array, " A"]  # length of the way from start to goal
+    route_length: Float[Array, " A"]  # from start to goal, m
     present: Bool[Array, " A"]
 
 
@@ -89,7 +89,7 @@ class Patches:
     radius: Float[Array, " N"]
     surface: Int[Array, " N"]  # index into SURFACES
     film_mm: Float[Array, " N"]
-    open_road_film_fraction: Float[Array, " N"]  # fraction of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
+    open_road_film_fraction: Float[Array, " N"]  # part of the open road's film added to `film_mm`: 1 in a puddle
     present: Bool[Array, " N"]
 
 
@@ -172,7 +172,7 @@ class Motion:
     upright: Float[Array, " A"]  # cosine between the car's and the world's up
     steer: Float[Array, " A"]  # mean angle of the front wheels
     contact_force: Float[Array, " A"]  # largest force of another car or box in the last control step, N
-    grip: Float[Array, " A"]  # friction coefficient, mean over the wheels
+    mu: Float[Array, " A"]  # friction coefficient, mean over the wheels
     friction_utilization: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
     slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
 
@@ -201,14 +201,14 @@ class StepMetrics:
     lane_heading: Float[Array, " A"]  # cosine between the car and the lane's own direction: negative against the traffic
     has_lane: Bool[Array, " A"]
     ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
-    gap: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
+    clearance: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
     stopping_margin: Float[Array, " A"]  # way free straight ahead less the way to stop on the road's friction; inf with nobody ahead
     edge_ttc: Float[Array, " A"]
-    edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
+    edge_clearance: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2
     distance_from_start: Float[Array, " A"]  # distance from the start
     contact_force: Float[Array, " A"]
-    grip: Float[Array, " A"]
+    mu: Float[Array, " A"]
     friction_utilization: Float[Array, " A"]
     slip: Float[Array, " A"]
     off_lane: Bool[Array, " A"]
@@ -226,7 +226,7 @@ class State:
     weather: Weather  # this episode's road condition
     active: Bool[Array, " A"]  # on stage and not finished
     past_events: Events  # events so far, in this agent's life
-    age: Int[Array, " A"]  # control steps since the agent's own start
+    steps_since_spawn: Int[Array, " A"]  # control steps
     previous_action: Float[Array, "A 3"]
     step: Int[Array, ""]
     key: PRNGKeyArray
@@ -240,7 +240,7 @@ class RewardInput:
     before: State
     action: Float[Array, "A 3"]
     after: State
-    facts: StepMetrics
+    metrics: StepMetrics
     events: Events  # new in this step and exclusive
 
 
@@ -264,10 +264,10 @@ class StepResult:
     reward: Float[Array, " A"]
     terms: dict[str, Float[Array, " A"]]  # weighted reward terms; they sum to `reward`
     events: Events
-    done: Bool[Array, " A"]  # an event ended the agent in this step
+    terminated: Bool[Array, " A"]  # an event ended the agent in this step
     truncated: Bool[Array, ""]  # the world's time is up
-    over: Bool[Array, ""]  # truncated, or no agent is left
-    facts: StepMetrics
+    world_done: Bool[Array, ""]  # truncated, or no agent is active
+    metrics: StepMetrics
 
 
 class Dynamics(NamedTuple):
@@ -279,12 +279,12 @@ class Dynamics(NamedTuple):
 
 
 class Env(NamedTuple):
-    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all `hold` control steps that it
-    stands for, their rewards added up.
+    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all its `action_repeat` control
+    steps, their rewards added up.
 
-    The others are their parts: `start` and `observe` divide a reset, so that a training loop can restart finished worlds before it pays
-    for the observation; `transition` is a single control step, for whoever looks closer than the agent acts. It reads every `hold`-th
-    action of an episode, the first one first, which stands until the next. `now` gives the scene as it is at a state's moment.
+    The other functions are their parts: `init_state` and `observe` divide a reset, so that training restarts finished worlds before it
+    computes the observation; `control_step` is a single control step. It reads every `action_repeat`-th action of an
+    episode, the first one first, and holds it until the next. `current_scene` gives the scene at the time of a state.
 
     All of them take arrays of numpy or JAX, also closed over, and raise ValueError when they are traced with an argument of another shape
     or kind of number than is annotated here. Values are not refused: an agent that starts with a number that is not finite, or with a size
@@ -293,11 +293,11 @@ class Env(NamedTuple):
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
-    start: Callable[..., State]  # (key, scene, control step at which it begins = 0)
-    transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
+    init_state: Callable[..., State]  # (key, scene, control step at which it begins = 0)
+    control_step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
     observe: Callable[[Scene, State], Observation]
-    now: Callable[[Scene, State], Scene]
-    hold: int = 1
+    current_scene: Callable[[Scene, State], Scene]
+    action_repeat: int = 1
 
 
 class Policy(NamedTuple):

@@ -148,7 +148,7 @@ def read(body: Body, *, height: float) -> Motion:
         upright=jnp.ones_like(zero),
         steer=body.steer,
         contact_force=body.contact_force,
-        grip=body.mu,
+        mu=body.mu,
         friction_utilization=body.friction_utilization,
         slip=zero,
     )

@@ -108,13 +108,22 @@ def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
 
 
 def compute_forces(
-    cars: Boxes, neighbours: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, momentum_transfer_s: float, height: float
+    cars: Boxes,
+    neighbours: Boxes,
+    *,
+    stiffness: float,
+    damping: float,
+    friction: float,
+    mass: float,
+    momentum_transfer_s: float,
+    height: float,
 ) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
     Stiffness and damping of a pair scale with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
-    pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and `OFF_CENTRE` times that, 0.26,
-    off centre. Semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m is below 4: 0.58 and 2.1 with 3e4 N s/m.
+    pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and 0.26 off centre
+    (`OFF_CENTRE`). Semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m is below 4; 2 c dt / m is 0.58 and
+    2.1 with 3e4 N s/m.
 
     Args:
         cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
@@ -161,7 +170,7 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Computes the scale of a pair's force where one of the two has this many contacts.
 
     N springs and dampers on one car add up to N times what the explicit integrator must carry: 16 cars at one position became NaN within a
-    second. Two are stable at full strength; more are scaled to the strength of two. The scale is the same for both, so momentum is conserved.
+    second. Two are stable at full strength; more are scaled to the strength of two. Both cars have the same scale: momentum is kept.
     """
     return jnp.minimum(1.0, 2.0 / jnp.maximum(contacts, 1.0))
 

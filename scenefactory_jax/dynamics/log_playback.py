@@ -54,7 +54,7 @@ def make(
             upright=jnp.ones_like(zero),
             steer=zero,
             contact_force=zero,
-            grip=friction(scene.weather, position, safe_norm(velocity)),
+            mu=friction(scene.weather, position, safe_norm(velocity)),
             friction_utilization=zero,
             slip=zero,
         )

@@ -97,9 +97,9 @@ def simulate(
         speed: at the start, m/s; the wheels roll.
         iterations, line_search: replace those of `solver`; enough to converge.
     """
-    engine = make_one(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
-    place(engine, models.find_rest_pose(engine.model, car), np.zeros((1, 2)), np.zeros(1), np.array([speed]))
-    return simulate_placed(engine, controls[:, None], mu[None], substeps=substeps)
+    cars = make_one(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    place(cars, models.find_rest_pose(cars.model, car), np.zeros((1, 2)), np.zeros(1), np.array([speed]))
+    return simulate_placed(cars, controls[:, None], mu[None], substeps=substeps)
 
 
 def make_one(car: CarParameters, solver: Solver, *, physics_dt: float, iterations: int, line_search: int) -> CEngineCars:
@@ -108,15 +108,15 @@ def make_one(car: CarParameters, solver: Solver, *, physics_dt: float, iteration
     return _index_model(models.build_standalone_model(car, converged, physics_dt=physics_dt, visual=False, brake_rows=True), car, [""])
 
 
-def simulate_placed(engine: CEngineCars, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, "1 4"], *, substeps: int) -> Trajectory:
+def simulate_placed(cars: CEngineCars, controls: Float[np.ndarray, "T 1 3"], mu: Float[np.ndarray, "1 4"], *, substeps: int) -> Trajectory:
     """Simulates one car from its current state."""
-    engine.model.pair_friction[engine.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    cars.model.pair_friction[cars.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows = []
     for control in controls:
-        command = _compute_command(engine, control)
+        command = _compute_command(cars, control)
         for _ in range(substeps):
-            _step(engine, command)
-        rows.append(_record(engine))
+            _step(cars, command)
+        rows.append(_record(cars))
     return Trajectory(*(np.array(column)[:, 0] for column in zip(*rows, strict=True)))
 
 
@@ -136,46 +136,50 @@ def simulate_two(
     line_search: int,
 ) -> Encounter:
     """Simulates two cars with MuJoCo's box-box contact; arguments as those of `simulate`, with a car axis."""
-    engine = make_encounter(car, solver, contact, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
+    cars = make_encounter(car, solver, contact, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
     single = make_one(car, solver, physics_dt=physics_dt, iterations=iterations, line_search=line_search)
-    place(engine, models.find_rest_pose(single.model, car), position, yaw, speed)
-    return simulate_encounter(engine, controls, mu, substeps=substeps)
+    place(cars, models.find_rest_pose(single.model, car), position, yaw, speed)
+    return simulate_encounter(cars, controls, mu, substeps=substeps)
 
 
-def simulate_encounter(engine: CEngineCars, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "2 4"], *, substeps: int) -> Encounter:
+def simulate_encounter(
+    cars: CEngineCars, controls: Float[np.ndarray, "T 2 3"], mu: Float[np.ndarray, "2 4"], *, substeps: int
+) -> Encounter:  # fmt: skip
     """Simulates two cars from their current state."""
-    engine.model.pair_friction[engine.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    cars.model.pair_friction[cars.pairs.ravel(), :2] = mu.reshape(-1, 1)
     rows, strongest, first = [], [], np.inf
     for control in controls:
-        command = _compute_command(engine, control)
+        command = _compute_command(cars, control)
         largest = 0.0
         for _ in range(substeps):
-            _step(engine, command)
-            largest = max(largest, float(sum(np.linalg.norm(force) for force in _read_car_forces(engine).values())))
+            _step(cars, command)
+            largest = max(largest, float(sum(np.linalg.norm(force) for force in _read_car_forces(cars).values())))
             if largest > 0.0 and np.isinf(first):
-                first = engine.data.time
-        rows.append(_record(engine))
+                first = cars.data.time
+        rows.append(_record(cars))
         strongest.append(largest)
     trajectory = Trajectory(*(np.array(column) for column in zip(*rows, strict=True)))
     return Encounter(trajectory, np.array(strongest), float(first))
 
 
-def advance(engine: CEngineCars, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int) -> Float[np.ndarray, " N"]:
+def advance(
+    cars: CEngineCars, control: Float[np.ndarray, "N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int
+) -> Float[np.ndarray, " N"]:  # fmt: skip
     """Simulates one control step of all cars and returns the largest force of another car on each, N."""
-    engine.model.pair_friction[engine.pairs.ravel(), :2] = mu.reshape(-1, 1)
-    command, largest = _compute_command(engine, control), np.zeros(len(control))
+    cars.model.pair_friction[cars.pairs.ravel(), :2] = mu.reshape(-1, 1)
+    command, largest = _compute_command(cars, control), np.zeros(len(control))
     for _ in range(substeps):
-        _step(engine, command)
-        for (first, second), force in _read_car_forces(engine).items():
+        _step(cars, command)
+        for (first, second), force in _read_car_forces(cars).items():
             strength = float(np.linalg.norm(force))
             largest[first], largest[second] = max(largest[first], strength), max(largest[second], strength)
     return largest
 
 
-def has_failed(engine: CEngineCars) -> bool:
+def has_failed(cars: CEngineCars) -> bool:
     """Whether a number became not finite since the cars were placed; the engine then resets all cars to the origin."""
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-    return any(engine.data.warning[int(kind)].number for kind in bad)
+    return any(cars.data.warning[int(kind)].number for kind in bad)
 
 
 def make_encounter(
@@ -221,20 +225,20 @@ def make_encounter(
 
 
 def place(
-    engine: CEngineCars,
+    cars: CEngineCars,
     rest_pose: Float[np.ndarray, "17"],
     position: Float[np.ndarray, "N 2"],
     yaw: Float[np.ndarray, " N"],
     speed: Float[np.ndarray, " N"],
 ) -> None:
     """Resets the engine and places the cars at their starts with rolling wheels."""
-    mujoco.mj_resetData(engine.model, engine.data)
-    qpos, qvel = engine.qpos, engine.qvel
+    mujoco.mj_resetData(cars.model, cars.data)
+    qpos, qvel = cars.qpos, cars.qvel
     qpos[:] = rest_pose
     qpos[:, :2] = position
     qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
     qvel[:, 0], qvel[:, 1] = speed * np.cos(yaw), speed * np.sin(yaw)
-    qvel[:, engine.spin] = speed[:, None] / engine.car.wheel_radius
+    qvel[:, cars.spin] = speed[:, None] / cars.car.wheel_radius
 
 
 class Mechanics(NamedTuple):
@@ -246,20 +250,20 @@ class Mechanics(NamedTuple):
     potential_energy: float  # of gravity, springs and stops, J; without the tyres' compression
 
 
-def compute_mechanics(engine: CEngineCars, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
+def compute_mechanics(cars: CEngineCars, qpos: Float[np.ndarray, "N 17"], qvel: Float[np.ndarray, "N 16"]) -> Mechanics:
     """Computes momentum and energy of a state, wheels and suspension included."""
-    data = engine.data
+    data = cars.data
     data.qpos[:], data.qvel[:] = qpos.ravel(), qvel.ravel()
-    mujoco.mj_fwdPosition(engine.model, data)
-    mujoco.mj_fwdVelocity(engine.model, data)
-    mujoco.mj_subtreeVel(engine.model, data)
-    mujoco.mj_energyVel(engine.model, data)
-    mujoco.mj_energyPos(engine.model, data)
-    beyond = np.maximum(np.abs(engine.qpos[:, engine.suspension_q]) - engine.car.suspension_travel, 0.0)
-    stops = 0.5 * engine.car.stop_stiffness * (beyond**2).sum()
-    mass = engine.model.body_subtreemass[engine.chassis, None]
-    each = mass * data.subtree_linvel[engine.chassis]
-    angular = data.subtree_angmom[engine.chassis] + np.cross(data.subtree_com[engine.chassis], each)
+    mujoco.mj_fwdPosition(cars.model, data)
+    mujoco.mj_fwdVelocity(cars.model, data)
+    mujoco.mj_subtreeVel(cars.model, data)
+    mujoco.mj_energyVel(cars.model, data)
+    mujoco.mj_energyPos(cars.model, data)
+    beyond = np.maximum(np.abs(cars.qpos[:, cars.suspension_q]) - cars.car.suspension_travel, 0.0)
+    stops = 0.5 * cars.car.stop_stiffness * (beyond**2).sum()
+    mass = cars.model.body_subtreemass[cars.chassis, None]
+    each = mass * data.subtree_linvel[cars.chassis]
+    angular = data.subtree_angmom[cars.chassis] + np.cross(data.subtree_com[cars.chassis], each)
     return Mechanics(each.sum(0), angular.sum(0), float(data.energy[1]), float(data.energy[0] + stops))
 
 
@@ -301,21 +305,21 @@ class ControlStepInput(NamedTuple):
     brake: Float[np.ndarray, "N 4"]  # torque, rolling resistance included, N m
 
 
-def _compute_command(engine: CEngineCars, control: Float[np.ndarray, "N 3"]) -> ControlStepInput:
-    car = engine.car
+def _compute_command(cars: CEngineCars, control: Float[np.ndarray, "N 3"]) -> ControlStepInput:
+    car = cars.car
     throttle, steer, brake = np.clip(control[:, 0], 0.0, 1.0), np.clip(control[:, 1], -1.0, 1.0), np.clip(control[:, 2], 0.0, 1.0)
     strongest = np.array([car.brake_torque_front] * 2 + [car.brake_torque_rear] * 2)
     drive = (throttle * car.drive_torque)[:, None] * np.array([1.0, 1.0, 0.0, 0.0])
     return ControlStepInput(car.steering_limit * steer, drive, brake[:, None] * strongest + car.rolling_torque)
 
 
-def _step(engine: CEngineCars, command: ControlStepInput) -> None:
+def _step(cars: CEngineCars, command: ControlStepInput) -> None:
     """Runs one physics step, with the part of the slip's acceleration that MuJoCo ignores: see `tyres.compute_jdot_qvel`."""
-    model, data = engine.model, engine.data
-    _apply_forces(engine, command)
+    model, data = cars.model, cars.data
+    _apply_forces(cars, command)
     mujoco.mj_step1(model, data)
     contact = data.contact
-    pressed = np.flatnonzero((engine.tyre_of[contact.geom[:, 1]] < engine.pairs.size) & (contact.efc_address >= 0))
+    pressed = np.flatnonzero((cars.tyre_of[contact.geom[:, 1]] < cars.pairs.size) & (contact.efc_address >= 0))
     wheels = model.geom_bodyid[contact.geom[pressed, 1]]
     jac_linear, jac_angular = np.empty((3, model.nv)), np.empty((3, model.nv))
     hub, angular = np.empty((len(wheels), 3)), np.empty((len(wheels), 3))
@@ -328,25 +332,25 @@ def _step(engine: CEngineCars, command: ControlStepInput) -> None:
     mujoco.mj_step2(model, data)
 
 
-def _apply_forces(engine: CEngineCars, command: ControlStepInput) -> None:
+def _apply_forces(cars: CEngineCars, command: ControlStepInput) -> None:
     """Writes the forces of a physics step: engine, brakes, servo, bump stops, dampings, air drag, and the tyres' slip damping."""
-    car, qpos, qvel = engine.car, engine.qpos, engine.qvel
-    travel = qpos[:, engine.suspension_q]
+    car, qpos, qvel = cars.car, cars.qpos, cars.qvel
+    travel = qpos[:, cars.suspension_q]
     within = np.minimum(np.maximum(travel, -car.suspension_travel), car.suspension_travel)
-    engine.applied[:, engine.suspension] = car.stop_stiffness * (within - travel)
-    servo = car.steering_stiffness * (command.steer[:, None] - qpos[:, engine.steer_q]) - car.steering_damping * qvel[:, engine.steer]
-    spin = qvel[:, engine.spin]
+    cars.applied[:, cars.suspension] = car.stop_stiffness * (within - travel)
+    servo = car.steering_stiffness * (command.steer[:, None] - qpos[:, cars.steer_q]) - car.steering_damping * qvel[:, cars.steer]
+    spin = qvel[:, cars.spin]
     fade = (car.spin_limit - spin) / (DRIVE_FADE_FRACTION * car.spin_limit)
     drive = command.drive * np.minimum(np.maximum(fade, 0.0), 1.0)  # `np.clip` is slower on so few numbers
     common = np.where(spin > -ROLLBACK_SPIN, np.minimum(drive, command.brake), 0.0)
-    engine.applied[:, engine.spin] = drive - common
-    engine.model.dof_frictionloss.reshape(-1, 16)[:, engine.spin] = np.maximum(command.brake - common, MIN_FRICTION_LOSS)
-    engine.applied[:, engine.steer] = np.minimum(np.maximum(servo, -car.steering_torque), car.steering_torque)
+    cars.applied[:, cars.spin] = drive - common
+    cars.model.dof_frictionloss.reshape(-1, 16)[:, cars.spin] = np.maximum(command.brake - common, MIN_FRICTION_LOSS)
+    cars.applied[:, cars.steer] = np.minimum(np.maximum(servo, -car.steering_torque), car.steering_torque)
     speed = np.hypot(qvel[:, 0], qvel[:, 1])
     slip_damping = car.tyre_slip_damping * car.tyre_slip_speed / np.maximum(speed, car.tyre_slip_speed)
-    engine.model.pair_solreffriction[engine.pairs, 1] = -slip_damping[:, None]
+    cars.model.pair_solreffriction[cars.pairs, 1] = -slip_damping[:, None]
     rotation = np.empty(9)
-    for slot, wrench in enumerate(engine.wrenches):
+    for slot, wrench in enumerate(cars.wrenches):
         mujoco.mju_quat2Mat(rotation, qpos[slot, 3:7])
         wrench[:3] = 0.0
         if car.lateral_damping:
@@ -356,27 +360,27 @@ def _apply_forces(engine: CEngineCars, command: ControlStepInput) -> None:
         wrench[3:] = (-car.yaw_damping * qvel[slot, 5]) * rotation[2::3]
 
 
-def _record(engine: CEngineCars) -> tuple[np.ndarray, ...]:
+def _record(cars: CEngineCars) -> tuple[np.ndarray, ...]:
     """Reads state and tyre outputs of every car, as in `Trajectory`."""
-    model, data = engine.model, engine.data
-    count = len(engine.chassis)
+    model, data = cars.model, cars.data
+    count = len(cars.chassis)
     contact = data.contact
-    wheel, address = engine.tyre_of[contact.geom[:, 1]], contact.efc_address
+    wheel, address = cars.tyre_of[contact.geom[:, 1]], contact.efc_address
     pressed = (wheel < 4 * count) & (address >= 0)
     rows = address[pressed, None] + np.arange(3)
     force, slide = data.efc_force[rows], data.efc_vel[rows]  # both at the beginning of the step
     tyres = np.zeros((3, 4 * count))
     tyres[:, wheel[pressed]] = force[:, 0], np.hypot(force[:, 1], force[:, 2]), np.hypot(slide[:, 1], slide[:, 2])
     normal, tangent, slip = tyres.reshape(3, count, 4)
-    return engine.qpos.copy(), engine.qvel.copy(), model.pair_friction[engine.pairs, 0], normal, tangent, slip
+    return cars.qpos.copy(), cars.qvel.copy(), model.pair_friction[cars.pairs, 0], normal, tangent, slip
 
 
-def _read_car_forces(engine: CEngineCars) -> dict[tuple[int, int], Float[np.ndarray, "3"]]:
+def _read_car_forces(cars: CEngineCars) -> dict[tuple[int, int], Float[np.ndarray, "3"]]:
     """Reads the force of each pair of cars that touch in the last step, summed over its contact points, N."""
-    contact, found = engine.data.contact, {}
-    hits = np.flatnonzero(np.isin(contact.geom, engine.boxes).all(-1) & (contact.efc_address >= 0))
+    contact, found = cars.data.contact, {}
+    hits = np.flatnonzero(np.isin(contact.geom, cars.boxes).all(-1) & (contact.efc_address >= 0))
     for hit in hits:
-        first, second = (int(car) for car in np.searchsorted(engine.boxes, contact.geom[hit]))
-        rows = engine.data.efc_force[contact.efc_address[hit] + np.arange(3)]
+        first, second = (int(car) for car in np.searchsorted(cars.boxes, contact.geom[hit]))
+        rows = cars.data.efc_force[contact.efc_address[hit] + np.arange(3)]
         found[first, second] = found.get((first, second), 0.0) + contact.frame[hit].reshape(3, 3).T @ rows
     return found

@@ -59,22 +59,22 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
 
 def drive(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str, Array]:
     """One world without any control input: how many of its cars had what, see MEANING."""
-    state = env.start(key, scene)
+    state = env.init_state(key, scene)
     present = state.active
     action = jnp.zeros((len(present), 3), jnp.float32)
 
     def advance(state, _):
-        after, outcome = env.transition(scene, state, action)
-        return after, (outcome.facts, state.active)
+        after, outcome = env.control_step(scene, state, action)
+        return after, (outcome.metrics, state.active)
 
-    _, (facts, active) = jax.lax.scan(advance, state, length=steps)
-    events, ever = facts.events, lambda past_events: jnp.any(past_events & active, axis=0)  # facts of finished cars mean nothing
+    _, (metrics, active) = jax.lax.scan(advance, state, length=steps)
+    events, ever = metrics.events, lambda past_events: jnp.any(past_events & active, axis=0)  # metrics of finished cars mean nothing
     marks = {
         "cars": present,
         "faults": ever(events.numerical_error),
-        "overlapping": (facts.contact_force[0] > 0) & present,
+        "overlapping": (metrics.contact_force[0] > 0) & present,
         "on_edge": events.road_edge_contact[0] & present,
-        "off_lane": facts.off_lane[0] & present,
+        "off_lane": metrics.off_lane[0] & present,
         "collision": ever(events.collision),
         "road_edge_contact": ever(events.road_edge_contact),
     }

@@ -169,7 +169,9 @@ def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Ar
     """Reads theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.friction.surfaces: {', '.join(surfaces)}; expected exactly {', '.join(SURFACES)}")
-    rows = [instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.friction.surfaces.{n}")() for n in SURFACES]
+    rows = [
+        instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.friction.surfaces.{n}")() for n in SURFACES
+    ]
     for name, row in zip(SURFACES, rows, strict=True):
         check_numbers(vars(row), where=f"weather.friction.surfaces.{name}", above=0.0)
     return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)

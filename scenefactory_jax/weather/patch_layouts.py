@@ -107,7 +107,7 @@ def strips(
     Args:
         length_m: range.
         width_m: range.
-        offset_m: range of the band's offset from the lane's centre line, positive to the left; under the wheels of one side it makes split mu.
+        offset_m: range of the band's offset from the lane's centre line, positive to the left.
         points: vertices of the band's middle line, equidistant along the lane.
         count, chance, surface, film_mm, open_road_film_fraction: as for `circles`.
 

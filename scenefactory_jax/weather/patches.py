@@ -30,7 +30,7 @@ def contains_points(patches: Patches, position: Float[Array, "*shape 2"]) -> Boo
 
 
 def read_condition(weather: Weather, position: Float[Array, "*shape 2"]) -> tuple[Float[Array, "*shape"], Int[Array, "*shape"]]:
-    """Reads water film, mm, and surface (index into SURFACES) at points: of the last patch that contains the point, else of the open road."""
+    """Reads water film, mm, and surface (index into SURFACES) at points: of the last patch that contains them, else of the road."""
     patches, shape = weather.patches, position.shape[:-1]
     count = patches.present.shape[0]
     if count == 0:

@@ -6,7 +6,6 @@ import numpy as np
 
 from scenefactory_jax.dynamics.articulated import contact_solver
 from scenefactory_jax.dynamics.articulated import model as models
-from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.mjx_backend import MjxCar
 
 

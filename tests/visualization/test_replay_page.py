@@ -176,12 +176,12 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["run=nowhere"], "nowhere is no run: it has no config.yaml"),
+        (["run=nowhere"], "config.yaml not found in nowhere"),
         (["run=nowhere", "dynamics=bicycle"], "dynamics: decided by the run nowhere; to change it: overrides='[dynamics=...]'"),
         (["overrides=[weather=wet]"], "overrides: ['weather=wet'] without a run"),
         (["out=."], "out: . is a folder; give the page's own name, such as replay.html"),
         (["act=wild"], "act: 'wild'"),
-        (["worlds=0"], "worlds: 0; wanted is at least 1"),
+        (["worlds=0"], "worlds: expected an integer >= 1, got 0"),
         (["scenes=womd"], "scenes.path: null; give a bank, a scene file or a folder"),
     ],
 )

@@ -142,7 +142,8 @@ def test_drawn_areas_are_the_patches():
 
 
 def test_dry_surfaces_have_their_textbook_friction():
-    grip = instantiate.instantiate(scenefactory_jax.load_config("task")["weather"]["friction"], builtins=friction_model, where="weather.friction")
+    entry = scenefactory_jax.load_config("task")["weather"]["friction"]
+    grip = instantiate.instantiate(entry, builtins=friction_model, where="weather.friction")
     wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
     spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
@@ -310,7 +311,7 @@ def test_every_option_resets_steps_and_traces_once(option):
     for _ in range(3):
         states, outcome = step(scenes, states, jnp.zeros((6, 2, 3)))
     assert len(traces) == 1 and seen["weather"].shape == (6, 2, 4)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.facts.grip, outcome.observation, states.weather)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.metrics.mu, outcome.observation, states.weather)))
     np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
     later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(states.weather)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
@@ -323,7 +324,10 @@ def test_every_option_resets_steps_and_traces_once(option):
         np.testing.assert_array_equal(getattr(states.weather.patches, name), leaf)
 
 
-PUDDLE = "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, open_road_film_fraction: 1.0}]}"
+PUDDLE = (
+    "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, "
+    "open_road_film_fraction: 1.0}]}"
+)
 COURSE = "weather.rain={_target_: schedule, time_s: [0.0, 1.0], film_mm: [0.1, 0.4]}"
 
 
@@ -336,7 +340,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     for _ in range(30):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
         tokens.append(outcome.observation["weather"])
-        friction.append(outcome.facts.grip)
+        friction.append(outcome.metrics.mu)
     tokens, film, friction = np.array(tokens), 0.1 + 0.3 * np.arange(1, 31) / 30, np.array(friction)
     wet = np.array([4.0 * step / 30 for step in range(1, 31)]) < 1.9  # the bearings' drag takes little of 4 m/s
     np.testing.assert_allclose(tokens[:, 1, 0], film, atol=1e-5)
@@ -362,7 +366,7 @@ def test_an_entry_of_null_is_left_out_and_others_may_be_added():
     added = config_of("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")["weather"]
     laid = road_condition.make(added)(KEY, lanes_scene())
     assert laid.patches.present.shape == (6,) and (laid.patches.surface == ICE).all()
-    old = {name: entry for name, entry in config_of()["weather"].items() if name in ("draw", "grip")}  # of a run before there were patches
+    old = {name: config_of()["weather"][name] for name in ("sampler", "friction")}  # without patches and rain
     assert road_condition.make(old)(KEY, lanes_scene()).patches.present.shape == (0,)
 
 
@@ -382,12 +386,12 @@ def test_the_report_says_how_the_film_changed():
         ("+weather.patches.ice.cuont=3", r"weather\.patches\.ice\.cuont: unknown key of polygons; valid: chance, corners, count"),
         ("~weather.patches.ice.chance", r"weather\.patches\.ice\.chance: missing; polygons needs"),
         ("weather.patches.ice.surface=MUD", r"weather\.patches\.ice\.surface: 'MUD'; valid: AC, SMA, OGFC, GRAVEL, SNOW, ICE"),
-        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: 1\.5; wanted is a number from 0 to 1"),
-        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: \[3\.0, 1\.0\]; wanted is \[least, most\]"),
+        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: expected a number >= 0 and <= 1, got 1\.5"),
+        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: expected \[min, max\], got \[3\.0, 1\.0\]"),
         ("weather.patches.ice.film_mm=[-1.0,1.0]", r"weather\.patches\.ice\.film_mm: .*nothing below 0"),
-        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: 2; wanted is at least 3"),
-        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: -1\.0; wanted is at least 0"),
-        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: 'many' is of type str, wanted int"),
+        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: expected an integer >= 3, got 2"),
+        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: expected an integer >= 0, got -1\.0"),
+        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: expected an integer, got 'many'"),
         ("weather.patches=wet", r"weather\.patches: 'wet'"),
         ("+weather.rian=3", r"weather\.rian: unknown key; valid: draw, grip, patches, rain"),
         ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: drying, onset, pass_time, schedule"),
@@ -411,7 +415,7 @@ def test_refuses_by_name(override, message):
         ({**SHAPES[0], "strip": [[0, 0], [1, 0]]}, r"shapes\[0\]: .*one of circle"),
         ({**SHAPES[0], "width": 1.0}, r"shapes\[0\]\.width: unknown; a circle has circle, radius, surface"),
         ({k: v for k, v in SHAPES[0].items() if k != "radius"}, r"shapes\[0\]\.radius: missing; a circle has"),
-        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: -1\.0; wanted is at least 0"),
+        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: expected an integer >= 0, got -1\.0"),
         ({**SHAPES[0], "circle": [[0, 0]]}, r"shapes\[0\]\.circle: .*wanted tuple\[float, float\]"),
         ({**SHAPES[1], "polygon": [[0, 0], [1, 0]]}, r"shapes\[0\]\.polygon: 2 points; wanted are at least 3"),
         ({**SHAPES[1], "surface": "MUD"}, r"shapes\[0\]\.surface: 'MUD'; valid: AC"),
@@ -419,7 +423,7 @@ def test_refuses_by_name(override, message):
     ],
 )
 def test_given_shapes_are_refused_by_name(shape, message):
-    entry = {"draw": {"_target_": "keep_condition"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
+    entry = {"sampler": {"_target_": "keep_condition"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
     with pytest.raises(ConfigError, match=r"weather\.patches\.mine\." + message):
         road_condition.make(entry)(KEY, lanes_scene())
 

@@ -4,8 +4,8 @@ MuJoCo defines the acceleration of a step as the minimum of
 
     1/2 (a - a_smooth)^T M (a - a_smooth) + s(J a - a_ref)
 
-with one elliptic cone per tyre and one Huber cost per brake (MuJoCo documentation, "Computation", the primal problem). MJX solves it for any
-model, with dense 16 x 16 matrices, library calls for the factors, and loops until the last car of a batch has converged. A car's wheels are
+with one elliptic cone per tyre and one Huber cost per brake (MuJoCo documentation, "Computation", the primal problem). MJX solves it for
+any model, with dense 16 x 16 matrices, library calls for the factors, and loops until the last car of a batch has converged. Wheels are
 coupled only through the chassis, so the Hessian is an arrow: a 6 x 6 block for the chassis and a 3 x 3 block per wheel. Eliminating the
 wheels leaves 6 equations. All arithmetic is on scalars with the four wheels as an axis, so that XLA fuses it, and the iteration counts are
 fixed. Derivatives are those of the minimum, in forward and reverse mode.
@@ -199,7 +199,8 @@ def _newton_direction(problem: Problem, iterate: NewtonIterate, gradient: Accele
     contact = _compute_tyre_force(iterate.rows, problem.tyre)
     _, hold = _compute_brake_torque(iterate.brake, problem.brake)
     jacobian = problem.tyre.jacobian
-    stiff_jacobian = [[_dot(contact.stiffness[r], [row[c] for row in jacobian]) for c in range(BASE + WHEEL)] for r in range(3)]  # rows of dF J
+    columns = [[row[c] for row in jacobian] for c in range(BASE + WHEEL)]
+    stiff_jacobian = [[_dot(contact.stiffness[r], column) for column in columns] for r in range(3)]
 
     def curvature(i: int, j: int) -> Number:
         return _dot([row[i] for row in jacobian], [row[j] for row in stiff_jacobian])

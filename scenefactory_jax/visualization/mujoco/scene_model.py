@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated import model as models
-from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import ground_meshes

@@ -24,14 +24,14 @@ def write(folder: Path, found: Mapping[str, Any]) -> Path:
     reference = found["reference"]
     words = (
         f"Friction coefficient of a tyre at {reference['speed_mps']:g} m/s, before a contact's own floor: at slip "
-        f"{reference['slips']['static']:g} (static, which the simulation uses unless `weather.friction.mode` says otherwise) and, in brackets, "
+        f"{reference['slips']['static']:g} (static, the default of `weather.friction.mode`) and, in brackets, "
         f"{reference['slips']['dynamic']:g} (dynamic). Water films across, in mm. Zero: the tyre floats."
     )
     lines = ["# Friction on wet roads", f"`{found['command']}`", words, table(found)]
     if compared := compare_with_published(found):
         lines += ["## Beside the published table", compared]
     cliff = (
-        "The film at which grip is lost is where the water can no longer be squeezed out to the minimum spacing: 0.8 mm for every surface "
+        "Friction is lost at the film depth from which water is no longer squeezed out to the minimum spacing: 0.8 mm for every surface "
         "(`minimum_spacing` / `spacing_ratio`). Below it a film only thins the friction through the Stribeck speed; above it contact ends "
         "within hundredths of a millimetre. The model has no gradual aquaplaning, and its surfaces differ by their ratio theta alone."
     )
