@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.validation import engines
 from experiments.validation.equivalence import SPIN
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Boxes, Dynamics, Scene
+from scenefactory_jax.dynamics import open_ground
 from scenefactory_jax.dynamics.articulated import equations_of_motion, randomization
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
@@ -160,7 +160,7 @@ def _begin(
     place = lanes + np.array([case.position for case in crowd])
     zero = np.zeros((1, len(crowd)))
     size = (car.length, car.width)
-    worlds = engines.scenes(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
+    worlds = open_ground.make_open_ground(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
     scene = jax.tree.map(lambda leaf: leaf[0], worlds)
     body = jax.jit(backend.init)(jax.random.key(0), scene)
     walls = np.flatnonzero(["wall" in case.name for case in crowd])

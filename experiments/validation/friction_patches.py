@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.validation import engines, motion_laws
+from experiments.validation import motion_laws
 from experiments.validation.motion_laws import FULL_BRAKE, Trace
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches, Scene
+from scenefactory_jax.dynamics import open_ground
 
 
 class Patch(NamedTuple):
@@ -28,7 +29,7 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
     count = len(patches)
     zero = np.zeros((count, 1), np.float32)
     dry, asphalt = np.zeros(count), np.full(count, SURFACES.index("AC"), np.int32)
-    worlds = engines.scenes(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
+    worlds = open_ground.make_open_ground(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
     some = [patch or Patch([(0.0, 0.0), (0.0, 0.0)], 0.0, "AC") for patch in patches]
 
     def one(line: Array, radius: Array, surface: Array, present: Array) -> Patches:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from experiments.validation import engines
 from experiments.validation.random_drives import PATTERN_NAMES, Sequences
 from scenefactory_jax.core.types import Dynamics, Scene
-from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics import mujoco_c, open_ground
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, total_mass
@@ -53,8 +53,9 @@ def driver(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, sl
 
     def drive(cases: Sequences) -> Trace:
         zero = np.zeros((len(cases.speed), 1), np.float32)
-        return run(engines.scenes(zero[..., None].repeat(2, -1), zero, cases.speed[:, None], cases.friction, cases.pattern, size=size),
-                   cases.controls)  # fmt: skip
+        position = zero[..., None].repeat(2, -1)
+        worlds = open_ground.make_open_ground(position, zero, cases.speed[:, None], cases.friction, cases.pattern, size=size)
+        return run(worlds, cases.controls)
 
     return drive
 

@@ -13,7 +13,7 @@ from experiments.validation import validation_figures as figures
 from experiments.validation.validation_figures import NAMES
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.visualization.report import plots, verdicts
 
 Result = Mapping[str, Any]
 
@@ -30,7 +30,7 @@ def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mappi
         "drives": _drives, "settings": _settings, "encounters": _encounters, "laws": _laws,
         "extremes": robustness_report.extremes, "faults": robustness_report.faults, "costs": robustness_report.costs,
     }  # fmt: skip
-    lines = ["# Validation of the physics", _made(results), "## Verdicts", target_check.table(target_check.of(results, targets))]
+    lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(target_check.of(results, targets))]
     for name, make in makers.items():
         if name in results:
             lines += make(results[name]["result"], folder)

@@ -39,7 +39,7 @@ def cases(model):
     qvel = rng.normal(0, 1, (COUNT, 16)) * np.array([8, 3, 0.3, 0.3, 0.3, 0.6] + [1] * 10)
     qvel[:, at.spin_v] = qvel[:, :1] / car.wheel_radius + rng.normal(0, 10, (COUNT, 4))
     mu, push = rng.uniform(0.02, 1.3, (COUNT, 4)), rng.normal(0, 1, (COUNT, 16)) * np.array([2000, 2000, 500, 300, 300, 500] + [100] * 10)
-    brake = rng.uniform(0, 1500, (COUNT, 4)) * (rng.random((COUNT, 1)) < 0.6) + cars.LATENT_FRICTION
+    brake = rng.uniform(0, 1500, (COUNT, 4)) * (rng.random((COUNT, 1)) < 0.6) + cars.MIN_FRICTION_LOSS
     return [jnp.asarray(column, jnp.float32) for column in (qpos, qvel, push, mu, brake)]
 
 
