@@ -363,7 +363,8 @@ def test_the_token_lists_the_surfaces_that_it_is_told():
 
 
 def test_an_entry_of_null_is_left_out_and_others_may_be_added():
-    added = config_of("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")["weather"]
+    overrides = ("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")
+    added = scenefactory_jax.load_config("train", *overrides)["weather"]
     laid = road_condition.make(added)(KEY, lanes_scene())
     assert laid.patches.present.shape == (6,) and (laid.patches.surface == ICE).all()
     old = {name: config_of()["weather"][name] for name in ("sampler", "friction")}  # without patches and rain
@@ -398,7 +399,7 @@ def test_the_report_says_how_the_film_changed():
         ("weather.rain={_target_: drying, tau_s: [-1.0, 2.0], knots: 8}", r"weather\.rain\.tau_s: expected .*>= 0"),
         ("weather.rain={_target_: drying, tau_s: [1.0, 2.0], knots: 1}", r"weather\.rain\.knots: expected an integer >= 2, got 1"),
         ("weather.rain={_target_: schedule, time_s: [1.0, 1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.time_s: .*ascending"),
-        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.film_mm: expected one film per time and at least one, got 2 films for 1 times"),
+        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.film_mm: expected one film per time"),
         ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [-0.1]}", r"weather\.rain\.film_mm: expected .*>= 0"),
         ("observations.weather.surfaces=[AC,MUD]", r"observations\.weather\.surfaces: expected names of AC, SMA"),
     ],
