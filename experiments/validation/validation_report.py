@@ -215,7 +215,7 @@ def _stopping(result: Result) -> Sequence[str]:
     rows = [["v²/(2 μ g), less the air", *(f"{way:.1f}" for way in limit)]]
     for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
         rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
-    rows += [[f"C engine, mjx_car, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
+    rows += [[f"C engine, articulated, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
     return [
         words,
         agent_metrics.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows),

@@ -7,14 +7,14 @@ between articulated cars; they are reported and do not move the cars.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import heading_vector, safe_norm, wrap_angle
-from scenefactory_jax.core.instantiate import check_number, check_numbers
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
+from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.dynamics.collision import advance_boxes, collect_boxes, make_contact
@@ -37,17 +37,17 @@ class Body:
 
 def make(
     *,
-    mass: float,
-    wheelbase: float,
-    rear_length: float,
-    centre_height: float,
-    steering_limit: float,
-    acceleration: float,
-    deceleration: float,
-    rolling: float,
-    drag: float,
-    air_drag: float,
-    speed_limit: float,
+    mass: Positive,
+    wheelbase: Positive,
+    rear_length: NonNegative,
+    centre_height: NonNegative,
+    steering_limit: Annotated[float, Bounds(above=0.0, below=math.pi / 2)],
+    acceleration: NonNegative,
+    deceleration: NonNegative,
+    rolling: NonNegative,
+    drag: NonNegative,
+    air_drag: NonNegative,
+    speed_limit: Positive,
     contact: dict[str, Any],
     friction: Callable[..., Any],
     control_dt: float,
@@ -72,10 +72,6 @@ def make(
     Raises:
         ConfigError: a number out of range, or an unknown, missing or wrong value of `contact`, by name.
     """
-    check_numbers({"mass": mass, "wheelbase": wheelbase, "speed_limit": speed_limit}, where="dynamics", above=0.0)
-    check_number(steering_limit, where="dynamics.steering_limit", above=0.0, below=math.pi / 2)
-    pushes = {"acceleration": acceleration, "deceleration": deceleration, "rolling": rolling, "drag": drag, "air_drag": air_drag}
-    check_numbers({"rear_length": rear_length, "centre_height": centre_height, **pushes}, where="dynamics", least=0.0)
     collision = make_contact(contact, height=math.inf)
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 

@@ -7,7 +7,7 @@ other box's nearest face, which leaves two contact points, each with half the st
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.instantiate import ConfigError, check_numbers, instantiate
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace
+from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
@@ -45,12 +46,12 @@ def make_contact(entry: Mapping[str, Any], *, height: float, physics_dt: float |
 
 def make(
     *,
-    stiffness: float,
-    damping: float,
-    friction: float,
-    mass: float,
-    momentum_transfer_s: float,
-    max_neighbours: int,
+    stiffness: Positive,
+    damping: NonNegative,
+    friction: NonNegative,
+    mass: Positive,
+    momentum_transfer_s: Positive,
+    max_neighbours: Annotated[int, Bounds(min=0)],
     height: float,
     physics_dt: float | None = None,
 ) -> Contact:
@@ -63,8 +64,6 @@ def make(
     Raises:
         ConfigError: a number out of range, or a contact too stiff for `physics_dt`, by name.
     """
-    check_numbers({"stiffness": stiffness, "mass": mass, "momentum_transfer_s": momentum_transfer_s}, where="dynamics.contact", above=0.0)
-    check_numbers({"damping": damping, "friction": friction, "max_neighbours": max_neighbours}, where="dynamics.contact", least=0.0)
     load = OFF_CENTRE * (stiffness * (physics_dt or 0.0) + 2 * damping) * (physics_dt or 0.0) / (mass / 2)
     if load >= 4.0:  # see `compute_forces`
         raise ConfigError(

@@ -471,7 +471,7 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(rendering, "photograph", blind)
     assert render(settings) == xml and "no OpenGL through egl here" in capsys.readouterr().out
-    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: mjx_car"}.items():
+    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: articulated"}.items():
         with pytest.raises(ConfigError, match=message):
             render(hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", override))
 

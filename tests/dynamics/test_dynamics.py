@@ -372,21 +372,21 @@ def test_refuses_by_name(changes, named):
 @pytest.mark.parametrize(
     ("key", "bad", "wanted"),
     [
-        ("car.mass", -1800.0, "above 0"), ("car.mass", float("nan"), "above 0"), ("car.mass", float("inf"), "above 0"),
-        ("car.inertia", [-750.0, 2550.0, 3000.0], "above 0"), ("car.inertia", [750.0, 2550.0, 5000.0], "no moment above the sum"),
+        ("car.mass", -1800.0, "> 0"), ("car.mass", float("nan"), "> 0"), ("car.mass", float("inf"), "> 0"),
+        ("car.inertia", [-750.0, 2550.0, 3000.0], "> 0"), ("car.inertia", [750.0, 2550.0, 5000.0], "no moment above the sum"),
         ("car.wheel_inertia", [3.0, 1.3], "no moment above the sum"), ("car.inertia", [750.0, 2550.0], "3 moments"),
-        ("car.wheelbase", 0.0, "above 0"),
-        ("car.wheel_radius", -0.35, "above 0"), ("car.suspension_stiffness", 0.0, "above 0"), ("car.spin_limit", 0.0, "above 0"),
-        ("car.suspension_damping", -1.0, "of at least 0"), ("car.knuckle_mass", -50.0, "of at least 0"),
-        ("car.drive_torque", -500.0, "of at least 0"), ("car.steering_limit", 1.6, "below 1.5708"),
-        ("car.tyre_impedance", 1.0, "below 1"), ("car.brake_impedance", 0.0, "above 0"), ("car.mass_height", float("inf"), "finite"),
-        ("solver.iterations", 0, "of at least 1"), ("solver.line_search", -1, "of at least 1"), ("solver.friction_ratio", 0.0, "above 0"),
+        ("car.wheelbase", 0.0, "> 0"),
+        ("car.wheel_radius", -0.35, "> 0"), ("car.suspension_stiffness", 0.0, "> 0"), ("car.spin_limit", 0.0, "> 0"),
+        ("car.suspension_damping", -1.0, ">= 0"), ("car.knuckle_mass", -50.0, ">= 0"),
+        ("car.drive_torque", -500.0, ">= 0"), ("car.steering_limit", 1.6, "< 1.5708"),
+        ("car.tyre_impedance", 1.0, "< 1"), ("car.brake_impedance", 0.0, "> 0"), ("car.mass_height", float("inf"), "expected a"),
+        ("solver.iterations", 0, ">= 1"), ("solver.line_search", -1, ">= 1"), ("solver.friction_ratio", 0.0, "> 0"),
     ],
 )  # fmt: skip
 def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
     group, name = key.split(".")
     entry = {**config("articulated"), group: {**config("articulated")[group], name: bad}}
-    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted (is|are) .*{wanted}"):
+    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*.*{wanted}"):
         cars.read_parameters(entry)
 
 
@@ -405,7 +405,7 @@ def test_every_number_of_a_car_has_its_bounds():
     ],
 )  # fmt: skip
 def test_numbers_that_no_bicycle_has_are_refused(key, bad):
-    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: .*; wanted is"):
+    with pytest.raises(ConfigError, match=rf"^dynamics\.{key}: expected"):
         make("bicycle", **{key: bad})
     make("bicycle", rear_length=0.0)
 

@@ -15,6 +15,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import actuators, constants, randomization, tyres
 from scenefactory_jax.dynamics.articulated import state as states
+from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 
 FREE = dataclasses.replace(  # nothing else slows it
     CAR, wheel_damping=0.0, yaw_damping=0.0, rolling_torque=0.0, air_drag=0.0, tyre_slip_damping=5.0, tyre_slip_speed=1e3
@@ -36,7 +37,7 @@ def go(several, action, speed=0.0):
 def rolling(body):
     """Radius on which the cars roll, as the trace has it (the tyres are a little pressed), and mass with the wheels' inertia."""
     radius = np.median(body.qvel[..., 0] / np.maximum(body.qvel[..., SPIN].mean(-1), 1e-3), axis=0)
-    return radius, motion_laws.mass(FREE) + 4 * FREE.wheel_inertia[0] / radius**2
+    return radius, total_mass(FREE) + 4 * FREE.wheel_inertia[0] / radius**2
 
 
 def test_rolling_resistance_slows_a_car_evenly_and_then_holds_it():
@@ -118,7 +119,7 @@ def test_a_lateral_force_needs_the_same_slip_angle_at_every_speed():
     weight = constants.derive_constants(jax.tree.map(jnp.float32, law)).wheel_weight[2]
     d = law.tyre_impedance
     yields = float(weight) * (1 - d) / d / SOLVER.friction_ratio
-    assert fast == pytest.approx(motion_laws.mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
+    assert fast == pytest.approx(total_mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
 
 
 def test_below_the_slip_speed_nothing_changes():
@@ -179,7 +180,7 @@ def test_resistance_grows_with_the_footprint():
 
 def test_brakes_distance_counts_all_that_slows():
     car, v, x, dt = dataclasses.replace(CAR, **ON), 15.0, 0.0, 1e-4
-    mass = motion_laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    mass = total_mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
     while v > 0:
         torque = 2 * (car.brake_torque_front + car.brake_torque_rear) + 4 * (car.wheel_damping * v / car.wheel_radius + car.rolling_torque)
         v, x = v - dt * (torque / car.wheel_radius + car.air_drag * v * v) / mass, x + dt * v

@@ -163,10 +163,10 @@ def test_the_c_engines_contact_is_the_spring_damper(entry, impedance):
         peak = max(peak, force)
         rate -= force / (mass / 2) * dt
         depth += rate * dt
-    parting = story.path.qvel[-1, 1, 0] - story.path.qvel[-1, 0, 0]
+    parting = story.trajectory.qvel[-1, 1, 0] - story.trajectory.qvel[-1, 0, 0]
     assert parting == pytest.approx(-rate, rel=0.1)
     assert story.contact_force.max() == pytest.approx(peak, rel=0.05)
-    assert story.path.qvel[-1, :, 0].sum() == pytest.approx(10.0, rel=0.02)
+    assert story.trajectory.qvel[-1, :, 0].sum() == pytest.approx(10.0, rel=0.02)
 
 
 def test_near_misses_and_hits_are_told_apart(entry):

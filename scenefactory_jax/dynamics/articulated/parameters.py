@@ -5,14 +5,14 @@ Sources of the car's numbers: SceneFactory's vehicle (URDF and system identifica
 
 import dataclasses
 import math
-import typing
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number, instantiate
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import pytree
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order of every array with a wheel axis
 FRONT_WHEELS = WHEELS[:2]
@@ -23,20 +23,10 @@ ROLLBACK_SPIN = 0.5  # rad/s; a wheel that turns backwards faster is slowed by d
 DRIVE_FADE_FRACTION = 0.1  # of the spin limit, over which the drive torque falls to zero
 
 
-class Range(NamedTuple):
-    """Bounds of a number: `above` and `below` exclude the bound, `least` includes it."""
-
-    above: float | None = None
-    least: float | None = None
-    below: float | None = None
-
-
-Positive = Annotated[float, Range(above=0.0)]
-NonNegative = Annotated[float, Range(least=0.0)]
-OpenFraction = Annotated[float, Range(above=0.0, below=1.0)]
-Angle = Annotated[float, Range(least=0.0, below=math.pi / 2)]
-Count = Annotated[int, Range(least=1)]
-Moments = Annotated[tuple[float, ...] | list[float], Range(above=0.0)]
+Finite = Annotated[float, Bounds()]
+OpenFraction = Annotated[float, Bounds(above=0.0, below=1.0)]
+Angle = Annotated[float, Bounds(min=0.0, below=math.pi / 2)]
+Moments = Annotated[list[float], Bounds(above=0.0)]
 
 
 @pytree
@@ -49,11 +39,11 @@ class CarParameters:
     height: Positive  # chassis box, m
     mass: Positive  # chassis, kg
     inertia: Moments  # chassis about its centre of mass: roll, pitch, yaw, kg m^2
-    mass_forward: float  # chassis centre of mass, forward of the box's centre, m
-    mass_height: float  # chassis centre of mass, above the box's centre, m
+    mass_forward: Finite  # chassis centre of mass, forward of the box's centre, m
+    mass_height: Finite  # chassis centre of mass, above the box's centre, m
     wheelbase: Positive  # m
     track: Positive  # between the wheel centres, m
-    wheel_height: float  # wheel centres above the box's centre at mid travel, m
+    wheel_height: Finite  # wheel centres above the box's centre at mid travel, m
     wheel_radius: Positive  # m
     wheel_width: Positive  # m
     wheel_mass: Positive  # spinning part, kg
@@ -110,26 +100,11 @@ def read_parameters(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
     Raises:
         ConfigError: an unknown, missing or out-of-range number, by name.
     """
-    kinds = {"car": "CarParameters", "solver": "Solver"}
-    car, solver = (instantiate({**entry[k], "_target_": t}, builtins=__name__, where=f"dynamics.{k}")() for k, t in kinds.items())
-    check_ranges(car, where="dynamics.car")
-    check_ranges(solver, where="dynamics.solver")
+    car = schema.read(entry["car"], CarParameters, where="dynamics.car")
+    solver = schema.read(entry["solver"], Solver, where="dynamics.solver")
     for name, axes in {"inertia": (0, 1, 2), "wheel_inertia": (0, 1, 1)}.items():  # a wheel is a body of revolution
         _check_moments(list(getattr(car, name)), axes, where=f"dynamics.car.{name}")
     return car, solver
-
-
-def check_ranges(parameters: CarParameters | Solver, *, where: str) -> None:
-    """Checks every number against the range of its annotation. Outside of it cars lift off, sink or do not move, without an error.
-
-    Raises:
-        ConfigError: naming the number and its range.
-    """
-    for name, hint in typing.get_type_hints(type(parameters), include_extras=True).items():
-        value, ranges = getattr(parameters, name), getattr(hint, "__metadata__", (Range(),))
-        for number in value if isinstance(value, (list, tuple)) else (value,):
-            if not isinstance(number, str):
-                check_number(number, where=f"{where}.{name}", **ranges[0]._asdict())
 
 
 def _check_moments(moments: list[float], axes: tuple[int, ...], *, where: str) -> None:

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, check_numbers, check_range
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.dynamics.articulated.parameters import CarParameters, check_ranges, check_stability
+from scenefactory_jax.dynamics.articulated.parameters import CarParameters, check_stability
 
 WHERE = "dynamics.randomization"
 SCALE_WITH_FOOTPRINT = (  # every parameter with a newton or a kilogram in its unit
@@ -53,7 +54,7 @@ def car_parameter_sampler(
             raise ConfigError(f"{WHERE}.scale.{name}: unknown parameter; valid: {', '.join(vars(car))}")
         factors[name] = check_range(span, where=f"{WHERE}.scale.{name}")
         for end in factors[name]:
-            check_ranges(scale_parameters(car, {name: end}), where=f"{WHERE}.scale")
+            schema.check(vars(scale_parameters(car, {name: end})), CarParameters, where=f"{WHERE}.scale")
     stiffest = find_stiffest(car, factors)
     check_stability(stiffest, physics_dt=physics_dt, where=f"{WHERE}.scale")
     if size == "logged":
