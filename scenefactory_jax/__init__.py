@@ -8,7 +8,7 @@
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
     run = sf.train(config)                          # and sf.evaluate(sf.load_config("evaluate", f"run={run.folder}"))
 
-Everything under `run/` (`train`, `evaluate`, `replay`, `convert`, `render`) takes such a config.
+Every function of `scenefactory_jax.cli` that is named like a command takes such a config.
 """
 
 import contextlib
@@ -31,8 +31,8 @@ from scenefactory_jax.env.environment import make_env as make
 
 if TYPE_CHECKING:
     from scenefactory_jax.cli.evaluate import evaluate
+    from scenefactory_jax.cli.replay import replay
     from scenefactory_jax.cli.train import train
-    from scenefactory_jax.cli.view import replay
     from scenefactory_jax.learning.policy_io import load_policy
 
 __version__ = "0.1.0"
@@ -61,7 +61,7 @@ def __getattr__(name: str) -> Any:
     places = {
         "train": "cli.train",
         "evaluate": "cli.evaluate",
-        "replay": "cli.view",
+        "replay": "cli.replay",
         "load_policy": "learning.policy_io",
     }
     if name not in places:

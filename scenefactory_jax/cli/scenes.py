@@ -72,12 +72,19 @@ def draw(loaded: scene_source.Scenes, folder: Path, *, limit: int) -> list[Path]
     return paths
 
 
+def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """Step every scene for some seconds and print what went wrong."""
+    found = scene_simulation.simulate(config)
+    print(scene_simulation.describe(found), flush=True)
+    return found
+
+
 OPERATIONS: dict[str, Operation] = {
     "check": check,
     "sheet": sheet,
     "quality": scene_quality.quality,
     "compare": scene_comparison.compare,
-    "simulate": scene_simulation.simulate,
+    "simulate": simulate,
     "info": scene_operations.info,
     "filter": scene_operations.filter,
     "sample": scene_operations.sample,

@@ -104,3 +104,52 @@ class Render(Task):
     out: str
     image: dict[str, Any]
     world: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ViewFilm:
+    """A film in three dimensions, of the command `view`."""
+
+    view: Literal["chase", "bird", "both"]
+    width: Annotated[int, Bounds(min=64)]
+    height: Annotated[int, Bounds(min=64)]
+    fps: Frequency
+    stride: Count
+    at_s: NonNegative
+    trail_s: NonNegative
+
+
+@dataclass(frozen=True)
+class KeyboardResponse:
+    """How keys become pedals and steering, in the command `view`."""
+
+    rise_s: Seconds
+    fall_s: Seconds
+    turn_s: Seconds
+    centre_s: Seconds
+    half_steer_mps: Seconds
+    tap_s: Seconds
+
+
+@dataclass(frozen=True)
+class View(Task):
+    """The command `view`."""
+
+    scenes: Group
+    run: str | None
+    trust: bool
+    overrides: list[str]
+    act: Literal["policy", "coast", "random"]
+    worlds: Count
+    skip: Seed
+    seconds: Frequency
+    seed: Seed
+    out: str
+    window: bool
+    title: str | None
+    car: Seed | None
+    off_map_m: Annotated[float, Bounds(min=1)]
+    film: ViewFilm
+    camera: Camera
+    keys: Keys
+    keyboard_response: KeyboardResponse

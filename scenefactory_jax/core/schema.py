@@ -19,7 +19,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar
 
 T = TypeVar("T")
 
@@ -109,7 +109,7 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
     Raises:
         ConfigError: naming `where`, what is expected and the value.
     """
-    value = os.fspath(value) if isinstance(value, os.PathLike) else value
+    value = os.fspath(typing.cast(Any, value)) if isinstance(value, os.PathLike) else value
     plain, bounds = _split(hint)
     options = typing.get_args(plain) if typing.get_origin(plain) in (typing.Union, types.UnionType) else (plain,)
     for option in options:
@@ -120,13 +120,14 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
             return {key: read_value(item, items[1], where=_join(where, key)) for key, item in value.items()}
     if not _fits(value, plain):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
-    numbers = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_number(number)]
+    numbers: list[Any] = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_number(number)]
     if bounds is not None and not all(math.isfinite(number) and number in bounds for number in numbers):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     if isinstance(value, (list, tuple)) and (items := _item_hints(options)):
         hints = items if len(items) == len(value) and Ellipsis not in items else items[:1] * len(value)
         return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
-    return float(value) if _is_number(value) and float in options and int not in options else value
+    as_float = isinstance(value, int) and not isinstance(value, bool) and float in options and int not in options
+    return float(typing.cast(int, value)) if as_float else value
 
 
 def _split(hint: Any) -> tuple[Any, Bounds | None]:
@@ -143,7 +144,7 @@ def _item_hints(options: tuple[Any, ...]) -> tuple[Any, ...]:
     return next((typing.get_args(option) for option in options if typing.get_origin(option) in (list, tuple)), ())
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float | int]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

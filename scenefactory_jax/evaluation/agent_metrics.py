@@ -1,8 +1,7 @@
 """From per-agent records to numbers with intervals.
 
-Records are a mapping from column name to an array with one row per spawned agent and episode (`COLUMNS`; further columns are kept and may
-serve a breakdown). Agents of one scene meet each other and share a road, so they are no independent samples: intervals come from
-resampling whole scenes.
+Records are a mapping from column name to an array with one row per spawned agent and episode (`COLUMNS`; further columns are kept).
+Agents of one scene are not independent samples: intervals come from resampling whole scenes.
 """
 
 import csv

@@ -17,7 +17,7 @@ from scenefactory_jax.learning import phase_timing
 from scenefactory_jax.visualization.report import throughput_report as report
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = ("experiment=smoke", "worlds=4", "warmup=0", "repeats=1")
+SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeats=1")
 VARIANTS = {"training": {}, "environment": {"scope": "environment"}, "physics": {"scope": "physics", "worlds": 2, "phases": False}}
 
 

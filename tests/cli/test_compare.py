@@ -90,7 +90,7 @@ def test_what_cannot_be_compared_is_named(tmp_path):
     one = run(tmp_path / "a", seed=0)
     with pytest.raises(ConfigError, match=r"nothing matches '.*none-\*'"):
         compare(settings(tmp_path / "none-*"))
-    with pytest.raises(ConfigError, match="config.yaml not found in"):
+    with pytest.raises(ConfigError, match=r"config\.yaml not found in"):
         compare(settings(tmp_path))
     with pytest.raises(ConfigError, match=r"metrics\.csv has no column 'speed'; there are: iteration, minutes"):
         compare(settings(one, metrics=["speed"]))

@@ -26,9 +26,9 @@ from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
 from scenefactory_jax.cli.export import export, named
 from scenefactory_jax.cli.render import render
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
-from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock, result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.bank import bank_reader
@@ -281,7 +281,8 @@ def told(report: Path):
 
 
 def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
-    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in ([], ["protocol.termination=[goal_only]"]))
+    choices = [], ["protocol.termination=[goal_only]"]
+    first, second = (judged(whole, tmp_path / str(len(ends)), "video.enable=false", *ends) for ends in choices)
     assert set(first.records) == {"strict", "goal_only"} and set(second.records) == {"goal_only"} and first.report.is_file()
     for again, protocol in ((second, "goal_only"), (whole, "strict")):  # strict: what training itself wrote
         assert (first.folder / f"agents-{protocol}.csv").read_bytes() == (again.folder / f"agents-{protocol}.csv").read_bytes()
@@ -338,7 +339,9 @@ def test_an_exported_policy_stands_for_its_run(whole, tmp_path, monkeypatch):
     assert trained.folder == kept and trained.config["observations"] == whole.config["observations"]
     jax.tree.map(np.testing.assert_array_equal, trained.parameters, jax.device_get(whole.state.parameters))
     again = evaluate(
-        hydra_config.load_config("evaluate", "run=handy", "protocol.termination=[strict]", "video.enable=false", "failures.pictures.enable=false")
+        hydra_config.load_config(
+            "evaluate", "run=handy", "protocol.termination=[strict]", "video.enable=false", "failures.pictures.enable=false"
+        )
     )
     assert again.folder == Path("runs/handy/evaluation")
     assert (again.folder / "agents-strict.csv").read_bytes() == (whole.folder / "agents-strict.csv").read_bytes()
@@ -364,7 +367,8 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
 
 
 def test_a_damaged_config_is_named(tmp_path):
-    for content, message in {"": "expected the config of a run, got ", "- 1": "expected the config of a run, got list", "a: [1": "damaged: while parsing"}.items():
+    expected = "expected the config of a run, got "
+    for content, message in {"": expected, "- 1": f"{expected}list", "a: [1": "damaged: while parsing"}.items():
         (tmp_path / "config.yaml").write_text(content)
         with pytest.raises(ConfigError, match=message):
             evaluate(hydra_config.load_config("evaluate", f"run={tmp_path}"))
@@ -643,4 +647,5 @@ def test_episodes_are_described():
 @pytest.mark.parametrize("name", names("experiment"))
 def test_every_experiment_builds(name):
     builds(hydra_config.load_config("train", f"experiment={name}"))
-    assert hydra_config.load_config("benchmark", f"experiment={name}")["ppo"] == hydra_config.load_config("train", f"experiment={name}")["ppo"]
+    measured, trained = (hydra_config.load_config(command, f"experiment={name}") for command in ("benchmark", "train"))
+    assert measured["ppo"] == trained["ppo"]

@@ -25,6 +25,7 @@ from scenefactory_jax.data.generators.town.intersections import Arm, find_turns,
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Street, assemble
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing.pack import prepare
+from scenefactory_jax.visualization.report import scene_comparison
 
 CONFIG = yaml.safe_load((Path(__file__).resolve().parents[2] / "conf" / "scenes" / "town.yaml").read_text())["generate"]
 TRAFFIC, NETWORK = CONFIG["traffic"], CONFIG["network"]
@@ -368,6 +369,6 @@ def test_realism_writes_a_report(scenes, tmp_path):
     sets = {
         name: distribution_distance.collect(part, scene_size_m=200.0) for name, part in (("logged", scenes[:3]), ("town", scenes[3:6]))
     }
-    path = distribution_distance.write(tmp_path, "logged", sets, scene_size_m=200.0, command="scenes op=compare")
+    path = scene_comparison.write(tmp_path, "logged", sets, scene_size_m=200.0, command="scenes op=compare")
     text = path.read_text()
     assert "lanes in the box, m" in text and (tmp_path / "realism.png").stat().st_size > 10_000

@@ -128,7 +128,7 @@ def test_kinds_rows_and_masses_are_the_configs(street):
     assert at(street, "log_playback", 0, mass_kg=heavy).mass[0] == 1500.0
     with pytest.raises(ConfigError, match=r"mass_kg: expected exactly vehicle, pedestrian.*, got vehicle"):
         at(street, "log_playback", 0, mass_kg={"vehicle": None})
-    with pytest.raises(ConfigError, match=r"mass_kg\.vehicle: 0.0"):
+    with pytest.raises(ConfigError, match=r"mass_kg\.vehicle: expected a number > 0 or null, got 0.0"):
         at(street, "log_playback", 0, mass_kg={**heavy, "vehicle": 0.0})
     with pytest.raises(ConfigError, match=r"traffic\.kinds.*horse"):
         environment.make_env(load_config("task", "dynamics=bicycle", "traffic=log_playback", "traffic.kinds=[horse]"))

@@ -54,7 +54,8 @@ FORMATS = (
 )  # fmt: skip
 QUICK = (
     "experiment=quick", *SMALL[1:], f"worlds={WORLDS}", "ppo.horizon=6", "ppo.epochs=1", "ppo.minibatches=2", "policy.vector=[16]",
-    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16", "traffic=log_playback", "weather=mixed",
+    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16",
+    "traffic=log_playback", "weather=mixed",
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from support.replays import STEPS, changed, made
 from support.scene_documents import document, written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.view import replay
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mp4_writer import VideoError

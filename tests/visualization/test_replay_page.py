@@ -14,7 +14,7 @@ from support.scene_documents import document as scene_document
 from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.view import replay
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene
 from scenefactory_jax.core.types import SURFACES
 from scenefactory_jax.visualization.web import replay_data, replay_page
