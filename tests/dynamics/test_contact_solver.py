@@ -15,6 +15,7 @@ from scenefactory_jax.dynamics.articulated import contact_solver, mjx_backend
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
 COUNT = 48
 RATIO = 10.0
 
@@ -81,9 +82,14 @@ def solved(model, cases):
     return problem, functools.partial(newton, stages=stages, friction_ratio=RATIO)
 
 
+@functools.cache
+def _converge(solver):
+    return jax.jit(jax.vmap(functools.partial(solver, iterations=20, line_search=10)))
+
+
 def converged(solved):
     problem, solver = solved
-    return jax.jit(jax.vmap(functools.partial(solver, iterations=20, line_search=10)))(*problem)
+    return _converge(solver)(*problem)
 
 
 def test_places_are_those_of_the_rows(model, solved):

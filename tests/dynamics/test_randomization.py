@@ -101,7 +101,7 @@ def test_columns_are_those_that_started_relies_on():
     assert at.wheel.tolist() == WHEEL_BODIES and at.chassis == CHASSIS
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_fitted_model_is_the_compiled_one(seed):
     """Every number that MJX's step reads, to 1e-4."""
     other = random_car(seed)
@@ -127,7 +127,7 @@ def test_a_fitted_model_is_the_compiled_one(seed):
     np.testing.assert_allclose(fitted.body_pos[2:], wanted.body_pos[2:], rtol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_standing_height_is_where_the_c_engine_settles(seed):
     """Of level cars: the centre of mass amidships. A car that leans is 'level' at its axles' mean."""
     for other in (dataclasses.replace(random_car(seed), mass_forward=0.0, wheel_damping=0.5), changed(mass=2.5, suspension_stiffness=0.5)):
