@@ -40,7 +40,7 @@ def compare_solvers(
         friction: [min, max] of the friction coefficient.
     """
     rng = np.random.default_rng(seed)
-    speed, mu = rng.uniform(0.0, speed_max, drives), rng.uniform(*friction, drives)
+    speed, mu = rng.uniform(0.0, speed_max, drives), rng.uniform(friction[0], friction[1], drives)
     steps, hold = round(seconds * control_hz), round(hold_s * control_hz)
     actions = rng.uniform(-1.0, 1.0, (drives, -(-steps // hold), 3)).repeat(hold, axis=1)[:, :steps].astype(np.float32)
     car, solver = read_parameters(next(iter(backends.values())))
