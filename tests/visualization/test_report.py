@@ -200,7 +200,7 @@ def test_outcomes_are_exclusive_and_add_up():
     assert summary["clean_success_rate"].value <= summary["success_rate"].value
     names, counts = np.unique(plots.outcomes(records), return_counts=True)
     assert set(names) <= set(plots.OUTCOMES) and counts.sum() == len(records["scene"])
-    arrived = counts[np.char.startswith(names, "goal_reached")].sum()
+    arrived = counts[np.char.startswith(names, "reached")].sum()
     assert arrived == records["goal_reached"].sum()
 
 
@@ -439,12 +439,12 @@ def test_report_says_what_happened(tmp_path):
     summary = {name: agent_metrics.summarise(r, **BOOTSTRAP) for name, r in records.items()}
     (tmp_path / "a film.gif").write_bytes(b"GIF89a")
     path = evaluation_report.write(
-        tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip": 0.15}},
+        tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip_eps": 0.15}},
         versions={"GPU": "none"}, baselines={"strict": "strict, untrained"}, videos={"Four worlds": tmp_path / "a film.gif"},
         commands=["python -m scenefactory_jax evaluate run=X"], **BOOTSTRAP,
     )  # fmt: skip
     text = path.read_text()
-    assert f"**{records['strict']['reached'].sum()} of 72 cars reached their goal" in text
+    assert f"**{records['strict']['goal_reached'].sum()} of 72 cars reached their goal" in text
     assert "![Four worlds](../a%20film.gif)" in text
     for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip_eps` | 0.15 |", "evaluate run=X", "scene, 00"):
         assert part in text, part
