@@ -170,7 +170,7 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "locked_c_m": _locked_in_c(config, spread),
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
         "backends": {name: _obeys(name, settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
-        "patches": on_patches(config["dynamics"], config["weather"]["grip"]),
+        "patches": on_patches(config["dynamics"], config["weather"]["friction"]),
     }
 
 

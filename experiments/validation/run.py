@@ -18,6 +18,7 @@ from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.process_pool import make_task_map
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.visualization.report import verdicts
 
 DIGITS = 5  # more than anybody reads
 
@@ -61,7 +62,7 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
             _measure(name, config, out, spread)
     found, targets = read(out), config["validation"]["targets"]
     if found:
-        print(f"{report.write(out, found, targets)}\n{target_check.text(target_check.of(found, targets))}", flush=True)
+        print(f"{report.write(out, found, targets)}\n{verdicts.text(target_check.of(found, targets))}", flush=True)
     return found
 
 

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from experiments.validation import target_check
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
@@ -37,6 +36,7 @@ from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
 from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
 from scenefactory_jax.sysid.parameter_space import Space
 from scenefactory_jax.visualization.report import sysid_report as report
+from scenefactory_jax.visualization.report import verdicts
 
 DIGITS = 7  # of the numbers in result.json
 
@@ -83,7 +83,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     (out / "fitted.yaml").write_text(yaml.safe_dump(result_file.plain(fitted(where, refined.best), digits=5), sort_keys=False))
     result = result_file.read(out / "result.json")
     found = report.verdicts(result, settings["targets"])
-    print(f"{report.write(out, result, settings['targets'])}\n{target_check.text(found)}", flush=True)
+    print(f"{report.write(out, result, settings['targets'])}\n{verdicts.text(found)}", flush=True)
     return result
 
 

@@ -219,8 +219,8 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
         ("timing.control_hz=0", "timing.control_hz: expected a number > 0, got 0"),
         ("timing.episode_s=long", "timing.episode_s: expected a number > 0, got 'long'"),
         ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: expected a number >= 0 or null, got 'near'"),
-        ("dynamics.wheelbase=long", "dynamics.wheelbase: expected a number, got 'long'"),
-        ("weather.grip.mode=sticky", "weather.grip.mode: expected"),
+        ("dynamics.wheelbase=long", "dynamics.wheelbase: expected a number > 0, got 'long'"),
+        ("weather.friction.mode=sticky", "weather.friction.mode: expected"),
         (
             "termination.ending=[goal_reached,bored]",
             "termination.ending: expected a list, each one of numerical_error, goal_reached, ",

@@ -246,7 +246,7 @@ def test_a_real_car_stops_at_a_wall_and_drives_on_past_a_person():
     place = np.stack([np.zeros(4), lanes], 1)
     scene = replace(scene_of(place, place, speeds=[10.0] * 4), traffic=boxes)
     entry, mu = load_config("task", "dynamics=articulated")["dynamics"], lambda weather, position, speed: jnp.full(position.shape[:-1], 0.8)
-    context = {"grip": mu, "physics_dt": 1 / 120, "control_dt": CONTROL}
+    context = {"friction": mu, "physics_dt": 1 / 120, "control_dt": CONTROL}
     dynamics = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
     @jax.jit

@@ -168,7 +168,7 @@ def test_pieces_do_not_matter(drive, entry):
 
 @pytest.mark.slow
 def test_ice_pushes_wide_and_splits(entry):
-    grip = load_config("task")["weather"]["grip"]
+    grip = load_config("task")["weather"]["friction"]
     options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
     found = friction_patches.patches(entry, grip, **RATES, **options)
     wide = np.array(found["bend"]["wide_m"])
