@@ -80,7 +80,7 @@ OPERATIONS |= {"export": EXPORT, "compare": COMPARED}
 CONVERT = {"source": PLACE, "out": PLACE, "progress": FLAG, "features": Key(dict | None), "spread": Key(dict)}
 BANK = {"shard_scenes": COUNT, "compression": Key(Literal["zstd", "lz4"] | None)}
 SOURCE = {"path": PLACE, "seed": SEED, "count": COUNT, "workers": COUNT}
-CELLS = {"radius_m": Key(float | None, 0), "size_m": Key(float, 0.1)}
+ROAD_GRID = {"radius_m": Key(float | None, 0), "size_m": Key(float, 0.1)}
 TAKE = {"count": Key(int | None, 1), "seed": SEED}
 HELDOUT = {"path": PLACE, "seed": SEED, "count": COUNT}
 
@@ -205,8 +205,8 @@ def check_scenes(config: Mapping[str, Any]) -> None:
     """
     check(config, SOURCE, where="scenes")
     check(config["heldout"], HELDOUT, where="scenes.heldout")
-    check(config["cells"], CELLS, where="scenes.cells")
-    check(config.get("take") or {"count": None, "seed": 0}, TAKE, where="scenes.take")
+    check(config["road_grid"], ROAD_GRID, where="scenes.road_grid")
+    check(config["take"], TAKE, where="scenes.take")
 
 
 def check_operations(config: Mapping[str, Any]) -> None:

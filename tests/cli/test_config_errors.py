@@ -69,7 +69,7 @@ def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
     path = written(tmp_path, document(objects=[thing(0, id=7, speed=40), far]))
     summary = convert(hydra_config.load_config("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE))
     assert summary.agents_kept == 1 and summary.agents_dropped["goal_outside_box"] == 1
-    scene, report = bank_reader.pack_scenes(bank_reader.open(tmp_path / "bank"), [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(bank_reader.open(tmp_path / "bank")), [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and scene.agents.present.sum() == 1
 
     alone = written(tmp_path, document(objects=[thing(0, kind="pedestrian"), far]), "alone.json")

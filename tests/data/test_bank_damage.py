@@ -18,6 +18,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, bank_writer, shard_files
 from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading import scene_source
 
 PAGE = 4096
 TIMES = itertools.count(1)  # of files: a file that is changed twice within a tick of the clock would seem unchanged
@@ -121,7 +122,7 @@ def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, sc
     put(two, sizes[0])
     assert outcome(path, wanted, one) == "refused"
     with pytest.raises(SceneError, match=r"^/.*/scenes-00000\.arrow: "):
-        bank_reader.pack_scenes(bank_reader.open(path), [0], check=checker(), pack=packer(), workers=1)
+        scene_source.pack_scenes(scene_source.open_bank(bank_reader.open(path)), [0], check=checker(), pack=packer(), workers=1)
 
 
 def test_a_damaged_index_is_refused(tmp_path, scenes):

@@ -234,7 +234,7 @@ def test_cars_meet(scenes):
 
 
 def test_nothing_is_lost_when_scenes_are_packed(scenes):
-    parts = scene_source.make_readers(hydra_config.load_config("train", "scenes=procedural")["scenes"])
+    parts = scene_source.make_packing(hydra_config.load_config("train", "scenes=procedural")["scenes"])
     for scene in scenes[: len(KINDS)]:
         packed = prepare(scene, check=parts["check"], pack=parts["pack"])
         assert packed.report.agents_kept == len(scene.tracks)

@@ -302,16 +302,16 @@ def test_no_single_number_asks_for_much_work(street):
     edge, lane, sign = street.roads
     car, other = street.tracks
     far = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e7, 0.0, 0.0]])
-    message = r"roads\[1\] \(id 1\): the segment from xyz\[1\] is 1e\+07 m long; valid: up to 1000 \(scenes\.check\.segment_most_m\)"
+    message = r"roads\[1\] \(id 1\): the segment from xyz\[1\] is 1e\+07 m long; valid: up to 1000 \(scenes\.check\.max_segment_m\)"
     refused(message, roads=(edge, replace(lane, xyz=far), sign))
-    refused(r"roads\[0\].*segment_most_m", roads=(replace(edge, xyz=far[1:]), lane))
+    refused(r"roads\[0\].*max_segment_m", roads=(replace(edge, xyz=far[1:]), lane))
     to_and_fro = 900.0 * (np.arange(120) % 2)[:, None] * np.array([1.0, 0.0, 0.0])
-    message = r"roads: 107180 m of driving lanes; valid: up to 100000 \(scenes\.check\.lanes_most_m\)"
+    message = r"roads: 107180 m of driving lanes; valid: up to 100000 \(scenes\.check\.max_lanes_m\)"
     refused(message, roads=(edge, lane, replace(lane, id=5, xyz=to_and_fro)))
     checker()(replace(street, roads=(replace(edge, xyz=to_and_fro), lane)))  # nothing counts along edges
     refused(r"tracks\[1\] \(id 8\): velocity\[0\]: 9e\+06 .* 340", tracks=(car, replace(other, velocity=other.velocity + 9e6 - 40)))
     refused(r"size\[1\]: 1e\+06 is too large; valid: up to 100 \(scenes\.check\.size", tracks=(replace(car, size=(4.0, 1e6, 1.0)),))
-    refused(r"times: 20000 steps; valid: up to 10000 \(scenes\.check\.steps_most\)", times=np.arange(20_000.0))
+    refused(r"times: 20000 steps; valid: up to 10000 \(scenes\.check\.max_steps\)", times=np.arange(20_000.0))
     refused(r"times\[11\]: 1e\+06 s after the step before; valid: 0\.001 to 10 s", times=np.append(street.times[:-1], 1e6 + 1.0))
     refused(r"times\[1\]: 1e-12 s after", times=1e-12 * np.arange(STEPS))
     validation.check(replace(street, roads=(edge, replace(lane, xyz=far))), **OLD_CHECK)  # a run from before judges as it did

@@ -29,7 +29,7 @@ from scenefactory_jax.visualization.report import throughput_report
 pytestmark = pytest.mark.usefixtures("quickly")
 
 WORLDS = 8
-SHORT = ("stream.workers=0", "stream.sample=4", "stream.share=0.5")
+SHORT = ("stream.workers=0", "stream.sample=4", "stream.swap_fraction=0.5")
 CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
 
 
@@ -214,11 +214,11 @@ def alone(found, index, sizes):
 
 
 def fit(found, sizes, excess="cut"):
-    return batches.BoxSizes(sizes, found["scenes"]["cells"], excess)
+    return batches.BoxSizes(sizes, found["scenes"]["road_grid"], excess)
 
 
 def measured(found, source, *, sample=8, **given):
-    return batches.measure(source, None, grid=found["scenes"]["cells"], sample=sample, headroom=1.0, given=given, seed=0)
+    return batches.measure(source, None, grid=found["scenes"]["road_grid"], sample=sample, headroom=1.0, given=given, seed=0)
 
 
 def test_every_world_holds_the_scene_that_the_stream_says():
@@ -256,7 +256,7 @@ def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     )  # fmt: skip
     same(
         loaded.scene,
-        spatial_grid.attach_grid(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
+        spatial_grid.attach_grid(whole, **found["scenes"]["road_grid"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
     )
 
 
@@ -306,9 +306,9 @@ def test_room_for_more_changes_no_look_up():
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
         (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
-        (["stream.share=1.5"], r"stream\.share: 1\.5; wanted is a number from 0 to 1"),
-        (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
-        (["stream.excess=drop"], r"stream\.excess: 'drop'"),
+        (["stream.swap_fraction=1.5"], r"stream\.swap_fraction: 1\.5; wanted is a number from 0 to 1"),
+        (["stream.prefetch=0"], r"stream\.prefetch: 0; wanted is at least 1"),
+        (["stream.on_overflow=drop"], r"stream\.on_overflow: 'drop'"),
         (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),
         (["+stream.speed=2"], r"stream\.speed: unknown key"),
     ],
