@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
-from experiments.validation.measurements import Spread
+from experiments.validation.measurements import Spread, spread_cases
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file

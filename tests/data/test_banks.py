@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import shapely
 from support import eventful
-from support.scene_banks import stacked_scenes
+from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import (
     FORMATS,
     STEPS,
@@ -188,7 +188,7 @@ def test_what_cannot_be_packed_is_refused_or_named(made):
     tools = TOOLS | {"pack": packer(scene_size_m=2.0)}
     with pytest.raises(SceneError, match=r"scene 0, street: tracks: no agent is left of 2: 1 .*; leave it out, or change"):
         stacked_scenes(opened, [0], capacity=NONE, **tools)
-    found = scene_source.pack_scenes(scene_source.open_bank(opened), [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
+    found = packed_scenes(opened, [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
     assert isinstance(found[0], Reject) and found[0].scene == "straße" and "no driving lane" in found[0].reason
 
 
@@ -348,9 +348,9 @@ def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
     assert opened.metadata["packing"].to_pylist() == ["no_agent_left"] * 3
     found = operations.statistics(opened.metadata, by=None)["all"]["texts"]
     assert found["packing"] == {"no_agent_left": 3}
-    wide = scene_source.pack_scenes(scene_source.open_bank(opened), range(3), check=checker(), pack=packer(), workers=1)
+    wide = packed_scenes(opened, range(3), check=checker(), pack=packer(), workers=1)
     assert [type(one).__name__ for one in wide] == ["Packed", "Packed", "Reject"] and wide[2].kind == "no_agent_left"
-    assert scene_source.pack_scenes(scene_source.open_bank(opened), [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
+    assert packed_scenes(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
     whole = conversion.convert(folder, tmp_path / "wide", **options())
     assert bank_reader.open(tmp_path / "wide").metadata["packing"].to_pylist() == ["packed", "packed", "no_agent_left"]
     assert whole.scenes == 3 and whole.agents_kept == 4 and whole.refused == {"no_agent_left": 1}

@@ -20,8 +20,9 @@ from support.format_documents import (
 )
 from support.scene_documents import FORMATS, document, scenefactory_document, thing
 
-from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.core.raw_scene import Reject, SceneError
 from scenefactory_jax.data.formats import json_documents, reader_selection, tfrecord
+from scenefactory_jax.data.loading import scene_source
 
 JSON_JUNK = tuple(value for value in fuzzing.JUNK if not isinstance(value, (bytes, set, np.ndarray)))
 PEAK_BYTES = 30_000_000

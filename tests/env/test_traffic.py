@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.hand_scenes import road_of, scene_of
-from support.scene_banks import stacked_scenes
+from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import STEPS, checker, document, packer, parsed, prepared, thing
 from test_dynamics import LANES, constant, make, scene_for
 from test_environment import CIRCLES, build_env, drive
@@ -21,7 +21,6 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROAD_USERS, Boxes, TrafficLog
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, pack, stack, validation
 from scenefactory_jax.env import environment, spawning, traffic
 
@@ -308,7 +307,7 @@ def test_banks_and_stacks_carry_others(tmp_path, logged):
     full, less = prepared(logged), prepared(logged, traffic=1, agents=3)
     tools = {"check": checker(), "pack": packer(), "workers": 1}
     for name, leaf in columns.flatten(full.scene).items():
-        np.testing.assert_array_equal(columns.flatten(scene_source.pack_scenes(scene_source.open_bank(opened), [0], **tools)[0].scene)[name], leaf)
+        np.testing.assert_array_equal(columns.flatten(packed_scenes(opened, [0], **tools)[0].scene)[name], leaf)
     stacked, report = stacked_scenes(opened, [1, 0, 1], capacity={}, **tools)
     assert report.capacity["traffic"] == 4 and stacked.traffic_log.valid.any(-1).sum(1).tolist() == [1, 4, 1]
     assert stacked.traffic.present.shape == (3, 0)

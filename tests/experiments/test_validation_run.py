@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
-from scenefactory_jax.core.parallel.process_pool import spread_cases
 
 from experiments.validation import engines, friction_patches, motion_laws, random_drives, target_check
 from experiments.validation import run as command
 from experiments.validation import validation_report as report
+from experiments.validation.measurements import spread_cases
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError

@@ -28,9 +28,14 @@ def banked(folder, raws, *, described=True):
     return banks.write(folder, raws, settings={"made": "up"}, features=FEATURES if described else None)
 
 
+def packed_scenes(bank, indices, **packing):
+    """Scenes of a bank, packed, and a reject in place of each that cannot be."""
+    return scene_source.pack_scenes(scene_source.open_bank(bank), indices, **packing)
+
+
 def stacked_scenes(bank, indices, *, capacity, check, pack, workers=1):
     """Scenes of a bank, packed and stacked, and the report of what a capacity cut."""
-    packed = scene_source.pack_scenes(scene_source.open_bank(bank), indices, check=check, pack=pack, workers=workers)
+    packed = packed_scenes(bank, indices, check=check, pack=pack, workers=workers)
     return stack([one.scene for one in packed], capacity=capacity)
 
 
