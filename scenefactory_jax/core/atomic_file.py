@@ -8,7 +8,10 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path` to write to. In the end its file is flushed to the disk and replaces `path`; after an error it is removed."""
+    """A hidden path beside `path` to write to.
+
+    In the end its file is flushed to the disk and replaces `path`; after an error it is removed.
+    """
     part = path.with_name(f".{path.name}.part")
     try:
         yield part

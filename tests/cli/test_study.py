@@ -376,7 +376,7 @@ def test_later_overrides_win():
 
 
 def test_fewer_scenes_of_one_seed_are_a_part_of_more():
-    load = lambda *own: scene_source.load_training_scenes(
+    load = lambda *own: scene_source.load_training_scenes(  # noqa: E731
         hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]
     )
     everything = load()

@@ -176,8 +176,8 @@ def test_an_older_bank_is_read_chosen_from_and_gone_on_with(tmp_path, scenes):
 
 
 def options(**changes):
-    numbers = {"features": None, "refine": None, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None}
-    return {"formats": {"plain": eventful.plainly}, "check": checker(), "pack": packer()} | numbers | changes
+    tools = conversion.SceneTools({"plain": eventful.plainly}, check=checker(), pack=packer())
+    return {"tools": tools, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None} | changes
 
 
 @pytest.mark.parametrize("number", [1, 2, 5])  # before the first catalogue, the first index, and the second one take their places
@@ -188,7 +188,7 @@ def test_a_bank_whose_writing_was_killed_becomes_the_undisturbed_one(tmp_path, n
         written(folder, document(name=name), f"{name}.json")
     written(folder, json.dumps(document())[:500], "b.json")
     written(folder, document(name="still", objects=[thing(0, speed=0)]), "e.json")
-    rest = {name: value for name, value in options().items() if name not in ("formats", "spread")}
+    rest = {name: value for name, value in options().items() if name != "spread"}
     process = multiprocessing.get_context("spawn").Process(target=eventful.convert_until_placed, args=(number, folder, out, rest))
     process.start()
     process.join()

@@ -55,7 +55,7 @@ from scenefactory_jax.roadgraph import lane_topology
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
-TOPOLOGY = {key: value for key, value in hydra_config.load_config("lanes")["lanes"]["topology"].items() if key != "_target_"}
+TOPOLOGY = {key: value for key, value in hydra_config.load_config("convert")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
@@ -180,14 +180,13 @@ def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
         np.testing.assert_array_equal(columns.flatten(stacked)[name], leaf)
     assert sorted(cut.world for cut in report.cuts) == [0, 1, 2]
     with pytest.raises(SceneError, match="no scene 7; valid: 0 to 2"):
-        stacked_scenes(moved, [7], capacity=NONE, **TOOLS)
+        bank_reader.read_raw(moved, 7)
 
 
 def test_what_cannot_be_packed_is_refused_or_named(made):
     _, opened = made
-    tools = TOOLS | {"pack": packer(scene_size_m=2.0)}
-    with pytest.raises(SceneError, match=r"scene 0, street: tracks: no agent is left of 2: 1 .*; leave it out, or change"):
-        stacked_scenes(opened, [0], capacity=NONE, **tools)
+    [found] = packed_scenes(opened, [0], **TOOLS | {"pack": packer(scene_size_m=2.0)})
+    assert (found.scene, found.kind) == ("street", "no_agent_left") and found.reason.startswith("tracks: no agent is left of 2: 1 ")
     found = packed_scenes(opened, [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
     assert isinstance(found[0], Reject) and found[0].scene == "straße" and "no driving lane" in found[0].reason
 
@@ -384,7 +383,7 @@ def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     summary = conversion.convert(folder, tmp_path / "bank", **options(formats={"eventful": eventful.read}, spread=spread))
     reasons = {(Path(reject["source"]).stem, reject["scene"]): reject["reason"] for reject in summary.rejects}
     assert reasons == {
-        ("b_killed", None): "the process at it was ended by SIGKILL, perhaps for want of memory",
+        ("b_killed", None): "its process was ended by SIGKILL, perhaps for want of memory",
         ("c_two", "second"): "record 2 at byte 77: its checksum is wrong",
         ("d_endless", None): "no result after 2 s (timeout_s)",
         ("f_broken", None): "KeyError: 'x'",
@@ -481,9 +480,9 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
     wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"beside_m": [5.0, 2.0]})
     for workers in (1, 2):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
-        with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
+        with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: expected .*, got \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
-        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
             source = scene_source.open_files(folder, reader_selection.make(FORMATS))
             scene_source.pack_all(source, check=checker(), pack=packer(scene_size_m=-1.0), workers=workers)
     assert not (tmp_path / "bank").exists()
@@ -492,9 +491,9 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
 @pytest.mark.parametrize("numbers", [{"workers": 0}, {"timeout_s": 0.0}, {"timeout_s": -1.0}])
 def test_numbers_with_which_nothing_would_be_done_are_refused(numbers):
     [name] = numbers
-    with pytest.raises(ConfigError, match=rf"spread\.{name}: "):
+    with pytest.raises(ConfigError, match=rf"spread\.{name}: expected "):
         list(spreads.local(dies_of_three, [1], **{"workers": 1, "timeout_s": None} | numbers))
-    with pytest.raises(ConfigError, match=r"spread\.pending: 0"):
+    with pytest.raises(ConfigError, match=r"spread\.pending: expected a number >= 1, got 0"):
         list(spreads.ray(dies_of_three, [1], address=None, pending=0, timeout_s=None))
 
 
@@ -549,7 +548,7 @@ def test_a_cluster_is_a_spread_like_any_other(tmp_path, monkeypatch):
     cluster(monkeypatch)
     assert list(ray(dies_of_three, [1, 2, 3, 4])) == [10, 20, spreads.FailedTask("Ray: RayError: the worker died"), 40]
     with monkeypatch.context() as without:
-        without.setattr(spreads, "_timed", missing)
+        without.setattr(spreads.worker, "run_task", missing)
         with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'scenefactory_jax'; "):
             list(ray(dies_of_three, [1]))
     folder = streets(tmp_path / "in", "a", "b")
@@ -562,7 +561,7 @@ def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
     (tmp_path / "here_alone.py").write_text("def read(path):\n    yield from ()\n")
     monkeypatch.syspath_prepend(tmp_path)
     work = importlib.import_module("here_alone").read
-    pack = spreads._packed
+    pack = spreads._pack
 
     def pack_and_forget(*given):
         packed = pack(*given)
@@ -570,13 +569,13 @@ def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
         del sys.modules["here_alone"]
         return packed
 
-    monkeypatch.setattr(spreads, "_packed", pack_and_forget)
+    monkeypatch.setattr(spreads, "_pack", pack_and_forget)
     cluster(monkeypatch)
     spread = spreads.ray if over == "cluster" else spreads.local
     numbers = {"address": None, "pending": 2} if over == "cluster" else {"workers": 2}
     with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'here_alone'; every process"):
         list(spread(work, [1, 2, 3], timeout_s=9.0, **numbers))
-    monkeypatch.setattr(spreads, "_packed", pack)
+    monkeypatch.setattr(spreads, "_pack", pack)
     with pytest.raises(SceneError, match=r"cannot be sent to another process: .*; readers and parts must be functions of a module"):
         list(spreads.local(lambda item: item, [1], workers=1, timeout_s=9.0))
 

@@ -98,7 +98,7 @@ def test_order_and_place_change_nothing():
 
 @pytest.mark.parametrize("name", ["cell_m", "height_m", "headings", "one_in"])
 def test_a_number_of_no_place_is_refused(name):
-    with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: 0; wanted is a number above 0"):
+    with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: expected a number > 0, got 0"):
         geographic_split.find_streets(generated(0), **STREETS | {name: type(STREETS[name])(0)})
 
 

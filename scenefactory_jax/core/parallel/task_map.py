@@ -175,6 +175,7 @@ class _Pool:
         by_connection = {one.connection: one for one in self._workers if one.task is not None}
         for connection in wait(list(by_connection)):
             one = by_connection[connection]  # pyright: ignore[reportArgumentType]
+            assert one.task is not None
             try:
                 answer = one.connection.recv()
             except (EOFError, OSError):

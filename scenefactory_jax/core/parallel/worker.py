@@ -46,7 +46,8 @@ class Worker:
         command = [sys.executable, "-P", "-c", COMMAND, *arguments]
         self.process = subprocess.Popen(command, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL, env={**os.environ, **environment})
         its.close()  # the pipe breaks when the process dies
-        self.started, self.task = False, None  # task: number of the item
+        self.started = False
+        self.task: int | None = None  # number of the item
 
     def describe_end(self, timeout_s: float | None) -> str:
         """The cause of the end of a process that ended by itself."""

@@ -2,10 +2,8 @@
 
 import itertools
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.raw_scene import COMPANION, RawScene, Reject
 from scenefactory_jax.data.loading import scene_source
 
@@ -25,18 +23,3 @@ def scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[R
     limit = config["count"] if limit is None and source.count is None else limit
     for one in itertools.islice(found, limit):
         yield ": ".join(filter(None, (one.source, one.scene, one.reason))) if isinstance(one, Reject) else one
-
-
-def read(path: Path | str) -> Iterator[RawScene | str]:
-    """Reads every scene of a bank, a file or a folder, in float64 and uncut, in any of the known formats.
-
-        for raw in scenefactory_jax.read("scenes.tfrecord"):
-            print(raw if isinstance(raw, str) else raw.name)
-
-    Returns:
-        The scenes one after another; in place of one that cannot be read, the reason.
-
-    Raises:
-        SceneError: no such path.
-    """
-    return scenes(configs.load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
@@ -21,6 +20,7 @@ from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
 from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading.scenes_config import check_config
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
 from scenefactory_jax.data.packing.summary import Summary, summarise_packed
@@ -151,8 +151,8 @@ def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
         ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
     """
     if "_target_" not in (config["generate"] or {}):  # an experiment may set numbers of a generator that `scenes=womd` does not have
-        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=town")
-    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
+        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=streets")
+    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="scenes.generate")
 
 
 def make_packing(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,7 +243,7 @@ def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
         ConfigError: neither path nor generator, or not one usable scene, with the reasons.
         SceneError: no scenes at the path.
     """
-    schema.check_scenes(config)
+    check_config(config)
     return take_scenes(load_all_scenes(config), config)
 
 
@@ -265,7 +265,7 @@ def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     Raises:
         ConfigError: more than there are.
     """
-    schema.check_scenes(config)
+    check_config(config)
     count, seed = config["take"]["count"], config["take"]["seed"]
     if count is None or count == len(scenes):
         return scenes
@@ -284,7 +284,7 @@ def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scene
         ConfigError: the config names none, or not one usable scene.
         SceneError: no scenes at the path.
     """
-    schema.check_scenes(config)
+    check_config(config)
     heldout = config["heldout"]
     path = path if path is not None else heldout["path"]
     if path is None:
@@ -300,7 +300,7 @@ def check_heldout(config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: naming the key.
     """
-    schema.check_scenes(config)
+    check_config(config)
     path, trained = config["heldout"]["path"], config["path"]
     if path is not None and not Path(path).exists():
         raise ConfigError(f"scenes.heldout.path: {path}: no such file or folder; give held-out scenes, or null for none")

@@ -4,16 +4,17 @@
         scenes = flow.scenes()                                # for all worlds, on their devices
         for iteration in range(iterations):
             if iteration:
-                state, scenes = flow.exchange(trainer.swap, state, scenes)
-            state, metrics = trainer.iterate(state, scenes)
+                state, scenes = flow.exchange(trainer.replace_scenes, state, scenes)
+            state, metrics = trainer.train_iteration(state, scenes)
             flow.draw()                                       # while the devices work
-            flow.note(*jax.device_get((state.record.episodes, state.record.successes)))
+            flow.note(*jax.device_get((state.scene_stats.episodes, state.scene_stats.successes)))
 
 What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
 state, it makes a resumed run the unbroken one, bit for bit.
 """
 
 import contextlib
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, instantiate
 from scenefactory_jax.core.parallel.task_map import open_pool
@@ -34,7 +34,9 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
 from scenefactory_jax.data.loading.batches import Batch, BatchLoader
 from scenefactory_jax.data.loading.scene_source import SceneSource, make_packing, open_source
+from scenefactory_jax.data.loading.scenes_config import check_config
 
+LOG = logging.getLogger(__name__)
 SHOWN = 10  # scenes left out that are told by name
 
 
@@ -191,7 +193,7 @@ class SceneStream:
         for name, reason in taken.batch.refused.items():
             if name not in self._told and len(self._told) < SHOWN:
                 self._told.add(name)
-                print(escape_for_terminal(f"left out {name}: {reason}"), flush=True)
+                LOG.info(escape_for_terminal(f"left out {name}: {reason}"))
         return taken
 
 
@@ -218,7 +220,7 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         ConfigError: a key that does not fit, sizes that make no sense, or a state that belongs to other scenes.
         SceneError: scenes that cannot be read, with reasons.
     """
-    schema.check_scenes(config["scenes"])
+    check_config(config["scenes"])
     if (count := config["scenes"]["take"]["count"]) is not None:
         raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=select` makes a smaller bank")
     source = open_source(config["scenes"])
@@ -243,7 +245,7 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
 
         held = _new(source, sizes, config["worlds"]) if before is None else before
         what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
-        print(f"stream of {source.description}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}", flush=True)
+        LOG.info(f"stream of {source.description}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}")
         yield SceneStream(source, entry, lambda indices: thread.submit(load, indices), held)
 
 

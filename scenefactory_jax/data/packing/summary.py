@@ -56,10 +56,12 @@ def summarise(
 ) -> Summary:
     """The summary of counts (`count_results`) and of what was left out."""
     listed = {"rejects": tuple(map(dict, rejects)), "companions": tuple(map(dict, companions))}
-    return Summary(files=files, **listed, **count_results([]) | counts)
+    return Summary(files=files, **listed, **count_results([]) | dict(counts))
 
 
-def summarise_packed(reports: Iterable[PackReport], rejects: Sequence[Reject], *, files: int, earlier: Sequence[Mapping[str, Any]] = ()) -> Summary:
+def summarise_packed(
+    reports: Iterable[PackReport], rejects: Sequence[Reject], *, files: int, earlier: Sequence[Mapping[str, Any]] = ()
+) -> Summary:
     """The summary of scenes that were packed, after rejects of an earlier conversion."""
     listed = [*earlier, *(as_entry(reject) for reject in rejects if reject.kind != COMPANION)]
     companions = [as_entry(reject) for reject in rejects if reject.kind == COMPANION]

@@ -43,8 +43,8 @@ def check(
         max_speed_m_s: largest velocity along x or y.
         max_steps: most steps of a log.
         step_s: shortest and longest step of a log.
-        uneven_fraction: logs whose steps differ from the median step by more than the first fraction of it, and by no more than the second, are
-            resampled to even steps; logs that are more uneven stay as they are.
+        uneven_fraction: logs whose steps differ from the median step by more than the first fraction of it and
+            by no more than the second are resampled to even steps; logs that are more uneven stay as they are.
 
     Raises:
         SceneError: steps that disagree, no driving lane, or a number that is not finite or beyond a bound, naming the file and the element.
