@@ -222,7 +222,7 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
     """
     check_config(config["scenes"])
     if (count := config["scenes"]["take"]["count"]) is not None:
-        raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=select` makes a smaller bank")
+        raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=sample` makes a smaller bank")
     source = open_source(config["scenes"])
     context = {"seed": config["seed"], "worlds": config["worlds"], "devices": 1 if mesh is None else mesh.size}
     entry: StreamSettings = instantiate({"_target_": "make_settings", **config["stream"]}, builtins=__name__, where="stream", **context)()
