@@ -8,7 +8,7 @@
     state, observation = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), len(scenes)), scenes.scene)
     run = sf.train(config)                          # and sf.evaluate(sf.load_config("evaluate", f"run={run.folder}"))
 
-Everything under `run/` (`train`, `evaluate`, `replay`, `convert`, `render`) takes such a config.
+Every function of `scenefactory_jax.cli` that is named like a command takes such a config.
 """
 
 import contextlib

@@ -32,7 +32,7 @@ TERMS = """
 
 GROUPS = """
     import jax.numpy as jnp
-    from scenefactory_jax.types import Rows
+    from scenefactory_jax.core.types import SetObservation
 
     def clock(scene, state, *, period_s: float, control_dt: float):
         angle = 2 * jnp.pi * state.steps_since_spawn * control_dt / period_s
@@ -40,7 +40,7 @@ GROUPS = """
 
     def mates(scene, state, *, scale_m: float):
         offset = (state.motion.position[None, :, :2] - state.motion.position[:, None, :2]) / scale_m
-        return Rows(offset, jnp.broadcast_to(state.active[None], offset.shape[:2]))
+        return SetObservation(offset, jnp.broadcast_to(state.active[None], offset.shape[:2]))
     """
 
 CONTROLS = """
@@ -52,10 +52,10 @@ CONTROLS = """
 
 BACKEND = """
     import jax.numpy as jnp
-    from scenefactory_jax.struct import replace, struct
-    from scenefactory_jax.types import Dynamics, Motion
+    from scenefactory_jax.core.pytree import replace, pytree_dataclass
+    from scenefactory_jax.core.types import Dynamics, Motion
 
-    @struct
+    @pytree_dataclass
     class Body:
         place: jnp.ndarray
         velocity: jnp.ndarray
@@ -84,12 +84,12 @@ BACKEND = """
 READER = """
     import csv
     import numpy as np
-    from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, Track
+    from scenefactory_jax.core.raw_scene import FormatMismatch, Polyline, RawScene, Track
 
     def read(path, *, step_s: float):
         '''Rows `lane,x,y` and `car,x,y`: one lane, and one car's way from step to step.'''
         if path.suffix != ".csv":
-            raise OtherFormat(f"{path}: no .csv")
+            raise FormatMismatch(f"{path}: no .csv")
         rows = list(csv.reader(path.open()))
         lane, car = (np.array([[float(x), float(y), 0.0] for kind, x, y in rows if kind == wanted]) for wanted in ("lane", "car"))
         steps = len(car)
