@@ -18,7 +18,7 @@ from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
-from scenefactory_jax.core.parallel.process_pool import map_tasks
+from scenefactory_jax.core.parallel.task_map import open_pool, require_results
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.sysid import (
@@ -169,7 +169,7 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
     }
     masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
     every, found = config["sysid"]["every"], {}
-    with map_tasks(config["workers"]) as each:
+    with open_pool(config["workers"] if config["workers"] > 1 else 0) as task_map:
         for name, suite in suites.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
             made = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
@@ -180,7 +180,8 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
                 except ConfigError:
                     print(f"{path}: of other settings, recorded anew", flush=True)
             begun = time.perf_counter()
-            found[name] = list(each(functools.partial(reference_recordings.record, teacher=instructor), suite(entries)[::every]))
+            record = functools.partial(reference_recordings.record, teacher=instructor)
+            found[name] = list(require_results(task_map(record, suite(entries)[::every])))
             reference_recordings.save(path, found[name], digest=made)
             print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found

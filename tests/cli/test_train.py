@@ -570,7 +570,7 @@ def options():
 def builds(whole_config):
     env, policy = environment.make_env(whole_config), make_policy(whole_config)
     assert make_trainer(whole_config, env, policy).train_iteration
-    assert {"gpudrive", "scenefactory"} <= set(scene_source.make_readers(whole_config["scenes"])["formats"])
+    assert {"gpudrive", "scenefactory"} <= set(whole_config["scenes"]["formats"])
     if scene_source.has_heldout(whole_config["scenes"]):
         instantiate(
             whole_config["scenes"]["generate"],

@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import OtherContent, Polyline, RawScene, Sc
 from scenefactory_jax.core.types import ROAD_USERS
 from scenefactory_jax.data.formats import json_documents
 
-STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.steps_most` less the first step
+STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.max_steps` less the first step
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 
 
