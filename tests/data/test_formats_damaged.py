@@ -57,8 +57,8 @@ def test_damaged_bytes(files, readers, name):
     path.write_bytes(content)
     assert fuzzing.attempt(readers[name], path) == "read"
     verdicts = fuzzing.attack(readers[name], path, content)
-    assert verdicts["OtherFormat"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
-    assert set(verdicts) <= {"read", "OtherFormat", "SceneError"}
+    assert verdicts["FormatMismatch"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
+    assert set(verdicts) <= {"read", "FormatMismatch", "SceneError"}
 
 
 @pytest.mark.parametrize("whole", [scenarionet_document(), in_spring_2023(scenarionet_document()), in_march_2023(scenarionet_document()),
