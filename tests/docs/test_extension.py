@@ -219,7 +219,7 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
     ("override", "message"),
     [
         ("+reward.haste={_target_: my_terms.haste, weight: 1.0}", r"reward\.haste\.unit_mps: missing"),
-        ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"reward\.haste\.unit_mps: expected a number, got 'fast'"),
+        ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"haste\.unit_mps: expected a number, got 'fast'"),
         ("+reward.haste={_target_: my_terms.hurry, weight: 1.0}", r"'my_terms\.hurry' is not in my_terms; valid: haste, jerkiness"),
         ("+observations.clock={_target_: my_clocks.clock}", r"observations\.clock\._target_: cannot import 'my_clocks'"),
         (
