@@ -1,6 +1,7 @@
 """The replay's page holds what was recorded: unpacked here as `data.js` does it, and compared with the recording."""
 
 import base64
+import dataclasses
 import html
 import json
 import re
@@ -10,13 +11,14 @@ import jax
 import numpy as np
 import pytest
 from support.replays import HZ, NAMES, POSTS, STEPS, changed, made
+from support.running import ROOT
 from support.scene_documents import document as scene_document
 from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene
-from scenefactory_jax.core.types import SURFACES
+from scenefactory_jax.core.types import SURFACES, Events
 from scenefactory_jax.visualization.web import replay_data, replay_page
 from scenefactory_jax.visualization.web.array_packing import Packer
 from scenefactory_jax.visualization.web.replay_page import ReplayError
@@ -55,6 +57,15 @@ def arrays(directory: dict, text: str) -> dict[str, np.ndarray]:
             values = np.where(codes == 65535, np.nan, entry["low"] + codes * entry["step"])
         found[name] = values.reshape(entry["shape"])
     return found
+
+
+def test_the_page_reads_what_there_is(page):
+    """Every key that a script reads of a world is one that is written, or one that `data.js` derives; events have their own names."""
+    scripts = "\n".join(path.read_text() for path in (ROOT / "scenefactory_jax" / "visualization" / "web" / "page").glob("*.js"))
+    derived = {"array", "bySlot", "end", "road"}
+    assert set(re.findall(r"\bworld\.(\w+)", scripts)) <= set(unpacked(page)[0]) | derived
+    corners = re.search(r"const corners = \{([^}]+)\}\[name\]", scripts).group(1)
+    assert set(re.findall(r"(\w+):", corners)) <= {field.name for field in dataclasses.fields(Events)}
 
 
 @pytest.mark.parametrize("values", [

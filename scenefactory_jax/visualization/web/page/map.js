@@ -129,7 +129,7 @@ function drawOthers() {
   const step = now();
   pen.strokeStyle = css("outline");
   pen.lineWidth = Math.max(0.06, 0.6 / app.view.scale);
-  app.world.others.forEach((other, row) => {
+  app.world.traffic.forEach((other, row) => {
     if (!within(other.spans, step)) return;
     const { x, y, yaw } = pose(app.world, "other:", row, app.time);
     const [length, width] = other.size;
