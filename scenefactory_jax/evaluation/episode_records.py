@@ -162,7 +162,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
     """One recorded world as a viewer wants it: cut a second after the last car finished, or after that many steps."""
     frames, control_hz = jax.tree.map(lambda leaf: leaf[index, :steps], recording.frames), recording.control_hz
     live = np.flatnonzero(frames.active.any(axis=1))
-    end = min((live[-1] if len(live) else 0) + round(control_hz), len(frames.active))
+    end = int(min((live[-1] if len(live) else 0) + round(control_hz), len(frames.active)))
     frames = jax.tree.map(lambda leaf: leaf[:end], frames)
     scene = jax.device_get(jax.tree.map(lambda leaf: leaf[index], recording.batch))
     weather = jax.tree.map(lambda leaf: leaf[index], recording.weather)

@@ -312,7 +312,7 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
     counts = {name: int(stage.counts[name][now]) for name in MARKS if name in stage.counts}
     total, once = int(stage.trajectory.present.sum()), not drawing.find_respawns(stage.trajectory)
     entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "numerical_error"}
-    entries |= {"goal_reached": f"{entries['reached']} of {total}"} if once and "goal_reached" in entries else {}
+    entries |= {"goal_reached": f"{entries['goal_reached']} of {total}"} if once and "goal_reached" in entries else {}
     while sum(font.getlength(entry) + 12 for entry in entries.values()) > panel - font.getlength(clock) and len(entries) > 1:
         others = [name for name in reversed(entries) if name != "goal_reached"]
         del entries[next((name for name in others if not counts[name]), others[0])]
