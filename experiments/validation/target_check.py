@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.evaluation import agent_metrics
 
 
 class Verdict(NamedTuple):
@@ -32,7 +32,7 @@ def of(results: Results, targets: Targets) -> list[Verdict]:
 
 def table(verdicts: list[Verdict]) -> str:
     """As Markdown."""
-    return agent_metrics.grid(
+    return markdown.format_table(
         ["What", "Target", "Measured", "Met"], [[v.what, v.target, v.measured, "yes" if v.met else "**no**"] for v in verdicts]
     )
 

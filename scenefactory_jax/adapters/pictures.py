@@ -81,5 +81,5 @@ def check_mode(mode: Any) -> None:
 
 def _shown(env: Env, scenes: Scene, world: Episode) -> ShownWorld:
     state = world.state
-    now = env.now(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
+    now = env.current_scene(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
     return ShownWorld(world.scene, state.motion, state.active, state.past_events, state.agents, state.weather, now.traffic)

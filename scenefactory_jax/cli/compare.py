@@ -9,10 +9,11 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
+from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import read_folder
 from scenefactory_jax.loggers import metrics_csv
-from scenefactory_jax.visualization.report import evaluation_report
 from scenefactory_jax.visualization.report import run_comparison as report
 
 STEPS = "steps/total"
@@ -42,7 +43,7 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
         ConfigError: no such run, a run without metrics, one that is named twice, two of one setting and seed, or a metric that one of them
             lacks, by name.
     """
-    schema.check(config, schema.COMPARE)
+    schema.check(config, schema.Compare)
     if not config["metrics"]:
         raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/goal_reached")
     runs = [_read(folder) for folder in _find(config["runs"])]
@@ -89,10 +90,8 @@ def _read(folder: Path) -> ReadRun:
     config, metrics = configs.read_values(folder), metrics_csv.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
-    settings = {
-        key: value for key, value in evaluation_report.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")
-    }
-    return ReadRun(folder, config, settings, metrics, result_file.records(folder))
+    settings = {key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
+    return ReadRun(folder, config, settings, metrics, read_folder(folder))
 
 
 def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -125,7 +124,7 @@ def _group(runs: list[ReadRun], config: Mapping[str, Any]) -> dict[str, Any]:
     for name in runs[0].records:
         if all(name in run.records for run in runs):
             each = {seed: run.records[name] for seed, run in seeds.items()}
-            evaluated[name] = hierarchical_bootstrap.summarise(each, bootstrap=config["bootstrap"], seed=config["seed"])
+            evaluated[name] = statistics.summarise_runs(each, bootstrap=config["bootstrap"], seed=config["seed"])
     return {
         "runs": [run.folder.name for run in runs],
         "seeds": [run.config["seed"] for run in runs],

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.scenes import draw
+from scenefactory_jax.cli.view_schema import Render
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Scene
@@ -32,7 +33,7 @@ def render(config: Mapping[str, Any]) -> Path:
         ConfigError: no such scene, or a dynamics without a car to show.
         SceneError: nothing usable at the path.
     """
-    schema.check(config, schema.RENDER)
+    schema.check(config, Render)
     loaded = scene_source.load_training_scenes(config["scenes"])
     index, count = config["index"], len(loaded)
     if not 0 <= index < count:

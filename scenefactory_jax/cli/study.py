@@ -22,8 +22,8 @@ from scenefactory_jax.cli.study_results import RESULT, TRAINED
 from scenefactory_jax.core import atomic_file, folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.evaluation.protocols import Evaluator, make_evaluator
+from scenefactory_jax.evaluation.records import write_records
 from scenefactory_jax.learning import checkpoint, policy_io, training_loop
 
 COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
@@ -272,7 +272,7 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
             examine = examine or shared.examiner(one, "policies")
             records = examine(_weights(one, shared))
             with atomic_file.write_atomically(one.file) as half:
-                agent_metrics.write_csv(half, records)
+                write_records(half, records)
             counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("goal_reached", "clean", "collision")]
             print(f"{one.row}, seed {one.training.seed}, {one.condition}, {one.protocol}: {', '.join(counts)}", flush=True)
         longest = max(longest, time.monotonic() - begun)

@@ -11,7 +11,8 @@ from scenefactory_jax.cli import study_plan
 from scenefactory_jax.cli.study_plan import Plan, Training
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import read_records, write_records
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import study_report as report
 
@@ -71,7 +72,7 @@ def _records(plan: Plan) -> Judged:
     for one in plan.judgings:
         runs = found.setdefault((one.row, one.condition, one.protocol), {})
         if one.file.is_file():
-            runs[one.training.seed] = agent_metrics.read_csv(one.file)
+            runs[one.training.seed] = read_records(one.file)
     return found
 
 
@@ -86,7 +87,7 @@ def _write_agents(out: Path, records: Judged) -> None:
         seeds = np.concatenate([np.full(len(rows["scene"]), seed) for seed, rows in runs.items()])
         first = next(iter(runs.values()))
         columns = {name: _rounded(np.concatenate([rows[name] for rows in runs.values()])) for name in first}
-        agent_metrics.write_csv(out / agents_file(place), {"training_seed": seeds, **columns})
+        write_records(out / agents_file(place), {"training_seed": seeds, **columns})
 
 
 def agents_file(place: Place) -> str:
@@ -134,18 +135,18 @@ def _named(path: str | None) -> str:
     return "the recipe's own" if path is None else Path(path).name
 
 
-def _row(place: Place, runs: hierarchical_bootstrap.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
+def _row(place: Place, runs: statistics.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
     row, condition, protocol = place
     first = next(iter(runs.values()))
     return {
         "row": row, "condition": condition, "protocol": protocol, "seeds": list(runs), "agents": len(first["scene"]),
         "scenes": len(np.unique(first["scene"])), "agents_file": agents_file(place),
-        "pooled": hierarchical_bootstrap.summarise(runs, **resampling), "each": hierarchical_bootstrap.per_seed(runs),
+        "pooled": statistics.summarise_runs(runs, **resampling), "each": statistics.summarise_each_run(runs),
     }  # fmt: skip
 
 
 def _differences(
-    pairs: Iterable[list[str]], records: Mapping[tuple[str, str, str], hierarchical_bootstrap.Runs], resampling: Mapping[str, int]
+    pairs: Iterable[list[str]], records: Mapping[tuple[str, str, str], statistics.Runs], resampling: Mapping[str, int]
 ) -> list[dict[str, Any]]:
     """Every pair wherever both were judged, on the seeds that both have."""
     found = []
@@ -157,7 +158,7 @@ def _differences(
             shared = [seed for seed in runs if seed in others]
             old, new = ({seed: one[seed] for seed in shared} if shared else one for one in (runs, others))
             place = {"before": before, "after": after, "condition": condition, "protocol": protocol, "seeds": [len(old), len(new)]}
-            found.append({**place, "change": hierarchical_bootstrap.difference(old, new, **resampling)})
+            found.append({**place, "change": statistics.difference_of_runs(old, new, **resampling)})
     return found
 
 

@@ -71,7 +71,7 @@ def make_episode_runner(
 
     @jax.jit
     def boxes(scene, state):  # that depends on nothing but the scene and the step, so it need not be kept
-        at = lambda step: env.now(scene, replace(state, step=step)).traffic  # noqa: E731
+        at = lambda step: env.current_scene(scene, replace(state, step=step)).traffic  # noqa: E731
         return jax.lax.map(at, jnp.arange(1, limit + 1, dtype=jnp.int32))
 
     def run(parameters):
@@ -113,7 +113,7 @@ def _records(
         **events,
         "clean": events["goal_reached"] & ~others,
         "time_s": of(tally.steps) / control_hz,
-        "route_m": of(state.agents.route),
+        "route_m": of(state.agents.route_length),
         "start_distance_m": of(started),
         "end_distance_m": of(tally.goal_distance),
         "max_drac": of(tally.drac_max),

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.evaluation.agent_metrics import Records, RecordsError
+from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation.records import Records, RecordsError, check_records
 
 NONE = "none"  # the kind of a clean arrival
 
@@ -138,7 +138,7 @@ def check(records: Records) -> None:
     Raises:
         RecordsError: naming the column.
     """
-    agent_metrics.check(records)
+    check_records(records)
     wanted = ("failure", "failure_s", "failure_x_m", "failure_y_m", "severity", *FLAGS)
     for name in wanted:
         if name not in records:
@@ -201,7 +201,7 @@ def table(records: Records, *, most: int = 3) -> str:
         also = [f"{FLAGS[name]} {count}" for name, count in flag_counts(failures).items()]
         most_of = ", ".join(f"{scene} ({count})" for scene, count in scenes(failures)[:most])
         rows.append([KINDS[kind].label, len(failures), f"{100 * len(failures) / agents:.1f} %", ", ".join(also), most_of])
-    return agent_metrics.grid(["First that went wrong", "Agents", f"Share of {agents}", "Of these also", "Scenes with the most"], rows)
+    return markdown.format_table(["First that went wrong", "Agents", f"Share of {agents}", "Of these also", "Scenes with the most"], rows)
 
 
 def list_thresholds(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:

@@ -36,7 +36,7 @@ class Estimate(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Metrics of all runs by seed and agent. An agent is a scene, a world (a scene may be evaluated in two), an episode's seed and a slot."""
+    """Metrics of all runs by seed and agent. An agent is a scene, a world (a scene may have two), a seed of the episode and a slot."""
 
     sums: Float[np.ndarray, "S U M"]  # value of each metric, 0 where the agent does not count
     counts: Float[np.ndarray, "S U M"]  # 1 where the agent counts, 0 where it does not or the seed has no such agent
@@ -92,7 +92,7 @@ def difference(before: Records, after: Records, *, bootstrap: int, seed: int) ->
     """Estimates `after` minus `before` for every metric of two runs on the same scenes; each resample draws scenes once for both.
 
     A difference of rates that does not vary takes Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, method 10); one of
-    means has none. `count` is the smaller of the two counts.
+    means has none if agents of one scene alone count. `count` is the smaller of the two counts.
 
     Raises:
         RecordsError: see `summarise`; or the two have different scenes.
@@ -175,7 +175,7 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
         if not np.isfinite(value):
             found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
-        elif _varies(low, high) and not one_scene:
+        elif low is not None and not one_scene and (_varies(low, high) or not metric.rate):
             found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
         elif metric.rate:
             ends = newcombe(*((float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)))
@@ -188,7 +188,10 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
 def _percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float | None, float | None]:
     """The middle 95 % of the draws that have a value."""
     finite = draws[np.isfinite(draws)]
-    return tuple(float(end) for end in np.percentile(finite, [2.5, 97.5])) if len(finite) else (None, None)
+    if not len(finite):
+        return None, None
+    low, high = np.percentile(finite, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def _varies(low: float | None, high: float | None) -> bool:

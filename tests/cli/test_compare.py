@@ -10,7 +10,8 @@ import yaml
 from scenefactory_jax.cli.compare import compare
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import COLUMNS, write_records
 
 METRICS = ("events/goal_reached", "reward")
 
@@ -23,11 +24,11 @@ def run(folder, *, seed, dtype="float32", goal_reached=(0.0, 0.2, 0.4, 0.6), age
     with open(folder / "metrics.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, ["iteration", "minutes", "steps/total", "casps", *METRICS])
         writer.writeheader()
-        for i, share in enumerate(reached, start=1):
+        for i, share in enumerate(goal_reached, start=1):
             row = {"iteration": i, "minutes": 0.5 * i, "steps/total": 100 * i, "casps": 1000.0 + seed}
             writer.writerow(row | {"events/goal_reached": share, "reward": seed})
     if agents is not None:
-        agent_metrics.write_csv(folder / "agents-strict.csv", agents)
+        write_records(folder / "agents-strict.csv", agents)
     return folder
 
 
@@ -65,8 +66,8 @@ def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
     runs = [run(tmp_path / "a", seed=0, agents=first), run(tmp_path / "b", seed=1, agents=second)]
     [group] = compare(settings(*runs, out=str(tmp_path / "out")))["groups"].values()
     found = group["evaluated"]["strict"]["success_rate"]
-    assert (found["value"], found["count"], found["method"]) == (0.5, 8, agent_metrics.LEVELS)
-    by_seed = hierarchical_bootstrap.summarise({0: first, 1: second}, bootstrap=100, seed=0)["success_rate"]
+    assert (found["value"], found["count"], found["method"]) == (0.5, 8, statistics.LEVELS)
+    by_seed = statistics.summarise_runs({0: first, 1: second}, bootstrap=100, seed=0)["success_rate"]
     assert (found["low"], found["high"]) == pytest.approx((by_seed.low, by_seed.high), rel=1e-5)
     text = (tmp_path / "out" / "compare.md").read_text()
     assert "## Evaluation at the end, strict" in text and "| Success rate | 50.0 %" in text
@@ -76,10 +77,10 @@ def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
 def records():
     """Agents of an evaluation: some reached their goal, some ran out of time."""
 
-    def made(*, reached, missed):
-        count = reached + missed
-        good = np.arange(count) < reached
-        columns = {name: np.zeros(count, dtype) for name, dtype in agent_metrics.COLUMNS.items()}
+    def made(*, goal_reached, missed):
+        count = goal_reached + missed
+        good = np.arange(count) < goal_reached
+        columns = {name: np.zeros(count, dtype) for name, dtype in COLUMNS.items()}
         columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "goal_reached": good, "clean": good}
         return columns
 
@@ -90,7 +91,7 @@ def test_what_cannot_be_compared_is_named(tmp_path):
     one = run(tmp_path / "a", seed=0)
     with pytest.raises(ConfigError, match=r"nothing matches '.*none-\*'"):
         compare(settings(tmp_path / "none-*"))
-    with pytest.raises(ConfigError, match="is no run"):
+    with pytest.raises(ConfigError, match=r"config\.yaml not found in"):
         compare(settings(tmp_path))
     with pytest.raises(ConfigError, match=r"metrics\.csv has no column 'speed'; there are: iteration, minutes"):
         compare(settings(one, metrics=["speed"]))

@@ -17,7 +17,9 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.metrics import agent_metrics
+from scenefactory_jax.evaluation.records import read_records, select_rows
 from scenefactory_jax.learning import run_folder, training_loop
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import study_figures
@@ -27,7 +29,13 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 TOY = {
-    "base": ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observations.ego._target_=study_parts.ego"],
+    "base": [
+        "experiment=smoke",
+        "worlds=2",
+        "scenes.count=2",
+        "scenes.heldout.count=2",
+        "observations.ego._target_=support.study_parts.ego",
+    ],
     "common": ["evaluation.every=1"],
     "examined": ["timing.episode_s=1", "spawning=logged", "weather=dry", "traffic=none", "reward=paper"],
     "trainings": {"all terms": [], "one scene": ["scenes.take.count=1"], "no TTC": ["reward.ttc=null", "ppo.learning_rate=1.0e-2"]},
@@ -78,9 +86,9 @@ def test_a_study_ends_with_everything_that_it_wants(whole):
 def test_numbers_are_those_of_the_records(whole):
     folder, result = whole
     plan = study_plan.make(toy(folder))
-    own = {one.training.seed: agent_metrics.read_csv(one.file) for one in plan.judgings if (one.row, one.condition) == ("no TTC", "dry")}
+    own = {one.training.seed: read_records(one.file) for one in plan.judgings if (one.row, one.condition) == ("no TTC", "dry")}
     row = next(row for row in result["rows"] if row["row"] == "no TTC")
-    rate = hierarchical_bootstrap.summarise(own, bootstrap=20, seed=1000)["road_edge_rate"]
+    rate = statistics.summarise_runs(own, bootstrap=20, seed=1000)["road_edge_rate"]
     assert row["pooled"]["road_edge_rate"]["value"] == pytest.approx(rate.value, rel=1e-4)
     for seed, records in own.items():
         assert row["each"][str(seed)]["mean_remaining_m"] == pytest.approx(records["end_distance_m"].mean(), rel=1e-4)
@@ -111,10 +119,10 @@ def test_every_agent_is_listed_beside_the_report(whole):
     assert {path.name for path in (folder / "out" / "agents").iterdir()} == {row["agents_file"].split("/")[1] for row in result["rows"]}
     for row in result["rows"]:
         file = folder / "out" / row["agents_file"]
-        agents = agent_metrics.read_csv(file)
-        runs = {seed: agent_metrics.select(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
+        agents = read_records(file)
+        runs = {seed: select_rows(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
         assert sum(len(one["scene"]) for one in runs.values()) == len(agents["scene"]) and {"surface", "failure"} <= set(agents)
-        found = hierarchical_bootstrap.summarise(runs, bootstrap=20, seed=1000)
+        found = statistics.summarise_runs(runs, bootstrap=20, seed=1000)
         for name in ("success_rate", "collision_rate", "mean_max_drac", "mean_time_to_goal_s"):
             reported = row["pooled"][name]["value"]
             assert found[name].value == (reported if reported is None else pytest.approx(reported, rel=1e-3)), name
@@ -164,7 +172,7 @@ def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path
 
 
 def test_an_interval_that_misses_its_value_is_drawn_up_to_it():
-    odd = {name: agent_metrics.Estimate(0.5, 0.55, 0.6, 9, agent_metrics.SHARE, agent_metrics.LEVELS) for name in study_figures.SHOWN}
+    odd = {name: statistics.Estimate(0.5, 0.55, 0.6, 9, agent_metrics.FRACTION, statistics.LEVELS) for name in study_figures.SHOWN}
     whole = study_figures._bars({"odd": odd}, {"odd": "#cc3311"})
     reach = [bars.get_segments() for axes in whole.axes for bars in axes.collections]
     assert len(reach) == len(study_figures.SHOWN) and all([end[0] for end in one[0]] == [0.5, 0.6] for one in reach)
@@ -376,7 +384,7 @@ def test_later_overrides_win():
 
 
 def test_fewer_scenes_of_one_seed_are_a_part_of_more():
-    load = lambda *own: scene_source.load_training_scenes(
+    load = lambda *own: scene_source.load_training_scenes(  # noqa: E731
         hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]
     )
     everything = load()

@@ -478,7 +478,7 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
         with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
-        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
             conversion.read(
                 folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(scene_size_m=-1.0), workers=workers
             )

@@ -17,7 +17,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import AgentLog, TrafficLog
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics, episode_records, failure_signals, failures
+from scenefactory_jax.evaluation import episode_records, failure_signals, failures
+from scenefactory_jax.evaluation.records import RecordsError, read_records, select_rows, write_records
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.report import failure_pictures
 
@@ -194,14 +195,14 @@ def test_the_worst_come_first(played):
 
 def test_records_keep_their_kinds_in_a_file(played, tmp_path):
     records, _ = played
-    agent_metrics.write_csv(tmp_path / "agents.csv", records)
-    again = agent_metrics.read_csv(tmp_path / "agents.csv")
+    write_records(tmp_path / "agents.csv", records)
+    again = read_records(tmp_path / "agents.csv")
     assert failures.rank_failures(again) == failures.rank_failures(records)
     told = json.loads(failure_pictures.write(tmp_path, {"strict": records}, {}).read_text())["strict"]["kinds"]
     assert {kind: entry["agents"] for kind, entry in told.items()} == {
         kind: len(ranked) for kind, ranked in failures.rank_failures(records).items()
     }
-    with pytest.raises(agent_metrics.RecordsError, match=r"records\.severity: column missing; kinds of failures need"):
+    with pytest.raises(RecordsError, match=r"records\.severity: column missing; kinds of failures need"):
         failures.rank_failures({name: column for name, column in records.items() if name != "severity"})
 
 
@@ -224,7 +225,7 @@ def test_pictures_show_the_place(played, settings, tmp_path):
 
 def test_a_film_shows_the_seconds_around_each_failure(played, settings, tmp_path):
     records, recording = played
-    chosen = agent_metrics.select(records, np.isin(records["failure"], ["edge", "wrong_way"]))
+    chosen = select_rows(records, np.isin(records["failure"], ["edge", "wrong_way"]))
     wanted = {**settings["failures"], "pictures": {"enable": True, "panels": 1, "before_s": 1.0, "video": True}}
     look = {**settings["video"], "stride": 15, "fps": 5.0, "panel": 120}
     paths = failure_pictures.draw(tmp_path, "strict, untrained", chosen, recording, {"failures": wanted, "video": look})
@@ -248,5 +249,5 @@ def test_settings_are_checked_at_the_door():
     del config["failures"]["notes"]["near_m"]
     with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
         schema.check_evaluate(config)
-    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: 0; wanted is at least 1"):
+    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: expected an integer >= 1, got 0"):
         schema.check_train(configs.load_config("train", "evaluation.failures.pictures.panels=0"))

@@ -54,7 +54,8 @@ FORMATS = (
 )  # fmt: skip
 QUICK = (
     "experiment=quick", *SMALL[1:], f"worlds={WORLDS}", "ppo.horizon=6", "ppo.epochs=1", "ppo.minibatches=2", "policy.vector=[16]",
-    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16", "traffic=log_playback", "weather=mixed",
+    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16",
+    "traffic=log_playback", "weather=mixed",
 )  # fmt: skip
 
 
@@ -137,7 +138,7 @@ def training(*overrides: str) -> Any:
     trainer, worlds = make_trainer(config, sf.make(config), make_policy(config)), scenes().scene
     state, rows = trainer.init(jax.random.key(0), worlds), []
     for _ in range(3):
-        state, row = trainer.iterate(state, worlds)
+        state, row = trainer.train_iteration(state, worlds)
         rows.append(jax.device_get(row))
     return rows, state.parameters
 

@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.core import markdown
 from scenefactory_jax.visualization.report import plots
 
 # SceneFactory, Table 5: static friction at 13.89 m/s by film, mm; where it prints "at most 0.001" the tyre floats
@@ -46,7 +46,7 @@ def table(found: Mapping[str, Any]) -> str:
     films = found["reference"]["films_mm"]
     cells = {name: zip(row["static"], row["dynamic"], strict=True) for name, row in found["table"].items()}
     rows = [[name, *(f"{static:.3f} ({dynamic:.3f})" for static, dynamic in pairs)] for name, pairs in cells.items()]
-    return agent_metrics.grid(["Surface", *(f"{film:g}" for film in films)], rows)
+    return markdown.format_table(["Surface", *(f"{film:g}" for film in films)], rows)
 
 
 def compare_with_published(found: Mapping[str, Any]) -> str:
@@ -57,7 +57,7 @@ def compare_with_published(found: Mapping[str, Any]) -> str:
         [name, *(f"{found['table'][name]['static'][at]:.3f} / {row[film]:.3f}" for at, film in shown)]
         for name, row in PUBLISHED.items() if name in found["table"]
     ]  # fmt: skip
-    return agent_metrics.grid(["Here / published", *(f"{film:g}" for _, film in shown)], rows) if rows and shown else ""
+    return markdown.format_table(["Here / published", *(f"{film:g}" for _, film in shown)], rows) if rows and shown else ""
 
 
 def figure(found: Mapping[str, Any]) -> Figure:

@@ -4,15 +4,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
-from scenefactory_jax.evaluation.agent_metrics import Estimate
-from scenefactory_jax.visualization.report import plots, study_figures
+from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.statistics import Estimate
+from scenefactory_jax.visualization.report import plots, study_figures, tables
 from scenefactory_jax.visualization.report.evaluation_report import PROTOCOLS
 
 Result = Mapping[str, Any]
 
 RATES = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate", "unfinished_rate")
-SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "least_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
+SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "min_ttc_s", "near_miss_rate", "mean_time_to_goal_s", "yaw_acceleration",
           "friction_utilization", "stopping_margin_m")  # fmt: skip
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background traffic", "dynamics": "Dynamics"}  # of an episode
@@ -48,7 +49,7 @@ def headline(result: Result) -> str:
     for name in result["study"]["trainings"]:
         row = next((row for row in result["rows"] if row["row"] == name), None)
         if row:
-            success, clean, collisions = (agent_metrics.text(Estimate(**row["pooled"][metric])) for metric in study_figures.HEADLINE)
+            success, clean, collisions = (tables.format_estimate(Estimate(**row["pooled"][metric])) for metric in study_figures.HEADLINE)
             size = f"{_many(len(row['seeds']), 'seed')} x {row['agents']} agents"
             told = f"success {success}, without any other event {clean}, collisions {collisions}"
             lines.append(f"- **{name}** ({row['condition']}, {row['protocol']}; {size}): {told}")
@@ -104,26 +105,26 @@ def _episodes(study: Mapping[str, Any]) -> str:
     for name, own in study["conditions"].items():
         chosen = dict(override.partition("=")[::2] for override in [*common, *study["examined"], *own])
         cells.append([name, *(chosen.get(group, AS_TRAINED) for group in GROUPS)])
-    return "Judged in these episodes:\n\n" + agent_metrics.grid(["Condition", *GROUPS.values()], cells)
+    return "Judged in these episodes:\n\n" + markdown.format_table(["Condition", *GROUPS.values()], cells)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], wanted: Sequence[str]) -> str:
-    shown = {name: metric for name, metric in hierarchical_bootstrap.labels(wanted).items() if any(name in row["pooled"] for row in rows)}
+    shown = {name: METRICS[name] for name in wanted if any(name in row["pooled"] for row in rows)}
     cells = []
     for row in rows:
         estimates = [row["pooled"].get(name) for name in shown]
-        texts = ["" if one is None else agent_metrics.text(Estimate(**one)) for one in estimates]
+        texts = ["" if one is None else tables.format_estimate(Estimate(**one)) for one in estimates]
         cells.append([row["row"], row["condition"], f"{len(row['seeds'])} x {row['agents']}", *texts])
-    return agent_metrics.grid(["", "Condition", "n", *(metric.label for metric in shown.values())], cells)
+    return markdown.format_table(["", "Condition", "n", *(metric.label for metric in shown.values())], cells)
 
 
 def _differences(found: Sequence[Mapping[str, Any]]) -> list[str]:
     if not found:
         return []
-    labels = hierarchical_bootstrap.labels(CHANGES)
+    labels = {name: METRICS[name] for name in CHANGES}
     cells = [
         [one["before"], one["after"], one["condition"], one["protocol"],
-         *(agent_metrics.text(Estimate(**one["change"][name]), signed=True) for name in labels)]
+         *(tables.format_estimate(Estimate(**one["change"][name]), signed=True) for name in labels)]
         for one in found
     ]  # fmt: skip
     intervals, without_zero = count_intervals(found)
@@ -132,7 +133,7 @@ def _differences(found: Sequence[Mapping[str, Any]]) -> list[str]:
         f"twenty would still exclude zero: {intervals / 20:.1f} of the {intervals} in this table. {without_zero} of them do. No correction "
         "for multiple comparisons is applied."
     )
-    return [words, agent_metrics.grid(["From", "To", "Condition", "Protocol", *(metric.label for metric in labels.values())], cells)]
+    return [words, markdown.format_table(["From", "To", "Condition", "Protocol", *(metric.label for metric in labels.values())], cells)]
 
 
 def count_intervals(found: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
@@ -148,8 +149,8 @@ def _each_seed(rows: Sequence[Mapping[str, Any]]) -> str:
         for seed, values in row["each"].items():
             told = ["" if values[name] is None else f"{100 * values[name]:.1f} %" for name in RATES]
             cells.append([row["row"], row["condition"], row["protocol"], seed, *told])
-    header = ["", "Condition", "Protocol", "Seed", *(metric.label for metric in hierarchical_bootstrap.labels(RATES).values())]
-    return f"<details><summary>Rates of each seed</summary>\n\n{agent_metrics.grid(header, cells)}\n\n</details>" if cells else ""
+    header = ["", "Condition", "Protocol", "Seed", *(METRICS[name].label for name in RATES)]
+    return f"<details><summary>Rates of each seed</summary>\n\n{markdown.format_table(header, cells)}\n\n</details>" if cells else ""
 
 
 def _trainings(result: Result) -> list[str]:
@@ -168,7 +169,7 @@ def _trainings(result: Result) -> list[str]:
         f"{total:.0f} minutes of training in all. Minutes are those of iterations; the first run of a program compiles it in its first "
         "iteration. Agent steps are control steps of spawned slots; of the steps a second, the median over iterations."
     )
-    return [words, agent_metrics.grid(header, cells), _to_target(result, target)]
+    return [words, markdown.format_table(header, cells), _to_target(result, target)]
 
 
 def _to_target(result: Result, target: float) -> str:
@@ -181,7 +182,7 @@ def _to_target(result: Result, target: float) -> str:
     if not cells:
         return ""
     header = ["", "Protocol", "Seed", f"First at {100 * target:.1f} % or more", "First at its last figure or more", "Last"]
-    return "Held-out success while training, under the first condition:\n\n" + agent_metrics.grid(header, cells)
+    return "Held-out success while training, under the first condition:\n\n" + markdown.format_table(header, cells)
 
 
 def _moment(found: Mapping[str, float | int] | None) -> str:
@@ -209,7 +210,7 @@ def _scenes(result: Result) -> list[str]:
     shown = ("date", "cut", "policies", "curve points")
     cells = [[*(look[name] for name in shown), f"{look['seconds'] / 60:.1f}", f"`{look['command']}`"] for look in looks]
     table = (
-        agent_metrics.grid(["Date", "Cut", "Policies judged", "Points of learning curves", "Minutes", "Command"], cells) if cells else ""
+        markdown.format_table(["Date", "Cut", "Policies judged", "Points of learning curves", "Minutes", "Command"], cells) if cells else ""
     )
     counted = (
         f"This study looked at them {times['policies']} times to judge a policy (under one condition and protocol) and "
@@ -220,7 +221,7 @@ def _scenes(result: Result) -> list[str]:
 
 
 def _meaning(result: Result) -> str:
-    shown = hierarchical_bootstrap.labels(name for name in (*RATES, *SAFETY) if any(name in row["pooled"] for row in result["rows"]))
+    shown = {name: METRICS[name] for name in (*RATES, *SAFETY) if any(name in row["pooled"] for row in result["rows"])}
     return "\n".join(f"- **{metric.label}**: {metric.definition}" for metric in shown.values())
 
 
@@ -236,8 +237,8 @@ def _again(result: Result) -> list[str]:
     return [
         "\n".join(text),
         f"Seeds of training: {', '.join(map(str, seeds)) or 'none yet'}. Judging: one deterministic episode a scene and repeat; {told}.",
-        agent_metrics.grid(["Variant", "Overrides of `train`, beside those of where its scenes lie"], variants),
-        agent_metrics.grid(["Condition", "Overrides of `evaluate`"], conditions),
-        agent_metrics.grid(["Floor", "What it is"], floors) if floors else "",
-        agent_metrics.grid(["The report was made with", ""], [[name, value] for name, value in made.items()]),
+        markdown.format_table(["Variant", "Overrides of `train`, beside those of where its scenes lie"], variants),
+        markdown.format_table(["Condition", "Overrides of `evaluate`"], conditions),
+        markdown.format_table(["Floor", "What it is"], floors) if floors else "",
+        markdown.format_table(["The report was made with", ""], [[name, value] for name, value in made.items()]),
     ]

@@ -149,7 +149,8 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
     columns = {
         "x": shots.position[..., 0], "y": shots.position[..., 1], "yaw": shots.yaw, "speed": shots.speed, "steer": shots.steer,
         "throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2], "ttc": _near(np.asarray(shots.ttc)),
-        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip, "friction_utilization": shots.friction_utilization,
+        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip,
+        "friction_utilization": shots.friction_utilization,
         "slip": shots.slip, "contact_force": shots.contact_force,
     }  # fmt: skip
     finely = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
