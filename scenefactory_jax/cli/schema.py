@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed, check
-from scenefactory_jax.evaluation.settings import Failures, Judging, Video
+from scenefactory_jax.evaluation.settings import Episodes, Failures, Video
 
 Group = dict[str, Any]
 
@@ -34,7 +34,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class TrainEvaluation(Judging):
+class TrainEvaluation(Episodes):
     """The group `evaluation` of `train`."""
 
     enable: bool
@@ -64,7 +64,7 @@ class Scenes:
 
 
 @dataclass(frozen=True)
-class Evaluate(Judging):
+class Evaluate(Episodes):
     """The command `evaluate`."""
 
     run: str
@@ -280,7 +280,7 @@ class Study:
     until_s: NonNegative | None
     target: NonNegative
     progress: bool
-    evaluation: Judging
+    evaluation: Episodes
     protocol: Protocol
     study: StudyPlan
 

@@ -124,13 +124,14 @@ def test_the_report_shows_the_worst_of_every_kind_of_failure(whole):
     ranked = failures.rank_failures(read_records(whole.folder / "agents-strict.csv"))
     told = json.loads((whole.folder / "failures.json").read_text())
     assert set(told) == {"strict", "strict, untrained"}
-    assert {kind: len(found) for kind, found in ranked.items()} == {k: entry["agents"] for k, entry in told["strict"]["kinds"].items()}
+    assert {kind: len(found) for kind, found in ranked.items()} == {k: entry["agents"] for k, entry in told["strict"]["types"].items()}
     assert ranked and sum(map(len, ranked.values())) == told["strict"]["agents"] - told["strict"]["clean"]
     text = (whole.folder / "report.md").read_text()
-    for kind, entry in told["strict"]["kinds"].items():
+    for kind, entry in told["strict"]["types"].items():
         picture = f"failures-strict-{kind}.png"
         assert entry["picture"] == picture and f"]({picture})" in text and (whole.folder / picture).is_file()
-        assert f"| {failures.KINDS[kind].label} | {entry['agents']} |" in text and f"- **{failures.KINDS[kind].label}**: " in text
+        label = failures.FAILURE_TYPES[kind].label
+        assert f"| {label} | {entry['agents']} |" in text and f"- **{label}**: " in text
 
 
 def test_every_spawned_agent_has_a_record(whole):

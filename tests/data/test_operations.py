@@ -419,5 +419,5 @@ def test_scenes_are_simulated(capsys):
     )
     clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
     assert clean == [True] * 3
-    assert "3 scenes, 6 steps each; 3 without any of these" in capsys.readouterr().out
+    assert "3 scenes; 3 without any of these" in capsys.readouterr().out
     assert STREETS["count"] > 3

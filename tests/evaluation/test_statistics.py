@@ -96,9 +96,9 @@ def test_a_rate_of_all_takes_the_score_interval_of_distinct_agents():
 
 
 def test_a_mean_that_does_not_vary_has_no_interval():
-    found = statistics.summarise_runs(
-        {0: records(np.ones((4, 5)), friction_utilization=np.full((4, 5), 1.42))}, bootstrap=20, seed=0
-    )["friction_utilization"]
+    found = statistics.summarise_runs({0: records(np.ones((4, 5)), friction_utilization=np.full((4, 5), 1.42))}, bootstrap=20, seed=0)[
+        "friction_utilization"
+    ]
     assert tables.format_estimate(found) == "142.0 %" and found.method == statistics.NONE
 
 

@@ -70,7 +70,7 @@ def write(
         files: what it is -> file, linked at the end (per-agent CSV, metrics).
         commands: how to get these numbers again.
         failed: name of records with kinds of failures -> kind -> picture of the worst; "film" -> their video.
-        kinds: the numbers that the definitions of `failures.KINDS` name.
+        kinds: the numbers that the definitions of `failures.FAILURE_TYPES` name.
         episodes: what decided the episodes, "Starts" -> "as recorded, from rest".
 
     Raises:
@@ -215,7 +215,7 @@ def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Pat
     """How agents ended or failed, the worst of each kind, and a list of those that did not reach their goal cleanly."""
     parts = [f"### {name}"]
     if "failure" in records:
-        parts += [failures.table(records), failures.list_definitions(records, numbers), _worst(folder, name, records, drawn)]
+        parts += [failures.format_table(records), failures.format_definitions(records, numbers), _worst(folder, name, records, drawn)]
     else:
         result = plots.outcomes(records)
         counts = [[outcome, int(np.sum(result == outcome)), f"{100 * np.mean(result == outcome):.1f} %"] for outcome in plots.OUTCOMES]
@@ -242,9 +242,8 @@ def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path])
     """The pictures of the worst of each kind, folded."""
     if not drawn:
         return ""
-    shown = [
-        _show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.rank_failures(records) if kind in drawn
-    ]
+    labels = {kind: failures.FAILURE_TYPES[kind].label for kind in failures.rank_failures(records) if kind in drawn}
+    shown = [_show(folder, f"{label}, {name}", drawn[kind]) for kind, label in labels.items()]
     if "film" in drawn:
         shown.append(_show(folder, f"The worst of each kind, {name}; clocks start where the film does", drawn["film"]))
     return "\n\n".join([f"<details><summary>The worst of each kind, side by side ({name})</summary>", *shown, "</details>"])
@@ -254,7 +253,7 @@ def _story(records: Records, row: int) -> str:
     """An agent's events in words."""
     past_events = [MARKS[event].label for event in MARKS if records[event][row]]
     if "failure" in records:
-        kind = failures.KINDS[str(records["failure"][row])].label
+        kind = failures.FAILURE_TYPES[str(records["failure"][row])].label
         also = [event for event in past_events if event not in kind]
         return kind + (f"; also {', '.join(also)}" if also else "")
     return ", ".join(past_events) if past_events else "out of time"
