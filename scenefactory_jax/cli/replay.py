@@ -134,7 +134,7 @@ def select_policy(config: Mapping[str, Any], settings: Mapping[str, Any], *, slo
 def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> RecordedWorlds:
     """The first usable scenes; no more is read than they take."""
     scene_source.check_config(config)
-    parts = scene_source.make_readers(config)
+    parts = scene_source.make_packing(config)
     packed: list[Packed] = []
     posts: list[replay_data.RoadPosts] = []
     reasons: list[str] = []

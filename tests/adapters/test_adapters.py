@@ -30,7 +30,7 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
 
 
-@pytest.mark.parametrize("observations", ["reference", "foresight"])  # together all groups of the package
+@pytest.mark.parametrize("observe", ["paper", "lane_preview"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
     settings = hydra_config.load_config(
         "train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4"
@@ -130,7 +130,7 @@ def test_a_step_is_all_control_steps_of_an_action():
         ("scenes.pack.agents=4", r"scenes\.pack\.agents: 4; this environment drives one car: set scenes\.pack\.agents=1"),
         ("spawning.respawn_clearance_m=5.0", r"spawning\.respawn_clearance_m: 5\.0; here a car that ended stays so"),
         ("dynamics=hover", "Could not find 'dynamics/hover'"),
-        ("timing.control_hz=0", r"timing\.control_hz: 0"),
+        ("timing.control_hz=0", r"timing\.control_hz: expected a number > 0, got 0"),
     ],
 )
 def test_a_config_that_does_not_fit_says_what_to_set(override, message):

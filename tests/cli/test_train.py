@@ -298,7 +298,7 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
 
 
 def test_other_settings_of_a_run(whole, tmp_path):
-    short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
+    short = "overrides=[timing.episode_s=1, weather.friction.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
     changed = judged(whole, tmp_path / "short", *small, "protocol.termination=[goal_only]", short)
     assert set(changed.records) == {"goal_only"} and changed.records["goal_only"]["time_s"].max() <= 1.0
@@ -474,7 +474,7 @@ def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(rendering, "photograph", blind)
     assert render(settings) == xml and "no OpenGL through egl here" in capsys.readouterr().out
-    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: mjx_car"}.items():
+    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: articulated"}.items():
         with pytest.raises(ConfigError, match=message):
             render(hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", override))
 
@@ -569,7 +569,7 @@ def options():
 def builds(whole_config):
     env, policy = environment.make_env(whole_config), make_policy(whole_config)
     assert make_trainer(whole_config, env, policy).train_iteration
-    assert {"gpudrive", "scenefactory"} <= set(scene_source.make_readers(whole_config["scenes"])["formats"])
+    assert {"gpudrive", "scenefactory"} <= set(whole_config["scenes"]["formats"])
     if scene_source.has_heldout(whole_config["scenes"]):
         instantiate(
             whole_config["scenes"]["generate"],

@@ -210,7 +210,7 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
     opened = bank_reader.open(tmp_path / "bank")
     assert (summary.files, summary.scenes, opened.names) == (2, 2, ("street", "street"))  # the GPUDrive document has this name too
     index = next(i for i, source in enumerate(opened.metadata["source"].to_pylist()) if source.endswith(".csv"))
-    scene, report = bank_reader.pack_scenes(opened, [index], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(opened), [index], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)
     assert scene.agents.route_length[0] == pytest.approx(40.0) and report.segments_kept == 80
 

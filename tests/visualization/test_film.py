@@ -182,7 +182,8 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("override", "message"), [
     ("out=a.avi", "out: a.avi; valid endings: .html, .gif, .mp4, .png, .rrd"),
-    ("film.view=side", "film.view: 'side'"), ("film.stride=0", "film.stride: expected an integer >= 1, got 0"),
+    ("film.view=side", "film.view: expected one of chase, bird, both, got 'side'"),
+    ("film.stride=0", "film.stride: expected an integer >= 1, got 0"),
 ])  # fmt: skip
 def test_a_wrong_setting_is_named(override, message):
     with pytest.raises(ValueError) as caught:

@@ -180,7 +180,7 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
         (["run=nowhere", "dynamics=bicycle"], "dynamics: decided by the run nowhere; to change it: overrides='[dynamics=...]'"),
         (["overrides=[weather=wet]"], "overrides: ['weather=wet'] without a run"),
         (["out=."], "out: . is a folder; give the page's own name, such as replay.html"),
-        (["act=wild"], "act: 'wild'"),
+        (["act=wild"], "act: expected one of policy, coast, random, got 'wild'"),
         (["worlds=0"], "worlds: expected an integer >= 1, got 0"),
         (["scenes=womd"], "scenes.path: null; give a bank, a scene file or a folder"),
     ],
