@@ -68,7 +68,9 @@ def make(config: Mapping[str, Any]) -> Plan:
     seeds = study["seeds"] if config["seeds"] is None else config["seeds"]
     trainings = [training for variant in study["trainings"] for training in _trainings(config, variant, seeds)]
     terminations = load_terminations(study["protocols"])
-    evaluations = [one for training in trainings for one in _evaluations(config, training, terminations, is_first=training.seed == seeds[0])]
+    evaluations = [
+        one for training in trainings for one in _evaluations(config, training, terminations, is_first=training.seed == seeds[0])
+    ]
     rows = [*study["trainings"], *study["baselines"]]
     conditions = list(study["conditions"])
     evaluations.sort(key=lambda one: (conditions.index(one.condition), rows.index(one.row)))

@@ -46,8 +46,8 @@ def test_intervals_and_looks_are_counted():
     counts = [study_report.count_intervals(studies[name]["differences"]) for name in PARTS_TAKEN_OUT]
     intervals, without_zero = map(sum, zip(*counts, strict=True))
     assert f"{intervals} intervals of differences, {without_zero} without zero; chance alone gives about {intervals / 20:.0f}" in SAID
-    looks = [look for study in studies.values() for look in study.get("looks", []) if look["cut"] == "test"]
-    policies, points = (sum(look[name] for look in looks) for name in ("policies", "curve points"))
+    uses = [use for study in studies.values() for use in study.get("held_out_uses", []) if use["cut"] == "test"]
+    policies, points = (sum(use[name] for use in uses) for name in ("policies", "curve points"))
     assert f"{policies} policies and {points} points of curves" in SAID
 
 
