@@ -57,7 +57,7 @@ def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, car):
 
 
 def test_the_brakes_limit_solves_its_equation(car):
-    inertia = motion_laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    inertia = motion_laws.total_mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
     speed, way, dt = 15.0, 0.0, 1e-4
     while speed > 0.0:
         way += speed * dt
@@ -65,7 +65,7 @@ def test_the_brakes_limit_solves_its_equation(car):
         force = (torque + 4 * car.rolling_torque) / car.wheel_radius + car.air_drag * speed**2
         speed -= force / inertia * dt
     assert motion_laws.brake_limit_m(car, 15.0) == pytest.approx(way, rel=1e-3)
-    assert motion_laws.mass(car) == pytest.approx(1980.03, abs=0.01)
+    assert motion_laws.total_mass(car) == pytest.approx(1980.03, abs=0.01)
 
 
 def test_braked_cars_stand(drive):
