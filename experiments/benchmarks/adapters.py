@@ -25,11 +25,10 @@ from scenefactory_jax.adapters import episodes, flatten_observation
 from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli.hydra_config import versions
-from scenefactory_jax.core import result_file
+from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics
 
 ALONE = episodes.ALONE
 FILE, DIGITS = "adapters.json", 5
@@ -233,7 +232,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    return agent_metrics.grid(header, cells)
+    return markdown.format_table(header, cells)
 
 
 def adapters(config: Mapping[str, Any]) -> list[dict[str, Any]]:

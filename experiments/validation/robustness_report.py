@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.core import markdown
 
 Result = Mapping[str, Any]
 
@@ -26,7 +26,7 @@ def extremes(result: Result, folder: Path) -> list[str]:
         f"Cars in states that no driver would choose, each for an episode of {result['seconds']:g} s. Highest and lowest are of the box's "
         "centre, which stands at 0.755 m; energy may only grow where the engine drives, so it is not looked at there."
     )
-    return ["## Extremes", words, agent_metrics.grid(header, rows)]
+    return ["## Extremes", words, markdown.format_table(header, rows)]
 
 
 def faults(result: Result, folder: Path) -> list[str]:
@@ -52,7 +52,7 @@ def faults(result: Result, folder: Path) -> list[str]:
         "One car is broken in the middle of a run. Its world is held, bit for bit, against a run in which it left the stage at that step, "
         "the other worlds against a run in which nothing happened."
     )
-    return ["## Faults", words, agent_metrics.grid(header, rows), "## Determinism", f"On {device}. {'; '.join(same)}."]
+    return ["## Faults", words, markdown.format_table(header, rows), "## Determinism", f"On {device}. {'; '.join(same)}."]
 
 
 def costs(result: Result, folder: Path) -> list[str]:
@@ -72,4 +72,4 @@ def costs(result: Result, folder: Path) -> list[str]:
         "taken: weather, friction under every wheel, others, contacts and the cars; no observations, rewards or policy. Medians, all "
         "variants one after the other in one run."
     )
-    return ["## What features cost", words, agent_metrics.grid(header, rows)]
+    return ["## What features cost", words, markdown.format_table(header, rows)]

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from experiments.validation import robustness_report, target_check
 from experiments.validation import validation_figures as figures
 from experiments.validation.validation_figures import NAMES
+from scenefactory_jax.core import markdown
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import plots, verdicts
 
 Result = Mapping[str, Any]
@@ -52,7 +52,7 @@ def _made(results: Mapping[str, Mapping[str, Any]]) -> str:
     return "\n\n".join([
         f"The batched cars against MuJoCo's C engine, in double precision and converged, and against laws of motion. {versions}; "
         f"{whole / 60:.1f} minutes in all, compilation included. The numbers are in `results/`.",
-        agent_metrics.grid(["Part", "Seconds", "Device", "Processes for the C engine", "Command"], rows),
+        markdown.format_table(["Part", "Seconds", "Device", "Processes for the C engine", "Command"], rows),
     ])  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def _drives(result: Result, folder: Path) -> list[str]:
     return [
         "## Single cars: error growth", words, why,
         _picture(folder, "errors", "Difference of the batched path from the C engine over time", figures.errors(result)),
-        agent_metrics.grid(header, rows),
+        markdown.format_table(header, rows),
         "## Forces on the wheels",
         f"What the tyres did in all drives at all control steps. Share that the two engines' histograms have in common: {shares}.",
         _picture(folder, "forces", "Wheels of all drives in both engines; shares on a log scale", figures.histograms(result)),
@@ -139,7 +139,7 @@ def _settings(result: Result, folder: Path) -> list[str]:
             f"{_mm(result['bound']['bound_m'])} asks the solver to add no more than a time step does."
         )
     return [
-        "## Solver, iterations, time step", words, agent_metrics.grid(header, rows), " ".join(refused),
+        "## Solver, iterations, time step", words, markdown.format_table(header, rows), " ".join(refused),
         _picture(folder, "settings", "Position error by setting, and the share of drives inside the bound", figures.settings(result)),
     ]  # fmt: skip
 
@@ -168,13 +168,13 @@ def _encounters(result: Result, folder: Path) -> list[str]:
     header = ["C engine's contact", "Same event", "Both hit", "Batched only", "C only", "Neither", "Compared",
               "Speed error, median", "90 %", "Velocity error / closing speed, median", "Momentum, median", "Energy lost / C's, median",
               "Largest delay, steps"]  # fmt: skip
-    lines += [agent_metrics.grid(header, rows)]
+    lines += [markdown.format_table(header, rows)]
     name, seen = next(iter(result["contacts"].items()))
     if seen["rows"]["closing"]:
         caption = f"Both engines' collisions, {name} contact in the C engine; an encounter or car a point"
         lines += [_picture(folder, "collisions", caption, figures.collisions(result, name))]
         worst = [[row["case"], f"{100 * row['relative']:.3g} %", f"{100 * row['speed_share']:.3g} %"] for row in seen["worst"]]
-        lines += [agent_metrics.grid([f"Worst encounters ({name})", "Velocity error / closing speed", "Speed error"], worst)]
+        lines += [markdown.format_table([f"Worst encounters ({name})", "Velocity error / closing speed", "Speed error"], worst)]
     return lines
 
 
@@ -218,7 +218,7 @@ def _stopping(result: Result) -> Sequence[str]:
     rows += [[f"C engine, articulated, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
     return [
         words,
-        agent_metrics.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows),
+        markdown.format_table(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows),
         _brakes(found, limit),
         _hops(result),
     ]
@@ -273,7 +273,7 @@ def _standing(result: Result) -> Sequence[str]:
         "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion. What the brakes take of the "
         "engine's torque is therefore taken off before the solver sees it; latched brakes cannot do that."
     )
-    return [words, agent_metrics.grid(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
+    return [words, markdown.format_table(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
 
 
 def _cornering(result: Result) -> Sequence[str]:
@@ -293,7 +293,7 @@ def _cornering(result: Result) -> Sequence[str]:
     words = (
         "A steady steering angle without throttle, by speed and friction. Tyres can give μ g at most; a kinematic car knows no such limit."
     )
-    return [words, agent_metrics.grid(header, rows)]
+    return [words, markdown.format_table(header, rows)]
 
 
 def _split(result: Result, folder: Path) -> Sequence[str]:
@@ -313,7 +313,7 @@ def _split(result: Result, folder: Path) -> Sequence[str]:
     ways = ", ".join(f"{name} {' and '.join(f'{w:.1f}' for w in both)} m" for name, both in wide.items())
     return [
         f"Full brake with one side on friction {low:g}, the other on {high:g}: the car turns to the side that grips (left is positive).",
-        agent_metrics.grid(header, rows),
+        markdown.format_table(header, rows),
         _picture(folder, "split", "Yaw while braking on split friction", figures.split(result)),
         f"A patch of ice or snow in a bend carries the car off the dry car's circle (left and right turn): {ways}.",
         _picture(folder, "bend", "Ways through a bend; the circle is the patch", figures.bend(result)),
@@ -340,4 +340,4 @@ def _ride(result: Result) -> Sequence[str]:
     carried = {name: found["on_springs"] for name, found in _rows(result, "ride").items()}
     lying = [(name, f"{100 * share:.0f} %") for name, share in carried.items() if share < 0.5]
     notes = [f"{name} lies on its bump stops: its springs carry {share} of the weight." for name, share in lying]
-    return [words, agent_metrics.grid(header, rows), " ".join(notes)]
+    return [words, markdown.format_table(header, rows), " ".join(notes)]

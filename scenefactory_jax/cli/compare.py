@@ -11,7 +11,8 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import read_folder
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import run_comparison as report
 
@@ -90,17 +91,7 @@ def _read(folder: Path) -> ReadRun:
     if not metrics:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
     settings = {key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
-    return ReadRun(folder, config, settings, metrics, read_records(folder))
-
-
-def read_records(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Reads protocol -> records of the trained policy's agents that an evaluation wrote to a folder; empty without an evaluation.
-
-    Raises:
-        RecordsError: a file with other contents.
-    """
-    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    return {name: agent_metrics.read_csv(path) for name, path in files.items() if not name.endswith("-untrained")}
+    return ReadRun(folder, config, settings, metrics, read_folder(folder))
 
 
 def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -133,7 +124,7 @@ def _group(runs: list[ReadRun], config: Mapping[str, Any]) -> dict[str, Any]:
     for name in runs[0].records:
         if all(name in run.records for run in runs):
             each = {seed: run.records[name] for seed, run in seeds.items()}
-            evaluated[name] = hierarchical_bootstrap.summarise(each, bootstrap=config["bootstrap"], seed=config["seed"])
+            evaluated[name] = statistics.summarise_runs(each, bootstrap=config["bootstrap"], seed=config["seed"])
     return {
         "runs": [run.folder.name for run in runs],
         "seeds": [run.config["seed"] for run in runs],

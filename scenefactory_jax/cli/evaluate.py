@@ -11,10 +11,10 @@ from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import agent_metrics, protocols
+from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
 from scenefactory_jax.learning import checkpoint, policy_io
-from scenefactory_jax.visualization.report import evaluation_files, evaluation_report
+from scenefactory_jax.visualization.report import evaluation_files, evaluation_report, tables
 from scenefactory_jax.visualization.report.evaluation_files import Result
 
 
@@ -58,7 +58,7 @@ def _evaluate(config: Mapping[str, Any], run: Path, out: Path, *, asked: Mapping
         out, evaluated, config=config, run=run, asked=asked, settings=settings, versions=configs.versions(),
         commands=[format_rerun_command(asked, settings)],
     )  # fmt: skip
-    print(agent_metrics.markdown(result.summary), f"\nreport {result.report}", sep="\n", flush=True)
+    print(tables.format_summaries(result.summary), f"\nreport {result.report}", sep="\n", flush=True)
     return result
 
 

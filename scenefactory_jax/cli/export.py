@@ -9,10 +9,10 @@ import yaml
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
-from scenefactory_jax.cli.compare import read_records
-from scenefactory_jax.core import result_file, trusted_targets
+from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import read_folder, read_settings
 from scenefactory_jax.learning import checkpoint, policy_io
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import policy_card
@@ -34,7 +34,7 @@ def export(config: Mapping[str, Any]) -> Path:
         raise ConfigError(f"out: {out} holds something already; give a new folder")
     folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
-    episodes = {named(what, folder): result_file.read_evaluated(folder).get("episodes", {}) for what, folder in folders.items()}
+    episodes = {named(what, folder): read_settings(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
     configs.print_outside_targets(trained.config, trained.folder)
     (out / "checkpoints").mkdir(parents=True)
@@ -46,7 +46,7 @@ def export(config: Mapping[str, Any]) -> Path:
     configs.write(out, own)
     shutil.copy(trained.folder / "versions.yaml", out)
     versions = yaml.safe_load((out / "versions.yaml").read_text())
-    text = policy_card.markdown(
+    text = policy_card.format_card(
         out.name, config["card"]["about"], config=own, versions=versions, training=metrics_csv.read(trained.folder), judged=judged,
         episodes=episodes, outside=sorted(set(trusted_targets.find_outside_targets(own).values())),
     )  # fmt: skip
@@ -57,16 +57,16 @@ def export(config: Mapping[str, Any]) -> Path:
 
 def named(what: str, folder: Path) -> str:
     """What was driven, and with what it differed from the run's own held-out scenes and settings; of paths the names alone."""
-    noted = result_file.read_evaluated(folder)
+    noted = read_settings(folder)
     told = [] if noted["scenes"] is None else [Path(noted["scenes"]).name]
     told += [] if (protocol := noted.get("protocol", "trained")) == "trained" else [f"protocol={protocol}"]
     told += [override for override in noted["overrides"] if "path=" not in override]
     return f"{what} ({', '.join(told)})" if told else what
 
 
-def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, agent_metrics.Estimate]]:
+def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, statistics.Estimate]]:
     """Protocol -> estimates of an evaluation's trained policy."""
-    records = read_records(folder)
+    records = read_folder(folder)
     if not records:
         raise ConfigError(f"card.judged.{what}: {folder} holds no records of agents; give a folder that `evaluate` wrote")
-    return {name: agent_metrics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
+    return {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}

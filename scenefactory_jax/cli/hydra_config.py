@@ -29,7 +29,7 @@ from scenefactory_jax.core.config import FILE, find_commit, format_command, read
 from scenefactory_jax.core.instantiate import ConfigError
 
 # Keys whose values are lists of overrides
-LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined", r"protocol\.settings")
+LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.evaluation_overrides", r"protocol\.settings")
 
 
 def find_conf() -> Path:

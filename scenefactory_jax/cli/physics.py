@@ -8,11 +8,10 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
-from scenefactory_jax.core import result_file
+from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics import c_engine_comparison
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import friction_tables
 
 DIGITS = 5
@@ -46,4 +45,4 @@ def physics(config: Mapping[str, Any]) -> dict[str, Any]:
 def _format_distances(distances: Mapping[tuple[str, str], np.ndarray]) -> str:
     """Formats the largest distances of the drives as a table."""
     rows = [[*pair, *(f"{1e3 * value:.3g}" for value in (np.median(found), found.max()))] for pair, found in distances.items()]
-    return agent_metrics.grid(["Solver", "Compared with", "Distance, mm: median drive", "worst drive"], rows)
+    return markdown.format_table(["Solver", "Compared with", "Distance, mm: median drive", "worst drive"], rows)

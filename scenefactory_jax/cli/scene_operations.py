@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 from rich.progress import Progress
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal, to_file_name
@@ -19,7 +20,6 @@ from scenefactory_jax.data.curation import duplicates, operations
 from scenefactory_jax.data.curation.features import COLUMNS, EVERY_BANK
 from scenefactory_jax.data.export import files, gpudrive, scenarionet
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import agent_metrics
 
 SHOWN = 10  # groups of duplicates, and values of a text, that are printed
 
@@ -61,7 +61,7 @@ def split(config: Mapping[str, Any]) -> dict[str, Bank]:
     parts = operations.split(*_opened(config), **config["split"], seed=config["seed"])
     account = parts.account
     rows = [[name, part["scenes"], f"{part['share']:.1%}", account["leaks"][name]] for name, part in account["parts"].items()]
-    print(agent_metrics.grid(["part", "scenes", "share", "show streets of another part"], rows))
+    print(markdown.format_table(["part", "scenes", "share", "show streets of another part"], rows))
     sizes = ", ".join(f"{number} of {size}" for size, number in account["groups_by_size"].items())
     print(f"{account['scenes']} scenes on {account['groups']} streets of their own; groups by number of scenes: {sizes}", flush=True)
     if config["out"] is None:
@@ -211,4 +211,4 @@ def _table(summary: Mapping[str, Any]) -> str:
     for name, found in summary["numbers"].items():
         cells = [f"{found[key]:.5g}" if key in found else "" for key in ("min", "median", "mean", "max", "sum")]
         rows.append([name, *cells, found["missing"] or "", meaning.get(name, "")])
-    return agent_metrics.grid(["column", "least", "median", "mean", "most", "sum", "missing", "meaning"], rows)
+    return markdown.format_table(["column", "least", "median", "mean", "most", "sum", "missing", "meaning"], rows)

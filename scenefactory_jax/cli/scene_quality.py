@@ -8,14 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core import schema
+from scenefactory_jax.core import markdown, schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.schema import Seed
 from scenefactory_jax.data.curation import quality_gate as judging
 from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.data.loading import raw_scenes, scene_source
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import scene_quality as report
 from scenefactory_jax.visualization.report.scene_quality import Count, Example
 
@@ -71,7 +70,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
         Path(config["out"]), scenes=scenes, counts=counts, entries={name: settings["rules"][name] for name in rules}, examples=chosen,
         refused=refused, dropped=dropped, unread=unread, window_m=numbers["window_m"], command=configs.format_command("scenes"), **names,
     )  # fmt: skip
-    print(agent_metrics.grid(["rule", "findings", "scenes", "objects"], [[name, *count] for name, count in counts.items()]))
+    print(markdown.format_table(["rule", "findings", "scenes", "objects"], [[name, *count] for name, count in counts.items()]))
     print(f"{scenes} scenes judged, {refused} refused, {dropped} objects left out, {len(unread)} not read\n{path}", flush=True)
     return counts
 

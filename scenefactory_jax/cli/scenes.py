@@ -9,11 +9,11 @@ import numpy as np
 
 from scenefactory_jax.cli import scene_comparison, scene_operations, scene_quality
 from scenefactory_jax.cli.scene_schema import SceneOperations
-from scenefactory_jax.core import schema
+from scenefactory_jax.core import markdown, schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import agent_metrics, scene_simulation
+from scenefactory_jax.evaluation import scene_simulation
 from scenefactory_jax.visualization.birds_eye import contact_sheet, figures
 from scenefactory_jax.visualization.report import plots
 
@@ -40,7 +40,7 @@ def check(config: Mapping[str, Any]) -> scene_source.Scenes:
     """Pack the scenes and print what was kept, dropped and refused, scene by scene."""
     loaded = scene_source.load_training_scenes(config["scenes"])
     table = [[name, *_row(jax.tree.map(lambda leaf, i=index: leaf[i], loaded.scene))] for index, name in enumerate(loaded.names)]
-    print(agent_metrics.grid(["scene", "agents", "segments", "lane m", "edge m", "route m"], table))
+    print(markdown.format_table(["scene", "agents", "segments", "lane m", "edge m", "route m"], table))
     print(loaded.account, flush=True)
     return loaded
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed, check
-from scenefactory_jax.evaluation.settings import Failures, Judging, Video
+from scenefactory_jax.evaluation.settings import Episodes, Failures, Video
 
 Group = dict[str, Any]
 
@@ -34,7 +34,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class TrainEvaluation(Judging):
+class TrainEvaluation(Episodes):
     """The group `evaluation` of `train`."""
 
     enable: bool
@@ -64,7 +64,7 @@ class Scenes:
 
 
 @dataclass(frozen=True)
-class Evaluate(Judging):
+class Evaluate(Episodes):
     """The command `evaluate`."""
 
     run: str
@@ -220,7 +220,7 @@ class Validate:
 
 
 @dataclass(frozen=True)
-class StudyFloor:
+class StudyBaseline:
     """A baseline of a study."""
 
     of: str
@@ -247,15 +247,14 @@ class StudyPlan:
     common: list[str]
     trainings: dict[str, list]
     seeds: list[int]
-    examined: list[str]
+    evaluation_overrides: list[str]
     conditions: dict[str, list]
     protocols: list[str]
-    judged: dict[str, list] | None
-    floors: dict[str, StudyFloor]
+    evaluated: dict[str, list] | None
+    baselines: dict[str, StudyBaseline]
     compare: list[list[str]]
     figures: list[Literal["learning", "rates", "matrix", "differences", "trend"]]
     trend: StudyTrend | None
-    reading: str | None
 
     def __post_init__(self) -> None:
         _check_seeds(self.seeds)
@@ -276,13 +275,13 @@ class Study:
     seeds: list[int] | None
     common: list[str]
     only: list[str] | None
-    parts: list[Literal["train", "judge", "report", "draw"]]
+    parts: list[Literal["train", "evaluate", "report", "draw"]]
     processes: Count
     per_gpu: Count
-    until_s: NonNegative | None
+    time_limit_s: NonNegative | None
     target: NonNegative
     progress: bool
-    evaluation: Judging
+    evaluation: Episodes
     protocol: Protocol
     study: StudyPlan
 

@@ -1,4 +1,4 @@
-"""What a study is to train and to judge, read out of its config: every training and every judging with a digest of all that decides it."""
+"""Trainings and evaluations of a study, read from its config, each with a digest of all that decides its numbers."""
 
 import functools
 import hashlib
@@ -9,17 +9,18 @@ from typing import Any, NamedTuple
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.cli.evaluate import load_terminations
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.env import environment
 
-TASK = tuple(group for group in environment.GROUPS if group != "termination")  # how episodes end is the protocol's
-LEARNER = (*TASK, "termination", "policy", "ppo", "devices")  # what programs of training are made of
-# What changes nothing about what is learnt
-ASIDE = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
-TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, and what it began with
+TASK = tuple(group for group in environment.GROUPS if group != "termination")  # the termination is the protocol's
+LEARNER = (*TASK, "termination", "policy", "ppo", "devices")  # groups that the compiled training depends on
+# Keys that do not change what is learnt
+IGNORED = ("name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "evaluation")
+TRAINED, UNTRAINED = "checkpoints", "untrained"  # weights: a run's checkpoints, or those before training
 
 
 class Training(NamedTuple):
@@ -31,63 +32,66 @@ class Training(NamedTuple):
     config: dict[str, Any]
     folder: Path
     digest: str
-    program: str
+    program: str  # digest of what its compiled program depends on
 
 
 class Evaluation(NamedTuple):
     """One policy under one condition and protocol."""
 
-    row: str  # of the report: a variant, or a floor
+    row: str  # of the report: a variant or a baseline
     training: Training
     weights: str  # TRAINED or UNTRAINED
     condition: str
     protocol: str
     config: dict[str, Any]
-    program: str
+    program: str  # digest of all but the weights
     file: Path  # of its records
 
 
 class Plan(NamedTuple):
-    """Everything that a study wants, in the order of its config."""
+    """All trainings and evaluations of a study, in the order of its config."""
 
     name: str
     trainings: list[Training]
-    judgings: list[Evaluation]
+    evaluations: list[Evaluation]
 
 
 def make(config: Mapping[str, Any]) -> Plan:
-    """The plan of a `study` config.
+    """Plans a study.
 
     Raises:
         ConfigError: a key, a name or an override that does not fit, naming the variant or condition.
     """
     check(config)
-    scenes_print.cache_clear()  # other scenes may lie there than when this process planned before
-    study, runs = config["study"], Path(config["runs"])
+    digest_files.cache_clear()  # the files may have changed since this process planned last
+    study = config["study"]
     seeds = study["seeds"] if config["seeds"] is None else config["seeds"]
-    trainings = [one for variant in study["trainings"] for one in _trainings(config, variant, seeds, runs)]
-    judgings = [one for training in trainings for one in _judgings(config, training, first=seeds[0])]
-    rows = {name: index for index, name in enumerate([*study["trainings"], *study["floors"]])}
-    places = {name: index for index, name in enumerate(study["conditions"])}
-    return Plan(study["name"], trainings, sorted(judgings, key=lambda one: (places[one.condition], rows[one.row])))
+    trainings = [training for variant in study["trainings"] for training in _trainings(config, variant, seeds)]
+    terminations = load_terminations(study["protocols"])
+    evaluations = [
+        one for training in trainings for one in _evaluations(config, training, terminations, is_first=training.seed == seeds[0])
+    ]
+    rows = [*study["trainings"], *study["baselines"]]
+    conditions = list(study["conditions"])
+    evaluations.sort(key=lambda one: (conditions.index(one.condition), rows.index(one.row)))
+    return Plan(study["name"], trainings, evaluations)
 
 
-def is_watched(plan: Plan, training: Training) -> list[Evaluation]:
-    """How a variant is judged while it trains: under its first condition, in every protocol."""
-    own = [one for one in plan.judgings if one.row == training.variant and one.training.seed == training.seed]
-    return [one for one in own if one.condition == own[0].condition]
+def evaluations_while_training(plan: Plan, training: Training) -> list[Evaluation]:
+    """Returns the evaluations that a training repeats while it runs: those under its first condition, in every protocol."""
+    found = [one for one in plan.evaluations if one.row == training.variant and one.training.seed == training.seed]
+    return [one for one in found if one.condition == found[0].condition]
 
 
-def scenes_key(config: Mapping[str, Any], path: str | None) -> str:
-    """Tells which settings of a `scenes` entry give the same scenes, before `take`."""
+def digest_scenes(config: Mapping[str, Any], path: str | None) -> str:
+    """Computes a digest of the settings of a `scenes` entry that decide its scenes, before `take`."""
     entry = {name: value for name, value in config.items() if name not in ("take", "heldout", "workers", "path")}
     return result_file.digest({**entry, "path": None if path is None else str(path)})
 
 
 @functools.lru_cache
-def scenes_print(path: str | None) -> str | None:
-    """Tells other scenes of the same path: a bank's index, which has digests of its files, or name, size and time of every file; None where
-    there are none."""
+def digest_files(path: str | None) -> str | None:
+    """Computes a digest of the scene files at a path: of a bank's index, or of name, size and time of every file. None: there are none."""
     if path is None or not Path(path).exists():
         return None
     if bank_index.is_bank(path):
@@ -97,40 +101,39 @@ def scenes_print(path: str | None) -> str | None:
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Every key of the command and of the study, and every name that one part of it uses of another.
+    """Checks every key of the command and of the study, and every name that one part of it uses of another.
 
     Raises:
         ConfigError: naming the key, the value and what would be valid.
     """
     schema.check_study(config)
     study = config["study"]
-    variants, conditions = list(study["trainings"]), list(study["conditions"])
-    rows = [*variants, *study["floors"]]
-    names = {"only": (config["only"], variants), "study.judged": (study["judged"], variants)}
-    names |= {f"study.judged.{name}": (chosen, conditions) for name, chosen in (study["judged"] or {}).items()}
-    names |= {f"study.floors.{name}.of": ([floor["of"]], variants) for name, floor in study["floors"].items()}
-    names |= {f"study.floors.{name}.conditions": (floor["conditions"], conditions) for name, floor in study["floors"].items()}
-    names |= {f"study.compare.{index}": (pair, rows) for index, pair in enumerate(study["compare"])}
+    variants, conditions, baselines = list(study["trainings"]), list(study["conditions"]), study["baselines"]
+    names = {"only": (config["only"], variants), "study.evaluated": (study["evaluated"], variants)}
+    names |= {f"study.evaluated.{name}": (chosen, conditions) for name, chosen in (study["evaluated"] or {}).items()}
+    names |= {f"study.baselines.{name}.of": ([one["of"]], variants) for name, one in baselines.items()}
+    names |= {f"study.baselines.{name}.conditions": (one["conditions"], conditions) for name, one in baselines.items()}
+    names |= {f"study.compare.{index}": (pair, [*variants, *baselines]) for index, pair in enumerate(study["compare"])}
     names["study.trend.values"] = ((study["trend"] or {"values": {}})["values"], variants)
     for where, (chosen, valid) in names.items():
         for name in chosen or []:
             if name not in valid:
-                raise ConfigError(f"{where}: unknown {name!r}; valid: {', '.join(valid)}")
+                raise ConfigError(f"{where}: expected one of {', '.join(valid)}, got {name!r}")
     if "draw" in config["parts"] and len(config["parts"]) > 1:
-        raise ConfigError(f"parts: {config['parts']}; `draw` stands alone: `report` draws, too")
-    if doubled := set(variants) & set(study["floors"]):
-        raise ConfigError(f"study.floors: {sorted(doubled)[0]!r} is a variant, too; rows need names of their own")
+        raise ConfigError(f"parts: expected `draw` alone, got {config['parts']}; `report` draws, too")
+    if doubled := set(variants) & set(baselines):
+        raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
     if not variants or not conditions:
-        raise ConfigError("study: without trainings or without conditions there is nothing to find out")
+        raise ConfigError("study: expected one or more trainings and conditions, got none")
 
 
 def merge_overrides(overrides: Sequence[str]) -> list[str]:
-    """Overrides without those that a later one of the same key replaces; Hydra takes no group twice."""
+    """Drops overrides that a later one of the same key replaces; Hydra takes no group twice."""
     last = {override.partition("=")[0].lstrip("+"): index for index, override in enumerate(overrides)}
     return [override for index, override in enumerate(overrides) if last[override.partition("=")[0].lstrip("+")] == index]
 
 
-def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: Path) -> list[Training]:
+def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int]) -> list[Training]:
     """A variant's training with each seed."""
     study = config["study"]
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
@@ -141,67 +144,70 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int], runs: 
         each = configs.load_each("train", *merge_overrides([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:
         raise ConfigError(f"study.trainings.{variant}: {error}") from None
-    return [_training({**one, "name": f"{study['name']}, {variant}"}, variant, overrides, runs) for one in each]
+    return [_training({**one, "name": f"{study['name']}, {variant}"}, variant, overrides, Path(config["runs"])) for one in each]
 
 
 def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs: Path) -> Training:
-    entry = {name: value for name, value in settings.items() if name not in ASIDE}
+    entry = {name: value for name, value in settings.items() if name not in IGNORED}
     entry["scenes"] = {name: value for name, value in settings["scenes"].items() if name not in ("heldout", "workers")}
-    entry |= _printed(settings["scenes"]["path"])
+    entry |= _files_entry(settings["scenes"]["path"])
     if settings["scenes"]["take"]["count"] is None:
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = result_file.digest(entry), settings["seed"]
-    known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it, under a name of its own
+    known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it under another name
     folder = known[0] if known else runs / f"{slug(variant)}-{seed}-{digest}"
     program = result_file.digest({name: settings[name] for name in LEARNER})
     return Training(variant, seed, overrides, settings, folder, digest, program)
 
 
-def _judgings(config: Mapping[str, Any], training: Training, *, first: int) -> list[Evaluation]:
-    """All that is judged of one training: its policy, and the floors that begin with it."""
-    study = config["study"]
-    everywhere = list(study["conditions"])
-    judged = everywhere if study["judged"] is None else study["judged"].get(training.variant, [])
-    found = [_judging(config, training, training.variant, TRAINED, name, [], p) for name in judged for p in study["protocols"]]
-    for name, floor in study["floors"].items():
-        if floor["of"] != training.variant or (floor["seeds"] == 1 and training.seed != first):
-            continue
-        for condition in everywhere if floor["conditions"] is None else floor["conditions"]:
-            own = list(floor["overrides"])
-            found += [_judging(config, training, name, UNTRAINED, condition, own, protocol) for protocol in study["protocols"]]
+def _evaluations(
+    config: Mapping[str, Any], training: Training, terminations: Mapping[str, Mapping[str, Any]], *, is_first: bool
+) -> list[Evaluation]:
+    """The evaluations of a training's policy, and of the baselines that begin with it."""
+    study, variant = config["study"], training.variant
+    conditions = list(study["conditions"])
+    evaluated = conditions if study["evaluated"] is None else study["evaluated"].get(variant, [])
+    rows = [(variant, TRAINED, evaluated, [])]
+    for name, baseline in study["baselines"].items():
+        if baseline["of"] == variant and (is_first or baseline["seeds"] != 1):
+            chosen = conditions if baseline["conditions"] is None else baseline["conditions"]
+            rows.append((name, UNTRAINED, chosen, list(baseline["overrides"])))
+    found = []
+    for row, weights, chosen, overrides in rows:
+        for condition in chosen:
+            try:
+                merged = [*study["evaluation_overrides"], *study["conditions"][condition], *overrides]
+                environment_config = configs.apply_overrides(training.config, merged)
+            except ConfigError as error:
+                raise ConfigError(f"study.conditions.{condition}: {error}") from None
+            for protocol, termination in terminations.items():
+                program = _digest_program(config, environment_config, protocol)
+                file = training.folder / f"evaluated-{weights}-{program}.csv"
+                one = {**environment_config, "termination": termination}
+                found.append(Evaluation(row, training, weights, condition, protocol, one, program, file))
     return found
 
 
-def _judging(
-    config: Mapping[str, Any], training: Training, row: str, weights: str, condition: str, own: list[str], protocol: str
-) -> Evaluation:
-    study = config["study"]
-    try:
-        examined = configs.apply_overrides(training.config, [*study["examined"], *study["conditions"][condition], *own])
-    except ConfigError as error:
-        raise ConfigError(f"study.conditions.{condition}: {error}") from None
-    path = config["test_scenes"]
+def _digest_program(config: Mapping[str, Any], environment_config: Mapping[str, Any], protocol: str) -> str:
     settings = {name: value for name, value in config["evaluation"].items() if name != "bootstrap"}
-    parts = {name: examined[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": settings}
-    # without a path they are the recipe's own held-out ones
-    heldout = examined["scenes"]["heldout"] if path is None else None
-    drawn = {"scenes": scenes_key(examined["scenes"], path), "heldout": heldout}
-    program = result_file.digest(parts | drawn | _printed(path if heldout is None else heldout["path"]))
-    file = training.folder / f"judged-{weights}-{program}.csv"
-    return Evaluation(row, training, weights, condition, protocol, examined, program, file)
+    parts = {name: environment_config[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": settings}
+    path, scenes = config["test_scenes"], environment_config["scenes"]
+    heldout = scenes["heldout"] if path is None else None  # without a path: the recipe's own held-out scenes
+    parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout}
+    return result_file.digest(parts | _files_entry(path if heldout is None else heldout["path"]))
 
 
-def _printed(path: str | None) -> dict[str, str]:
-    """What a digest holds of scenes that are not made by a generator."""
-    found = scenes_print(path)
+def _files_entry(path: str | None) -> dict[str, str]:
+    """What a digest holds of scenes that no generator makes."""
+    found = digest_files(path)
     return {} if found is None else {"scenes_print": found}
 
 
 def _quoted(path: str) -> str:
-    """A path as a value in Hydra's grammar."""
+    """Formats a path as a value in Hydra's grammar."""
     return "'" + str(path).replace("'", "\\'") + "'"
 
 
 def slug(name: str) -> str:
-    """A name as part of a file's."""
+    """Returns a name as part of a file's name."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

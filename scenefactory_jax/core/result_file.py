@@ -10,11 +10,6 @@ import numpy as np
 
 from scenefactory_jax.core import atomic_file
 
-JUDGED = "judged.json"  # settings of an evaluation, beside its records
-# Files that an evaluation writes
-WRITTEN = (JUDGED, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
-WRITTEN += ("trajectories.png", "video.gif", "video.mp4", "report.md")
-
 
 def digest(settings: Mapping[str, Any]) -> str:
     """Computes a digest of settings: 16 hexadecimal digits."""
@@ -59,15 +54,3 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return [float("nan") if item is None else _numbers(item) for item in value]
     return value
-
-
-def begin(folder: Path, judged: Mapping[str, Any]) -> None:
-    """Writes what is evaluated, and removes the files of an earlier evaluation in the folder."""
-    for file in [file for pattern in WRITTEN for file in folder.glob(pattern)]:
-        file.unlink()
-    write(folder / JUDGED, judged, digits=None)
-
-
-def read_evaluated(folder: Path) -> dict[str, Any]:
-    """Reads what `begin` wrote; defaults without it."""
-    return read(folder / JUDGED) if (folder / JUDGED).is_file() else {"scenes": None, "overrides": []}

@@ -1,11 +1,11 @@
-"""Whole episodes with everything that a viewer shows, kept on device.
+"""Rolls a policy out: a scan of policy and environment over control steps, with a hook that measures or records each of them.
 
-`report.replay_html` makes a page of them, `report.film` pictures and films, `report.rerun_file` a file for rerun.
+Evaluation, recordings for replay and scene simulation use it. Training has a scan of its own, which restarts worlds
+(`learning/ppo/rollout.py`).
 """
 
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,72 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.pytree import pytree_dataclass, replace
-from scenefactory_jax.core.types import Boxes, Env, Events, Observation, Scene, State
+from scenefactory_jax.core.types import Boxes, Env, Events, Observation, Scene, State, StepResult
 from scenefactory_jax.dynamics.articulated.tyres import Tyres
 
 Act = Callable[[Any, Observation, PRNGKeyArray], Array]  # (parameters, observation, key) -> action of every car
 
 
+class ControlStep(NamedTuple):
+    """One control step of one world, as a hook receives it."""
+
+    scene: Scene
+    before: State  # without active agents once the world is done
+    after: State
+    result: StepResult
+
+
+Hook = Callable[[Any, ControlStep], tuple[Any, Any]]  # (carry, step) -> carry, output of the step
+
+
+@pytree_dataclass
+class RolloutState:
+    """A world during a rollout, with the carry of the hook."""
+
+    state: State
+    world_done: Bool[Array, ""]
+    carry: Any
+
+
+def start_rollout(state: State, carry: Any) -> RolloutState:
+    """Returns a rollout that starts at a state of the environment."""
+    return RolloutState(state, ~jnp.any(state.active), carry)
+
+
+def rollout(
+    env: Env, act: Act, parameters: Any, scene: Scene, start: RolloutState, key: PRNGKeyArray, *, steps: int, hook: Hook
+) -> tuple[RolloutState, Any]:
+    """Rolls out one world for whole actions of `env.action_repeat` control steps each; a world that is done does not move.
+
+    The policy observes the world once an action. The compiler removes observations that `act` does not read.
+
+    Args:
+        start: at a control step in which the environment reads an action.
+        steps: control steps; if it is no multiple of the action repeat, the rollout ends later, but gives the outputs of these.
+
+    Returns:
+        The rollout to continue from, and the outputs of the hook with a leading axis of steps.
+    """
+    repeat = env.action_repeat
+
+    def take_action(rollout: RolloutState, key: PRNGKeyArray) -> tuple[RolloutState, Any]:
+        action = act(parameters, env.observe(scene, rollout.state), key)
+
+        def control_step(rollout: RolloutState, _: None) -> tuple[RolloutState, Any]:
+            before = replace(rollout.state, active=rollout.state.active & ~rollout.world_done)
+            after, result = env.control_step(scene, before, action)
+            carry, output = hook(rollout.carry, ControlStep(scene, before, after, result))
+            return RolloutState(after, rollout.world_done | result.world_done, carry), output
+
+        return jax.lax.scan(control_step, rollout, None, length=repeat, unroll=repeat == 1)
+
+    end, outputs = jax.lax.scan(take_action, start, jax.random.split(key, -(-steps // repeat)))
+    return end, jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])[:steps], outputs)
+
+
 @pytree_dataclass
 class StepRecord:
-    """One control step: where everybody is after it, and what it gave. Facts, actions and rewards mean something where `active` is."""
+    """One control step: states after it, and its metrics, actions and rewards, which are valid where `active` is."""
 
     time_s: Float[Array, ""]  # since the episode began
     active: Bool[Array, " A"]  # in this step
@@ -48,14 +105,14 @@ class StepRecord:
 
 @pytree_dataclass
 class Recording:
-    """Worlds `[W, ...]` and their steps `[W, T, ...]`. The scenes hold the episodes' own agents and weather, both as they began."""
+    """Worlds `[W, ...]` and their steps `[W, T, ...]`. The scenes hold the agents and the weather at the start of the episodes."""
 
     scene: Scene
     shots: StepRecord
 
 
 def record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray, *, steps: int) -> Recording:
-    """Drive one episode in every world, all at once in one program; a world that is over stands still.
+    """Records one episode in every world, all in one program.
 
         act = lambda parameters, observation, key: policy.apply(parameters, observation)[0]
         recording = jax.device_get(record(env, act, parameters, scenes.scene, jax.random.key(0), steps=600))
@@ -65,29 +122,22 @@ def record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray,
         key: split among the worlds.
         steps: control steps to record.
     """
-    one = functools.partial(_record, env, act, steps=steps)
-    keys = jax.random.split(key, scene.agents.yaw.shape[0])
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))(parameters, scene, keys)
+
+    def record_world(parameters: Any, scene: Scene, key: PRNGKeyArray) -> Recording:
+        key, start_key = jax.random.split(key)
+        state = env.init_state(start_key, scene)
+        _, shots = rollout(env, act, parameters, scene, start_rollout(state, None), key, steps=steps, hook=record_step)
+        return Recording(replace(scene, agents=state.agents, weather=state.weather), shots)
+
+    def record_step(carry: None, step: ControlStep) -> tuple[None, StepRecord]:
+        return carry, make_step_record(env, *step)
+
+    return jax.jit(jax.vmap(record_world, in_axes=(None, 0, 0)))(parameters, scene, jax.random.split(key, scene.agents.yaw.shape[0]))
 
 
-def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray, *, steps: int) -> Recording:
-    key, start = jax.random.split(key)
-    state, observation = env.reset(start, scene)
-
-    def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], StepRecord]:
-        state, observation, over = carry
-        before = replace(state, active=state.active & ~over)
-        after, outcome = env.control_step(scene, before, act(parameters, observation, key))
-        return (after, env.observe(scene, after), over | outcome.world_done), make_step_record(env, scene, before, after, outcome)
-
-    over = ~jnp.any(state.active)
-    _, shots = jax.lax.scan(body, (state, observation, over), jax.random.split(key, steps))
-    return Recording(replace(scene, agents=state.agents, weather=state.weather), shots)
-
-
-def make_step_record(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> StepRecord:
-    """What one control step shows."""
-    motion, metrics = after.motion, outcome.metrics
+def make_step_record(env: Env, scene: Scene, before: State, after: State, result: StepResult) -> StepRecord:
+    """Gathers what a viewer shows of one control step."""
+    motion, metrics = after.motion, result.metrics
     tyres, joints = (getattr(after.body, name, None) for name in ("tyres", "qpos"))
     return StepRecord(
         time_s=after.weather.rain.now_s,
@@ -98,8 +148,8 @@ def make_step_record(env: Env, scene: Scene, before: State, after: State, outcom
         steer=motion.steer,
         goal=after.agents.goal,
         action=after.previous_action,
-        terms=outcome.terms,
-        events=outcome.events,
+        terms=result.terms,
+        events=result.events,
         ttc=metrics.ttc,
         edge_ttc=metrics.edge_ttc,
         goal_distance=metrics.goal_distance,

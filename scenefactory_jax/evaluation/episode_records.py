@@ -1,6 +1,5 @@
-"""Episodes played all at once: per-agent records, and a recording of which single worlds can be drawn."""
+"""Runs episodes of all scenes at once: records of every agent, and a recording of which single worlds can be drawn."""
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,17 +12,18 @@ from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import episodes, failure_signals, failures
+from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
+from scenefactory_jax.evaluation import episodes, failures
+from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment
+from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.learning.training_loop import make_policy
-
-Records = dict[str, np.ndarray]
 
 
 class Recording(NamedTuple):
-    """What was kept of an episode: the first worlds, on the host. 30 bytes for a slot and step: 46 MB for 64 worlds of 16 for 50 s."""
+    """The first worlds of an evaluation, on the host. 30 bytes a slot and step: 46 MB for 64 worlds of 16 slots for 50 s."""
 
     batch: Scene  # of all worlds, on the device
-    boxes: Callable[[Scene, State], Boxes]  # everybody else over all steps of one world
+    boxes: Callable[[Scene, State], Boxes]  # background traffic over all steps of one world
     frames: episodes.EpisodeFrame  # numpy, [W, T, ...]
     state: State  # of all worlds at the end
     weather: Weather  # at the start
@@ -32,13 +32,9 @@ class Recording(NamedTuple):
 
 
 def make_episode_runner(
-    config: Mapping[str, Any],
-    scenes: scene_source.Scenes,
-    *,
-    settings: Mapping[str, Any],
-    worlds: int | None,
-) -> Callable[[Any], tuple[Records, Recording | None]]:
-    """A function parameters -> (records, recording) that plays one deterministic episode for every scene and repeat, all at once.
+    config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any], worlds: int | None
+) -> Callable[[Any], tuple[dict[str, np.ndarray], Recording | None]]:
+    """Returns a function parameters -> (records, recording) that runs one deterministic episode for every scene and repeat.
 
     It compiles when it is first called, and not again for other parameters.
 
@@ -52,117 +48,122 @@ def make_episode_runner(
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
-    control_hz, chunk = float(config["timing"]["control_hz"]), settings["chunk_steps"]
-    limit, numbers = environment.episode_steps(config["timing"]), settings["failures"]
+    control_hz, limit = float(config["timing"]["control_hz"]), environment.episode_steps(config["timing"])
+    chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
+    thresholds = settings["failures"]
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], signals=thresholds["signals"])
 
-    def act(parameters, observation):
+    def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
 
     @jax.jit
-    def begin(keys, batch):
-        return jax.vmap(functools.partial(episodes.begin, env))(keys, batch)
+    def start(keys, batch):
+        states = jax.vmap(env.init_state)(keys, batch)
+        return jax.tree.map(jnp.copy, jax.vmap(lambda state: start_rollout(state, episodes.make_metrics(state)))(states))  # to donate
 
-    @functools.partial(jax.jit, donate_argnums=2)
-    def play(parameters, batch, episode):
-        own = dict(steps=chunk, ttc_limit_s=settings["ttc_limit_s"], notes=numbers["notes"])
-        episode, frames = jax.vmap(functools.partial(episodes.run_episode_chunk, env, act, parameters, **own))(batch, episode)
+    def run_chunk(parameters, scene, episode: RolloutState):
+        return rollout(env, act, parameters, scene, episode, jax.random.key(0), steps=chunk, hook=hook)
+
+    def run_chunks(parameters, batch, episode):
+        episode, frames = jax.vmap(run_chunk, in_axes=(None, 0, 0))(parameters, batch, episode)
         return episode, jax.tree.map(lambda leaf: leaf[:worlds], frames)
 
+    run_chunks = jax.jit(run_chunks, donate_argnums=2)
+
     @jax.jit
-    def boxes(scene, state):  # that depends on nothing but the scene and the step, so it need not be kept
+    def boxes(scene, state):  # traffic depends on the scene and the step alone
         at = lambda step: env.current_scene(scene, replace(state, step=step)).traffic  # noqa: E731
         return jax.lax.map(at, jnp.arange(1, limit + 1, dtype=jnp.int32))
 
     def run(parameters):
-        episode = begin(keys, batch)
-        present, started, weather = jax.device_get((episode.state.agents.present, episode.tally.goal_distance, episode.state.weather))
-        kept = []
+        episode = start(keys, batch)
+        first, distance = jax.device_get((episode.state, episode.carry.goal_distance))
+        frames = []
         for _ in range(0, limit, chunk):
-            episode, frames = play(parameters, batch, episode)
+            episode, chunk_frames = run_chunks(parameters, batch, episode)
             if worlds:
-                kept.append(jax.device_get(frames))
-            if bool(episode.over.all()):
+                frames.append(jax.device_get(chunk_frames))
+            if bool(episode.world_done.all()):
                 break
-        state, tally = jax.device_get((episode.state, episode.tally))
-        records = _records(tally, state, present, started, weather, names, seed=settings["seed"], control_hz=control_hz)
-        records |= failures.classify({**records, **_clues(tally, state, present, control_hz)}, **numbers["kinds"])
-        if not kept:
+        state, metrics = jax.device_get((episode.state, episode.carry))
+        records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
+        signals = _make_signals(metrics, state, first.agents.present, control_hz)
+        records |= failures.classify({**records, **signals}, **thresholds["types"])
+        if not worlds:
             return records, None
-        frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *kept)
-        return records, Recording(batch, boxes, frames, state, weather, names, control_hz)
+        recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
+        return records, Recording(batch, boxes, recorded, state, first.weather, names, control_hz)
 
     return run
 
 
-def _records(
-    tally: episodes.EpisodeMetrics, state: State, present, started, weather: Weather, names: list[str], *, seed: int, control_hz: float
-) -> Records:
-    """One row for every spawned agent of every world; film and surface are the open road's at the start."""
-    row_world, row_agent = np.nonzero(present)
-    of = lambda leaf: np.asarray(leaf)[row_world, row_agent]  # noqa: E731
-    events = {name: of(value) for name, value in vars(tally.past_events).items()}
-    others = events["collision"] | events["out_of_bounds"] | events["road_edge_contact"] | events["numerical_error"]
-    steps = np.maximum(of(tally.steps), 1)
-    seen = of(tally.ttc_steps)
+def _make_records(
+    metrics: episodes.EpisodeMetrics, first: State, distance: np.ndarray, names: list[str], *, seed: int, control_hz: float
+) -> dict[str, np.ndarray]:
+    """Returns one row for every spawned agent of every world; film and surface are those of the open road at the start."""
+    world, agent = np.nonzero(first.agents.present)
+    of = lambda leaf: np.asarray(leaf)[world, agent]  # noqa: E731
+    events = {name: of(value) for name, value in vars(metrics.past_events).items()}
+    steps, ttc_steps = np.maximum(of(metrics.steps), 1), of(metrics.ttc_steps)
     return {
-        "scene": np.array(names)[row_world],
-        "world": row_world,
-        "seed": np.full(len(row_world), seed),
-        "agent": row_agent,
+        "scene": np.array(names)[world],
+        "world": world,
+        "seed": np.full(len(world), seed),
+        "agent": agent,
         **events,
-        "clean": events["goal_reached"] & ~others,
-        "time_s": of(tally.steps) / control_hz,
-        "route_m": of(state.agents.route_length),
-        "start_distance_m": of(started),
-        "end_distance_m": of(tally.goal_distance),
-        "max_drac": of(tally.drac_max),
-        "min_ttc_s": of(tally.ttc_min),
-        "mean_ttc_s": of(tally.ttc_sum) / np.maximum(seen, 1),
-        "has_ttc": seen > 0,
-        "mean_speed": of(tally.speed_sum) / steps,
-        "yaw_acceleration": of(tally.swing_sum) / steps * control_hz,
-        "max_contact_force_n": of(tally.force_max),
-        "film_mm": np.asarray(weather.film_mm)[row_world],
-        "surface": np.array(SURFACES)[np.asarray(weather.surface)[row_world]],
-        "friction": of(tally.grip_sum) / steps,
-        "friction_utilization": of(tally.grip_use_sum) / steps,
-        "stopping_margin_m": of(tally.margin_min),
+        "clean": events["goal_reached"] & ~np.any([events[name] for name in FAILURE_EVENTS], axis=0),
+        "time_s": of(metrics.steps) / control_hz,
+        "route_m": of(first.agents.route_length),
+        "start_distance_m": of(distance),
+        "end_distance_m": of(metrics.goal_distance),
+        "max_drac": of(metrics.max_drac),
+        "min_ttc_s": of(metrics.min_ttc),
+        "mean_ttc_s": of(metrics.ttc_sum) / np.maximum(ttc_steps, 1),
+        "has_ttc": ttc_steps > 0,
+        "mean_speed": of(metrics.speed_sum) / steps,
+        "yaw_acceleration": of(metrics.yaw_rate_change_sum) / steps * control_hz,
+        "max_contact_force_n": of(metrics.max_contact_force),
+        "film_mm": np.asarray(first.weather.film_mm)[world],
+        "surface": np.array(SURFACES)[np.asarray(first.weather.surface)[world]],
+        "friction": of(metrics.mu_sum) / steps,
+        "friction_utilization": of(metrics.friction_utilization_sum) / steps,
+        "stopping_margin_m": of(metrics.min_stopping_margin),
     }
 
 
-def _clues(tally: episodes.EpisodeMetrics, state: State, present, control_hz: float) -> Records:
-    """What `failures.classify` wants to know of every spawned agent."""
-    row_world, row_agent = np.nonzero(present)
-    of = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[row_world, row_agent], tree)  # noqa: E731
-    found, last = of(tally.clues), of(tally.steps)
-    end = unchecked(failure_signals.EventMoment, step=last, place=of(state.motion.position)[:, :2])
-    moments = {"event": found.first, "closest": found.closest, "rest": found.rest, "against": found.turned, "end": end}
-    first = np.where(found.harmed, np.array(failure_signals.FAILURE_EVENTS)[found.harm], failures.NONE)
+def _make_signals(metrics: episodes.EpisodeMetrics, state: State, present: np.ndarray, control_hz: float) -> Records:
+    """Returns the columns that `failures.classify` reads, of every spawned agent."""
+    world, agent = np.nonzero(present)
+    of = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[world, agent], tree)  # noqa: E731
+    signals, steps = of(metrics.signals), of(metrics.steps)
+    end = unchecked(Moment, step=steps, position=of(state.motion.position)[:, :2])
+    moments = {"event": signals.first, "closest": signals.closest, "last_rest": signals.rest, "first_wrong_way": signals.wrong_way}
+    moments["end"] = end
     return {
         **{f"{name}_s": moment.step / control_hz for name, moment in moments.items()},
-        **{f"{name}_{axis}_m": moment.place[:, i] for name, moment in moments.items() for i, axis in enumerate("xy")},
-        "first_event": first,
-        "event_mps": found.speed,
-        "hit": found.impact.partner,
-        "own_mps": found.impact.own,
-        "other_mps": found.impact.other,
-        "own_against": found.impact.against,
-        "other_against": found.impact.other_against,
-        "closest_m": found.closest_m,
-        "gone_m": found.gone_m,
-        "still_s": (last - found.rest.step) / control_hz,
-        "wrong_way": found.wrong_way,
-        "against_m": found.against_m,
-        "against_share": found.against_steps / np.maximum(last, 1),
+        **{f"{name}_{axis}_m": moment.position[:, i] for name, moment in moments.items() for i, axis in enumerate("xy")},
+        "first_event": np.where(signals.has_failed, np.array(FAILURE_EVENTS)[signals.first_event], failures.NONE),
+        "event_mps": signals.speed,
+        "collision_partner": signals.collision.partner,
+        "approach_mps": signals.collision.approach,
+        "partner_approach_mps": signals.collision.partner_approach,
+        "collision_wrong_way": signals.collision.wrong_way,
+        "partner_wrong_way": signals.collision.partner_wrong_way,
+        "closest_m": signals.min_goal_distance,
+        "departure_m": signals.goal_departure,
+        "rest_s": (steps - signals.rest.step) / control_hz,
+        "wrong_way": signals.has_driven_wrong_way,
+        "wrong_way_m": signals.max_wrong_way,
+        "wrong_way_fraction": signals.wrong_way_steps / np.maximum(steps, 1),
     }
 
 
 def trajectory(recording: Recording, index: int, *, steps: int | None = None) -> Trajectory:
-    """One recorded world as a viewer wants it: cut a second after the last car finished, or after that many steps."""
+    """Returns one recorded world until a second after the last car finished, or for that many steps."""
     frames, control_hz = jax.tree.map(lambda leaf: leaf[index, :steps], recording.frames), recording.control_hz
     live = np.flatnonzero(frames.active.any(axis=1))
-    end = min((live[-1] if len(live) else 0) + round(control_hz), len(frames.active))
+    end = int(min((live[-1] if len(live) else 0) + round(control_hz), len(frames.active)))
     frames = jax.tree.map(lambda leaf: leaf[:end], frames)
     scene = jax.device_get(jax.tree.map(lambda leaf: leaf[index], recording.batch))
     weather = jax.tree.map(lambda leaf: leaf[index], recording.weather)
@@ -180,13 +181,13 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         present=agents.present,
         control_hz=control_hz,
         title=recording.names[index],
-        weather=_describe(weather, seconds=end / control_hz),
-        traffic=TrafficBoxes.from_boxes(boxes).clip(0, int(end)),
+        weather=_format_weather(weather, seconds=end / control_hz),
+        traffic=TrafficBoxes.from_boxes(boxes).clip(0, end),
     )
 
 
-def _describe(weather: Weather, *, seconds: float) -> str:
-    """Surface and film of the open road at the start, and the film at the end where that is another."""
+def _format_weather(weather: Weather, *, seconds: float) -> str:
+    """Formats surface and film of the open road at the start, and the film at the end if it differs."""
     rain, first = weather.rain, f"{float(weather.film_mm):.1f}"
     last = f"{np.interp(seconds, rain.time_s, rain.film_mm):.1f}" if len(rain.time_s) else first
     return f"{SURFACES[int(weather.surface)]}, {first} mm" if first == last else f"{SURFACES[int(weather.surface)]}, {first} to {last} mm"

@@ -1,49 +1,46 @@
-"""One deterministic episode a world, measured on device: what happened to every agent, and what a viewer needs to draw it.
+"""Metrics and frames of one episode a world, computed on the device as a hook of the rollout.
 
-Events are counted from step metrics, not from the exclusive events of rewards: an agent that touches an edge and another car in one step
-has done both. Nothing is counted after an agent's end or the world's.
+Events are counted from the step metrics, not from the exclusive events that rewards use: an agent that touches an edge and another car in
+one step has both events. Nothing is counted after an agent or its world has ended.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.pytree import pytree_dataclass, replace
-from scenefactory_jax.core.types import Env, Events, Scene, State, StepResult
+from scenefactory_jax.core.pytree import pytree_dataclass
+from scenefactory_jax.core.types import Env, Events, State
 from scenefactory_jax.env import termination
+from scenefactory_jax.env.rollout import ControlStep, Hook
 from scenefactory_jax.evaluation import failure_signals
 from scenefactory_jax.evaluation.failure_signals import FailureSignals
-
-Act = Callable[[Any, Any], Array]  # (parameters, observation) -> action
 
 
 @pytree_dataclass
 class EpisodeMetrics:
-    """Running record of one episode."""
+    """Sums and extremes over the steps of an episode in which an agent was active."""
 
     past_events: Events
-    ended: Bool[Array, " A"]
     steps: Int[Array, " A"]
     goal_distance: Float[Array, " A"]
-    drac_max: Float[Array, " A"]
-    ttc_min: Float[Array, " A"]
+    max_drac: Float[Array, " A"]
+    min_ttc: Float[Array, " A"]
     ttc_sum: Float[Array, " A"]
     ttc_steps: Int[Array, " A"]
     speed_sum: Float[Array, " A"]
-    swing_sum: Float[Array, " A"]  # |change of the yaw rate|, rad/s
-    grip_sum: Float[Array, " A"]
-    grip_use_sum: Float[Array, " A"]
-    margin_min: Float[Array, " A"]
-    force_max: Float[Array, " A"]
-    clues: FailureSignals
+    yaw_rate_change_sum: Float[Array, " A"]  # absolute, rad/s
+    mu_sum: Float[Array, " A"]
+    friction_utilization_sum: Float[Array, " A"]
+    min_stopping_margin: Float[Array, " A"]
+    max_contact_force: Float[Array, " A"]
+    signals: FailureSignals
 
 
 @pytree_dataclass
 class EpisodeFrame:
-    """What one moment looks like from above; where the others are then follows from the scene and the step alone."""
+    """The agents in one control step, for pictures from above."""
 
     position: Float[Array, "A 2"]
     yaw: Float[Array, " A"]
@@ -53,88 +50,68 @@ class EpisodeFrame:
     events: Events
 
 
-@pytree_dataclass
-class Episode:
-    """Everything that a running episode carries."""
-
-    state: State
-    observation: Any
-    tally: EpisodeMetrics
-    over: Bool[Array, ""]
-
-
-def begin(env: Env, key: PRNGKeyArray, scene: Scene) -> Episode:
-    """An episode at its start."""
-    state, observation = env.reset(key, scene)
+def make_metrics(state: State) -> EpisodeMetrics:
+    """Returns the metrics of an episode that starts at a state."""
     count = state.active.shape[0]
     zero, none = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32)
     distance = jnp.linalg.norm(state.agents.goal - state.motion.position[:, :2], axis=1)
-    tally = EpisodeMetrics(
+    return EpisodeMetrics(
         past_events=termination.make_empty_events(count),
-        ended=jnp.zeros(count, bool),
         steps=none,
         goal_distance=distance,
-        drac_max=zero,
-        ttc_min=zero + jnp.inf,
+        max_drac=zero,
+        min_ttc=zero + jnp.inf,
         ttc_sum=zero,
         ttc_steps=none,
         speed_sum=zero,
-        swing_sum=zero,
-        grip_sum=zero,
-        grip_use_sum=zero,
-        margin_min=zero + jnp.inf,
-        force_max=zero,
-        clues=failure_signals.begin(state, distance),
+        yaw_rate_change_sum=zero,
+        mu_sum=zero,
+        friction_utilization_sum=zero,
+        min_stopping_margin=zero + jnp.inf,
+        max_contact_force=zero,
+        signals=failure_signals.begin(state, distance),
     )
-    return Episode(state, observation, tally, ~jnp.any(state.active))
 
 
-def run_episode_chunk(
-    env: Env, act: Act, parameters: Any, scene: Scene, episode: Episode, *, steps: int, ttc_limit_s: float, notes: Mapping[str, float]
-) -> tuple[Episode, EpisodeFrame]:
-    """Drive on for that many control steps; frames come back with a leading step axis.
+def make_hook(env: Env, *, ttc_limit_s: float, signals: Mapping[str, float]) -> Hook:
+    """Returns the hook of a rollout that updates `EpisodeMetrics` and gives an `EpisodeFrame` a step.
 
     Args:
-        ttc_limit_s: TTC above this counts as this in an agent's mean (the published evaluation uses 10 s).
-        notes: numbers of `clues.note`.
+        ttc_limit_s: TTC is clamped to it in an agent's mean (the published evaluation: 10 s).
+        signals: numbers of `failure_signals.update`.
     """
 
-    def body(episode: Episode, _: None) -> tuple[Episode, EpisodeFrame]:
-        before = replace(episode.state, active=episode.state.active & ~episode.over)
-        action = act(parameters, episode.observation)
-        state, outcome = env.control_step(scene, before, action)
-        seen, boxes = episode.tally, env.current_scene(scene, state).traffic
-        found = failure_signals.update(seen.clues, seen.past_events, scene.lanes, boxes, before, state, outcome.metrics, **notes)
-        tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
-        place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
-        frame = EpisodeFrame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
-        return Episode(state, env.observe(scene, state), tally, episode.over | outcome.world_done), frame
+    def hook(metrics: EpisodeMetrics, step: ControlStep) -> tuple[EpisodeMetrics, EpisodeFrame]:
+        before, state, result = step.before, step.after, step.result
+        boxes = env.current_scene(step.scene, state).traffic
+        found = failure_signals.update(
+            metrics.signals, metrics.past_events, step.scene.lanes, boxes, before, state, result.metrics, **signals
+        )
+        position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
+        frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events)
+        return _update(metrics, step, found, ttc_limit_s=ttc_limit_s), frame
 
-    return jax.lax.scan(body, episode, None, length=steps)
+    return hook
 
 
-def _note(
-    tally: EpisodeMetrics, before: State, after: State, outcome: StepResult, found: FailureSignals, *, ttc_limit_s: float
-) -> EpisodeMetrics:
-    metrics = outcome.metrics
-    active = before.active & ~metrics.events.numerical_error  # a broken car's metrics are no measurements
-    seen = active & jnp.isfinite(metrics.ttc)
-    past_events = jax.tree.map(lambda old, new: old | (new & before.active), tally.past_events, metrics.events)
+def _update(metrics: EpisodeMetrics, step: ControlStep, signals: FailureSignals, *, ttc_limit_s: float) -> EpisodeMetrics:
+    before, after, now = step.before, step.after, step.result.metrics
+    active = before.active & ~now.events.numerical_error  # metrics of a state that is not finite are not valid
+    has_ttc = active & jnp.isfinite(now.ttc)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
     return EpisodeMetrics(
-        past_events=past_events,
-        ended=tally.ended | (outcome.terminated & before.active),
-        steps=tally.steps + active.astype(jnp.int32),
-        goal_distance=jnp.where(active, metrics.goal_distance, tally.goal_distance),
-        drac_max=jnp.maximum(tally.drac_max, jnp.where(active, metrics.drac, 0.0)),
-        ttc_min=jnp.minimum(tally.ttc_min, jnp.where(active, metrics.ttc, jnp.inf)),
-        ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(metrics.ttc, ttc_limit_s), 0.0),
-        ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
-        speed_sum=add(tally.speed_sum, metrics.speed),
-        swing_sum=add(tally.swing_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
-        grip_sum=add(tally.grip_sum, metrics.mu),
-        grip_use_sum=add(tally.grip_use_sum, metrics.friction_utilization),
-        margin_min=jnp.minimum(tally.margin_min, jnp.where(active, metrics.stopping_margin, jnp.inf)),
-        force_max=jnp.maximum(tally.force_max, jnp.where(active, metrics.contact_force, 0.0)),
-        clues=found,
+        past_events=jax.tree.map(lambda old, new: old | (new & before.active), metrics.past_events, now.events),
+        steps=metrics.steps + active.astype(jnp.int32),
+        goal_distance=jnp.where(active, now.goal_distance, metrics.goal_distance),
+        max_drac=jnp.maximum(metrics.max_drac, jnp.where(active, now.drac, 0.0)),
+        min_ttc=jnp.minimum(metrics.min_ttc, jnp.where(active, now.ttc, jnp.inf)),
+        ttc_sum=metrics.ttc_sum + jnp.where(has_ttc, jnp.minimum(now.ttc, ttc_limit_s), 0.0),
+        ttc_steps=metrics.ttc_steps + has_ttc.astype(jnp.int32),
+        speed_sum=add(metrics.speed_sum, now.speed),
+        yaw_rate_change_sum=add(metrics.yaw_rate_change_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
+        mu_sum=add(metrics.mu_sum, now.mu),
+        friction_utilization_sum=add(metrics.friction_utilization_sum, now.friction_utilization),
+        min_stopping_margin=jnp.minimum(metrics.min_stopping_margin, jnp.where(active, now.stopping_margin, jnp.inf)),
+        max_contact_force=jnp.maximum(metrics.max_contact_force, jnp.where(active, now.contact_force, 0.0)),
+        signals=signals,
     )

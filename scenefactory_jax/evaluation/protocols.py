@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.evaluation import agent_metrics, episode_records
+from scenefactory_jax.evaluation import episode_records, statistics
 from scenefactory_jax.evaluation.episode_records import Recording, Records
 from scenefactory_jax.loggers import metrics_csv
 
@@ -82,7 +82,7 @@ def make_training_callback(
         start = time.monotonic()
         found = {key: row[key] for key in ("iteration", "steps/total", "minutes")}
         for protocol, evaluator in evaluators.items():
-            summary = agent_metrics.summarise(evaluator(parameters), bootstrap=settings["bootstrap"], seed=settings["seed"])
+            summary = statistics.summarise(evaluator(parameters), bootstrap=settings["bootstrap"], seed=settings["seed"])
             for name, estimate in summary.items():
                 for key in ("value", "low", "high"):
                     found[f"{protocol}/{name}/{key}"] = np.nan if (number := getattr(estimate, key)) is None else number

@@ -1,4 +1,4 @@
-"""`scenes op=simulate`: some seconds of every scene, as a check that it can be simulated at all."""
+"""Simulates some seconds of every scene, as a check that it can be simulated at all."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.env.rollout import rollout, start_rollout
 
 MEANING = {
     "cars": "agents",
@@ -39,7 +40,7 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
     scene_source.use_compilation_cache()
     env, loaded = environment.make_env(config), scene_source.load_training_scenes(config["scenes"])
     steps = max(round(config["simulate"]["seconds"] * config["timing"]["control_hz"]), 1)
-    run = jax.jit(jax.vmap(lambda key, scene: drive(env, key, scene, steps=steps)))
+    run = jax.jit(jax.vmap(lambda key, scene: simulate_scene(env, key, scene, steps=steps)))
     found: dict[str, dict[str, int]] = {}
     size = min(config["simulate"]["worlds"], len(loaded))
     for begin in range(0, len(loaded), size):
@@ -52,32 +53,28 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
 
 
 def describe(found: Mapping[str, Mapping[str, int]]) -> str:
-    """A table of the scenes in which something went wrong, and the sums."""
+    """Formats a table of the scenes in which something went wrong, and the sums."""
     bad = {name: row for name, row in found.items() if any(row[key] for key in list(MEANING)[1:])}
-    lines = [agent_metrics.grid(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()])]
+    lines = [markdown.format_table(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()])]
     lines += [f"{key}: {sum(row[key] for row in found.values())} {meaning}" for key, meaning in MEANING.items()]
     return "\n".join([*lines, f"{len(found)} scenes; {len(found) - len(bad)} without any of these"])
 
 
-def drive(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str, Array]:
-    """One world without any control input: how many of its cars had what, see MEANING."""
+def simulate_scene(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str, Array]:
+    """Simulates one world without control input and counts its cars by what happened to them, see MEANING."""
     state = env.init_state(key, scene)
     present = state.active
-    action = jnp.zeros((len(present), 3), jnp.float32)
-
-    def advance(state, _):
-        after, outcome = env.control_step(scene, state, action)
-        return after, (outcome.metrics, state.active)
-
-    _, (metrics, active) = jax.lax.scan(advance, state, length=steps)
-    events, ever = metrics.events, lambda past_events: jnp.any(past_events & active, axis=0)  # metrics of finished cars mean nothing
+    act = lambda parameters, observation, key: jnp.zeros((len(present), 3), jnp.float32)  # noqa: E731
+    measure = lambda carry, step: (carry, (step.result.metrics, step.before.active))  # noqa: E731
+    _, (metrics, active) = rollout(env, act, None, scene, start_rollout(state, None), key, steps=steps, hook=measure)
+    events, at_any_step = metrics.events, lambda event: jnp.any(event & active, axis=0)  # metrics of inactive cars are not valid
     marks = {
         "cars": present,
-        "faults": ever(events.numerical_error),
+        "faults": at_any_step(events.numerical_error),
         "overlapping": (metrics.contact_force[0] > 0) & present,
         "on_edge": events.road_edge_contact[0] & present,
         "off_lane": metrics.off_lane[0] & present,
-        "collision": ever(events.collision),
-        "road_edge_contact": ever(events.road_edge_contact),
+        "collision": at_any_step(events.collision),
+        "road_edge_contact": at_any_step(events.road_edge_contact),
     }
     return {name: jnp.sum(mark) for name, mark in marks.items()}

@@ -29,25 +29,25 @@ class Video:
 
 
 @dataclass(frozen=True)
-class FailureNotes:
+class SignalThresholds:
     """Thresholds of the failure signals."""
 
     moving_mps: NonNegative
     lane_m: NonNegative
-    against_cos: Annotated[float, Bounds(min=-1)]
+    wrong_way_cos: Annotated[float, Bounds(min=-1)]
     wrong_way_m: NonNegative
     rest_m: NonNegative
     near_m: NonNegative
 
 
 @dataclass(frozen=True)
-class FailureKinds:
+class TypeThresholds:
     """Thresholds of the failure types."""
 
-    own_share: NonNegative
-    own_mps: NonNegative
+    at_fault_speed_fraction: NonNegative
+    at_fault_min_mps: NonNegative
     stuck_s: NonNegative
-    away_m: NonNegative
+    departure_m: NonNegative
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,13 @@ class FailurePictures:
 class Failures:
     """The group `failures`."""
 
-    notes: FailureNotes
-    kinds: FailureKinds
+    signals: SignalThresholds
+    types: TypeThresholds
     pictures: FailurePictures
 
 
 @dataclass(frozen=True)
-class Judging:
+class Episodes:
     """How many episodes are evaluated, and how their metrics are estimated."""
 
     seed: Seed

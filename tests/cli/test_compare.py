@@ -10,7 +10,8 @@ import yaml
 from scenefactory_jax.cli.compare import compare
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import COLUMNS, write_records
 
 METRICS = ("events/goal_reached", "reward")
 
@@ -27,7 +28,7 @@ def run(folder, *, seed, dtype="float32", goal_reached=(0.0, 0.2, 0.4, 0.6), age
             row = {"iteration": i, "minutes": 0.5 * i, "steps/total": 100 * i, "casps": 1000.0 + seed}
             writer.writerow(row | {"events/goal_reached": share, "reward": seed})
     if agents is not None:
-        agent_metrics.write_csv(folder / "agents-strict.csv", agents)
+        write_records(folder / "agents-strict.csv", agents)
     return folder
 
 
@@ -65,8 +66,8 @@ def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
     runs = [run(tmp_path / "a", seed=0, agents=first), run(tmp_path / "b", seed=1, agents=second)]
     [group] = compare(settings(*runs, out=str(tmp_path / "out")))["groups"].values()
     found = group["evaluated"]["strict"]["success_rate"]
-    assert (found["value"], found["count"], found["method"]) == (0.5, 8, agent_metrics.LEVELS)
-    by_seed = hierarchical_bootstrap.summarise({0: first, 1: second}, bootstrap=100, seed=0)["success_rate"]
+    assert (found["value"], found["count"], found["method"]) == (0.5, 8, statistics.LEVELS)
+    by_seed = statistics.summarise_runs({0: first, 1: second}, bootstrap=100, seed=0)["success_rate"]
     assert (found["low"], found["high"]) == pytest.approx((by_seed.low, by_seed.high), rel=1e-5)
     text = (tmp_path / "out" / "compare.md").read_text()
     assert "## Evaluation at the end, strict" in text and "| Success rate | 50.0 %" in text
@@ -79,7 +80,7 @@ def records():
     def made(*, goal_reached, missed):
         count = goal_reached + missed
         good = np.arange(count) < goal_reached
-        columns = {name: np.zeros(count, dtype) for name, dtype in agent_metrics.COLUMNS.items()}
+        columns = {name: np.zeros(count, dtype) for name, dtype in COLUMNS.items()}
         columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "goal_reached": good, "clean": good}
         return columns
 

@@ -1,4 +1,4 @@
-"""Whole studies at the smallest size: they end, go on where they were stopped, do nothing twice, compile once, say what they rest on."""
+"""Studies at the smallest size: they end, continue where they were stopped, do nothing twice, compile once, report what they rest on."""
 
 import json
 import math
@@ -17,33 +17,33 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.metrics import agent_metrics
+from scenefactory_jax.evaluation.records import read_records, select_rows
 from scenefactory_jax.learning import run_folder, training_loop
-from scenefactory_jax.loggers import metrics_csv
-from scenefactory_jax.visualization.report import study_figures
-from scenefactory_jax.visualization.report import study_report as report
+from scenefactory_jax.visualization.report import study_figures, study_report
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
+BASE = ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2"]
 TOY = {
-    "base": [
-        "experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observations.ego._target_=support.study_parts.ego"],
+    "base": [*BASE, "observations.ego._target_=support.study_parts.ego"],
     "common": ["evaluation.every=1"],
-    "examined": ["timing.episode_s=1", "spawning=logged", "weather=dry", "traffic=none", "reward=paper"],
-    "trainings": {"all terms": [], "one scene": ["scenes.take.count=1"], "no TTC": ["reward.ttc=null", "ppo.learning_rate=1.0e-2"]},
+    "evaluation_overrides": ["timing.episode_s=1", "spawning=logged", "weather=dry", "traffic=none", "reward=paper"],
+    "trainings": {"all scenes": [], "one scene": ["scenes.take.count=1"]},
     "conditions": {"dry": [], "at random": ["spawning=random_pairs", "weather=snow"]},
     "protocols": ["strict"],
-    "judged": {"all terms": ["dry", "at random"], "one scene": ["dry"], "no TTC": ["dry"]},
-    "floors": {
-        "untrained": {"of": "all terms", "overrides": [], "conditions": ["dry"], "seeds": None},
-        "log replay": {"of": "all terms", "overrides": ["dynamics=log_playback"], "conditions": ["dry"], "seeds": 1},
+    "evaluated": {"all scenes": ["dry", "at random"], "one scene": ["dry"]},
+    "baselines": {
+        "untrained": {"of": "all scenes", "overrides": [], "conditions": ["dry"], "seeds": None},
+        "log replay": {"of": "all scenes", "overrides": ["dynamics=log_playback"], "conditions": ["dry"], "seeds": 1},
     },
-    "compare": [["all terms", "no TTC"], ["untrained", "all terms"]],
+    "compare": [["all scenes", "one scene"], ["untrained", "all scenes"]],
     "figures": ["learning", "rates", "matrix", "differences", "trend"],
-    "trend": {"label": "training scenes", "values": {"one scene": 1, "all terms": None}},
+    "trend": {"label": "training scenes", "values": {"one scene": 1, "all scenes": None}},
 }
-ALONE = {"trainings": {"all terms": []}, "conditions": {"dry": []}, "judged": None, "floors": {}, "compare": [], "trend": None}
+ALONE = {"trainings": {"all scenes": []}, "conditions": {"dry": []}, "evaluated": None, "baselines": {}, "compare": [], "trend": None}
 ALONE |= {"figures": []}
 
 
@@ -56,116 +56,149 @@ def toy(folder, *overrides, **changes):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study")
-    return folder, study(toy(folder))
+def done(tmp_path_factory):
+    """A whole study: its folder, its result, and how often its programs had been traced after each training."""
+    folder, counts, train_one = tmp_path_factory.mktemp("study"), [], command._train_one
+
+    def counted(*arguments):
+        note = train_one(*arguments)
+        counts.append(len(study_parts.TRACES))
+        return note
+
+    study_parts.TRACES.clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "_train_one", counted)
+        return folder, study(toy(folder)), counts
+
+
+@pytest.fixture
+def stub_training(monkeypatch, request):
+    """Trainings that lock and write their folders as real ones do, and compute nothing: a list of (seed, resumed) as they begin."""
+    begun, stops = [], request.node.name.startswith("test_a_stopped")
+
+    def train(config, **_):
+        with run_folder.open_run_folder(config) as (folder, _):
+            begun.append((config["seed"], config["resume"]))
+            hydra_config.write(folder, config)
+            row = {"iteration": 1, "steps/total": 10, "minutes": 0.1, "casps": 100.0}
+            (folder / "metrics.csv").write_text(",".join(row) + "\n" + ",".join(map(str, row.values())) + "\n")
+            if len(begun) == 2 and stops:
+                raise KeyboardInterrupt
+        return training_loop.Run(folder, config, None, None, None, [row])
+
+    monkeypatch.setattr(training_loop, "train", train)
+    monkeypatch.setattr(training_loop, "prepare", lambda config: training_loop.Prepared(None, None, None, None))
+    monkeypatch.setattr(command.Session, "training_scenes", lambda *_: None)
+    monkeypatch.setattr(command.checkpoint, "drop_training_state", lambda *_: None)
+    return begun
 
 
 # ---- what a study leaves
 
 
-def test_a_study_ends_with_everything_that_it_wants(whole):
-    folder, result = whole
-    assert result["missing"] == [] and len(list((folder / "runs").glob("*/trained.json"))) == 6
+def test_a_study_leaves_all_rows(done):
+    folder, result, _ = done
+    assert result["missing"] == [] and len(list((folder / "runs").glob("*/trained.json"))) == 4
     places = [(row["condition"], row["row"], row["seeds"]) for row in result["rows"]]
-    dry = [("dry", name, [3, 4]) for name in ("all terms", "one scene", "no TTC", "untrained")]
-    assert places == [*dry, ("dry", "log replay", [3]), ("at random", "all terms", [3, 4])]
+    dry = [("dry", name, [3, 4]) for name in ("all scenes", "one scene", "untrained")]
+    assert places == [*dry, ("dry", "log replay", [3]), ("at random", "all scenes", [3, 4])]
     runs = {variant: trained["runs"]["3"] for variant, trained in result["trainings"].items()}
-    assert [run["scenes"] for run in runs.values()] == [2, 1, 2] and all(run["iterations"] == 2 for run in runs.values())
-    watched = result["trainings"]["no TTC"]["held_out"]["strict"]
-    assert list(watched) == ["3", "4"] and len(watched["3"]["success"]) == 2 and watched["3"]["to_final"] is not None
+    assert [run["scenes"] for run in runs.values()] == [2, 1] and all(run["iterations"] == 2 for run in runs.values())
+    curves = result["trainings"]["one scene"]["held_out"]["strict"]
+    assert list(curves) == ["3", "4"] and len(curves["3"]["success"]) == 2 and curves["3"]["to_final"] is not None
 
 
-def test_numbers_are_those_of_the_records(whole):
-    folder, result = whole
+def test_numbers_are_those_of_the_records(done):
+    folder, result, _ = done
     plan = study_plan.make(toy(folder))
-    own = {one.training.seed: agent_metrics.read_csv(one.file) for one in plan.judgings if (one.row, one.condition) == ("no TTC", "dry")}
-    row = next(row for row in result["rows"] if row["row"] == "no TTC")
-    rate = hierarchical_bootstrap.summarise(own, bootstrap=20, seed=1000)["road_edge_rate"]
+    own = {e.training.seed: read_records(e.file) for e in plan.evaluations if (e.row, e.condition) == ("one scene", "dry")}
+    row = next(row for row in result["rows"] if row["row"] == "one scene")
+    rate = statistics.summarise_runs(own, bootstrap=20, seed=1000)["road_edge_rate"]
     assert row["pooled"]["road_edge_rate"]["value"] == pytest.approx(rate.value, rel=1e-4)
     for seed, records in own.items():
         assert row["each"][str(seed)]["mean_remaining_m"] == pytest.approx(records["end_distance_m"].mean(), rel=1e-4)
     assert {(one["before"], one["after"], one["condition"]) for one in result["differences"]} == {
-        ("all terms", "no TTC", "dry"), ("untrained", "all terms", "dry")}  # fmt: skip
+        ("all scenes", "one scene", "dry"), ("untrained", "all scenes", "dry")}  # fmt: skip
 
 
-def test_the_report_shows_what_it_rests_on_and_no_place_of_this_machine(whole):
-    folder, result = whole
+def test_the_report_shows_what_it_rests_on_and_no_path_of_this_machine(done):
+    folder, result, _ = done
     text = (folder / "out" / "navigation.md").read_text()
     shown = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
     assert len(shown) == 6 and all((folder / "out" / name).stat().st_size > 5000 for name in shown)
-    assert "Collision rate" in text and "Clean success rate" in text and "| all terms | 3 | 2 (" in text
+    assert "Collision rate" in text and "Clean success rate" in text and "| all scenes | 3 | 2 (" in text
     assert str(folder) not in text and str(folder) not in (folder / "out" / "result.json").read_text()
     assert result["made_with"]["commit"] in text and result["made_with"]["jax"] == jax.__version__
-    assert "| dry | logged | dry | ignore | as trained |" in text and "| at random | random_pairs | snow | ignore | as trained |" in text
-    ends = [one["change"][name] for one in result["differences"] for name in report.CHANGES]
+    assert "| dry | logged | dry | none | as trained |" in text and "| at random | random_pairs | snow | none | as trained |" in text
+    ends = [one["change"][name] for one in result["differences"] for name in study_report.CHANGES]
     without_zero = sum(end["low"] is not None and not end["low"] <= 0 <= end["high"] for end in ends)
     counted = sum(end["low"] is not None for end in ends)
     assert f"{counted / 20:.1f} of the {counted} in this table. {without_zero} of them do" in text
-    assert "judged on the recipe's own: the test scenes." in text and "chose no setting" not in text  # nothing here knows that
+    assert "evaluated on the recipe's own: the test scenes." in text
 
 
-def test_every_agent_is_listed_beside_the_report(whole):
-    """The tables give the report's own numbers, and are as small as a repository wants them."""
-    folder, result = whole
+def test_every_agent_is_listed_beside_the_report(done):
+    """The tables give the report's own numbers, and are small enough for a repository."""
+    folder, result, _ = done
     text = (folder / "out" / "navigation.md").read_text()
     assert {path.name for path in (folder / "out" / "agents").iterdir()} == {row["agents_file"].split("/")[1] for row in result["rows"]}
     for row in result["rows"]:
         file = folder / "out" / row["agents_file"]
-        agents = agent_metrics.read_csv(file)
-        runs = {seed: agent_metrics.select(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
+        agents = read_records(file)
+        runs = {seed: select_rows(agents, agents["training_seed"] == seed) for seed in row["seeds"]}
         assert sum(len(one["scene"]) for one in runs.values()) == len(agents["scene"]) and {"surface", "failure"} <= set(agents)
-        found = hierarchical_bootstrap.summarise(runs, bootstrap=20, seed=1000)
+        found = statistics.summarise_runs(runs, bootstrap=20, seed=1000)
         for name in ("success_rate", "collision_rate", "mean_max_drac", "mean_time_to_goal_s"):
             reported = row["pooled"][name]["value"]
             assert found[name].value == (reported if reported is None else pytest.approx(reported, rel=1e-3)), name
         assert f"({row['agents_file']})" in text and file.stat().st_size < 200 * len(agents["scene"]) + 2000
 
 
-def test_looks_are_counted_over_all_calls(whole):
-    """11 judgings of policies, and a point after each of two iterations of six trainings, in the one call that did something."""
-    folder, result = whole
-    [look] = result["looks"]
-    assert (look["policies"], look["curve points"], look["cut"]) == (11, 12, "test")
-    assert "11 times to judge a policy" in (folder / "out" / "navigation.md").read_text()
+def test_uses_of_the_held_out_scenes_are_counted_over_all_calls(done):
+    """9 evaluations of policies, and a point after each of two iterations of four trainings, in the one call that did something."""
+    folder, result, _ = done
+    [use] = result["held_out_uses"]
+    assert (use["policies"], use["curve points"], use["cut"]) == (9, 8, "test")
+    assert "9 times for a policy" in (folder / "out" / "navigation.md").read_text()
 
 
-def test_a_report_is_drawn_anew_from_its_numbers(whole, tmp_path):
-    folder, result = whole
+def test_a_report_is_drawn_again_from_its_numbers(done, tmp_path):
+    """With the interpretation that lies beside them now."""
+    folder, result, _ = done
     shutil.copytree(folder / "out", tmp_path / "out")
     (tmp_path / "out" / "learning.png").unlink()
-    again = study(toy(tmp_path, "parts=draw", reading="What it shows."))
-    assert again == result | {"study": result["study"] | {"reading": "What it shows."}} and not (tmp_path / "runs").exists()
+    (tmp_path / "out" / study_report.INTERPRETATION).write_text("What it shows.\n")
+    assert study(toy(tmp_path, "parts=draw")) == result and not (tmp_path / "runs").exists()
     before, after = ((place / "out" / "navigation.md").read_text().splitlines() for place in (folder, tmp_path))
     assert [line for line in after if line not in before] == ["What it shows."] and (tmp_path / "out" / "learning.png").is_file()
-    with pytest.raises(ConfigError, match=r"nowhere: no result\.json to draw"):
+    with pytest.raises(ConfigError, match=r"result\.json not found in .*nowhere"):
         study(toy(tmp_path, "parts=draw") | {"out": str(tmp_path / "nowhere")})
-    with pytest.raises(ConfigError, match=r"`draw` stands alone"):
+    with pytest.raises(ConfigError, match=r"expected `draw` alone"):
         study(toy(tmp_path, "parts=[draw,train]"))
     with pytest.raises(ConfigError, match="parts"):
         study(toy(tmp_path) | {"parts": None})
 
 
-def test_a_report_of_a_validation_cut_says_so_and_how_to_make_it_again(whole, tmp_path):
-    folder, result = whole
+def test_a_report_of_a_validation_cut_says_so_and_how_to_repeat_it(done, tmp_path):
+    folder, result, _ = done
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "result.json").write_text(json.dumps(result | {"settings": result["settings"] | {"cut": "validation"}}))
     study(toy(tmp_path, "parts=draw"))
     text = (tmp_path / "out" / "navigation.md").read_text()
     assert "are no test" in text and "study=navigation cut=validation train_scenes=..." in text
-    assert "cut=" not in (folder / "out" / "navigation.md").read_text().split("To do it again")[1]
+    assert "cut=" not in (folder / "out" / "navigation.md").read_text().split("How to repeat it")[1]
 
 
-def test_a_result_of_other_runs_is_not_written_over_with_nothing(whole, tmp_path, capsys):
-    folder, result = whole
+def test_a_result_of_other_runs_is_not_written_over_with_nothing(done, tmp_path, capsys):
+    folder, result, _ = done
     shutil.copytree(folder / "out", tmp_path / "out")
     assert study(toy(tmp_path, "parts=report"))["rows"] == result["rows"]
-    assert "stay as they are" in capsys.readouterr().out
+    assert "are not changed" in capsys.readouterr().out
     assert (tmp_path / "out" / "result.json").read_bytes() == (folder / "out" / "result.json").read_bytes()
 
 
 def test_an_interval_that_misses_its_value_is_drawn_up_to_it():
-    odd = {name: agent_metrics.Estimate(0.5, 0.55, 0.6, 9, agent_metrics.SHARE, agent_metrics.LEVELS) for name in study_figures.SHOWN}
+    odd = {name: statistics.Estimate(0.5, 0.55, 0.6, 9, agent_metrics.FRACTION, statistics.LEVELS) for name in study_figures.SHOWN}
     whole = study_figures._bars({"odd": odd}, {"odd": "#cc3311"})
     reach = [bars.get_segments() for axes in whole.axes for bars in axes.collections]
     assert len(reach) == len(study_figures.SHOWN) and all([end[0] for end in one[0]] == [0.5, 0.6] for one in reach)
@@ -174,29 +207,38 @@ def test_an_interval_that_misses_its_value_is_drawn_up_to_it():
 # ---- nothing twice
 
 
-def test_what_is_done_is_not_done_again(whole, monkeypatch):
-    folder, result = whole
+def test_what_is_done_is_not_done_again(done, monkeypatch):
+    folder, result, _ = done
     monkeypatch.setattr(training_loop, "train", lambda *a, **k: pytest.fail("trained again"))
-    monkeypatch.setattr(command, "make_examiner", lambda *a, **k: pytest.fail("judged again"))
+    monkeypatch.setattr(command, "make_evaluator", lambda *a, **k: pytest.fail("evaluated again"))
     again = study(toy(folder))
-    assert again["rows"] == result["rows"] and again["looks"] == result["looks"]
+    assert again["rows"] == result["rows"] and again["held_out_uses"] == result["held_out_uses"]
     other = toy(folder, f"out={folder / 'other'}", **{**ALONE, "name": "other"})  # what another study has done
     assert study({**other, "common": ["checkpoint_every=7"]})["rows"][0]["pooled"] == result["rows"][0]["pooled"]
 
 
-def test_seeds_and_variants_share_their_programs(tmp_path):
-    """With more seeds and another number of scenes nothing is traced anew: the same count as for one seed of one variant."""
-    counts = []
-    for seeds, variants in (("[0]", {"a": []}), ("[0,1,2]", {"a": [], "b": ["scenes.take.count=1"]})):
-        study_parts.TRACES.clear()
-        study(toy(tmp_path / str(len(counts)), f"seeds={seeds}", **{**ALONE, "trainings": variants}))
-        counts.append(len(study_parts.TRACES))
-    assert counts[0] > 0 and counts[1] == counts[0]
+def test_seeds_and_variants_share_their_programs(done):
+    """After the first training nothing is traced again for other seeds and another number of scenes."""
+    counts = done[2]
+    assert counts[0] > 0 and counts == [counts[0]] * 4
 
 
-def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch):
-    folder, _ = whole
-    add, calls = metrics_csv.MetricsFile.add, []
+def test_a_stopped_study_resumes_its_trainings(stub_training, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        study(toy(tmp_path, "parts=train", **ALONE))
+    assert len(list((tmp_path / "runs").glob("*/trained.json"))) == 1 and len(list((tmp_path / "runs").iterdir())) == 2
+    study(toy(tmp_path, "parts=train", **ALONE))
+    assert stub_training == [(3, False), (4, False), (4, True)]
+    assert len(list((tmp_path / "runs").glob("*/trained.json"))) == 2
+    study(toy(tmp_path, "parts=train", **ALONE))
+    assert len(stub_training) == 3
+
+
+@pytest.mark.slow  # the same with real trainings, to the last bit; resumed runs are tests/cli/test_train's
+def test_a_killed_study_gives_the_same_numbers(done, tmp_path, monkeypatch):
+    from scenefactory_jax.loggers import metrics_csv
+
+    folder, add, calls = done[0], metrics_csv.MetricsFile.add, []
 
     def killed(self, row):
         add(self, row)
@@ -208,49 +250,65 @@ def test_a_killed_study_goes_on_to_the_same_numbers(whole, tmp_path, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         study(toy(tmp_path, **ALONE))
     monkeypatch.undo()
-    assert len(list((tmp_path / "runs").glob("*/trained.json"))) == 1 and len(list((tmp_path / "runs").iterdir())) == 2
     study(toy(tmp_path, **ALONE))
-    files = sorted((tmp_path / "runs").glob("*/judged-*.csv"))
+    files = sorted((tmp_path / "runs").glob("*/evaluated-*.csv"))
     assert len(files) == 2
     for file in files:
         [same] = (folder / "runs").glob(f"{file.parent.name}/{file.name}")
         assert file.read_bytes() == same.read_bytes()
 
 
-def test_what_another_command_trains_is_left_to_it(tmp_path, capsys):
+def test_what_another_command_trains_is_left_to_it(stub_training, tmp_path, capsys):
     first, second = study_plan.make(toy(tmp_path, **ALONE)).trainings
     with run_folder.open_run_folder({**first.config, "out": str(first.folder)}):
-        result = study(toy(tmp_path, **ALONE))
-    assert "training all terms, seed 3: left to the command that trains in" in capsys.readouterr().out
-    assert not command.is_trained(first) and command.is_trained(second) and result["rows"][0]["seeds"] == [4]
+        study(toy(tmp_path, "parts=train", **ALONE))
+    assert "training all scenes, seed 3: left to the command that trains in" in capsys.readouterr().out
+    assert not command.is_trained(first) and command.is_trained(second)
 
 
+def test_tasks_are_divided_among_processes(stub_training, tmp_path):
+    """What one process has claimed another does not do; the counts of all are added up."""
+    config = toy(tmp_path, "parts=[train]", **ALONE)
+    claims = tmp_path / "claims"
+    claims.mkdir()
+    first, second = study_plan.make(config).trainings
+    command.TaskClaims(claims).take(first.digest)
+    assert command._run_tasks(1, "train", config, claims)
+    assert stub_training == [(second.seed, False)] and not command.is_trained(first)
+    uses = command.HeldOutUses(tmp_path / "result.json", command="study", cut="test")
+    uses.add_all([{"policies": 1, "curve points": 2, "seconds": 0.5}] * 2)
+    [counted] = uses.read_result()["held_out_uses"]
+    assert [counted[name] for name in command.COUNTS] == [2, 4, 1.0]
+
+
+@pytest.mark.slow  # two processes compile a training and an evaluation each
 def test_processes_divide_a_study_among_them(tmp_path, capfd):
     result = study(toy(tmp_path, "processes=2", "per_gpu=2", **ALONE))
     assert result["missing"] == [] and len(list((tmp_path / "runs").glob("*/trained.json"))) == 2
     assert result["rows"][0]["seeds"] == [3, 4]
-    assert all(run["device"].endswith(", shared by 2") for run in result["trainings"]["all terms"]["runs"].values())
+    assert all(run["device"].endswith(", shared by 2") for run in result["trainings"]["all scenes"]["runs"].values())
     printed = capfd.readouterr().out
-    assert [printed.count(f"training all terms, seed {seed}\n") for seed in (3, 4)] == [1, 1]
-    (looks,) = result["looks"]
-    assert (looks["policies"], looks["curve points"]) == (2, 4) and looks["seconds"] > 0
+    assert [printed.count(f"training all scenes, seed {seed}\n") for seed in (3, 4)] == [1, 1]
+    (uses,) = result["held_out_uses"]
+    assert (uses["policies"], uses["curve points"]) == (2, 4) and uses["seconds"] > 0
 
 
-def test_a_process_that_fails_is_told_once_the_others_are_done(tmp_path):
+@pytest.mark.slow  # two processes that import all of it; tests/core/test_gpu_processes has the errors of processes
+def test_an_error_in_a_process_is_reported_once_the_others_have_ended(tmp_path):
     wrong = toy(tmp_path, "processes=2", "test_scenes=nowhere.bank", **ALONE)
     with pytest.raises(RuntimeError, match="2 of 2 processes ended with an error"):
         study(wrong)
 
 
-def test_a_study_stops_in_time_and_tells_what_is_missing(tmp_path, capsys):
-    result = study(toy(tmp_path, "until_s=0.0"))
-    assert "training all terms, seed 3: would take" in capsys.readouterr().out and not (tmp_path / "runs").exists()
-    assert len(result["missing"]) == 6 + 11 and "**Not complete**: 17 " in (tmp_path / "out" / "navigation.md").read_text()
-    assert Clock(None).fits(1e9, what="") and Clock(100.0).fits(50.0, what="")
-    assert Clock(100.0).fits(1000.0, what="")  # would never fit: it goes on from its checkpoint
+def test_a_study_stops_at_its_time_limit_and_says_what_is_missing(tmp_path, capsys):
+    result = study(toy(tmp_path, "time_limit_s=0.0"))
+    assert "training all scenes, seed 3: would take" in capsys.readouterr().out and not (tmp_path / "runs").exists()
+    assert len(result["missing"]) == 4 + 9 and "**Not complete**: 13 " in (tmp_path / "out" / "navigation.md").read_text()
+    assert Clock(None).fits(1e9, task="") and Clock(100.0).fits(50.0, task="")
+    assert Clock(100.0).fits(1000.0, task="")  # longer than the limit: it resumes from its checkpoint
     late = Clock(100.0)
-    late._begun -= 60.0
-    assert late.fits(30.0, what="") and not late.fits(50.0, what="judging")
+    late._start -= 60.0
+    assert late.fits(30.0, task="") and not late.fits(50.0, task="evaluation")
 
 
 # ---- what is refused
@@ -261,13 +319,13 @@ def test_a_study_stops_in_time_and_tells_what_is_missing(tmp_path, capsys):
     [
         ({**ALONE, "trainings": {"a": ["wrlds=3"]}}, r"study\.trainings\.a: wrlds: unknown key 'wrlds'; the top level has: "),
         ({**ALONE, "conditions": {"wet": ["weather=foggy"]}}, r"study\.conditions\.wet: .*Could not find 'weather/foggy'"),
-        ({"judged": {"all terms": ["drizzle"]}}, r"study\.judged\.all terms: unknown 'drizzle'; valid: dry, at random"),
-        ({"compare": [["all terms", "nobody"]]}, r"study\.compare\.0: unknown 'nobody'; valid: all terms, one scene, .*log replay"),
-        ({"compare": [["all terms"]]}, r"study\.compare: \['all terms'\]; wanted are pairs"),
-        ({"colour": "red"}, r"study\.colour: unknown key; valid: name, question"),
-        ({"protocols": ["lenient"]}, r"study\.protocols: \['lenient'\]; valid: one or more of goal_only, strict"),
-        ({"figures": ["pie"]}, r"study\.figures: \['pie'\]"),
-        ({"floors": {"f": {"of": "all terms"}}}, r"study\.floors\.f\.overrides: missing"),
+        ({"evaluated": {"all scenes": ["drizzle"]}}, r"study\.evaluated\.all scenes: expected one of dry, at random, got 'drizzle'"),
+        ({"compare": [["all scenes", "other"]]}, r"study\.compare\.0: expected one of all scenes, one scene, .*replay, got 'other'"),
+        ({"compare": [["all scenes"]]}, r"study\.compare: expected pairs \[before, after\], got \['all scenes'\]"),
+        ({"colour": "red"}, r"study\.colour: unknown key; valid: base, baselines"),
+        ({"protocols": ["lenient"]}, r"study\.protocols: expected one or more of goal_only, strict, got \['lenient'\]"),
+        ({"figures": ["pie"]}, r"study\.figures.*got \['pie'\]"),
+        ({"baselines": {"f": {"of": "all scenes"}}}, r"study\.baselines\.f.*overrides"),
     ],
 )
 def test_wrong_keys_of_a_study_are_named(tmp_path, changes, message):
@@ -279,17 +337,18 @@ def test_wrong_keys_of_a_study_are_named(tmp_path, changes, message):
 def test_wrong_keys_of_the_command_are_named(tmp_path):
     with pytest.raises(ConfigError, match=r"Available options:.*friction.*navigation"):
         hydra_config.load_config("study")
-    for override, message in {"only=[bicycle]": r"only: unknown 'bicycle'; valid: all terms", "seeds=[1,1]": r"seeds: \[1, 1\]"}.items():
+    messages = {"only=[bicycle]": r"only: expected one of all scenes, .*got 'bicycle'", "seeds=[1,1]": r"seeds: .*got \[1, 1\]"}
+    for override, message in messages.items():
         with pytest.raises(ConfigError, match=message):
             study(toy(tmp_path, override))
-    with pytest.raises(ConfigError, match=r"parts: \['trian'\]"):
+    with pytest.raises(ConfigError, match=r"parts.*got \['trian'\]"):
         study(toy(tmp_path, "parts=trian"))
 
 
 # ---- the studies of the paper
 
 
-# As the paper's tables, and what a CPU judges
+# As the paper's tables, and what a CPU evaluates
 ONE_PROTOCOL = ("transfer", "friction", "winter", "floors", "network", "rewards", "recipe", "rewards_laptop", "network_laptop")
 
 
@@ -299,18 +358,21 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
-@pytest.mark.parametrize("name", STUDIES)
+TWINS = {"rewards_laptop"}  # the same variants as another study, for a CPU
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES])
 def test_every_study_is_whole(name, tmp_path):
-    """Every training and judging builds, and whatever is compared or drawn is judged."""
+    """Every training and evaluation builds, and what is compared or drawn is evaluated."""
     entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "train_scenes=train.bank", "seeds=[0]")
     assert entry["study"]["protocols"] == ["goal_only"] + ["strict"] * (name not in ONE_PROTOCOL)
     plan = study_plan.make(entry | {"test_scenes": "it's.bank", "study": {**entry["study"], "protocols": ["strict"]}})
-    assert entry["study"]["seeds"] == [0, 1, 2] and plan.trainings and plan.judgings
-    for built in {one.program: one.config for one in (*plan.trainings, *plan.judgings)}.values():
+    assert entry["study"]["seeds"] == [0, 1, 2] and plan.trainings and plan.evaluations
+    for built in {one.program: one.config for one in (*plan.trainings, *plan.evaluations)}.values():
         assert built["scenes"]["path"] == "train.bank" and built["scenes"]["heldout"]["path"] == "it's.bank"
-        environment.make_parts(built | {"termination": hydra_config.load_config("task")["termination"]})
+        environment.make_parts(built)
     assert name == "longer" or len({steps_of(one.config) for one in plan.trainings}) == 1  # as much experience for all
-    assert {one.config["spawning"]["respawn_clearance_m"] for one in plan.judgings} == {None}  # one life a car
+    assert {one.config["spawning"]["respawn_clearance_m"] for one in plan.evaluations} == {None}  # one life a car
 
 
 def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
@@ -320,9 +382,10 @@ def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
     plan = study_plan.make(entry)
     for name, condition in conditions.items():
         asked = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
-        rows = [one for one in plan.judgings if (one.row, one.condition) == ("rigid body", condition)]
+        rows = [one for one in plan.evaluations if (one.row, one.condition) == ("rigid body", condition)]
         assert {one.protocol for one in rows} >= set(asked["protocol"]["termination"])
-        assert rows[0].config == hydra_config.apply_overrides(rows[0].training.config, asked["protocol"]["settings"])
+        expected = hydra_config.apply_overrides(rows[0].training.config, asked["protocol"]["settings"])
+        assert rows[0].config | {"termination": None} == expected | {"termination": None}
         assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
 
 
@@ -338,13 +401,17 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
         os.utime(tmp_path / "files" / "a.json", ns=(0, 0))
         (bank / bank_index.INDEX).write_text(index if content == "one" else index.replace("[]", '["new"]'))
         plan = study_plan.make(entry)
-        found.append((plan.trainings[0].digest, plan.judgings[0].program))
+        found.append((plan.trainings[0].digest, plan.evaluations[0].program))
     assert found[0][0] != found[1][0] and found[0][1] != found[1][1] and found[1] == found[2]
 
 
 @pytest.mark.parametrize(
     ("name", "base"),
-    [("network", "experiment=smoke"), ("recipe", "experiment=quick,worlds=2"), ("network_laptop", "experiment=laptop,scenes.take.count=1")],
+    [
+        ("network", "experiment=smoke"),
+        ("recipe", "experiment=quick,worlds=2"),
+        pytest.param("network_laptop", "experiment=laptop,scenes.take.count=1", marks=pytest.mark.slow),  # observations as in network
+    ],
 )
 def test_networks_of_the_studies_fit_their_observations(name, base):
     plan = study_plan.make(hydra_config.load_config("study", f"study={name}", "seeds=[0]", f"study.base=[{base},scenes.count=1]"))
@@ -364,7 +431,7 @@ def test_studies_share_what_they_train_alike(alike, tmp_path):
     for name, variant in alike.items():
         entry = hydra_config.load_config("study", f"study={name}", f"runs={tmp_path}", "seeds=[1]")
         entry["study"]["trainings"] = {variant: entry["study"]["trainings"][variant]}
-        plan = study_plan.make(entry | {"study": {**entry["study"], "compare": [], "trend": None, "floors": {}}})
+        plan = study_plan.make(entry | {"study": {**entry["study"], "compare": [], "trend": None, "baselines": {}}})
         same |= {one.digest for one in plan.trainings}
     assert len(same) == 1
 
@@ -377,16 +444,15 @@ def test_later_overrides_win():
 
 
 def test_fewer_scenes_of_one_seed_are_a_part_of_more():
-    load = lambda *own: scene_source.load_training_scenes(  # noqa: E731
-        hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]
-    )
-    everything = load()
-    some = [set(load("seed=5", f"scenes.take.count={count}").names) for count in (1, 2, 3)]
+    entry = lambda *own: hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]  # noqa: E731
+    everything = scene_source.load_training_scenes(entry())
+    take = lambda *own: scene_source.take_scenes(everything, entry(*own))  # noqa: E731
+    some = [set(take("seed=5", f"scenes.take.count={count}").names) for count in (1, 2, 3)]
     assert [len(names) for names in some] == [1, 2, 3] and some[0] < some[1] < some[2] < set(everything.names)
-    fixed = load("seed=1", "scenes.take.count=3", "scenes.take.seed=5")
+    fixed = take("seed=1", "scenes.take.count=3", "scenes.take.seed=5")
     assert set(fixed.names) == some[2] and "3 of the 4 scenes" in fixed.account
     shapes = [[leaf.shape[1:] for leaf in jax.tree.leaves(scenes.scene)] for scenes in (fixed, everything)]
     assert shapes[0] == shapes[1]  # so that programs are the same
     with pytest.raises(ConfigError, match=r"scenes\.take\.count: 7, but there are 4 scenes"):
-        load("scenes.take.count=7")
+        take("scenes.take.count=7")
     assert json.dumps(hydra_config.load_config("train")["scenes"]["take"]) == '{"count": null, "seed": 0}'

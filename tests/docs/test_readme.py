@@ -6,8 +6,8 @@ import numpy as np
 from support.running import ROOT
 
 from scenefactory_jax.core import result_file
-from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.visualization.report import study_report
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.visualization.report import study_report, tables
 
 TEXT = (ROOT / "README.md").read_text()
 SAID = " ".join(TEXT.split())
@@ -36,7 +36,7 @@ def test_results_are_those_of_the_studies():
     found = {(row["row"], row["condition"]): row["pooled"] for study in studies for row in study["rows"] if row["protocol"] == "goal_only"}
     for label, condition, metric in ROWS:
         pooled = [found.get((name, condition)) for name in COLUMNS]  # recorded drivers never start from rest
-        cells = ["" if one is None else agent_metrics.text(agent_metrics.Estimate(**one[metric])) for one in pooled]
+        cells = ["" if one is None else tables.format_estimate(statistics.Estimate(**one[metric])) for one in pooled]
         assert re.sub(r" +", " ", f"| {label} | {' | '.join(cells)} |") in TEXT
 
 
@@ -46,8 +46,8 @@ def test_intervals_and_looks_are_counted():
     counts = [study_report.count_intervals(studies[name]["differences"]) for name in PARTS_TAKEN_OUT]
     intervals, without_zero = map(sum, zip(*counts, strict=True))
     assert f"{intervals} intervals of differences, {without_zero} without zero; chance alone gives about {intervals / 20:.0f}" in SAID
-    looks = [look for study in studies.values() for look in study.get("looks", []) if look["cut"] == "test"]
-    policies, points = (sum(look[name] for look in looks) for name in ("policies", "curve points"))
+    uses = [use for study in studies.values() for use in study.get("held_out_uses", []) if use["cut"] == "test"]
+    policies, points = (sum(use[name] for use in uses) for name in ("policies", "curve points"))
     assert f"{policies} policies and {points} points of curves" in SAID
 
 

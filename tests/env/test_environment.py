@@ -15,7 +15,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import RewardInput
-from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, surrogate_safety
+from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.roadgraph import queries
@@ -368,14 +368,16 @@ def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
 
 def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     """It breaks in the first step: nothing is known of it but its start. Nor is a speed a number whose square is none."""
-    notes = scenefactory_jax.load_config("evaluate", "run=town")["failures"]["notes"]
-    broken = lambda parameters, observation: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
-    episode = episodes.begin(env, jax.random.key(0), two_cars)
-    far = episode.tally.goal_distance
-    tally = episodes.run_episode_chunk(env, broken, None, two_cars, episode, steps=2, ttc_limit_s=10.0, notes=notes)[0].tally
-    assert tally.past_events.numerical_error.tolist() == tally.ended.tolist() == [True, False] and tally.steps.tolist() == [0, 2]
-    assert float(tally.goal_distance[0]) == float(far[0]) and not tally.speed_sum.any()
-    motion = replace(episode.state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
+    signals = scenefactory_jax.load_config("evaluate", "run=town")["failures"]["signals"]
+    broken = lambda parameters, observation, key: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
+    state = env.init_state(jax.random.key(0), two_cars)
+    start = rollout.start_rollout(state, episodes.make_metrics(state))
+    hook = episodes.make_hook(env, ttc_limit_s=10.0, signals=signals)
+    end, _ = rollout.rollout(env, broken, None, two_cars, start, jax.random.key(0), steps=2, hook=hook)
+    metrics = end.carry
+    assert metrics.past_events.numerical_error.tolist() == [True, False] and metrics.steps.tolist() == [0, 2]
+    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.speed_sum.any()
+    motion = replace(state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
     assert step_metrics.is_finite(motion).tolist() == [False, True]
 
 

@@ -17,7 +17,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import AgentLog, TrafficLog
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.evaluation import agent_metrics, episode_records, failure_signals, failures
+from scenefactory_jax.evaluation import episode_records, failure_signals, failures
+from scenefactory_jax.evaluation.records import RecordsError, read_records, select_rows, write_records
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.report import failure_pictures
 
@@ -141,11 +142,11 @@ def test_a_scripted_drive_has_its_kind(played, name, agent, kind):
 
 def test_every_failure_has_one_kind_and_no_other_agent_has(played):
     records, _ = played
-    assert set(records["failure"]) == {*failures.KINDS, failures.NONE}
+    assert set(records["failure"]) == {*failures.FAILURE_TYPES, failures.NONE}
     np.testing.assert_array_equal(records["failure"] == failures.NONE, records["clean"])
     found = failures.rank_failures(records)
     rows = [failure.row for ranked in found.values() for failure in ranked]
-    assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == list(failures.KINDS)
+    assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == list(failures.FAILURE_TYPES)
 
 
 def test_when_where_and_how_much(played):
@@ -153,17 +154,21 @@ def test_when_where_and_how_much(played):
     of = lambda name, agent=0: {column: values[row_of(records, name, agent)] for column, values in records.items()}  # noqa: E731
     hit = of("rear_end")
     assert hit["failure_s"] == pytest.approx(2.6, abs=0.1) and hit["failure_x_m"] == pytest.approx(-4.0, abs=0.6), "26 m at 10 m/s"
-    assert (hit["own_mps"], hit["other_mps"]) == pytest.approx((10, 0), abs=0.1) and hit["severity"] == pytest.approx(10, abs=0.1)
-    assert hit["hit"] == 1 and of("rear_end", 1)["hit"] == 0 and of("box")["hit"] == 2, "the box comes after the two cars"
+    assert (hit["approach_mps"], hit["partner_approach_mps"]) == pytest.approx((10, 0), abs=0.1) and hit["severity"] == pytest.approx(
+        10, abs=0.1
+    )
+    assert hit["collision_partner"] == 1 and of("rear_end", 1)["collision_partner"] == 0 and of("box")["collision_partner"] == 2, (
+        "the box comes after the two cars"
+    )
     ahead = of("slower_ahead", 1)
-    assert (ahead["own_mps"], ahead["other_mps"]) == pytest.approx((-3, 10), abs=0.1)
-    assert of("wrong_way")["failure_s"] == pytest.approx(15 / 4, abs=0.15) and of("wrong_way")["against_share"] > 0.95
-    assert of("wrong_way")["against_m"] == pytest.approx(4 * SECONDS, abs=0.3)
+    assert (ahead["approach_mps"], ahead["partner_approach_mps"]) == pytest.approx((-3, 10), abs=0.1)
+    assert of("wrong_way")["failure_s"] == pytest.approx(15 / 4, abs=0.15) and of("wrong_way")["wrong_way_fraction"] > 0.95
+    assert of("wrong_way")["wrong_way_m"] == pytest.approx(4 * SECONDS, abs=0.3)
     passed = of("overshoot")
     assert (passed["closest_m"], passed["failure_s"], passed["failure_x_m"]) == pytest.approx((5, 4, 0), abs=0.1)
     assert passed["severity"] == pytest.approx(np.hypot(20, 5) - 5, abs=0.2)
     stood = of("stuck")
-    assert stood["still_s"] == pytest.approx(SECONDS - 1.5, abs=0.2) and stood["failure_x_m"] == pytest.approx(-18, abs=1.0)
+    assert stood["rest_s"] == pytest.approx(SECONDS - 1.5, abs=0.2) and stood["failure_x_m"] == pytest.approx(-18, abs=1.0)
 
 
 def test_weaving_shows_as_yaw_acceleration(played):
@@ -187,26 +192,26 @@ def test_the_worst_come_first(played):
     found = failures.rank_failures(records)
     for ranked in found.values():
         assert [failure.severity for failure in ranked] == sorted((failure.severity for failure in ranked), reverse=True)
-    assert failures.scenes(found["at_fault"])[0] == ("head_on_off_lane", 2), "most of a kind"
+    assert failures.count_by_scene(found["at_fault"])[0] == ("head_on_off_lane", 2), "most of a kind"
     chosen = failures.find_worst_failures(found["at_fault"], 3)
     assert len({failure.scene for failure in chosen}) == 3 and chosen[0].scene == "head_on_off_lane"
 
 
 def test_records_keep_their_kinds_in_a_file(played, tmp_path):
     records, _ = played
-    agent_metrics.write_csv(tmp_path / "agents.csv", records)
-    again = agent_metrics.read_csv(tmp_path / "agents.csv")
+    write_records(tmp_path / "agents.csv", records)
+    again = read_records(tmp_path / "agents.csv")
     assert failures.rank_failures(again) == failures.rank_failures(records)
-    told = json.loads(failure_pictures.write(tmp_path, {"strict": records}, {}).read_text())["strict"]["kinds"]
+    told = json.loads(failure_pictures.write(tmp_path, {"strict": records}, {}).read_text())["strict"]["types"]
     assert {kind: entry["agents"] for kind, entry in told.items()} == {
         kind: len(ranked) for kind, ranked in failures.rank_failures(records).items()
     }
-    with pytest.raises(agent_metrics.RecordsError, match=r"records\.severity: column missing; kinds of failures need"):
+    with pytest.raises(RecordsError, match=r"records\.severity: column missing; failure types need"):
         failures.rank_failures({name: column for name, column in records.items() if name != "severity"})
 
 
 def test_definitions_name_the_numbers(played, settings):
-    text = failures.list_definitions(played[0], failures.list_thresholds(settings["failures"]))
+    text = failures.format_definitions(played[0], failures.list_thresholds(settings["failures"]))
     assert "`" not in text and "a stretch of 15 m" in text and "at least 33 % of the closing speed" in text
 
 
@@ -224,7 +229,7 @@ def test_pictures_show_the_place(played, settings, tmp_path):
 
 def test_a_film_shows_the_seconds_around_each_failure(played, settings, tmp_path):
     records, recording = played
-    chosen = agent_metrics.select(records, np.isin(records["failure"], ["edge", "wrong_way"]))
+    chosen = select_rows(records, np.isin(records["failure"], ["edge", "wrong_way"]))
     wanted = {**settings["failures"], "pictures": {"enable": True, "panels": 1, "before_s": 1.0, "video": True}}
     look = {**settings["video"], "stride": 15, "fps": 5.0, "panel": 120}
     paths = failure_pictures.draw(tmp_path, "strict, untrained", chosen, recording, {"failures": wanted, "video": look})
@@ -245,8 +250,8 @@ def test_lanes_that_cross_are_not_driven_against():
 
 def test_settings_are_checked_at_the_door():
     config = configs.load_config("evaluate", "run=x")
-    del config["failures"]["notes"]["near_m"]
-    with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
+    del config["failures"]["signals"]["near_m"]
+    with pytest.raises(ConfigError, match=r"failures\.signals\.near_m: missing"):
         schema.check_evaluate(config)
     with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: expected an integer >= 1, got 0"):
         schema.check_train(configs.load_config("train", "evaluation.failures.pictures.panels=0"))

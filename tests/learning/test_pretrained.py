@@ -7,7 +7,7 @@ from support.running import ROOT
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.evaluation.metrics import agent_metrics
 from scenefactory_jax.learning import policy_io
 
 SHIPPED = [file.parent for file in sorted(policy_io.SHIPPED.glob("*/config.yaml"))]
@@ -28,14 +28,17 @@ def test_a_policy_learnt_on_generated_scenes(folder):
     assert scenes["generate"]["_target_"].startswith("scenefactory_jax.data.generators.") and scenes["seed"] != scenes["heldout"]["seed"]
 
 
-def test_town_drives_where_it_has_never_been(tmp_path, quickly):
-    overrides = "overrides=[spawning=logged,weather=dry,scenes.heldout.count=2,timing.episode_s=12]"
-    plainly = ["protocol.termination=[strict]", "untrained=true", "video.enable=false", "failures.pictures.enable=false"]
-    found = sf.evaluate(sf.load_config("evaluate", "run=town", f"out={tmp_path}", overrides, *plainly)).records
-    records, before = found["strict"], found["strict, untrained"]  # which came with no checkpoint
-    assert len(before["goal_reached"]) == len(records["goal_reached"]) and before["clean"].mean() < records["clean"].mean()
+def drive_town(out, *, scenes, untrained, dynamics):
+    overrides = f"overrides=[spawning=logged,weather=dry,dynamics={dynamics},scenes.heldout.count={scenes},timing.episode_s=12]"
+    plainly = ["protocol.termination=[strict]", f"untrained={untrained}", "video.enable=false", "failures.pictures.enable=false"]
+    return sf.evaluate(sf.load_config("evaluate", "run=town", f"out={out}", overrides, *plainly)).records
+
+
+def test_town_drives_where_it_has_never_been(tmp_path):
+    """In bicycles, which compile in seconds: they drive as the articulated car does on a dry road."""
+    records = drive_town(tmp_path, scenes=1, untrained="false", dynamics="bicycle")["strict"]
     bends = records["route_m"] >= agent_metrics.BEND * records["start_distance_m"]
-    assert len(records["goal_reached"]) >= 8 and bends.any()
+    assert len(records["goal_reached"]) >= 4 and bends.any()
     assert records["goal_reached"].mean() > 0.75 and records["goal_reached"][bends].any()
 
 
@@ -44,3 +47,11 @@ def test_figures_of_the_readme_are_those_of_the_card():
     success, clean, _, collided, *_ = rows[0].split(" | ")
     said = " ".join((ROOT / "README.md").read_text().split())
     assert f"it reaches the goal in {success}, without any other event in {clean}, and {collided} of its cars collide" in said
+
+
+@pytest.mark.slow  # the car it learnt in, and the policy before training
+def test_town_drives_better_than_before_training(tmp_path, quickly):
+    found = drive_town(tmp_path, scenes=2, untrained="true", dynamics="articulated")
+    records, before = found["strict"], found["strict, untrained"]  # which came with no checkpoint
+    assert len(before["goal_reached"]) == len(records["goal_reached"]) >= 8
+    assert before["clean"].mean() < records["clean"].mean() and records["goal_reached"].mean() > 0.75

@@ -14,12 +14,14 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import AgentLog, Agents, Scene
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.metrics import agent_metrics
+from scenefactory_jax.evaluation.records import RecordsError, read_records, select_rows, write_records
 from scenefactory_jax.visualization import gif_writer
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, video
 from scenefactory_jax.visualization.birds_eye import figures as birds_eye_figures
 from scenefactory_jax.visualization.birds_eye import traffic_shapes as shapes
-from scenefactory_jax.visualization.report import evaluation_report, plots
+from scenefactory_jax.visualization.report import evaluation_report, plots, tables
 from scenefactory_jax.weather import patch_layouts
 from scenefactory_jax.weather.friction import make_uniform
 
@@ -122,16 +124,16 @@ def test_others_are_drawn_where_they_are(trajectory):
 )
 def test_wilson_matches_published_values(share, count, low, high):
     """81 of 263: Newcombe 1998, table I, method 3; the others: closed form with z = 1.96."""
-    np.testing.assert_allclose(agent_metrics.wilson(share, count), (low, high), atol=1e-4)
+    np.testing.assert_allclose(statistics.wilson(share, count), (low, high), atol=1e-4)
 
 
 def test_bootstrap_matches_the_normal_interval_of_scene_means():
     """With equal scenes the rate is a mean over scenes: its interval is about 1.96 standard errors of the scenes' means."""
     records = make_records(scenes=200, agents=5, seed=3)
     means = records["goal_reached"].reshape(200, 5).mean(1)
-    estimate = agent_metrics.summarise(records, bootstrap=4000, seed=1)["success_rate"]
+    estimate = statistics.summarise(records, bootstrap=4000, seed=1)["success_rate"]
     half = 1.96 * means.std() / np.sqrt(200)
-    assert estimate.method == agent_metrics.BOOTSTRAP
+    assert estimate.method == statistics.SCENES
     assert estimate.value == pytest.approx(means.mean())
     np.testing.assert_allclose([estimate.low, estimate.high], [means.mean() - half, means.mean() + half], atol=0.1 * half)
 
@@ -139,32 +141,32 @@ def test_bootstrap_matches_the_normal_interval_of_scene_means():
 def test_agents_that_share_a_fate_widen_the_interval():
     """Ten copies of each agent are no new evidence: the scene bootstrap must not narrow, as an interval over agents would."""
     one = make_records(scenes=30, agents=1, seed=5)
-    ten = {name: np.repeat(column, 10) for name, column in one.items()}
-    first, second = (agent_metrics.summarise(r, **BOOTSTRAP)["success_rate"] for r in (one, ten))
+    ten = {name: np.repeat(column, 10) for name, column in one.items()} | {"agent": np.tile(np.arange(10), 30)}
+    first, second = (statistics.summarise(r, **BOOTSTRAP)["success_rate"] for r in (one, ten))
     assert (second.low, second.high) == pytest.approx((first.low, first.high))
 
 
 def test_resampling_is_reproducible_and_holds_the_value():
     records = make_records()
-    first, again = (agent_metrics.summarise(records, **BOOTSTRAP) for _ in range(2))
+    first, again = (statistics.summarise(records, **BOOTSTRAP) for _ in range(2))
     assert first == again
     for name, estimate in first.items():
         assert estimate.low <= estimate.value <= estimate.high, name
-        assert estimate.unit != agent_metrics.SHARE or 0 <= estimate.low <= estimate.high <= 1
+        assert estimate.unit != agent_metrics.FRACTION or 0 <= estimate.low <= estimate.high <= 1
 
 
 def test_all_success_has_an_uncertain_lower_end():
-    estimate = agent_metrics.summarise(make_records(success=1.0), **BOOTSTRAP)["success_rate"]
-    assert (estimate.value, estimate.high, estimate.method) == (1.0, 1.0, agent_metrics.WILSON)
+    estimate = statistics.summarise(make_records(success=1.0), **BOOTSTRAP)["success_rate"]
+    assert (estimate.value, estimate.high, estimate.method) == (1.0, 1.0, statistics.WILSON)
     assert 0.9 < estimate.low < 1.0
-    assert agent_metrics.text(estimate).startswith("100.0 % [9")
+    assert tables.format_estimate(estimate).startswith("100.0 % [9")
 
 
 def test_one_scene_falls_back_and_says_so():
-    summary = agent_metrics.summarise(make_records(scenes=1, agents=16), **BOOTSTRAP)
-    assert summary["success_rate"].method == agent_metrics.WILSON
-    assert summary["mean_max_drac"].method == agent_metrics.AGENTS
-    assert "‡" in agent_metrics.text(summary["mean_max_drac"])
+    summary = statistics.summarise(make_records(scenes=1, agents=16), **BOOTSTRAP)
+    assert summary["success_rate"].method == statistics.WILSON
+    assert summary["mean_max_drac"].method == statistics.AGENTS
+    assert "‡" in tables.format_estimate(summary["mean_max_drac"])
 
 
 def test_a_metric_of_which_only_one_scene_knows_has_no_interval_from_scenes():
@@ -175,28 +177,28 @@ def test_a_metric_of_which_only_one_scene_knows_has_no_interval_from_scenes():
         "time_s": np.arange(len(first), dtype=float),
         "route_m": first * 99.0,
     }
-    found = agent_metrics.summarise(records, **BOOTSTRAP)
+    found = statistics.summarise(records, **BOOTSTRAP)
     assert (
-        found["mean_time_to_goal_s"].method == agent_metrics.AGENTS and found["mean_time_to_goal_s"].low < found["mean_time_to_goal_s"].high
+        found["mean_time_to_goal_s"].method == statistics.AGENTS and found["mean_time_to_goal_s"].low < found["mean_time_to_goal_s"].high
     )
-    assert found["clean_bend_rate"].method == agent_metrics.WILSON and found["clean_bend_rate"].count == 4
-    change = agent_metrics.difference(records, records, **BOOTSTRAP)["mean_time_to_goal_s"]
-    assert (change.value, change.low, change.method) == (0.0, None, agent_metrics.NONE)
-    alone = agent_metrics.summarise({**records, "goal_reached": np.arange(len(first)) == 0}, **BOOTSTRAP)["mean_time_to_goal_s"]
-    assert (alone.value, alone.low, alone.count, alone.method) == (0.0, None, 1, agent_metrics.NONE)
+    assert found["clean_bend_rate"].method == statistics.WILSON and found["clean_bend_rate"].count == 4
+    change = statistics.difference(records, records, **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert (change.value, change.low, change.method) == (0.0, None, statistics.NONE)
+    alone = statistics.summarise({**records, "goal_reached": np.arange(len(first)) == 0}, **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert (alone.value, alone.low, alone.count, alone.method) == (0.0, None, 1, statistics.NONE)
 
 
 def test_a_share_that_is_no_rate_may_exceed_one():
     records = make_records(scenes=1, agents=8)
-    found = agent_metrics.summarise({**records, "friction_utilization": np.linspace(1.2, 1.6, 8)}, **BOOTSTRAP)["friction_utilization"]
-    assert found.value == pytest.approx(1.4) and found.method == agent_metrics.AGENTS and 1.2 < found.low < 1.4 < found.high < 1.6
-    same = agent_metrics.summarise({**records, "friction_utilization": np.full(8, 1.42)}, **BOOTSTRAP)["friction_utilization"]
-    assert agent_metrics.text(same) == "142.0 %" and same.method == agent_metrics.NONE
+    found = statistics.summarise({**records, "friction_utilization": np.linspace(1.2, 1.6, 8)}, **BOOTSTRAP)["friction_utilization"]
+    assert found.value == pytest.approx(1.4) and found.method == statistics.AGENTS and 1.2 < found.low < 1.4 < found.high < 1.6
+    same = statistics.summarise({**records, "friction_utilization": np.full(8, 1.42)}, **BOOTSTRAP)["friction_utilization"]
+    assert tables.format_estimate(same) == "142.0 %" and same.method == statistics.NONE
 
 
 def test_outcomes_are_exclusive_and_add_up():
     records = make_records(seed=2)
-    summary = agent_metrics.summarise(records, **BOOTSTRAP)
+    summary = statistics.summarise(records, **BOOTSTRAP)
     assert summary["clean_success_rate"].value <= summary["success_rate"].value
     names, counts = np.unique(plots.outcomes(records), return_counts=True)
     assert set(names) <= set(plots.OUTCOMES) and counts.sum() == len(records["scene"])
@@ -207,41 +209,41 @@ def test_outcomes_are_exclusive_and_add_up():
 def test_published_means_weigh_worlds_equally():
     records = make_records(scenes=2, agents=4)
     records["max_drac"] = np.array([1.0, 1, 1, 1, 5, 5, 5, 5])
-    few = agent_metrics.select(records, np.array([0, 1, 2, 3, 4]))  # one agent is left in the second world
-    assert agent_metrics.summarise(few, **BOOTSTRAP)["mean_max_drac"].value == pytest.approx(3.0)
-    assert agent_metrics.summarise(few, **BOOTSTRAP)["high_drac_rate"].value == pytest.approx(0.2)
+    few = select_rows(records, np.array([0, 1, 2, 3, 4]))  # one agent is left in the second world
+    assert statistics.summarise(few, **BOOTSTRAP)["mean_max_drac"].value == pytest.approx(3.0)
+    assert statistics.summarise(few, **BOOTSTRAP)["high_drac_rate"].value == pytest.approx(0.2)
 
 
 def test_nobody_arrives_means_no_time_rather_than_nan():
-    estimate = agent_metrics.summarise(make_records(success=0.0), **BOOTSTRAP)["mean_time_to_goal_s"]
-    assert estimate == agent_metrics.Estimate(None, None, None, 0, "s", agent_metrics.NONE)
-    assert agent_metrics.text(estimate) == "no data"
+    estimate = statistics.summarise(make_records(success=0.0), **BOOTSTRAP)["mean_time_to_goal_s"]
+    assert estimate == statistics.Estimate(None, None, None, 0, "s", statistics.NONE)
+    assert tables.format_estimate(estimate) == "no data"
 
 
 def test_difference_is_paired_over_scenes():
     before = make_records(success=0.5, seed=1)
     after = {**before, "end_distance_m": before["end_distance_m"] - 2.0}
-    change = agent_metrics.difference(before, after, **BOOTSTRAP)
+    change = statistics.difference(before, after, **BOOTSTRAP)
     assert (change["mean_remaining_m"].low, change["mean_remaining_m"].high) == pytest.approx((-2.0, -2.0))
     assert change["success_rate"].value == 0.0
-    assert change["success_rate"].method == agent_metrics.NEWCOMBE and change["success_rate"].low < 0 < change["success_rate"].high
-    with pytest.raises(agent_metrics.RecordsError, match="same scenes"):
-        agent_metrics.difference(before, make_records(scenes=11), **BOOTSTRAP)
+    assert change["success_rate"].method == statistics.NEWCOMBE and change["success_rate"].low < 0 < change["success_rate"].high
+    with pytest.raises(RecordsError, match="same scenes"):
+        statistics.difference(before, make_records(scenes=11), **BOOTSTRAP)
 
 
 def test_breakdown_partitions_the_records():
     records = make_records()
-    parts = agent_metrics.breakdown(records, "film_mm", **BOOTSTRAP)
+    parts = statistics.breakdown(records, "film_mm", **BOOTSTRAP)
     assert list(parts) == ["0", "0.5"]
     assert sum(part["success_rate"].count for part in parts.values()) == len(records["scene"])
-    with pytest.raises(agent_metrics.RecordsError, match=r"records\.wind.*surface"):
-        agent_metrics.breakdown(records, "wind", **BOOTSTRAP)
+    with pytest.raises(RecordsError, match=r"records\.wind.*surface"):
+        statistics.breakdown(records, "wind", **BOOTSTRAP)
 
 
 def test_records_round_trip_through_csv(tmp_path):
     records = {**make_records(), "kind": np.repeat(["junction", "straight"], 36), "lap": np.arange(72), "note": np.tile([0.1, np.inf], 36)}
-    agent_metrics.write_csv(tmp_path / "records.csv", records)
-    back = agent_metrics.read_csv(tmp_path / "records.csv")
+    write_records(tmp_path / "records.csv", records)
+    back = read_records(tmp_path / "records.csv")
     assert list(back) == list(records)
     for name, column in records.items():
         np.testing.assert_array_equal(back[name], column, err_msg=name)
@@ -250,20 +252,20 @@ def test_records_round_trip_through_csv(tmp_path):
 
 def test_bad_records_are_refused_by_name(tmp_path):
     records = make_records()
-    with pytest.raises(agent_metrics.RecordsError, match="no rows"):
-        agent_metrics.summarise({name: column[:0] for name, column in records.items()}, **BOOTSTRAP)
-    with pytest.raises(agent_metrics.RecordsError, match=r"records\.clean: column missing"):
-        agent_metrics.summarise({name: column for name, column in records.items() if name != "clean"}, **BOOTSTRAP)
-    with pytest.raises(agent_metrics.RecordsError, match=r"records\.agent: 71 rows"):
-        agent_metrics.summarise({**records, "agent": records["agent"][1:]}, **BOOTSTRAP)
-    with pytest.raises(agent_metrics.RecordsError, match=r"Mean max DRAC.*row 3"):
-        agent_metrics.summarise({**records, "max_drac": np.where(np.arange(72) == 3, np.nan, 1.0)}, **BOOTSTRAP)
-    with pytest.raises(agent_metrics.RecordsError, match=r"none\.csv: no such file"):
-        agent_metrics.read_csv(tmp_path / "none.csv")
-    agent_metrics.write_csv(tmp_path / "records.csv", records)
+    with pytest.raises(RecordsError, match="expected one or more rows"):
+        statistics.summarise({name: column[:0] for name, column in records.items()}, **BOOTSTRAP)
+    with pytest.raises(RecordsError, match=r"records\.clean: column missing"):
+        statistics.summarise({name: column for name, column in records.items() if name != "clean"}, **BOOTSTRAP)
+    with pytest.raises(RecordsError, match=r"records\.agent: expected 72 rows, as records\.scene has, got 71"):
+        statistics.summarise({**records, "agent": records["agent"][1:]}, **BOOTSTRAP)
+    with pytest.raises(RecordsError, match=r"Mean max DRAC.*row 3"):
+        statistics.summarise({**records, "max_drac": np.where(np.arange(72) == 3, np.nan, 1.0)}, **BOOTSTRAP)
+    with pytest.raises(RecordsError, match=r"none\.csv: file not found"):
+        read_records(tmp_path / "none.csv")
+    write_records(tmp_path / "records.csv", records)
     (tmp_path / "records.csv").write_text((tmp_path / "records.csv").read_text().replace("True", "perhaps", 1))
-    with pytest.raises(agent_metrics.RecordsError, match="no bool"):
-        agent_metrics.read_csv(tmp_path / "records.csv")
+    with pytest.raises(RecordsError, match="expected cells of type bool"):
+        read_records(tmp_path / "records.csv")
 
 
 # Pictures and videos
@@ -405,7 +407,7 @@ def test_a_respawn_draws_no_line_across_the_map(trajectory):
 
 def test_every_figure_is_drawn(tmp_path, trajectory):
     first, second = make_records(success=0.3), make_records()
-    summary = [agent_metrics.summarise(r, **BOOTSTRAP) for r in (first, second)]
+    summary = [statistics.summarise(r, **BOOTSTRAP) for r in (first, second)]
     row = {"iteration": 0, "steps/spawned": 1e4, "reward/goal": 1.0, "reward/edge": -0.5, "loss/kl": 0.01}
     rows = [{**row, "events/goal_reached": i / 9} for i in range(9)]
     figures = {
@@ -436,7 +438,7 @@ def test_plots_refuse_what_they_cannot_show():
 
 def test_report_says_what_happened(tmp_path):
     records = {"strict": make_records(), "strict, untrained": make_records(success=0.1, seed=9)}
-    summary = {name: agent_metrics.summarise(r, **BOOTSTRAP) for name, r in records.items()}
+    summary = {name: statistics.summarise(r, **BOOTSTRAP) for name, r in records.items()}
     (tmp_path / "a film.gif").write_bytes(b"GIF89a")
     path = evaluation_report.write(
         tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip_eps": 0.15}},
@@ -455,7 +457,7 @@ def test_report_says_what_happened(tmp_path):
 
 def test_report_refuses_what_does_not_fit(tmp_path):
     records = {"strict": make_records()}
-    summary = {"strict": agent_metrics.summarise(records["strict"], **BOOTSTRAP)}
+    summary = {"strict": statistics.summarise(records["strict"], **BOOTSTRAP)}
     rest = {"title": "", "config": {}, "versions": {}, **BOOTSTRAP}
     with pytest.raises(evaluation_report.DocumentError, match="nothing to report"):
         evaluation_report.write(tmp_path, summary={}, records={}, **rest)

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from scenefactory_jax.core.trajectory import Trajectory
-from scenefactory_jax.evaluation.failures import FLAGS, KINDS, Failure
+from scenefactory_jax.evaluation.failures import FAILURE_TYPES, FLAGS, Failure
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
 from scenefactory_jax.visualization.birds_eye.drawing import INK, QUIET, Colour, View
 from scenefactory_jax.visualization.birds_eye.video import road_image
@@ -43,7 +43,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
     Raises:
         TrajectoryError: arrays that do not belong together.
     """
-    kind = KINDS[cases[0].failure.kind]
+    kind = FAILURE_TYPES[cases[0].failure.kind]
     with matplotlib.rc_context(STYLE):
         rows = 1 if len(cases) > 2 else 2 if len(cases) > 1 else 3  # of the legend
         head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.22
@@ -73,7 +73,7 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
 
 def _title(failure: Failure) -> str:
     """Who, where, when, how bad, and what else is true: a line for what is known of every failure, and one more for the rest."""
-    kind, name = KINDS[failure.kind], failure.scene
+    kind, name = FAILURE_TYPES[failure.kind], failure.scene
     name = name if len(name) <= 42 else f"…{name[-41:]}"
     also = ", ".join(FLAGS[flag] for flag in failure.flags)
     line = f"{failure.moment_s:.1f} s · {kind.measure} {failure.severity:.1f} {kind.unit}"
@@ -84,12 +84,12 @@ def _whole(case: Case) -> tuple[float, float, float]:
     """The square that shows the car's way, its goal and the place."""
     agent, trajectory = case.failure.agent, case.trajectory
     way = trajectory.position[trajectory.active[:, agent], agent]
-    points = np.concatenate([way, drawing.goal_at(trajectory, _step(case))[[agent]], [case.failure.place]])
+    points = np.concatenate([way, drawing.goal_at(trajectory, _step(case))[[agent]], [case.failure.position]])
     return drawing.fit_view(points, margin=9.0, smallest=50.0)
 
 
 def _near(case: Case) -> tuple[float, float, float]:
-    x, y = case.failure.place
+    x, y = case.failure.position
     return x - _NEAR_M / 2, y - _NEAR_M / 2, _NEAR_M
 
 

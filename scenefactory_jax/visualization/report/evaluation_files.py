@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.core import result_file
 from scenefactory_jax.core.trajectory import Trajectory
-from scenefactory_jax.evaluation import agent_metrics, circumstances, episode_records, failures
-from scenefactory_jax.evaluation.agent_metrics import Estimate
+from scenefactory_jax.evaluation import circumstances, episode_records, failures, statistics
 from scenefactory_jax.evaluation.protocols import Evaluated
+from scenefactory_jax.evaluation.records import begin_folder, write_records
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
 from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots
@@ -52,9 +52,9 @@ def write(
     for one in evaluated:
         if not records:
             noted = {**asked, "episodes": circumstances.describe(config)}
-            result_file.begin(out, {**noted, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
+            begin_folder(out, {**noted, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
         records[one.label] = one.records
-        agent_metrics.write_csv(out / _agents_file(one.label), one.records)
+        write_records(out / _agents_file(one.label), one.records)
         if one.recording is None or one.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
@@ -62,7 +62,7 @@ def write(
         if settings["failures"]["pictures"]["enable"]:
             pictures[one.label] = failure_pictures.draw(out, one.label, one.records, one.recording, settings)
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
-    summary = {label: agent_metrics.summarise(rows, **resampling) for label, rows in records.items()}
+    summary = {label: statistics.summarise(rows, **resampling) for label, rows in records.items()}
     metrics = metrics_csv.read(run)
     baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
     files = {f"Agents, {name}": out / _agents_file(name) for name in records}

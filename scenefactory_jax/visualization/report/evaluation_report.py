@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.evaluation import agent_metrics, failures
-from scenefactory_jax.evaluation.agent_metrics import METRICS, Estimate, Records
+from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation import failures, statistics
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.records import Records, check_records
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.birds_eye.drawing import MARKS
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.visualization.report import plots, tables
 
 Summary = Mapping[str, Estimate]
 
@@ -67,7 +70,7 @@ def write(
         files: what it is -> file, linked at the end (per-agent CSV, metrics).
         commands: how to get these numbers again.
         failed: name of records with kinds of failures -> kind -> picture of the worst; "film" -> their video.
-        kinds: the numbers that the definitions of `failures.KINDS` name.
+        kinds: the numbers that the definitions of `failures.FAILURE_TYPES` name.
         episodes: what decided the episodes, "Starts" -> "as recorded, from rest".
 
     Raises:
@@ -82,7 +85,7 @@ def write(
     sections = [
         f"# {title}",
         _headline(first, summary[first], records[first]),
-        _section("Episodes", agent_metrics.grid(["", ""], list(episodes.items())) if episodes else ""),
+        _section("Episodes", markdown.format_table(["", ""], list(episodes.items())) if episodes else ""),
         _section("Results", _results({name: summary[name] for name in measured}, records)),
         _section("Comparison", *(_comparison(n, b, summary, records, bootstrap=bootstrap, seed=seed) for n, b in baselines.items())),
         _section("Video", *(_show(folder, caption, path) for caption, path in (videos or {}).items())),
@@ -105,7 +108,7 @@ def _check(summary: Mapping[str, Summary], records: Mapping[str, Records], basel
     for name in summary:
         if name not in records:
             raise DocumentError(f"records: no {name!r}, which stands in summary; there are {', '.join(records) or 'none'}")
-        agent_metrics.check(records[name])
+        check_records(records[name])
     for name, other in baselines.items():
         if name not in summary or other not in summary or other == name:
             raise DocumentError(f"baselines: {name!r} -> {other!r}; both must be different names of summary: {', '.join(summary)}")
@@ -128,8 +131,8 @@ def _headline(name: str, summary: Summary, records: Records) -> str:
     scenes, worlds = len(np.unique(records["scene"])), _worlds(records)
     success, clean = summary["success_rate"], summary["clean_success_rate"]
     parts = [
-        f"**{reached} of {agents} cars reached their goal ({agent_metrics.text(success)}),"
-        f" {agent_metrics.text(clean)} without any other event** "
+        f"**{reached} of {agents} cars reached their goal ({tables.format_estimate(success)}),"
+        f" {tables.format_estimate(clean)} without any other event** "
         f"(protocol: {name}).",
         f"{_counted(scenes, 'scene')}, {_counted(worlds, 'episode')}; deterministic policy; "
         f"seeds {', '.join(str(s) for s in np.unique(records['seed']))}.",
@@ -151,7 +154,7 @@ def _results(table: Mapping[str, Summary], records: Mapping[str, Records]) -> st
         for name in table
     ]  # fmt: skip
     return "\n\n".join(
-        [agent_metrics.markdown(table), marks(table), agent_metrics.grid(["Protocol", "Scenes", "Episodes", "Agents", "Seeds"], sizes)]
+        [tables.format_summaries(table), marks(table), markdown.format_table(["Protocol", "Scenes", "Episodes", "Agents", "Seeds"], sizes)]
     )
 
 
@@ -159,20 +162,20 @@ def marks(table: Mapping[str, Summary]) -> str:
     """What the marks behind intervals mean, those that occur."""
     used = {estimate.method for column in table.values() for estimate in column.values()}
     notes = ["n: agents that enter a number. Intervals: bootstrap over scenes."]
-    if agent_metrics.WILSON in used:
+    if statistics.WILSON in used:
         notes.append("†: Wilson score interval over agents, where a rate does not vary between scenes (all, none, or one scene only).")
-    if agent_metrics.NEWCOMBE in used:
+    if statistics.NEWCOMBE in used:
         notes.append("†: Newcombe's score interval over agents, where a difference does not vary between scenes.")
-    if agent_metrics.AGENTS in used:
+    if statistics.AGENTS in used:
         notes.append("‡: bootstrap over agents, where only one scene counts or a mean does not vary between scenes.")
-    if used & {agent_metrics.WILSON, agent_metrics.NEWCOMBE, agent_metrics.AGENTS}:
+    if used & {statistics.WILSON, statistics.NEWCOMBE, statistics.AGENTS}:
         notes.append("Marked intervals take the agents of a scene for independent, so they may be too narrow.")
     return " ".join(notes)
 
 
 def _comparison(name: str, other: str, summary: Mapping[str, Summary], records: Mapping[str, Records], *, bootstrap: int, seed: int) -> str:
     """Side by side with the paired difference."""
-    change = agent_metrics.difference(records[other], records[name], bootstrap=bootstrap, seed=seed)
+    change = statistics.difference(records[other], records[name], bootstrap=bootstrap, seed=seed)
     table = {other: summary[other], name: summary[name], "difference": change}
     gain = change["success_rate"]
     verdict = "cannot be told from chance"
@@ -180,9 +183,9 @@ def _comparison(name: str, other: str, summary: Mapping[str, Summary], records: 
         verdict = "is beyond what chance explains"
     lines = [
         f"### {name} against {other}",
-        f"Both drove the same scenes. The change of the success rate, {agent_metrics.text(gain, signed=True)}, {verdict}. "
+        f"Both drove the same scenes. The change of the success rate, {tables.format_estimate(gain, signed=True)}, {verdict}. "
         "Differences are in percentage points for rates; their intervals resample scenes in pairs.",
-        agent_metrics.markdown(table, signed=["difference"]),
+        tables.format_summaries(table, signed=["difference"]),
         marks({"difference": change}),
     ]
     return "\n\n".join(lines)
@@ -193,7 +196,7 @@ def _conditions(records: Records, name: str, columns: Sequence[str], *, bootstra
     metrics = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_time_to_goal_s")
     parts, seen = [], {}
     for column in columns:
-        table = agent_metrics.breakdown(records, column, bootstrap=bootstrap, seed=seed)
+        table = statistics.breakdown(records, column, bootstrap=bootstrap, seed=seed)
         if len(table) < 2:
             continue
         shown = list(table)
@@ -201,9 +204,9 @@ def _conditions(records: Records, name: str, columns: Sequence[str], *, bootstra
         if len(shown) > _GROUPS:
             shown = sorted(shown, key=lambda value: table[value]["success_rate"].value or 0.0)[:_GROUPS]
             note = f"The {_GROUPS} of {len(table)} with the lowest success rate."
-        rows = [[value, table[value]["success_rate"].count, *(agent_metrics.text(table[value][m]) for m in metrics)] for value in shown]
+        rows = [[value, table[value]["success_rate"].count, *(tables.format_estimate(table[value][m]) for m in metrics)] for value in shown]
         header = [column, "Agents", *(METRICS[metric].label for metric in metrics)]
-        parts += [f"### By {column} ({name})", *([note] if note else []), agent_metrics.grid(header, rows)]
+        parts += [f"### By {column} ({name})", *([note] if note else []), markdown.format_table(header, rows)]
         seen |= {f"{column}={value}": {metric: table[value][metric] for metric in metrics} for value in shown}
     return "\n\n".join([*parts, marks(seen)]) if parts else ""
 
@@ -212,11 +215,11 @@ def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Pat
     """How agents ended or failed, the worst of each kind, and a list of those that did not reach their goal cleanly."""
     parts = [f"### {name}"]
     if "failure" in records:
-        parts += [failures.table(records), failures.list_definitions(records, numbers), _worst(folder, name, records, drawn)]
+        parts += [failures.format_table(records), failures.format_definitions(records, numbers), _worst(folder, name, records, drawn)]
     else:
         result = plots.outcomes(records)
         counts = [[outcome, int(np.sum(result == outcome)), f"{100 * np.mean(result == outcome):.1f} %"] for outcome in plots.OUTCOMES]
-        parts.append(agent_metrics.grid(["Outcome", "Agents", "Share"], [row for row in counts if row[1]]))
+        parts.append(markdown.format_table(["Outcome", "Agents", "Share"], [row for row in counts if row[1]]))
     parts = [part for part in parts if part]
     rows = np.flatnonzero(~np.asarray(records["clean"], bool))
     if not len(rows):
@@ -232,16 +235,15 @@ def _failures(folder: Path, name: str, records: Records, drawn: Mapping[str, Pat
     header = ["Scene", "World", "Seed", "Agent", "What happened", "Driven, s", "Left to the goal, m", "Max DRAC, m/s²"]
     extent = f"all {len(rows)}" if len(rows) <= _FAILURES else f"{_FAILURES} of {len(rows)}, worst scenes first; the CSV has all"
     summary = f"<details><summary>Agents that did not arrive cleanly ({extent})</summary>"
-    return "\n\n".join([*parts, summary, agent_metrics.grid(header, lines), "</details>"])
+    return "\n\n".join([*parts, summary, markdown.format_table(header, lines), "</details>"])
 
 
 def _worst(folder: Path, name: str, records: Records, drawn: Mapping[str, Path]) -> str:
     """The pictures of the worst of each kind, folded."""
     if not drawn:
         return ""
-    shown = [
-        _show(folder, f"{failures.KINDS[kind].label}, {name}", drawn[kind]) for kind in failures.rank_failures(records) if kind in drawn
-    ]
+    labels = {kind: failures.FAILURE_TYPES[kind].label for kind in failures.rank_failures(records) if kind in drawn}
+    shown = [_show(folder, f"{label}, {name}", drawn[kind]) for kind, label in labels.items()]
     if "film" in drawn:
         shown.append(_show(folder, f"The worst of each kind, {name}; clocks start where the film does", drawn["film"]))
     return "\n\n".join([f"<details><summary>The worst of each kind, side by side ({name})</summary>", *shown, "</details>"])
@@ -251,7 +253,7 @@ def _story(records: Records, row: int) -> str:
     """An agent's events in words."""
     past_events = [MARKS[event].label for event in MARKS if records[event][row]]
     if "failure" in records:
-        kind = failures.KINDS[str(records["failure"][row])].label
+        kind = failures.FAILURE_TYPES[str(records["failure"][row])].label
         also = [event for event in past_events if event not in kind]
         return kind + (f"; also {', '.join(also)}" if also else "")
     return ", ".join(past_events) if past_events else "out of time"
@@ -274,8 +276,8 @@ def _setup(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     flat = flatten(config)
     rows = [[f"`{k}`", _shown(v)] for key in KEY_NUMBERS for k, v in flat.items() if k == key or k.startswith(key + ".")]
     parts = [
-        agent_metrics.grid(["Machine and software", ""], [[name, value] for name, value in versions.items()]) if versions else "",
-        agent_metrics.grid(["Setting", "Value"], rows) if rows else "",
+        markdown.format_table(["Machine and software", ""], [[name, value] for name, value in versions.items()]) if versions else "",
+        markdown.format_table(["Setting", "Value"], rows) if rows else "",
     ]
     return "\n\n".join(part for part in parts if part)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import episode_records, failures
-from scenefactory_jax.evaluation.failures import KINDS, Failure
+from scenefactory_jax.evaluation.failures import FAILURE_TYPES, Failure
 from scenefactory_jax.visualization.birds_eye import video
 from scenefactory_jax.visualization.birds_eye.failure_figures import Case, failures_figure
 from scenefactory_jax.visualization.report import plots
@@ -27,7 +27,7 @@ def draw(
         if failure.world not in worlds:
             worlds[failure.world] = episode_records.trajectory(recording, failure.world)
         met = failure.kind in ("at_fault", "struck")
-        return Case(failure, worlds[failure.world], int(records["hit"][failure.row]) if met else None)
+        return Case(failure, worlds[failure.world], int(records["collision_partner"][failure.row]) if met else None)
 
     paths = {}
     for kind, ranked in found.items():
@@ -46,7 +46,7 @@ def _film(case: Case, *, before_s: float) -> Trajectory:
     failure, whole = case.failure, case.trajectory
     middle, hz = failure.moment_s * whole.control_hz, whole.control_hz
     first, last = max(round(middle - before_s * hz), 0), round(middle + _AFTER_S * hz)
-    title = f"{KINDS[failure.kind].label}: car {failure.agent}, {whole.title}"
+    title = f"{FAILURE_TYPES[failure.kind].label}: car {failure.agent}, {whole.title}"
     return whole.clip(first, last)._replace(title=title)
 
 
@@ -55,8 +55,8 @@ def write(out: Path, records: Mapping[str, episode_records.Records], pictures: M
     found = {label: failures.as_json(rows) for label, rows in records.items()}
     for label, paths in pictures.items():
         for kind, path in paths.items():
-            if kind in found[label]["kinds"]:
-                found[label]["kinds"][kind]["picture"] = path.name
+            if kind in found[label]["types"]:
+                found[label]["types"][kind]["picture"] = path.name
     path = out / FILE
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return path

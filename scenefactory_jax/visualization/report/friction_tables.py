@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.core.instantiate import check_range, instantiate
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import plots
 from scenefactory_jax.weather import friction as model
 
@@ -88,7 +88,7 @@ def table(found: Mapping[str, Any]) -> str:
     films = found["reference"]["films_mm"]
     cells = {name: zip(row["static"], row["dynamic"], strict=True) for name, row in found["table"].items()}
     rows = [[name, *(f"{static:.3f} ({dynamic:.3f})" for static, dynamic in pairs)] for name, pairs in cells.items()]
-    return agent_metrics.grid(["Surface", *(f"{film:g}" for film in films)], rows)
+    return markdown.format_table(["Surface", *(f"{film:g}" for film in films)], rows)
 
 
 def compare_with_published(found: Mapping[str, Any]) -> str:
@@ -99,7 +99,7 @@ def compare_with_published(found: Mapping[str, Any]) -> str:
         [name, *(f"{found['table'][name]['static'][at]:.3f} / {row[film]:.3f}" for at, film in shown)]
         for name, row in PUBLISHED.items() if name in found["table"]
     ]  # fmt: skip
-    return agent_metrics.grid(["Here / published", *(f"{film:g}" for _, film in shown)], rows) if rows and shown else ""
+    return markdown.format_table(["Here / published", *(f"{film:g}" for _, film in shown)], rows) if rows and shown else ""
 
 
 def figure(found: Mapping[str, Any]) -> Figure:

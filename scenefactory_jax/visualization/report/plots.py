@@ -12,8 +12,10 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
-from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.evaluation.agent_metrics import METRICS, SHARE, Estimate, Records
+from scenefactory_jax.evaluation.metrics import agent_metrics
+from scenefactory_jax.evaluation.metrics.agent_metrics import FRACTION, METRICS
+from scenefactory_jax.evaluation.records import Records, check_records
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.birds_eye.drawing import MARKS
 from scenefactory_jax.visualization.web.term_styles import DASHES, HATCHES, TermLook, term_looks
 
@@ -146,7 +148,7 @@ def comparison_figure(
         PlotError: no metric has a value in both.
     """
     shown = [name for name in METRICS if name in before and name in after and None not in (before[name].value, after[name].value)]
-    rates, others = [name for name in shown if METRICS[name].unit == SHARE], [name for name in shown if METRICS[name].unit != SHARE]
+    rates, others = [name for name in shown if METRICS[name].unit == FRACTION], [name for name in shown if METRICS[name].unit != FRACTION]
     if not shown:
         raise PlotError("comparison: the two summaries have no metric with a value in common")
     with matplotlib.rc_context(STYLE):
@@ -192,7 +194,7 @@ def outcome_figure(records: Records, *, most: int = 30) -> Figure:
     Raises:
         RecordsError: see `tables.check`.
     """
-    agent_metrics.check(records)
+    check_records(records)
     result = outcomes(records)
     scenes, cluster = np.unique(records["scene"], return_inverse=True)
     counts = np.stack([np.bincount(cluster, result == name, minlength=len(scenes)) for name in OUTCOMES], axis=1)
@@ -228,7 +230,7 @@ def safety_figure(table: Mapping[str, Records]) -> Figure:
             max((float(np.max(records["max_drac"], initial=0)) for records in table.values()), default=0.0), 2 * agent_metrics.HIGH_DRAC
         )
         for row, (name, records) in enumerate(table.items()):
-            agent_metrics.check(records)
+            check_records(records)
             colour, agents = COLOURS[row % len(COLOURS)], len(records["scene"])
             ttc = records["min_ttc_s"][np.isfinite(records["min_ttc_s"])]
             for axes, values, top in ((first, records["max_drac"], ceiling), (second, np.minimum(ttc, 10.0), 10.0)):
@@ -358,7 +360,7 @@ def _draw_pairs(axes: Axes, pairs: Sequence[tuple[Estimate, Estimate]], names: t
         look = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 2.5, "label": names[side]}
         axes.errorbar(values, rows, xerr=[values - low, high - values], **look)
         for value, row, top in zip(values, rows, high, strict=True):
-            number = f"{100 * value:.1f} %" if pairs[0][0].unit == SHARE else f"{value:.2f}"
+            number = f"{100 * value:.1f} %" if pairs[0][0].unit == FRACTION else f"{value:.2f}"
             axes.annotate(number, (top, row), xytext=(5, 0), textcoords="offset points", va="center", fontsize=7, color=colour)
 
 

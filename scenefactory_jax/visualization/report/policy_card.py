@@ -3,20 +3,22 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.visualization.report import evaluation_report
+from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.metrics import agent_metrics
+from scenefactory_jax.visualization.report import evaluation_report, tables
 
 SHOWN = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate")
 
 
-def markdown(
+def format_card(
     name: str,
     about: str | None,
     *,
     config: Mapping[str, Any],
     versions: Mapping[str, str],
     training: Sequence[Mapping[str, float]],
-    judged: Mapping[str, Mapping[str, Mapping[str, agent_metrics.Estimate]]],
+    judged: Mapping[str, Mapping[str, Mapping[str, statistics.Estimate]]],
     episodes: Mapping[str, Mapping[str, str]],
     outside: Sequence[str],
 ) -> str:
@@ -32,7 +34,7 @@ def markdown(
         episodes: what was driven -> what decided its episodes, "Starts" -> "as recorded, from rest".
         outside: functions that the config names and the package does not have.
     """
-    parts = [f"# {name}", about or "", "## Training", agent_metrics.grid(["", ""], _training(config, versions, training))]
+    parts = [f"# {name}", about or "", "## Training", markdown.format_table(["", ""], _training(config, versions, training))]
     if judged:
         parts += ["## Scores", *_scores(judged), _episodes(episodes)]
     learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
@@ -70,12 +72,12 @@ def _episodes(episodes: Mapping[str, Mapping[str, str]]) -> str:
     return "\n".join(f"- **{what}**: {words}." for what, words in told.items())
 
 
-def _scores(judged: Mapping[str, Mapping[str, Mapping[str, agent_metrics.Estimate]]]) -> list[str]:
+def _scores(judged: Mapping[str, Mapping[str, Mapping[str, statistics.Estimate]]]) -> list[str]:
     """A table, what its marks mean, and what the protocols are."""
     placed = {(what, protocol): summary for what, protocols in judged.items() for protocol, summary in protocols.items()}
     found = {place: {metric: summary[metric] for metric in SHOWN} for place, summary in placed.items()}
-    rows = [[*place, shown["success_rate"].count, *map(agent_metrics.text, shown.values())] for place, shown in found.items()]
-    table = agent_metrics.grid(["Driven", "Protocol", "n", *(agent_metrics.METRICS[metric].label for metric in SHOWN)], rows)
+    rows = [[*place, shown["success_rate"].count, *map(tables.format_estimate, shown.values())] for place, shown in found.items()]
+    table = markdown.format_table(["Driven", "Protocol", "n", *(agent_metrics.METRICS[metric].label for metric in SHOWN)], rows)
     rules = [
         f"- **{name}**: {text}." for name, text in evaluation_report.PROTOCOLS.items() if any(name == protocol for _, protocol in found)
     ]

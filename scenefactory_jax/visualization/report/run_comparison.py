@@ -9,9 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.evaluation.agent_metrics import METRICS, Estimate
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.core import markdown
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.statistics import Estimate
+from scenefactory_jax.visualization.report import plots, tables
 
 Result = Mapping[str, Any]
 INTERVALS = "Intervals resample seeds of training, scenes and agents; those of a single seed hold scenes and agents alone."
@@ -29,7 +30,7 @@ def write(folder: Path, result: Result) -> Path:
     lines = ["# Runs compared", f"`{result['command']}`", words, table(result), f"![Learning curves]({picture.name})"]
     for name in dict.fromkeys(name for group in result["groups"].values() for name in group["evaluated"]):
         shown = {label: _summary(group["evaluated"][name]) for label, group in result["groups"].items() if name in group["evaluated"]}
-        lines += [f"## Evaluation at the end, {name}", agent_metrics.markdown(shown), INTERVALS]
+        lines += [f"## Evaluation at the end, {name}", tables.format_summaries(shown), INTERVALS]
     path = folder / "compare.md"
     path.write_text("\n\n".join(lines) + "\n", encoding="utf-8")
     return path
@@ -44,7 +45,7 @@ def table(result: Result) -> str:
         spent = [_spread(group["minutes"], ".1f"), _spread(group["casps"], ",.0f")]
         ends = [_spread(group["last"][name], ".3g") for name in metrics]
         rows.append([label, len(group["seeds"]), group["iterations"], steps, *spent, *ends])
-    return agent_metrics.grid(["Runs", "Seeds", "Iterations", "Agent steps", "Minutes", "Steps/s", *metrics], rows)
+    return markdown.format_table(["Runs", "Seeds", "Iterations", "Agent steps", "Minutes", "Steps/s", *metrics], rows)
 
 
 def _spread(values: list[float], form: str) -> str:

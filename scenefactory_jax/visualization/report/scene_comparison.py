@@ -7,9 +7,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.data.curation import distribution_distance
 from scenefactory_jax.data.curation.distribution_distance import Samples
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import plots
 
 
@@ -25,7 +25,7 @@ def table(reference: str, sets: Mapping[str, Samples]) -> str:
         shown = [text for one in apart for text in ((f"{one.ks:.2f}", f"{one.wasserstein:.2f}") if one else ("", ""))]
         rows.append([quantity.label, *middle, *shown])
     means = [f"{distribution_distance.mean_distance(found[other]):.2f}" if i == 0 else "" for other in others for i in range(2)]
-    return agent_metrics.grid(header, [*rows, ["mean", *("" for _ in sets), *means]])
+    return markdown.format_table(header, [*rows, ["mean", *("" for _ in sets), *means]])
 
 
 def figure(reference: str, sets: Mapping[str, Samples]) -> Figure:

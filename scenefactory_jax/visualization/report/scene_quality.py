@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
+from scenefactory_jax.core import markdown
 from scenefactory_jax.core.raw_scene import RawScene, Track
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES
 from scenefactory_jax.data.curation.quality_gate import Finding
-from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.birds_eye.drawing import Colour
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING
@@ -85,9 +85,9 @@ def write(
         "# Quality of scenes",
         f"`{command}`",
         f"{scenes} scenes judged by {len(counts)} rules: {refused} refused, {dropped} objects left out of the rest.",
-        agent_metrics.grid(["Rule", "Findings", "Scenes", "Objects", "Share of scenes", "Effect"], rows),
+        markdown.format_table(["Rule", "Findings", "Scenes", "Objects", "Share of scenes", "Effect"], rows),
         "## Thresholds",
-        agent_metrics.grid(["Rule", "Numbers"], numbers),
+        markdown.format_table(["Rule", "Numbers"], numbers),
         "## Examples",
         "Red: the place, and the lanes or edges in question. Blue: the vehicle in question and its logged path. Grey boxes: other vehicles "
         "at that step. Thin grey outlines: driveways.",

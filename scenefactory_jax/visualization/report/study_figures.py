@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter, PercentFormatter
 
-from scenefactory_jax.evaluation import hierarchical_bootstrap
-from scenefactory_jax.evaluation.agent_metrics import Estimate
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.visualization.report import plots, run_comparison
 from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 
@@ -98,7 +98,7 @@ def _bars(rows: Mapping[str, Mapping[str, Estimate]], colours: Mapping[str, str]
             for place, (label, row) in enumerate(rows.items()):
                 _bar(axes, place, row[name], colours[label], top)
             axes.set(
-                title=hierarchical_bootstrap.labels([name])[name].label,
+                title=METRICS[name].label,
                 xlim=(0, 1.2 * top),
                 xticks=[0, 0.5, 1] if top == 1.0 else [0, round(top, 2)],
             )
@@ -152,7 +152,7 @@ def _heat_maps(cells: Mapping[tuple[str, str], Mapping[str, Estimate]], rows: Se
                     axes.text(c, r, f"{100 * one.value:.1f}{ends}", ha="center", va="center", fontsize=7.5, color=ink)
             axes.imshow(values, vmin=0, vmax=top, cmap="Reds" if name == "collision_rate" else "Blues", aspect="auto")
             axes.set_yticks(range(len(rows)), rows)
-            axes.set_title(hierarchical_bootstrap.labels([name])[name].label)
+            axes.set_title(METRICS[name].label)
             for side in axes.spines.values():
                 side.set_visible(False)
         panels[-1].set_xticks(range(len(columns)), [column.replace(", ", ",\n") for column in columns], rotation=0)
@@ -184,7 +184,7 @@ def _forest(shown: Sequence[Mapping[str, Any]]) -> Figure:
                 axes.plot([100 * low, 100 * high], [place, place], color=COLOURS[0] if sure else "#888888", linewidth=2)
                 axes.plot(100 * change.value, place, "o", color=COLOURS[0] if sure else "#888888", markersize=5)
             axes.axvline(0, color="#222222", linewidth=1)
-            axes.set(title=hierarchical_bootstrap.labels([name])[name].label, xlabel="points")
+            axes.set(title=METRICS[name].label, xlabel="points")
         pairs = [f"{one['before']} → {one['after']}" + (f": {one['condition']}" if conditions else "") for one in shown]
         panels[0].set_yticks(range(len(shown)), pairs)
         panels[0].invert_yaxis()
@@ -234,7 +234,7 @@ def _line(axes: Axes, found: Sequence[tuple[float | int, Mapping[str, Estimate]]
     for colour, name in zip(_colours(len(names)), names, strict=True):
         told = [(x, row[name]) for x, row in found if row[name].value is not None]
         x, (values, low, high) = [one[0] for one in told], plots.intervals([one[1] for one in told])
-        axes.plot(x, values, color=colour, marker="o", markersize=4, label=hierarchical_bootstrap.labels([name])[name].label)
+        axes.plot(x, values, color=colour, marker="o", markersize=4, label=METRICS[name].label)
         axes.fill_between(x, low, high, color=colour, alpha=0.13, linewidth=0)
     axes.set_xscale("log", base=2)
     axes.set_xticks([x for x, _ in found], [f"{x:g}" for x, _ in found])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.core import markdown
 from scenefactory_jax.visualization.report import plots
 from scenefactory_jax.visualization.report import sysid_figures as figures
 from scenefactory_jax.visualization.report.verdicts import Verdict, table
@@ -82,7 +82,7 @@ def _stages(result: Result) -> list[str]:
         "Losses are means over a stage's manoeuvres and compare within a column only: the published teacher was another one, and its yaw "
         "rates were in degrees against radians. The first stage's seconds hold the compilation."
     )
-    return [words, agent_metrics.grid(header, rows)]
+    return [words, markdown.format_table(header, rows)]
 
 
 def _parameters(result: Result) -> list[str]:
@@ -99,7 +99,7 @@ def _parameters(result: Result) -> list[str]:
         "they say what these manoeuvres tell, not what is true of a real car."
     )
     header = ["Parameter", "Range", "Before", "Fitted", "Standard deviation", "Most correlated with", "At a bound"]
-    return [words, agent_metrics.grid(header, rows)]
+    return [words, markdown.format_table(header, rows)]
 
 
 def _families(result: Result, suite: str) -> list[str]:
@@ -115,7 +115,7 @@ def _families(result: Result, suite: str) -> list[str]:
             cells += [_median(np.array(known[key], float)[rows_of]) for known in cars.values()]
         rows.append(cells)
     header = ["Family", "n", *(f"{what}: {name}" for what in MEASURES.values() for name in cars)]
-    return [f"Medians, {suite}. Stopping distances are absolute differences.", agent_metrics.grid(header, rows)]
+    return [f"Medians, {suite}. Stopping distances are absolute differences.", markdown.format_table(header, rows)]
 
 
 def _misses(result: Result, targets: Mapping[str, float]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.core import markdown
 from scenefactory_jax.visualization.report import evaluation_report, plots
 
 Row = Mapping[str, Any]
@@ -76,7 +76,7 @@ def compare_with_published(result: Mapping[str, Any]) -> str:
             rows.append([f"{row['worlds']:,} x {row['slots']}", ours, f"{theirs:,}", f"{row['per_s'] / theirs:.1f}"])
     one = f"1 x {result['versions']['device'].split(' x ')[-1]}"  # there may have been more of them
     header = ["Worlds x cars", f"Steps/s on {one}", f"Published ({PUBLISHED_ON})", "Ratio"]
-    return agent_metrics.grid(header, rows) if rows else ""
+    return markdown.format_table(header, rows) if rows else ""
 
 
 def split(result: Mapping[str, Any]) -> str:
@@ -108,7 +108,7 @@ def over_devices(result: Mapping[str, Any]) -> str:
     one = alone[0]
     rows = [row for row in _timed(result) if row["devices"] > 1 and row["scope"] == one["scope"]]
     cells = [[row["name"], row["devices"], f"{row['slots_per_s']:,.0f}", f"{row['slots_per_s'] / one['slots_per_s']:.2f}"] for row in rows]
-    return agent_metrics.grid(["Configuration", "Devices", "Slots/s", f"Beside `{one['name']}`"], cells) if cells else ""
+    return markdown.format_table(["Configuration", "Devices", "Slots/s", f"Beside `{one['name']}`"], cells) if cells else ""
 
 
 def streaming_table(result: Mapping[str, Any]) -> str:
@@ -126,7 +126,7 @@ def streaming_table(result: Mapping[str, Any]) -> str:
                      f"{stream['cut']:,} and {stream['refused']:,}"])  # fmt: skip
     header = ["Configuration", "Worlds an iteration", "Scenes/s", "Steps/s", "Slots/s", "Lost", "Waited, ms an iteration", "Scenes drawn",
               "Cut and left out"]  # fmt: skip
-    return agent_metrics.grid(header, rows) if rows else ""
+    return markdown.format_table(header, rows) if rows else ""
 
 
 def _timed(result: Mapping[str, Any]) -> list[Row]:
@@ -146,7 +146,7 @@ def scaling(result: Mapping[str, Any]) -> str:
         worlds, ms, memory = row["worlds"], row["ms_a_control_step"], row["memory_gib"]
         each = f"{1e3 * ms / worlds:.1f}", f"{1024 * memory / worlds:.1f}"
         rows.append([f"{worlds:,} x {row['slots']}", f"{ms:.2f}", each[0], f"{memory:.1f}", each[1]])
-    table = agent_metrics.grid(["Worlds x slots", "ms a control step", "us a world", "Memory, GiB", "MiB a world"], rows)
+    table = markdown.format_table(["Worlds x slots", "ms a control step", "us a world", "Memory, GiB", "MiB a world"], rows)
     large = [f"{row['worlds']:,} x {row['slots']} ({row['scope']}) {TOO_LARGE}." for row in result["rows"] if not row["fits"]]
     return "\n\n".join([table, *large])
 
@@ -194,7 +194,7 @@ def rows_of(rows: list[Row]) -> str:
     """All rows as a table."""
     header = ["Configuration", "Scope", "Worlds x slots", "Devices", "Horizon", "Steps/s", "Slots/s", "Spawned", "ms a control step",
               "Memory, GiB", "Compile, s"]  # fmt: skip
-    return agent_metrics.grid(header, [_cells(row) for row in rows])
+    return markdown.format_table(header, [_cells(row) for row in rows])
 
 
 def _cells(row: Row) -> list[str]:
@@ -214,4 +214,4 @@ def phases_of(row: Row) -> str:
     """A row's phases as a table; they add up to its control step."""
     whole = row["ms_a_control_step"]
     parts = [[name, f"{value:.3f}", f"{100 * value / whole:.0f} %"] for name, value in row["phases_ms"].items()]
-    return agent_metrics.grid(["Phase", "ms a control step", "Share"], [*parts, ["whole", f"{whole:.3f}", "100 %"]])
+    return markdown.format_table(["Phase", "ms a control step", "Share"], [*parts, ["whole", f"{whole:.3f}", "100 %"]])

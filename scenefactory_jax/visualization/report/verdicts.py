@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.core import markdown
 
 
 class Verdict(NamedTuple):
@@ -16,7 +16,7 @@ class Verdict(NamedTuple):
 
 def table(verdicts: list[Verdict]) -> str:
     """Formats verdicts as a Markdown table."""
-    return agent_metrics.grid(
+    return markdown.format_table(
         ["What", "Target", "Measured", "Met"], [[v.what, v.target, v.measured, "yes" if v.met else "**no**"] for v in verdicts]
     )
 

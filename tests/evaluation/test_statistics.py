@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
-from scenefactory_jax.evaluation.agent_metrics import RecordsError
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import COLUMNS, RecordsError
+from scenefactory_jax.visualization.report import tables
 
 
 def records(reached, **columns):
@@ -13,14 +14,14 @@ def records(reached, **columns):
     reached = np.asarray(reached, bool)
     scenes, agents = reached.shape
     flat = reached.ravel()
-    rows = {name: np.zeros(flat.size, kind if kind is not str else "<U8") for name, kind in agent_metrics.COLUMNS.items()}
+    rows = {name: np.zeros(flat.size, kind if kind is not str else "<U8") for name, kind in COLUMNS.items()}
     rows |= {"scene": np.repeat([f"s{i}" for i in range(scenes)], agents), "world": np.repeat(np.arange(scenes), agents)}
     rows |= {"agent": np.tile(np.arange(agents), scenes), "goal_reached": flat, "clean": flat}
     return rows | {name: np.asarray(value).ravel() for name, value in columns.items()}
 
 
 def success(runs, bootstrap=4000):
-    return hierarchical_bootstrap.summarise(runs, bootstrap=bootstrap, seed=0)["success_rate"]
+    return statistics.summarise_runs(runs, bootstrap=bootstrap, seed=0)["success_rate"]
 
 
 def width(estimate):
@@ -30,7 +31,7 @@ def width(estimate):
 def test_seeds_that_disagree_widen_the_interval_to_the_seeds():
     """Two seeds, one reaches everything: a resample holds none, one or two of it, with chances 1/4, 1/2, 1/4."""
     found = success({0: records(np.ones((5, 3))), 1: records(np.zeros((5, 3)))})
-    assert (found.value, found.low, found.high, found.count, found.method) == (0.5, 0.0, 1.0, 30, agent_metrics.LEVELS)
+    assert (found.value, found.low, found.high, found.count, found.method) == (0.5, 0.0, 1.0, 30, statistics.LEVELS)
 
 
 def test_scenes_alone_give_the_binomial_of_scenes():
@@ -51,7 +52,7 @@ def test_all_three_levels_agree_with_loops():
     truth = [rng.random((6, 5)) < rate for rate in (0.3, 0.6, 0.8)]
     drac = [rng.random((6, 5)) * 4 for _ in truth]
     runs = {seed: records(one, max_drac=other) for seed, (one, other) in enumerate(zip(truth, drac, strict=True))}
-    found = hierarchical_bootstrap.summarise(runs, bootstrap=4000, seed=1)
+    found = statistics.summarise_runs(runs, bootstrap=4000, seed=1)
     draws = []
     for _ in range(4000):
         seeds, scenes, picked = rng.integers(0, 3, 3), rng.integers(0, 6, 6), rng.integers(0, 5, (6, 5))
@@ -68,11 +69,11 @@ def test_one_run_has_the_values_of_its_own_tables():
     one = records(rng.random((8, 6)) < 0.7, max_drac=rng.random((8, 6)), min_ttc_s=ttc, mean_ttc_s=ttc, has_ttc=ttc < 6, time_s=ttc)
     keep = rng.random(48) < 0.6  # scenes of different sizes
     one = {name: column[keep] for name, column in one.items()}
-    mine, own = hierarchical_bootstrap.summarise({0: one}, bootstrap=50, seed=0), agent_metrics.summarise(one, bootstrap=50, seed=0)
+    mine, own = statistics.summarise_runs({0: one}, bootstrap=50, seed=0), statistics.summarise(one, bootstrap=50, seed=0)
     for name, estimate in own.items():
         assert mine[name].value == pytest.approx(estimate.value) and mine[name].count == estimate.count
-    assert hierarchical_bootstrap.per_seed({0: one})[0]["success_rate"] == pytest.approx(own["success_rate"].value)
-    assert mine["least_ttc_s"].value == pytest.approx(np.minimum(one["min_ttc_s"], 10)[one["has_ttc"]].mean())
+    assert statistics.summarise_each_run({0: one})[0]["success_rate"] == pytest.approx(own["success_rate"].value)
+    assert mine["min_ttc_s"].value == pytest.approx(np.minimum(one["min_ttc_s"], 10)[one["has_ttc"]].mean())
 
 
 def test_a_paired_difference_knows_more_than_two_intervals():
@@ -81,34 +82,34 @@ def test_a_paired_difference_knows_more_than_two_intervals():
     after = before.copy()
     after[:, 0] = True
     runs = lambda table: {0: records(table), 1: records(table)}  # noqa: E731
-    change = hierarchical_bootstrap.difference(runs(before), runs(after), bootstrap=2000, seed=0)["success_rate"]
+    change = statistics.difference_of_runs(runs(before), runs(after), bootstrap=2000, seed=0)["success_rate"]
     apart = success(runs(before))
     assert change.value == pytest.approx(np.mean(after) - np.mean(before)) and width(change) < 0.5 * width(apart)
     assert change.low is not None and change.low >= 0.0
-    same = hierarchical_bootstrap.difference(runs(before), runs(before), bootstrap=100, seed=0)["success_rate"]
-    assert same.value == 0.0 and same.method == agent_metrics.NEWCOMBE and [same.low] == pytest.approx([-width(same) / 2])
+    same = statistics.difference_of_runs(runs(before), runs(before), bootstrap=100, seed=0)["success_rate"]
+    assert same.value == 0.0 and same.method == statistics.NEWCOMBE and [same.low] == pytest.approx([-width(same) / 2])
 
 
 def test_a_rate_of_all_takes_the_score_interval_of_distinct_agents():
     found = success({seed: records(np.ones((4, 5))) for seed in range(3)})
-    assert found.value == 1.0 and found.method == agent_metrics.WILSON and (found.low, found.high) == agent_metrics.wilson(1.0, 20)
+    assert found.value == 1.0 and found.method == statistics.WILSON and (found.low, found.high) == statistics.wilson(1.0, 20)
 
 
 def test_a_mean_that_does_not_vary_has_no_interval():
-    found = hierarchical_bootstrap.summarise(
-        {0: records(np.ones((4, 5)), friction_utilization=np.full((4, 5), 1.42))}, bootstrap=20, seed=0
-    )["friction_utilization"]
-    assert agent_metrics.text(found) == "142.0 %" and found.method == agent_metrics.NONE
+    found = statistics.summarise_runs({0: records(np.ones((4, 5)), friction_utilization=np.full((4, 5), 1.42))}, bootstrap=20, seed=0)[
+        "friction_utilization"
+    ]
+    assert tables.format_estimate(found) == "142.0 %" and found.method == statistics.NONE
 
 
 def test_agents_with_nobody_ahead_have_no_stopping_margin():
     one = records(np.ones((2, 2)), stopping_margin_m=[[1.0, np.inf], [3.0, np.inf]])
-    found = hierarchical_bootstrap.summarise({0: one}, bootstrap=10, seed=0)["stopping_margin_m"]
+    found = statistics.summarise_runs({0: one}, bootstrap=10, seed=0)["stopping_margin_m"]
     assert (found.value, found.count) == (2.0, 2)
 
 
 def test_what_cannot_be_compared_is_named():
-    with pytest.raises(RecordsError, match="no run"):
-        hierarchical_bootstrap.summarise({}, bootstrap=10, seed=0)
-    with pytest.raises(RecordsError, match="'s2' is in only one of the two"):
-        hierarchical_bootstrap.difference({0: records(np.ones((2, 2)))}, {0: records(np.ones((3, 2)))}, bootstrap=10, seed=0)
+    with pytest.raises(RecordsError, match="expected one or more runs"):
+        statistics.summarise_runs({}, bootstrap=10, seed=0)
+    with pytest.raises(RecordsError, match="'s2' is in one of the two"):
+        statistics.difference_of_runs({0: records(np.ones((2, 2)))}, {0: records(np.ones((3, 2)))}, bootstrap=10, seed=0)

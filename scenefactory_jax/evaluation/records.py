@@ -1,0 +1,120 @@
+"""Records of an evaluation: one row for every spawned agent and episode, in memory and as files."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefactory_jax.core import result_file, text_file
+
+Records = Mapping[str, np.ndarray]  # column -> one value for every agent
+RESULT = "evaluation.json"  # what was evaluated, beside the records
+FILES = (RESULT, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
+FILES += ("trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
+EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")
+COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown
+    "scene": str, "world": int, "seed": int, "agent": int, **dict.fromkeys(EVENTS, bool), "clean": bool,
+    "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
+    "max_drac": float, "min_ttc_s": float, "mean_ttc_s": float, "has_ttc": bool, "mean_speed": float, "max_contact_force_n": float,
+    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "friction_utilization": float,
+    "stopping_margin_m": float,
+}  # fmt: skip
+
+
+class RecordsError(ValueError):
+    """Records that no table can be made of; the message names the column or file and what would be valid."""
+
+
+def check_records(records: Records) -> None:
+    """Refuses records without rows, without a column of `COLUMNS`, or with columns of different lengths.
+
+    Raises:
+        RecordsError: naming the column.
+    """
+    for name in COLUMNS:
+        if name not in records:
+            raise RecordsError(f"records.{name}: column missing; expected {', '.join(COLUMNS)}")
+    rows = len(records["scene"])
+    for name, column in records.items():
+        if len(column) != rows:
+            raise RecordsError(f"records.{name}: expected {rows} rows, as records.scene has, got {len(column)}")
+    if rows == 0:
+        raise RecordsError("records: expected one or more rows, got 0; the evaluation spawned no agent")
+
+
+def select_rows(records: Records, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the rows that a boolean mask or an index array selects."""
+    return {name: np.asarray(column)[rows] for name, column in records.items()}
+
+
+def write_records(path: Path, records: Records) -> None:
+    """Writes records as CSV (`.csv` or `.csv.xz`), one row for every agent; each number reads back to the same value.
+
+    Raises:
+        RecordsError: see `check_records`.
+    """
+    check_records(records)
+    columns = [np.asarray(column).tolist() for column in records.values()]
+    with text_file.open_text(path, "w") as file:
+        writer = csv.writer(file)
+        writer.writerow(records)
+        writer.writerows(zip(*columns, strict=True))
+
+
+def read_records(path: Path) -> dict[str, np.ndarray]:
+    """Reads records that `write_records` wrote. Columns outside `COLUMNS` become int, float, bool or str: the first that fits all cells.
+
+    Raises:
+        RecordsError: no such file, no rows, a ragged row, or a cell that does not fit its column.
+    """
+    if not path.is_file():
+        raise RecordsError(f"{path}: file not found; expected the CSV of an evaluation")
+    with text_file.open_text(path, "r") as file:
+        names, *rows = list(csv.reader(file)) or [[]]
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(names):
+            raise RecordsError(f"{path}:{number}: expected {len(names)} cells, as in the header, got {len(row)}")
+    records = {}
+    for index, name in enumerate(names):
+        cells = [row[index] for row in rows]
+        types = [COLUMNS[name]] if name in COLUMNS else [int, float, bool, str]
+        column = next((c for c in (_parse(cells, kind) for kind in types) if c is not None), None)
+        if column is None:
+            raise RecordsError(f"{path}: column {name!r}: expected cells of type {types[0].__name__}")
+        records[name] = column
+    check_records(records)
+    return records
+
+
+def _parse(cells: list[str], kind: type) -> np.ndarray | None:
+    """The cells as one type; None: one does not fit."""
+    if kind is bool:
+        return np.array([cell == "True" for cell in cells]) if all(cell in ("True", "False") for cell in cells) else None
+    try:
+        return np.array([kind(cell) for cell in cells], dtype=kind)
+    except ValueError:
+        return None
+
+
+def begin_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Notes what is evaluated, and removes the files of an earlier evaluation from the folder."""
+    for file in [file for pattern in FILES for file in folder.glob(pattern)]:
+        file.unlink()
+    result_file.write(folder / RESULT, settings, digits=None)
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Reads what `begin_folder` noted; of a folder without an evaluation, no scenes and no overrides."""
+    return result_file.read(folder / RESULT) if (folder / RESULT).is_file() else {"scenes": None, "overrides": []}
+
+
+def read_folder(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none.
+
+    Raises:
+        RecordsError: see `read_records`.
+    """
+    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
+    return {name: read_records(path) for name, path in files.items() if not name.endswith("-untrained")}

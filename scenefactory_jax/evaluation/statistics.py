@@ -1,0 +1,282 @@
+"""Estimates of metrics with 95 % intervals, of one run or of several runs that differ in the seed of their training.
+
+Agents of one scene interact and share a road, so they are not independent samples: intervals resample whole scenes. Over several runs each
+resample draws seeds with replacement, scenes with replacement (the same for all seeds), and agents of each drawn scene with replacement
+(the same for all seeds). The interval of one run measures how well one set of weights is known, that of several how well their recipe is.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS, Metric
+from scenefactory_jax.evaluation.records import Records, RecordsError, check_records, select_rows
+
+Runs = Mapping[int, Records]  # seed of training -> records
+CHUNK = 2_000_000  # numbers of one chunk of resamples
+SCENES, LEVELS = "scene bootstrap", "seed, scene and agent bootstrap"  # methods of intervals
+WILSON, AGENTS, NEWCOMBE, NONE = "Wilson", "agent bootstrap", "Newcombe", "none"
+
+
+class Estimate(NamedTuple):
+    """A number with its 95 % interval.
+
+    `value` is None when no agent counts, `low` and `high` are None when nothing varies. `count` is the number of agents that count,
+    `method` the method of the interval.
+    """
+
+    value: float | None
+    low: float | None
+    high: float | None
+    count: int
+    unit: str
+    method: str
+
+
+class Table(NamedTuple):
+    """Metrics of all runs by seed and agent. An agent is a scene, a world (a scene may have two), a seed of the episode and a slot."""
+
+    sums: Float[np.ndarray, "S U M"]  # value of each metric, 0 where the agent does not count
+    counts: Float[np.ndarray, "S U M"]  # 1 where the agent counts, 0 where it does not or the seed has no such agent
+    scene: Int[np.ndarray, " U"]  # ascending
+    world: Int[np.ndarray, " U"]  # ascending
+
+
+def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    """Estimates every metric of one run.
+
+    Intervals are percentiles of a bootstrap over scenes. If nothing varies between resamples (one scene counts, or all agents have the same
+    value), a rate takes the Wilson score interval over agents, a mean a bootstrap over agents, or none if agents do not vary either. Both
+    treat the agents of a scene as independent, so they may be too narrow.
+
+    Args:
+        bootstrap: number of resamples.
+        seed: of the resampling.
+
+    Raises:
+        RecordsError: see `check_records`; or `bootstrap` is not positive.
+    """
+    found = _summarise({0: records}, agents=False, bootstrap=bootstrap, seed=seed)
+    for name, estimate in found.items():
+        if estimate.method == NONE and estimate.count:
+            values = np.asarray(METRICS[name].value(records), float)[np.asarray(METRICS[name].counted(records), bool)]
+            draws = np.random.default_rng(seed).multinomial(len(values), np.full(len(values), 1 / len(values)), size=bootstrap)
+            low, high = _percentiles(draws @ values / len(values))
+            if _varies(low, high):
+                found[name] = estimate._replace(low=low, high=high, method=AGENTS)
+    return found
+
+
+def summarise_runs(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    """Estimates every metric over several runs with equal weights; a rate that does not vary takes Wilson's interval, a mean none.
+
+    Raises:
+        RecordsError: no runs; or see `summarise`.
+    """
+    return _summarise(runs, agents=True, bootstrap=bootstrap, seed=seed)
+
+
+def summarise_each_run(runs: Runs) -> dict[int, dict[str, float | None]]:
+    """Computes the value of every metric for each run."""
+    found = {}
+    for seed, records in runs.items():
+        (table,) = _tabulate([{seed: records}])
+        values = _ratios(table, *_ones(table))[0]
+        found[seed] = {name: float(value) if np.isfinite(value) else None for name, value in zip(METRICS, values, strict=True)}
+    return found
+
+
+def difference(before: Records, after: Records, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    """Estimates `after` minus `before` for every metric of two runs on the same scenes; each resample draws scenes once for both.
+
+    A difference of rates that does not vary takes Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, method 10); one of
+    means has none if agents of one scene alone count. `count` is the smaller of the two counts.
+
+    Raises:
+        RecordsError: see `summarise`; or the two have different scenes.
+    """
+    return _difference({0: before}, {0: after}, agents=False, bootstrap=bootstrap, seed=seed)
+
+
+def difference_of_runs(before: Runs, after: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    """As `difference`, over several runs: each resample draws scenes and agents once for both, and seeds too if both have the same."""
+    return _difference(before, after, agents=True, bootstrap=bootstrap, seed=seed)
+
+
+def breakdown(records: Records, column: str, *, bootstrap: int, seed: int) -> dict[str, dict[str, Estimate]]:
+    """Computes `summarise` for each value of a column (surface, film_mm, scene, ...), in ascending order of the value.
+
+    Raises:
+        RecordsError: no such column; see also `check_records`.
+    """
+    check_records(records)
+    if column not in records:
+        raise RecordsError(f"records.{column}: column not found; expected one of {', '.join(records)}")
+    values = np.unique(records[column])
+    label = (lambda value: f"{value:g}") if values.dtype.kind == "f" else str
+    return {label(value): summarise(select_rows(records, records[column] == value), bootstrap=bootstrap, seed=seed) for value in values}
+
+
+def wilson(rate: float, count: int) -> tuple[float, float]:
+    """Computes the 95 % score interval of a rate in `count` independent trials (Wilson 1927)."""
+    z = 1.959963984540054
+    middle = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * np.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
+    return float(np.clip(middle - half, 0.0, rate)), float(np.clip(middle + half, rate, 1.0))
+
+
+def newcombe(before: tuple[float, int], after: tuple[float, int]) -> tuple[float, float]:
+    """Computes the 95 % hybrid score interval of a difference of two rates, each with its number of trials."""
+    (old, _), (new, _) = before, after
+    (old_low, old_high), (new_low, new_high) = wilson(*before), wilson(*after)
+    low, high = new - old - np.hypot(new - new_low, old_high - old), new - old + np.hypot(new_high - new, old - old_low)
+    return float(low), float(high)
+
+
+# ---- estimates of one or several runs
+
+
+def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    (table,) = _tabulate([runs])
+    values = _ratios(table, *_ones(table))[0]
+    weights = _resample(table, [len(runs)], agents=agents, bootstrap=bootstrap, seed=seed)
+    draws = np.concatenate([_ratios(table, *one) for one in weights])
+    found = {}
+    for m, (name, metric) in enumerate(METRICS.items()):
+        value, count = float(values[m]), int(table.counts[:, :, m].sum())
+        low, high = _percentiles(draws[:, m])
+        if not np.isfinite(value):
+            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
+        elif _varies(low, high):
+            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
+        elif metric.rate:
+            found[name] = Estimate(value, *wilson(min(max(value, 0.0), 1.0), _count_agents(table, m)), count, metric.unit, WILSON)
+        else:
+            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
+    return found
+
+
+def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
+    scenes = [set(np.concatenate([np.asarray(one["scene"], str) for one in runs.values()]).tolist()) for runs in (before, after)]
+    if odd := sorted(scenes[0] ^ scenes[1]):
+        raise RecordsError(f"records.scene: {odd[0]!r} is in one of the two evaluations only; expected the same scenes in both")
+    first, second = tables = _tabulate([before, after])
+    sizes = [len(before)] if list(before) == list(after) else [len(before), len(after)]
+    old, new = (_ratios(table, *_ones(table))[0] for table in tables)
+    draws = []
+    for *seeds, scene, agent in _resample(first, sizes, agents=agents, bootstrap=bootstrap, seed=seed):
+        draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
+    draws, found = np.concatenate(draws), {}
+    for m, (name, metric) in enumerate(METRICS.items()):
+        value, count = float(new[m] - old[m]), min(int(table.counts[:, :, m].sum()) for table in tables)
+        low, high = _percentiles(draws[:, m])
+        one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
+        if not np.isfinite(value):
+            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
+        elif low is not None and not one_scene and (_varies(low, high) or not metric.rate):
+            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
+        elif metric.rate:
+            ends = newcombe(*((float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)))
+            found[name] = Estimate(value, *ends, count, metric.unit, NEWCOMBE)
+        else:
+            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
+    return found
+
+
+def _percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float | None, float | None]:
+    """The middle 95 % of the draws that have a value."""
+    finite = draws[np.isfinite(draws)]
+    if not len(finite):
+        return None, None
+    low, high = np.percentile(finite, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def _varies(low: float | None, high: float | None) -> bool:
+    return low is not None and high is not None and high - low >= 1e-9
+
+
+def _count_agents(table: Table, m: int) -> int:
+    """Distinct agents: an agent that two seeds controlled is one."""
+    return max(1, int((table.counts[:, :, m].sum(axis=0) > 0).sum()))
+
+
+# ---- tables and resamples
+
+
+def _tabulate(every: Sequence[Runs]) -> list[Table]:
+    """The metrics of all runs over one list of agents."""
+    runs = [records for one in every for records in one.values()]
+    if not all(every):
+        raise RecordsError("records: expected one or more runs, got none")
+    for records in runs:
+        check_records(records)
+    names = np.unique(np.concatenate([np.asarray(records["scene"], str) for records in runs]))
+
+    def keys(records: Records) -> np.ndarray:
+        scene = np.searchsorted(names, np.asarray(records["scene"], str))
+        return np.stack([scene, records["world"], records["seed"], records["agent"]], axis=1)
+
+    agents = np.unique(np.concatenate([keys(records) for records in runs]), axis=0)
+    row = {tuple(agent): index for index, agent in enumerate(agents.tolist())}
+    world = np.unique(agents[:, :3], axis=0, return_inverse=True)[1].ravel()
+    tables = []
+    for one in every:
+        sums, counts = (np.zeros((len(one), len(agents), len(METRICS))) for _ in range(2))
+        for s, records in enumerate(one.values()):
+            rows = [row[tuple(agent)] for agent in keys(records).tolist()]
+            if len(set(rows)) < len(rows):
+                raise RecordsError("records: expected one row for every scene, world, seed and agent, got two of one")
+            for m, metric in enumerate(METRICS.values()):
+                sums[s, rows, m], counts[s, rows, m] = _values(metric, records)
+        tables.append(Table(sums, counts, agents[:, 0], world))
+    return tables
+
+
+def _values(metric: Metric, records: Records) -> tuple[np.ndarray, np.ndarray]:
+    """Value and weight of a metric in every row."""
+    counted = np.asarray(metric.counted(records), bool)
+    values = np.where(counted, np.asarray(metric.value(records), float), 0.0)
+    if not np.isfinite(values).all():
+        raise RecordsError(f"records: {metric.label} is not finite in row {int(np.argmin(np.isfinite(values)))}")
+    return values, counted
+
+
+def _ones(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of the sample itself: each seed, scene and agent once."""
+    return np.ones((1, len(table.sums))), np.ones((1, table.scene.max() + 1)), np.ones((1, len(table.scene)))
+
+
+def _resample(table: Table, seeds: Sequence[int], *, agents: bool, bootstrap: int, seed: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yields chunks of resamples: how often each seed (one array for each number of `seeds`), each scene and each agent was drawn."""
+    if bootstrap < 1:
+        raise RecordsError(f"bootstrap: expected 1 or more resamples, got {bootstrap}; 1000 give a steady interval")
+    rng, size = np.random.default_rng(seed), np.bincount(table.scene)
+    scenes = len(size)
+    # agents are at the end of their scene's row: multinomial gives what rounding leaves to the last column
+    present: Bool[np.ndarray, "C A"] = np.arange(size.max()) >= size.max() - size[:, None]
+    chunk = max(1, CHUNK // present.size)
+    for start in range(0, bootstrap, chunk):
+        count = min(chunk, bootstrap - start)
+        drawn_seeds = [rng.multinomial(number, np.full(number, 1 / number), size=count).astype(float) for number in seeds]
+        scene = rng.multinomial(scenes, np.full(scenes, 1 / scenes), size=count)
+        agent = rng.multinomial(scene * size, present / size[:, None])[:, present] if agents else scene[:, table.scene]
+        yield *drawn_seeds, scene.astype(float), agent.astype(float)
+
+
+def _ratios(
+    table: Table, seeds: Float[np.ndarray, "B S"], scenes: Float[np.ndarray, "B C"], agents: Float[np.ndarray, "B U"]
+) -> Float[np.ndarray, "B M"]:
+    """Computes each metric of each resample; NaN where no agent counts."""
+    top, bottom = (np.einsum("bs,bsm->bm", seeds, np.tensordot(agents, part, axes=(1, 1))) for part in (table.sums, table.counts))
+    first = np.flatnonzero(np.diff(table.world, prepend=-1))  # row of each world
+    for m in (m for m, metric in enumerate(METRICS.values()) if metric.by_world):
+        top[:, m] = bottom[:, m] = 0.0
+        for s in range(len(table.sums)):
+            total, number = (np.add.reduceat(agents * part[s, :, m], first, axis=1) for part in (table.sums, table.counts))
+            weight = scenes[:, table.scene[first]] * (number > 0) * seeds[:, s : s + 1]
+            top[:, m] += (weight * total / np.where(number > 0, number, 1.0)).sum(axis=1)
+            bottom[:, m] += weight.sum(axis=1)
+    return np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), np.nan)
