@@ -19,9 +19,9 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.cli import view as replays
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment as worlds
-from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
 from scenefactory_jax.visualization.mujoco.keyboard_control import COMMANDS, PEDALS, Drive, KeyboardResponse, World
 
@@ -172,7 +172,7 @@ def _show(
     scene_model.place_light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0
-    actors.add_others(marks, drawing.Others(*(np.asarray(getattr(seen.traffic, name))[None] for name in drawing.Others._fields)), 0)
+    actors.add_traffic(marks, TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(seen.traffic))), 0)
     turn = (float(yaw[built.car]) - heading + np.pi) % (2 * np.pi) - np.pi
     heading += turn / (1.0 + view.lag_s / built.dt)
     if now.chasing:

@@ -10,12 +10,12 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.pytree import replace, unchecked
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import episodes, failure_signals, failures
 from scenefactory_jax.learning.training_loop import make_policy
-from scenefactory_jax.visualization.birds_eye.drawing import Others, Trajectory
 
 Records = dict[str, np.ndarray]
 
@@ -190,7 +190,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_describe(weather, seconds=end / control_hz),
-        traffic=Others(*(np.asarray(getattr(boxes, name))[:end] for name in Others._fields)),
+        traffic=TrafficBoxes.from_boxes(boxes).clip(0, end),
     )
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file, trusted_targets
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import agent_metrics, circumstances, episode_records
 from scenefactory_jax.learning import checkpoint, policy_io
 from scenefactory_jax.loggers import metrics_csv
-from scenefactory_jax.visualization.birds_eye.drawing import Trajectory
 
 
 class Result(NamedTuple):

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.visualization import gif_writer, mp4_writer
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
+from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, Colour, Stroke, View
 from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
 from scenefactory_jax.visualization.mp4_writer import VideoError
 

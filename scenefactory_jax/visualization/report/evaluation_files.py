@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import agent_metrics, circumstances, failures
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
-from scenefactory_jax.visualization.birds_eye.drawing import Trajectory
 from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots
 
 
