@@ -26,9 +26,7 @@ commands: {", ".join(configs.COMMANDS)}
   compare   several runs              runs='[runs/A-*,runs/B]' out=FOLDER
   convert   scenes -> a bank          source=FILE_OR_FOLDER out=BANK
   scenes    look at, choose, divide   op=info|filter|split|merge|dedupe|... scenes.path=BANK out=BANK
-  render    scenes as MJCF and images scenes.path=FOLDER_OR_BANK out=FOLDER
-  replay    a page to watch and ask   run=RUN_DIR scenes.path=FOLDER_OR_BANK worlds=4 seconds=20 out=replay.html|.gif|.mp4|.png|.rrd
-  drive     a car, by keyboard        run=RUN_DIR scenes.path=FOLDER_OR_BANK weather=dry|ice|... dynamics=articulated|bicycle
+  view      watch or drive            run=RUN_DIR scenes.path=FOLDER_OR_BANK worlds=4 out=view.html|.gif|.mp4|.png|.rrd|.xml window=true
   export    a policy to hand on        run=RUN_DIR out=FOLDER
   bench     measure speed             experiment=paper scenes.path=FOLDER_OR_BANK suite=throughput out=FOLDER
   validate  hold the physics to tests validation=reduced|full parts='[drives,laws]' resume=true workers=N out=FOLDER
@@ -42,7 +40,6 @@ commands: {", ".join(configs.COMMANDS)}
 MODULES = {
     "train": "scenefactory_jax.learning.training_loop",
     "evaluate": "scenefactory_jax.evaluation.protocols",
-    "replay": "scenefactory_jax.cli.view",
     "bench": "scenefactory_jax.cli.benchmark",
     "weather": "scenefactory_jax.cli.physics",
     "validate": "experiments.validation.run",
@@ -81,7 +78,7 @@ def _run(command: str, arguments: Sequence[str]) -> None:
     elif not (flags.hydra_help or flags.shell_completion or flags.info or flags.experimental_rerun):
         varied = _check(command, configs.as_overrides(flags), sweeps=flags.multirun)
     sys.argv = [f"{sys.argv[0]} {command}", *map(configs.quote_override, arguments)]
-    name = flags.config_name or command
+    name = flags.config_name or configs.find_config_name(command)
     hydra.main(version_base="1.3", config_path=str(configs.find_conf()), config_name=name)(_job(command, varied))()
 
 

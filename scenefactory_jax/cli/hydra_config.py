@@ -27,7 +27,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from scenefactory_jax.core import atomic_file, trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 
-COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "render", "replay", "drive", "bench", "validate", "sysid", "study")
+COMMANDS = ("train", "evaluate", "compare", "convert", "scenes", "view", "bench", "validate", "sysid", "study")
 COMMANDS += ("weather", "export")
 # Keys whose values are lists of overrides
 LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.examined", r"protocol\.settings")
@@ -50,6 +50,11 @@ def find_conf() -> Path:
         if (candidate / "train.yaml").is_file():
             return candidate
     raise ConfigError(f"no conf/ in {package} or beside it; reinstall scenefactory_jax")
+
+
+def find_config_name(command: str) -> str:
+    """Name of a command's config below `conf/`."""
+    return f"command/{command}" if (find_conf() / "command" / f"{command}.yaml").is_file() else command
 
 
 def load_config(name: str = "train", *overrides: str) -> dict[str, Any]:
@@ -97,7 +102,7 @@ def _open(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     Raises:
         ConfigError: see `load`.
     """
-    known = sorted(path.stem for path in find_conf().glob("*.yaml"))
+    known = sorted(path.stem for folder in ("", "command") for path in (find_conf() / folder).glob("*.yaml"))
     if name not in known:
         raise ConfigError(f"no config {name!r}; valid: {', '.join(known)}")
     try:
@@ -130,7 +135,7 @@ def _check_emptied(opened: Any, overrides: Sequence[str]) -> None:
 def _compose(name: str, overrides: Sequence[str], *, whole: bool = False) -> Any:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(find_conf()), version_base="1.3"):
-        return hydra_compose(name, overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
+        return hydra_compose(find_config_name(name), overrides=[quote_override(override) for override in overrides], return_hydra_config=whole)
 
 
 def to_dict(config: Any) -> dict[str, Any]:

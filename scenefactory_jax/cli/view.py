@@ -1,162 +1,178 @@
-"""`replay`: some episodes of a trained policy, of the recording, or of no policy at all: as one HTML page to watch and to ask, as a film in
-three dimensions, or as a file for rerun; the ending of `out` decides."""
+"""`view`: episodes of a policy or of the log as a web page, a 3D film or picture, a rerun file or a MuJoCo model; or a car to drive."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
-from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.core.safe_names import escape_for_terminal
-from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.loading import raw_scenes, scene_source
-from scenefactory_jax.data.packing.pack import Packed, prepare
-from scenefactory_jax.data.packing.stack import stack
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
-from scenefactory_jax.env.rollout import Act, Recording, record
-from scenefactory_jax.learning import checkpoint, policy_io
-from scenefactory_jax.learning.training_loop import make_policy
-from scenefactory_jax.visualization import mp4_writer, rerun_file
-from scenefactory_jax.visualization.mujoco import film, offscreen_renderer
-from scenefactory_jax.visualization.web import replay_data, replay_page
+from scenefactory_jax.learning import policy_io
+from scenefactory_jax.visualization import recorded_episodes, rerun_file, video_file
+from scenefactory_jax.visualization.mujoco import film, keyboard_control, offscreen_renderer, world_mjcf
+from scenefactory_jax.visualization.recorded_episodes import ShownScenes
+from scenefactory_jax.visualization.web import replay_page
 
-ENDINGS = (".html", *film.SUFFIXES, ".rrd")
-SHOWN = 3  # reasons in a message
+if TYPE_CHECKING:
+    from scenefactory_jax.visualization.mujoco.keyboard_control import Drive
+
+SUFFIXES = (".html", *film.SUFFIXES, ".rrd", ".xml")
+DRIVEN = {"dynamics": "articulated", "timing.episode_s": 3600, "scenes.pack.agents": 1}  # of a window without a run, where not set otherwise
+DRIVEN_IN_RUN = ("termination=goal_only", "timing.episode_s=3600")
 
 
-class RecordedWorlds(NamedTuple):
-    """The scenes of a page, worlds along the first axis, and what stands on their maps."""
+def view(config: Mapping[str, Any]) -> "Path | Drive":
+    """Writes `out`, or opens the window.
 
-    scene: Scene
-    names: tuple[str, ...]
-    posts: tuple[replay_data.RoadPosts, ...]
+    Raises:
+        ConfigError, SceneError, VideoError, OpenGLError, RerunError: see `replay`.
+    """
+    if config["window"]:
+        return drive(config)
+    out = replay(config)
+    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB", flush=True)
+    return out
 
 
 def replay(config: Mapping[str, Any]) -> Path:
-    """Record one episode in each of some scenes and write `out` (`load("replay", "run=...")`); a film shows the first scene alone.
+    """Records one episode in each of some scenes and writes `out` (`load_config("view", "run=...", "out=page.html")`).
 
     Raises:
         ConfigError: no such run, no checkpoint in it, a key that does not fit, or one that the run decides.
         SceneError: no usable scene.
-        VideoError, OpenGLError, RerunError: nothing here to write such a file with; the message says what is missing.
+        VideoError, OpenGLError, RerunError: a missing library for this kind of file.
     """
     _check(config)
-    scene_source.use_compilation_cache()
-    settings = config if config["run"] is None else load_run_config(config, command="replay")
-    count = 1 if Path(config["out"]).suffix in film.SUFFIXES else config["worlds"]
-    env, shown = environment.make_env(settings), choose_scenes(settings["scenes"], count=count, skip=config["skip"])
-    act, parameters = select_policy(config, settings, slots=shown.scene.agents.yaw.shape[1])
-    steps = max(round(min(config["seconds"], settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
-    print(f"{len(shown.names)} worlds, {steps} control steps each: {', '.join(shown.names)}", flush=True)
-    recording = jax.device_get(record(env, act, parameters, shown.scene, jax.random.key(config["seed"]), steps=steps))
-    out = _write(config, settings, recording, shown)
-    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB; {'open it in a browser' if out.suffix == '.html' else 'done'}", flush=True)
-    return out
+    settings, out = _load_settings(config), Path(config["out"])
+    shown = _choose_scenes(config, settings, single=out.suffix in (*film.SUFFIXES, ".xml"))
+    goal_radius_m, dynamics = settings["step_metrics"]["goal_radius_m"], _choose_car(settings)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".xml":
+        return _write_mjcf(out, settings, shown, dynamics)
+    policy = recorded_episodes.select_policy(settings, run=config["run"], act=config["act"], slots=shown.scene.agents.yaw.shape[1])
+    recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=config["seconds"], seed=config["seed"])
+    if out.suffix in film.SUFFIXES:
+        look = {"settings": film.FilmSettings(**config["film"]), "camera": film.Camera(**config["camera"]), "slot": config["car"]}
+        return film.write(out, recording, car=cars.read_parameters(dynamics)[0], goal_radius_m=goal_radius_m, **look)
+    title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
+    if out.suffix == ".rrd":
+        return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal_radius_m)
+    return replay_page.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal_radius_m)
+
+
+def drive(config: Mapping[str, Any]) -> "Drive":
+    """Opens MuJoCo's viewer for a drive by keyboard until it is closed; returns the last state.
+
+    Raises:
+        ConfigError: no display, no such run, a key that does not fit, or one that the run decides.
+        SceneError: no usable scene.
+    """
+    from scenefactory_jax.visualization.mujoco import viewer  # loads the windowing library
+
+    _check(config)
+    codes = viewer.read_keys(config["keys"])
+    viewer.check_display()
+    settings = _load_settings(config)
+    shown = _choose_scenes(config, settings, single=True)
+    scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
+    slots = scene.agents.present.nonzero()[0].tolist()
+    car = slots[0] if config["car"] is None else config["car"]
+    if car not in slots:
+        raise ConfigError(f"car: expected one of {', '.join(map(str, slots))}, got {car}")
+    act, parameters = recorded_episodes.select_policy(settings, run=config["run"], act="policy", slots=scene.agents.yaw.shape[0])
+    env, dt = environment.make_env(settings), 1.0 / settings["timing"]["control_hz"]
+    world = keyboard_control.make_world(env, scene, act, parameters, car=car, dt=dt, off_map_m=config["off_map_m"])
+    response = keyboard_control.KeyboardResponse(**config["keyboard_response"])
+    print("; ".join(f"{command}: {key}" for command, key in config["keys"].items()), flush=True)
+    begun = keyboard_control.advance(world, keyboard_control.start(world, seed=config["seed"]), set(), set(), response=response)
+    drawn, camera = cars.read_parameters(_choose_car(settings))[0], film.Camera(**config["camera"])
+    return viewer.drive(world, begun, scene, drawn, response=response, camera=camera, codes=codes)
 
 
 def _check(config: Mapping[str, Any]) -> None:
-    """What would otherwise fail only after the drive."""
-    schema.check(config, schema.REPLAY)
-    schema.check(config["film"], schema.FILM, where="film")
-    out = Path(config["out"])
-    if out.is_dir():
-        raise ConfigError(f"out: {out} is a folder; give the page's own name, such as {out / 'replay.html'}")
-    if out.suffix not in ENDINGS:
-        raise ConfigError(f"out: {out}; valid endings: {', '.join(ENDINGS)}")
+    """Checks everything that would otherwise fail after the recording."""
+    schema.check(config, schema.VIEW)
+    schema.check_scenes(config["scenes"])
+    for group, keys in {"film": schema.FILM, "camera": schema.CAMERA, "keys": schema.KEYS, "keyboard_response": schema.RESPONSE}.items():
+        schema.check(config[group], keys, where=group)
     if config["run"] is None and config["overrides"]:
         raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
-    if out.suffix in (".gif", ".mp4"):
-        mp4_writer.check(out, fps=config["film"]["fps"])
+    scene_source.use_compilation_cache()
+    if config["window"]:
+        return
+    out = Path(config["out"])
+    if out.is_dir():
+        raise ConfigError(f"out: expected a file, got the folder {out}; for example {out / 'view.html'}")
+    if out.suffix not in SUFFIXES:
+        raise ConfigError(f"out: expected the suffix {', '.join(SUFFIXES)}, got {out}")
+    if out.suffix in video_file.SUFFIXES:
+        video_file.check(out, fps=config["film"]["fps"])
     if out.suffix in film.SUFFIXES:
         offscreen_renderer.check()
     if out.suffix == ".rrd":
         rerun_file.check()
 
 
-def _write(config: Mapping[str, Any], settings: Mapping[str, Any], recording: Recording, shown: "RecordedWorlds") -> Path:
-    out, goal = Path(config["out"]), settings["step_metrics"]["goal_radius_m"]
-    title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
-    if out.suffix in film.SUFFIXES:
-        return film.write(out, recording, car=choose_film_settings(settings), look=film.FilmSettings(**config["film"], goal_radius_m=goal))
-    if out.suffix == ".rrd":
-        return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal)
-    return replay_page.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal)
+def _load_settings(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The config of environment and scenes."""
+    if config["run"] is not None:
+        return load_run_config({**config, "overrides": [*(DRIVEN_IN_RUN if config["window"] else ()), *config["overrides"]]})
+    if not config["window"]:
+        return config
+    plain = configs.load_config("view")
+    return configs.apply_overrides(config, [f"{key}={value}" for key, value in DRIVEN.items() if _find(config, key) == _find(plain, key)])
 
 
-def choose_film_settings(settings: Mapping[str, Any]) -> cars.CarParameters:
-    """The car to draw: the dynamics' own, or the articulated one where it has none."""
-    own = settings["dynamics"]
-    return cars.read_parameters(own if "car" in own else configs.load_config("task")["dynamics"])[0]
+def _find(config: Any, key: str) -> Any:
+    for name in key.split("."):
+        config = config[name]
+    return config
 
 
-def load_run_config(config: Mapping[str, Any], *, command: str) -> dict[str, Any]:
-    """The run's own config with the overrides, and with the scenes that are asked for.
-
-    Args:
-        command: whose config it is: what differs from its own is what was asked for.
+def load_run_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The run's own config with the overrides, and with the scenes that the command names.
 
     Raises:
         ConfigError: no such run, a group that the run decides, or no scenes.
     """
-    plain = configs.load_config(command)
-    for group in environment.GROUPS:  # what a run has of its own
+    plain = configs.load_config("view")
+    for group in environment.GROUPS:
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
     trained = configs.apply_overrides(configs.read(policy_io.find(config["run"]), trust=config["trust"]), config["overrides"])
-    own, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
+    scenes, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
     if asked["path"] is not None:
-        return trained | {"scenes": own | {"path": asked["path"]}}
+        return trained | {"scenes": scenes | {"path": asked["path"]}}
     if any(asked[key] != default[key] for key in ("generate", "seed")):
-        return trained | {"scenes": own | {"path": None, "generate": asked["generate"], "seed": asked["seed"]}}
-    if not scene_source.has_heldout(own):
+        return trained | {"scenes": scenes | {"path": None, "generate": asked["generate"], "seed": asked["seed"]}}
+    if not scene_source.has_heldout(scenes):
         raise ConfigError("scenes.path: null, and the run names no held-out scenes; give scenes.path=..., or scenes=town")
-    heldout = own["heldout"]
-    return trained | {"scenes": own | {"path": heldout["path"], "seed": heldout["seed"]}}
+    heldout = scenes["heldout"]
+    return trained | {"scenes": scenes | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def select_policy(config: Mapping[str, Any], settings: Mapping[str, Any], *, slots: int) -> tuple[Act, Any]:
-    """Who drives, and with which parameters."""
-    if config["act"] == "policy" and config["run"] is not None:
-        policy = make_policy(settings)
-        parameters = checkpoint.restore_parameters(policy_io.find(config["run"]) / "checkpoints")
-        return lambda parameters, observation, key: policy.apply(parameters, observation)[0], parameters
-    if config["act"] == "random":
-        return lambda parameters, observation, key: jax.random.uniform(key, (slots, 3), jnp.float32, -1.0, 1.0), None
-    return lambda parameters, observation, key: jnp.zeros((slots, 3)), None
+def _choose_scenes(config: Mapping[str, Any], settings: Mapping[str, Any], *, single: bool) -> ShownScenes:
+    shown = recorded_episodes.choose_scenes(settings["scenes"], count=1 if single else config["worlds"], skip=config["skip"])
+    print(f"scenes: {', '.join(shown.names)}", flush=True)
+    return shown
 
 
-def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> RecordedWorlds:
-    """The first usable scenes; no more is read than they take."""
-    schema.check_scenes(config)
-    parts = scene_source.make_readers(config)
-    packed: list[Packed] = []
-    posts: list[replay_data.RoadPosts] = []
-    reasons: list[str] = []
-    for raw in raw_scenes.scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
-        if isinstance(raw, str):
-            reasons.append(raw)
-            continue
-        try:
-            one = prepare(raw, check=parts["check"], pack=parts["pack"])
-        except SceneError as error:
-            reasons.append(str(error))
-            continue
-        packed.append(one)
-        posts.append(replay_data.find_posts(raw, one.report.centre))
-        if len(packed) == skip + count:
-            break
-    if not packed:
-        raise ConfigError("\n  ".join([f"scenes.path={config['path']}: no usable scene of {len(reasons)}", *reasons[:SHOWN]]))
-    if len(packed) <= skip:
-        raise ConfigError(f"skip: {skip}; valid: 0 to {len(packed) - 1}, for {len(packed)} scenes can be used")
-    taken, account = packed[skip:], posts[skip:]
-    scene, _ = stack([one.scene for one in taken], capacity=config["capacity"])
-    return RecordedWorlds(
-        scene_source.attach_grids(scene, config), tuple(escape_for_terminal(one.report.name) for one in taken), tuple(account)
-    )
+def _choose_car(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Config of the articulated car to draw: the dynamics' own, or the default one for other dynamics."""
+    return settings["dynamics"] if "car" in settings["dynamics"] else configs.load_config("task")["dynamics"]
+
+
+def _write_mjcf(out: Path, settings: Mapping[str, Any], shown: ShownScenes, dynamics: Mapping[str, Any]) -> Path:
+    scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
+    context = {"control_dt": 1.0 / settings["timing"]["control_hz"]}
+    traffic = instantiate(settings["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context)
+    scene = replace(scene, traffic=traffic(jax.tree.map(jax.numpy.asarray, scene), jax.numpy.int32(0)))
+    size = {"scene_size_m": settings["scenes"]["pack"]["scene_size_m"], "goal_radius_m": settings["step_metrics"]["goal_radius_m"]}
+    out.write_text(world_mjcf.build(scene, dynamics, physics_hz=settings["timing"]["physics_hz"], **size).to_xml())
+    return out

@@ -48,6 +48,7 @@ class Trajectory(NamedTuple):
     title: str
     weather: str
     traffic: TrafficBoxes | None = None  # None: agents only
+    goal_radius_m: float = 3.0
 
     def clip(self, first: int, last: int) -> "Trajectory":
         """Steps `first` to `last`, without `last`."""

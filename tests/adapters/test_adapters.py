@@ -30,7 +30,7 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
 
 
-@pytest.mark.parametrize("observations", ["reference", "foresight"])  # together all groups of the package
+@pytest.mark.parametrize("observe", ["paper", "lane_preview"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
     settings = hydra_config.load_config(
         "train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4"

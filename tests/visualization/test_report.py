@@ -444,7 +444,7 @@ def test_report_says_what_happened(tmp_path):
         commands=["python -m scenefactory_jax evaluate run=X"], **BOOTSTRAP,
     )  # fmt: skip
     text = path.read_text()
-    assert f"**{records['strict']['reached'].sum()} of 72 cars reached their goal" in text
+    assert f"**{records['strict']['goal_reached'].sum()} of 72 cars reached their goal" in text
     assert "![Four worlds](../a%20film.gif)" in text
     for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip` | 0.15 |", "evaluate run=X", "scene, 00"):
         assert part in text, part

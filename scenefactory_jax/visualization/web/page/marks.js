@@ -67,7 +67,7 @@ function glyph(brush, name, x, y, reach, colour) {
     brush.stroke();
     return;
   }
-  const corners = { collided: 10, touched_edge: 4, crashed: 4, fault: 4 }[name] ?? 8;
+  const corners = { collision: 10, road_edge_contact: 4, out_of_bounds: 4, numerical_error: 4 }[name] ?? 8;
   const turn = name === "numerical_error" ? Math.PI / 4 : 0;
   if (name === "road_edge_contact") {
     const arm = 0.75 * reach;
