@@ -3,7 +3,7 @@
 import pytest
 from support import digests
 
-SLOW = ("environment traffic", "environment weather", "environment by mjx.step", "training quick")  # a program each
+SLOW = ("environment", "training quick")  # a program each
 
 
 @pytest.mark.parametrize(

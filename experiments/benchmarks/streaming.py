@@ -30,8 +30,8 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
         scenes = flow.scenes()
         state = trainer.init(jax.random.key(config["seed"]), scenes)
         begun = time.perf_counter()
-        compiled: Any = trainer.iterate.lower(state, scenes).compile()  # pyright: ignore[reportFunctionMemberAccess]
-        trainer = trainer._replace(iterate=compiled)
+        compiled: Any = trainer.train_iteration.lower(state, scenes).compile()  # pyright: ignore[reportFunctionMemberAccess]
+        trainer = trainer._replace(train_iteration=compiled)
         state, scenes, _ = step(trainer, state, scenes, flow, first=True)
         state, scenes, _ = step(trainer, state, scenes, flow, first=False)  # compiles the exchange
         compile_s, seconds, rows = time.perf_counter() - begun, [], []

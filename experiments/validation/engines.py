@@ -83,7 +83,7 @@ def scenes(
             speed=pace,
             size=jnp.tile(jnp.array(size, jnp.float32), (count, 1)),
             goal=place,
-            route=jnp.zeros_like(heading),
+            route_length=jnp.zeros_like(heading),
             present=jnp.ones(count, bool),
         )
         none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
 from experiments.validation.measurements import Spread
+from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.process_pool import make_task_map
@@ -50,7 +50,7 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown part, or a number that does not fit, by name.
     """
-    schema.check(config, schema.VALIDATE)
+    schema.check(config, schema.Validate)
     if unknown := [name for name in config["parts"] if name not in PARTS]:
         raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
     scene_source.use_compilation_cache()
@@ -100,3 +100,7 @@ def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
             source, target = source[name], target.setdefault(name, {})
         target[last] = source[last]
     return found
+
+
+if __name__ == "__main__":
+    entry.run("validate", validate, about="validate the physics against the C engine and laws of motion")

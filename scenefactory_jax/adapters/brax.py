@@ -7,7 +7,8 @@
         make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
 
 `done` is an event that ended the car. That the time is up is for Brax's EpisodeWrapper to say, which calls it truncation: give it
-`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events (`events/goal_reached`) of the step; what Brax
+`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events
+(`events/goal_reached`) of the step; what Brax
 reports of them are sums over an episode.
 
 Brax's own `wrap` repeats the first episode of each world for ever, the same scene and start; `wrap` of this module goes on to others.

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from scenefactory_jax.cli import schema
+from scenefactory_jax.cli.scene_schema import Convert
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.data.conversion import Summary, complete, describe
@@ -25,8 +26,7 @@ def convert(config: Mapping[str, Any]) -> Summary:
         ConfigError: source or out is missing, or a number that a part refuses.
         SceneError: no files, `out` is something else than a bank or a bank made with other settings, or not one usable scene.
     """
-    schema.check(config, schema.CONVERT)
-    schema.check(config["bank"], schema.BANK, where="bank")
+    schema.check(config, Convert)
     for key in ("source", "out"):
         if config[key] is None:
             raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")

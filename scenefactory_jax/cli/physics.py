@@ -1,4 +1,4 @@
-"""`weather`: what the friction model says of every surface, water film, speed and slip, as tables and figures."""
+"""`physics`: what the friction model says of every surface, water film, speed and slip, as tables and figures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,8 +18,8 @@ DIGITS = 5
 POINTS = 200  # of a curve
 
 
-def weather(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Work out and write what a config asks for (`load("weather", "out=...")`).
+def physics(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Work out and write what a config asks for (`load_config("physics", "out=...")`).
 
     Returns:
         What weather.json holds: friction at the reference speed by surface and film, and curves over film, speed and slip.
@@ -27,7 +27,7 @@ def weather(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key that does not fit, by name.
     """
-    schema.check(config, schema.WEATHER)
+    schema.check(config, schema.Physics)
     (slowest, fastest), (least, most) = (check_range(config[name], where=name) for name in ("speeds_mps", "slips"))
     grip = config["weather"]["grip"]
     tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()
@@ -42,7 +42,7 @@ def weather(config: Mapping[str, Any]) -> dict[str, Any]:
     speeds, slip = np.linspace(slowest, fastest, POINTS), np.linspace(least, most, POINTS)
     first = next(iter(grip["surfaces"]))
     found = {
-        "command": configs.format_command("weather"),
+        "command": configs.format_command("physics"),
         "reference": {"speed_mps": reference, "slips": slips, "films_mm": config["films_mm"], "surface": first},
         "table": {
             name: {kind: friction(name, reference, config["films_mm"], value) for kind, value in slips.items()}

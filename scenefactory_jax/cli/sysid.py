@@ -51,7 +51,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key or number that does not fit, by name; a missing teacher package.
     """
-    schema.check(config, schema.SYSID)
+    schema.check(config, schema.Sysid)
     scene_source.use_compilation_cache()
     out, settings = Path(config["out"]), config["sysid"]
     (out / "stages").mkdir(parents=True, exist_ok=True)

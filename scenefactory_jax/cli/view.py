@@ -1,33 +1,61 @@
 """`view`: episodes of a policy or of the log as a web page, a 3D film or picture, a rerun file or a MuJoCo model; or a car to drive."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, Literal
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
+from scenefactory_jax.cli.schema import Group, Task
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import Bounds, Count, Seed
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.visualization import recorded_episodes, rerun_file, video_file
 from scenefactory_jax.visualization.mujoco import film, keyboard_control, offscreen_renderer, world_mjcf
+from scenefactory_jax.visualization.mujoco.film import Camera, FilmSettings
+from scenefactory_jax.visualization.mujoco.keyboard_control import Drive, KeyboardResponse, Keys
 from scenefactory_jax.visualization.recorded_episodes import ShownScenes
 from scenefactory_jax.visualization.web import replay_page
 
-if TYPE_CHECKING:
-    from scenefactory_jax.visualization.mujoco.keyboard_control import Drive
-
 SUFFIXES = (".html", *film.SUFFIXES, ".rrd", ".xml")
-DRIVEN = {"dynamics": "articulated", "timing.episode_s": 3600, "scenes.pack.agents": 1}  # of a window without a run, where not set otherwise
-DRIVEN_IN_RUN = ("termination=goal_only", "timing.episode_s=3600")
+DRIVEN = ("termination=goal_only", "timing.episode_s=3600")  # of a world in the window
+DRIVEN_ALONE = ("scenes.pack.agents=1",)  # without a policy for the other agents: they are traffic
 
 
-def view(config: Mapping[str, Any]) -> "Path | Drive":
+@dataclass(frozen=True)
+class View(Task):
+    """The command `view`."""
+
+    scenes: Group
+    run: str | None
+    trust: bool
+    overrides: list[str]
+    act: Literal["policy", "coast", "random"]
+    worlds: Count
+    skip: Seed
+    seconds: Annotated[float, Bounds(min=0.1)]
+    seed: Seed
+    out: str
+    window: bool
+    title: str | None
+    car: Seed | None
+    off_map_m: Annotated[float, Bounds(min=1)]
+    film: FilmSettings
+    camera: Camera
+    keys: Keys
+    keyboard_response: KeyboardResponse
+
+
+def view(config: Mapping[str, Any]) -> Path | Drive:
     """Writes `out`, or opens the window.
 
     Raises:
@@ -46,27 +74,27 @@ def replay(config: Mapping[str, Any]) -> Path:
     Raises:
         ConfigError: no such run, no checkpoint in it, a key that does not fit, or one that the run decides.
         SceneError: no usable scene.
-        VideoError, OpenGLError, RerunError: a missing library for this kind of file.
+        VideoError, OpenGLError, RerunError: a library for this kind of file is missing.
     """
-    _check(config)
-    settings, out = _load_settings(config), Path(config["out"])
-    shown = _choose_scenes(config, settings, single=out.suffix in (*film.SUFFIXES, ".xml"))
+    asked = _check(config)
+    settings, out = _load_settings(config), Path(asked.out)
+    shown = _choose_scenes(asked, settings, single=out.suffix in (*film.SUFFIXES, ".xml"))
     goal_radius_m, dynamics = settings["step_metrics"]["goal_radius_m"], _choose_car(settings)
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".xml":
         return _write_mjcf(out, settings, shown, dynamics)
-    policy = recorded_episodes.select_policy(settings, run=config["run"], act=config["act"], slots=shown.scene.agents.yaw.shape[1])
-    recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=config["seconds"], seed=config["seed"])
+    policy = recorded_episodes.select_policy(settings, run=asked.run, act=asked.act, slots=shown.scene.agents.yaw.shape[1])
+    recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=asked.seconds, seed=asked.seed)
     if out.suffix in film.SUFFIXES:
-        look = {"settings": film.FilmSettings(**config["film"]), "camera": film.Camera(**config["camera"]), "slot": config["car"]}
-        return film.write(out, recording, car=cars.read_parameters(dynamics)[0], goal_radius_m=goal_radius_m, **look)
-    title = config["title"] or (Path(config["run"]).name if config["run"] else "replay")
+        look = {"settings": asked.film, "camera": asked.camera, "slot": asked.car, "goal_radius_m": goal_radius_m}
+        return film.write(out, recording, car=cars.read_parameters(dynamics)[0], **look)
+    title = asked.title or (Path(asked.run).name if asked.run else "replay")
     if out.suffix == ".rrd":
         return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal_radius_m)
     return replay_page.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal_radius_m)
 
 
-def drive(config: Mapping[str, Any]) -> "Drive":
+def drive(config: Mapping[str, Any]) -> Drive:
     """Opens MuJoCo's viewer for a drive by keyboard until it is closed; returns the last state.
 
     Raises:
@@ -75,64 +103,56 @@ def drive(config: Mapping[str, Any]) -> "Drive":
     """
     from scenefactory_jax.visualization.mujoco import viewer  # loads the windowing library
 
-    _check(config)
-    codes = viewer.read_keys(config["keys"])
+    asked = _check({**config, "window": True})
+    codes = viewer.read_keys(asked.keys)
     viewer.check_display()
-    settings = _load_settings(config)
-    shown = _choose_scenes(config, settings, single=True)
-    scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
-    slots = scene.agents.present.nonzero()[0].tolist()
-    car = slots[0] if config["car"] is None else config["car"]
+    settings = _load_settings({**config, "window": True})
+    scene = jax.tree.map(lambda leaf: leaf[0], _choose_scenes(asked, settings, single=True).scene)
+    slots = np.flatnonzero(np.asarray(scene.agents.present)).tolist()
+    car = slots[0] if asked.car is None else asked.car
     if car not in slots:
         raise ConfigError(f"car: expected one of {', '.join(map(str, slots))}, got {car}")
-    act, parameters = recorded_episodes.select_policy(settings, run=config["run"], act="policy", slots=scene.agents.yaw.shape[0])
+    act, parameters = recorded_episodes.select_policy(settings, run=asked.run, act="policy", slots=scene.agents.yaw.shape[0])
     env, dt = environment.make_env(settings), 1.0 / settings["timing"]["control_hz"]
-    world = keyboard_control.make_world(env, scene, act, parameters, car=car, dt=dt, off_map_m=config["off_map_m"])
-    response = keyboard_control.KeyboardResponse(**config["keyboard_response"])
-    print("; ".join(f"{command}: {key}" for command, key in config["keys"].items()), flush=True)
-    begun = keyboard_control.advance(world, keyboard_control.start(world, seed=config["seed"]), set(), set(), response=response)
-    drawn, camera = cars.read_parameters(_choose_car(settings))[0], film.Camera(**config["camera"])
-    return viewer.drive(world, begun, scene, drawn, response=response, camera=camera, codes=codes)
+    world = keyboard_control.make_world(env, scene, act, parameters, car=car, dt=dt, off_map_m=asked.off_map_m)
+    print("; ".join(f"{command}: {key}" for command, key in vars(asked.keys).items()), flush=True)
+    response, start = asked.keyboard_response, keyboard_control.start(world, seed=asked.seed)
+    begun = keyboard_control.advance(world, start, set(), set(), response=response)
+    drawn = cars.read_parameters(_choose_car(settings))[0]
+    return viewer.drive(world, begun, scene, drawn, response=response, camera=asked.camera, codes=codes)
 
 
-def _check(config: Mapping[str, Any]) -> None:
+def _check(config: Mapping[str, Any]) -> View:
     """Checks everything that would otherwise fail after the recording."""
-    schema.check(config, schema.VIEW)
-    schema.check_scenes(config["scenes"])
-    for group, keys in {"film": schema.FILM, "camera": schema.CAMERA, "keys": schema.KEYS, "keyboard_response": schema.RESPONSE}.items():
-        schema.check(config[group], keys, where=group)
-    if config["run"] is None and config["overrides"]:
-        raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
+    asked = schema.read(config, View)
+    if asked.run is None and asked.overrides:
+        raise ConfigError(f"overrides: {asked.overrides} without a run; write them as settings of the command")
     scene_source.use_compilation_cache()
-    if config["window"]:
-        return
-    out = Path(config["out"])
+    if asked.window:
+        return asked
+    out = Path(asked.out)
     if out.is_dir():
         raise ConfigError(f"out: expected a file, got the folder {out}; for example {out / 'view.html'}")
     if out.suffix not in SUFFIXES:
-        raise ConfigError(f"out: expected the suffix {', '.join(SUFFIXES)}, got {out}")
+        raise ConfigError(f"out: expected a file {', '.join(SUFFIXES)}, got {out}")
     if out.suffix in video_file.SUFFIXES:
-        video_file.check(out, fps=config["film"]["fps"])
+        video_file.check(out, fps=asked.film.fps)
     if out.suffix in film.SUFFIXES:
         offscreen_renderer.check()
     if out.suffix == ".rrd":
         rerun_file.check()
+    return asked
 
 
 def _load_settings(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The config of environment and scenes."""
+    """The config of environment and scenes; in the window an episode lasts an hour, and only the goal of another car ends it."""
+    driven = DRIVEN if config["window"] else ()
     if config["run"] is not None:
-        return load_run_config({**config, "overrides": [*(DRIVEN_IN_RUN if config["window"] else ()), *config["overrides"]]})
+        return load_run_config({**config, "overrides": [*driven, *config["overrides"]]})
     if not config["window"]:
         return config
-    plain = configs.load_config("view")
-    return configs.apply_overrides(config, [f"{key}={value}" for key, value in DRIVEN.items() if _find(config, key) == _find(plain, key)])
-
-
-def _find(config: Any, key: str) -> Any:
-    for name in key.split("."):
-        config = config[name]
-    return config
+    follows_log = config["dynamics"] == configs.load_config("view")["dynamics"]
+    return configs.apply_overrides(config, [*driven, *DRIVEN_ALONE, *(["dynamics=articulated"] if follows_log else [])])
 
 
 def load_run_config(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -157,8 +177,8 @@ def load_run_config(config: Mapping[str, Any]) -> dict[str, Any]:
     return trained | {"scenes": scenes | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def _choose_scenes(config: Mapping[str, Any], settings: Mapping[str, Any], *, single: bool) -> ShownScenes:
-    shown = recorded_episodes.choose_scenes(settings["scenes"], count=1 if single else config["worlds"], skip=config["skip"])
+def _choose_scenes(asked: View, settings: Mapping[str, Any], *, single: bool) -> ShownScenes:
+    shown = recorded_episodes.choose_scenes(settings["scenes"], count=1 if single else asked.worlds, skip=asked.skip)
     print(f"scenes: {', '.join(shown.names)}", flush=True)
     return shown
 
@@ -169,10 +189,11 @@ def _choose_car(settings: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _write_mjcf(out: Path, settings: Mapping[str, Any], shown: ShownScenes, dynamics: Mapping[str, Any]) -> Path:
+    """Writes the first scene with its traffic at the start."""
     scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
     context = {"control_dt": 1.0 / settings["timing"]["control_hz"]}
     traffic = instantiate(settings["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context)
-    scene = replace(scene, traffic=traffic(jax.tree.map(jax.numpy.asarray, scene), jax.numpy.int32(0)))
+    scene = replace(scene, traffic=traffic(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
     size = {"scene_size_m": settings["scenes"]["pack"]["scene_size_m"], "goal_radius_m": settings["step_metrics"]["goal_radius_m"]}
     out.write_text(world_mjcf.build(scene, dynamics, physics_hz=settings["timing"]["physics_hz"], **size).to_xml())
     return out

@@ -44,11 +44,11 @@ class Trajectory(NamedTuple):
     size: Float[np.ndarray, "A 2"]
     goal: Float[np.ndarray, "*T A 2"]
     present: Bool[np.ndarray, " A"]
+    goal_radius_m: float
     control_hz: float
     title: str
     weather: str
     traffic: TrafficBoxes | None = None  # None: agents only
-    goal_radius_m: float = 3.0
 
     def clip(self, first: int, last: int) -> "Trajectory":
         """Steps `first` to `last`, without `last`."""

@@ -68,7 +68,7 @@ def make(
         drag: deceleration per speed, 1/s; `air_drag` per speed squared, 1/m.
         speed_limit: m/s.
         contact: numbers of `contact.make`.
-        grip: (weather, position, speed) -> friction coefficient. It limits nothing here: `friction_utilization` is the acceleration over friction times
+        grip: (weather, position, speed) -> friction coefficient. Unused: `friction_utilization` is the acceleration over friction times
             gravity and exceeds one where a real car would slide.
 
     Raises:
@@ -151,7 +151,7 @@ def read(body: Body, *, height: float) -> Motion:
         upright=jnp.ones_like(zero),
         steer=body.steer,
         contact_force=body.contact_force,
-        grip=body.grip,
+        mu=body.grip,
         friction_utilization=body.friction_utilization,
         slip=zero,
     )

@@ -56,7 +56,7 @@ def make(
             upright=jnp.ones_like(zero),
             steer=zero,
             contact_force=zero,
-            grip=grip(scene.weather, position, safe_norm(velocity)),
+            mu=grip(scene.weather, position, safe_norm(velocity)),
             friction_utilization=zero,
             slip=zero,
         )

@@ -5,11 +5,11 @@ from typing import Any
 
 STARTS = {
     "logged": "as recorded, at the recorded speed",
-    "standing": "as recorded, from rest",
-    "underway": "somewhere on the recorded way",
+    "logged_from_rest": "as recorded, from rest",
+    "along_log": "somewhere on the recorded way",
     "random_pairs": "random, start and goal along lanes",
 }
-TRAFFIC = {"ignore": "none", "static": "parked cars stand", "replay": "as recorded, it does not react"}
+TRAFFIC = {"no_traffic": "none", "parked_traffic": "parked cars stand", "log_traffic": "as recorded, it does not react"}
 
 
 def describe(config: Mapping[str, Any]) -> dict[str, str]:
@@ -43,7 +43,8 @@ def _starts(draw: Mapping[str, Any]) -> str:
     name = draw["_target_"]
     if name != "mixed":
         return STARTS.get(name, f"`{name}`")
-    return "; ".join(f"{part['share']:.0%} {_starts(part['draw'])}" for part in draw["parts"].values())
+    total = sum(part["weight"] for part in draw["parts"].values())
+    return "; ".join(f"{part['weight'] / total:.0%} {_starts(part['sampler'])}" for part in draw["parts"].values())
 
 
 def _weather(weather: Mapping[str, Any]) -> str:

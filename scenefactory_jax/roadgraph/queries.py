@@ -12,10 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_sqrt, to_frame
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_sqrt, to_frame
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.types import Road, Scene, SetObservation
-from scenefactory_jax.env.surrogate_safety import SMALLEST
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
 
 

@@ -14,8 +14,8 @@ from jax.experimental.pallas import triton as plgpu
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import pallas
+from scenefactory_jax.core.geometry import SMALLEST
 from scenefactory_jax.core.types import Road, SpatialGrid
-from scenefactory_jax.env.surrogate_safety import SMALLEST
 
 LOOK, GATHER = 128, 128  # segments that a program takes at a time; the fastest of 20 settings on an H200
 LOOK_WARPS, GATHER_WARPS = 4, 4

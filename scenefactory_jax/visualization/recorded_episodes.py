@@ -16,7 +16,7 @@ from scenefactory_jax.data.loading import raw_scenes, scene_source
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.env import environment
-from scenefactory_jax.env.rollout import Act, Recording, StepRecord, record
+from scenefactory_jax.env.rollout import Act, Recording, record
 from scenefactory_jax.learning import checkpoint, policy_io
 from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.visualization.web.road_posts import RoadPosts, find_posts
@@ -42,6 +42,7 @@ def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> ShownS
         ConfigError: fewer than `skip + 1` usable scenes.
         SceneError: a path that cannot be read.
     """
+    scene_source.check_config(config)
     parts = scene_source.make_readers(config)
     packed: list[tuple[Packed, RoadPosts]] = []
     reasons: list[str] = []
@@ -82,7 +83,7 @@ def select_policy(settings: Mapping[str, Any], *, run: str | None, act: str, slo
     return lambda parameters, observation, key: jnp.zeros((slots, 3)), None
 
 
-def record_episodes(settings: Mapping[str, Any], scene: Scene, policy: tuple[Act, Any], *, seconds: float, seed: int) -> Recording:
+def record_episodes(settings: Mapping[str, Any], scene: Scene, policy: tuple[Act, Any], *, seconds: float | int, seed: int) -> Recording:
     """Records one episode in each world, on the host.
 
     Args:
@@ -94,11 +95,14 @@ def record_episodes(settings: Mapping[str, Any], scene: Scene, policy: tuple[Act
     return jax.device_get(record(environment.make_env(settings), act, parameters, scene, jax.random.key(seed), steps=steps))
 
 
-def cut_world(recording: Recording, index: int) -> tuple[Scene, StepRecord, Bool[np.ndarray, "T A"], float]:
-    """One world of a recording until one second after its last active step: scene, steps, valid states, steps per second.
+def cut_world(recording: Recording, index: int) -> tuple[Scene, Any, Bool[np.ndarray, "T A"], float]:
+    """One world of a recording until one second after its last active step.
 
     Args:
         recording: on the host.
+
+    Returns:
+        Scene, `StepRecord` of numpy arrays, mask of active and finite states, steps per second.
     """
     scene, shots = (jax.tree.map(lambda leaf: np.asarray(leaf)[index], part) for part in (recording.scene, recording.shots))
     hz = 1.0 / max(float(np.median(np.diff(shots.time_s))), 1e-6) if len(shots.time_s) > 1 else 1.0

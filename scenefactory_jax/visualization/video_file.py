@@ -20,7 +20,7 @@ class VideoError(ValueError):
     """A video that cannot be written; the message names the argument and the valid values."""
 
 
-def check(path: Path, *, fps: float) -> None:
+def check(path: Path, *, fps: float | int) -> None:
     """Checks suffix, rate and ffmpeg before anything is drawn.
 
     Raises:
@@ -34,7 +34,9 @@ def check(path: Path, *, fps: float) -> None:
         raise VideoError(f"fps: expected a number > 0, for a .gif <= {MAX_GIF_FPS}, got {fps}")
 
 
-def write(path: Path, pictures: Iterable[Picture], *, fps: float, samples: Sequence[Picture], colours: Sequence[tuple[int, ...]] = ()) -> Path:
+def write(
+    path: Path, pictures: Iterable[Picture], *, fps: float | int, samples: Sequence[Picture], colours: Sequence[tuple[int, ...]] = ()
+) -> Path:
     """Writes a looping GIF or an H.264 video.
 
     Args:
@@ -53,7 +55,7 @@ def write(path: Path, pictures: Iterable[Picture], *, fps: float, samples: Seque
     return path
 
 
-def _write_mp4(path: Path, pictures: Iterable[Picture], *, fps: float) -> None:
+def _write_mp4(path: Path, pictures: Iterable[Picture], *, fps: float | int) -> None:
     try:
         options = {"codec": "libx264", "quality": None, "macro_block_size": 2, "ffmpeg_log_level": "error"}
         quality = ["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
@@ -64,10 +66,9 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], *, fps: float) -> None:
         raise VideoError(f"{path}: ffmpeg failed: {' '.join(str(error).split())}") from None
 
 
-def _write_gif(path: Path, pictures: Iterable[Picture], *, fps: float, palette: Image.Image) -> None:
+def _write_gif(path: Path, pictures: Iterable[Picture], *, fps: float | int, palette: Image.Image) -> None:
     """Frame times are whole hundredths of a second that add up to the right speed; one palette keeps unchanged pixels unchanged."""
-    frames = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
-    shown = list(itertools.chain(frames))
+    shown = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = [round((index + 1) * 100 / fps) for index in range(len(shown))]
     times = [10 * (end - begin) for begin, end in itertools.pairwise([0, *ends])]
     shown[0].save(path, save_all=True, append_images=shown[1:], duration=times, loop=0, disposal=1, optimize=False)

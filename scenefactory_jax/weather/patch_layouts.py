@@ -173,7 +173,7 @@ def _shape(weather: Weather, shape: Mapping[str, Any], *, where: str) -> Patches
         radius=row(reach, jnp.float32),
         surface=_surface(weather, shape["surface"], name=f"{where}.surface")[None],
         film_mm=row(shape["film_mm"], jnp.float32),
-        follows=row(shape["follows"], jnp.float32),
+        open_road_film_fraction=row(shape["follows"], jnp.float32),
         present=row(True, bool),
     )
 
@@ -211,7 +211,7 @@ def _cover(
         radius=radius,
         surface=jnp.broadcast_to(_surface(weather, surface, name="surface"), (count,)),
         film_mm=_uniform(wet, film_mm, (count,), name="film_mm"),
-        follows=jnp.full(count, follows, jnp.float32),
+        open_road_film_fraction=jnp.full(count, follows, jnp.float32),
         present=possible & (jax.random.uniform(there, (count,)) < chance),
     )
 

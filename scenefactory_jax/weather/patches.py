@@ -37,7 +37,7 @@ def condition_at(weather: Weather, position: Float[Array, "*shape 2"]) -> tuple[
         return jnp.broadcast_to(weather.film_mm, shape), jnp.broadcast_to(weather.surface, shape)
     within = contains_points(patches, position)
     last = count - 1 - jnp.argmax(within[..., ::-1], axis=-1)
-    film_mm = (patches.film_mm + patches.follows * weather.film_mm)[last]
+    film_mm = (patches.film_mm + patches.open_road_film_fraction * weather.film_mm)[last]
     covered = jnp.any(within, axis=-1)
     return jnp.where(covered, film_mm, weather.film_mm), jnp.where(covered, patches.surface[last], weather.surface)
 

@@ -60,7 +60,7 @@ def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
 
 
 def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
-    @observations.bound_observation(observations.SHARE, observations.ANY)
+    @observations.bound_observation(observations.FRACTION, observations.ANY)
     def mine(scene, state, *, scale: float):
         return scale * jnp.array([[0.25, 30.0, -4.0]])
 
@@ -114,7 +114,7 @@ def test_a_step_is_all_control_steps_of_an_action():
     action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
     after, moment = jax.jit(functools.partial(episodes.step_worlds, held.env))(held.scenes, episode, action)
     scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
-    step, paid = jax.jit(held.env.transition), 0.0
+    step, paid = jax.jit(held.env.control_step), 0.0
     for _ in range(3):
         driving = state.active
         state, outcome = step(scene, state, action)

@@ -12,9 +12,9 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, validation
 from scenefactory_jax.roadgraph import spatial_grid
 
-PROCEDURAL = hydra_config.load_config("scenes")["scenes"]
+STREETS = hydra_config.load_config("scenes")["scenes"]
 WOMD = hydra_config.load_config("convert", "scenes=womd")["scenes"]
-GENERATE = instantiate(PROCEDURAL["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="generate")
+GENERATE = instantiate(STREETS["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="generate")
 SETTINGS = [
     {},
     {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"},

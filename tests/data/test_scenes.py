@@ -113,7 +113,7 @@ def test_scenefactory_json(tmp_path, readers):
     scene, report = prepared(raw)
     assert report.track_ids == (5,) and report.agents_dropped["not_a_vehicle"] == 1
     np.testing.assert_allclose(scene.agents.goal[0] - scene.agents.position[0], [20.0, 0.0], atol=1e-5)
-    np.testing.assert_allclose(scene.agents.route[0], 20.0, rtol=1e-6)
+    np.testing.assert_allclose(scene.agents.route_length[0], 20.0, rtol=1e-6)
 
 
 def damaged(path, value):
@@ -452,7 +452,7 @@ def test_backwards_is_no_start_speed_and_a_detour_is_a_longer_route(street):
     xyz[10:] = np.stack([10 * np.cos(angle), 10 * np.sin(angle), 0 * angle], axis=1)
     scene, _ = prepared(replace(street, tracks=(replace(track, xyz=xyz, yaw=track.yaw + 3 * np.pi),)), centre="mean")
     assert scene.agents.speed[0] == 0.0 and -np.pi <= scene.agents.yaw[0] < np.pi
-    np.testing.assert_allclose(scene.agents.route[0], np.linalg.norm(np.diff(xyz[10:], axis=0), axis=1).sum(), rtol=1e-6)
+    np.testing.assert_allclose(scene.agents.route_length[0], np.linalg.norm(np.diff(xyz[10:], axis=0), axis=1).sum(), rtol=1e-6)
 
 
 def test_no_agent_left_is_refused_with_reasons(tmp_path, readers):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.probes import NUMBERS, SMALL, probe, scenes
+from support.probes import make_trainer, probe, scenes
 from support.running import smoke
 from support.scene_documents import document, thing, written
 from support.streets import street
@@ -19,8 +19,6 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import batches, samplers, stream
 from scenefactory_jax.learning import checkpoint
-from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.training_loop import train as run_train
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.roadgraph import spatial_grid
@@ -47,9 +45,7 @@ def same(one, other):
 
 
 def trainer_of(**numbers):
-    return train_iteration.make_trainer(
-        probe(life=3, episode_steps=50), late_fusion.make(**SMALL), **{**NUMBERS, "episode_steps": 50, **numbers}
-    )
+    return make_trainer(probe(life=3, episode_steps=50), episode_steps=50, **numbers)
 
 
 @pytest.fixture(scope="module")
@@ -61,51 +57,50 @@ def trainer():
 def swapped(trainer):
     """States and scenes before and after other scenes came into worlds 6, 1 and 4, and what a restart in them alone gives."""
     stage, fresh, worlds = scenes(WORLDS), scenes(3, task=2), np.array([6, 1, 4])
-    state, _ = trainer.iterate(trainer.init(jax.random.key(0), stage), stage)
+    state, _ = trainer.train_iteration(trainer.init(jax.random.key(0), stage), stage)
     alone = trainer_of(stagger_episodes=False).restart(jax.tree.map(jnp.copy, state), fresh)
     before = bits((state, stage))
-    after, stage = trainer.swap(state, stage, worlds, fresh)
+    after, stage = trainer.replace_scenes(state, stage, worlds, fresh)
     kept = bits((after, stage))
-    following = trainer.iterate(after, stage)[0]
+    following = trainer.train_iteration(after, stage)[0]
     return SimpleNamespace(before=before, after=kept, alone=bits(alone), fresh=bits(fresh), worlds=worlds, following=following, stage=stage)
 
 
 def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
     state, stage = swapped.after
-    for name in ("worlds", "observation", "lives"):
-        same(jax.tree.map(lambda leaf: leaf[swapped.worlds], getattr(state, name)), getattr(swapped.alone, name))
+    same(jax.tree.map(lambda leaf: leaf[swapped.worlds], state.worlds), swapped.alone.worlds)
     same(jax.tree.map(lambda leaf: leaf[swapped.worlds], stage), swapped.fresh)
     same(state.key, swapped.alone.key)
-    assert not np.asarray(state.worlds.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
+    assert not np.asarray(state.worlds.state.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
 
 
 def test_a_swap_leaves_everybody_else_alone(swapped):
     others = np.setdiff1d(np.arange(WORLDS), swapped.worlds)
     rest = lambda tree: jax.tree.map(lambda leaf: leaf[others], tree)  # noqa: E731
     (before, stage_before), (after, stage_after) = swapped.before, swapped.after
-    for name in ("worlds", "observation", "lives", "record"):
+    for name in ("worlds", "scene_stats"):
         same(rest(getattr(before, name)), rest(getattr(after, name)))
     same(rest(stage_before), rest(stage_after))
-    for name in ("parameters", "optimiser", "iteration", "steps"):
+    for name in ("parameters", "optimizer", "iteration", "steps"):
         same(getattr(before, name), getattr(after, name))
 
 
 def test_records_count_from_the_swap_on(swapped):
     """Lives of three steps: five end in sixteen, of the two agents of each world; what began before the swap does not count."""
-    assert (swapped.before[0].record.episodes == 10).all() and (swapped.before[0].record.successes == 10).all()
+    assert (swapped.before[0].scene_stats.episodes == 10).all() and (swapped.before[0].scene_stats.successes == 10).all()
     wanted = np.where(np.isin(np.arange(WORLDS), swapped.worlds), 0, 10)
-    np.testing.assert_array_equal(swapped.after[0].record.episodes, wanted)
-    episodes = np.asarray(swapped.following.record.episodes)
+    np.testing.assert_array_equal(swapped.after[0].scene_stats.episodes, wanted)
+    episodes = np.asarray(swapped.following.scene_stats.episodes)
     assert (episodes[swapped.worlds] >= 10).all() and (episodes[swapped.worlds] <= 14).all()  # at most one more by time
-    assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.record.successes) <= episodes).all()
+    assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.scene_stats.successes) <= episodes).all()
 
 
 def test_nothing_compiles_twice(trainer, swapped):
     state, stage = jax.tree.map(jnp.copy, (swapped.following, swapped.stage))
     for world in range(3):
-        state, stage = trainer.swap(state, stage, np.array([world, 5, 7]), scenes(3, task=world + 1))
-        state, _ = trainer.iterate(state, stage)
-    assert trainer.swap._cache_size() == trainer.iterate._cache_size() == 1
+        state, stage = trainer.replace_scenes(state, stage, np.array([world, 5, 7]), scenes(3, task=world + 1))
+        state, _ = trainer.train_iteration(state, stage)
+    assert trainer.replace_scenes._cache_size() == trainer.train_iteration._cache_size() == 1
     np.testing.assert_array_equal(stage.weather.surface, [1, 2, 3, 5, 2, 3, 2, 3])
 
 
@@ -306,7 +301,7 @@ def test_room_for_more_changes_no_look_up():
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
         (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
-        (["stream.share=1.5"], r"stream\.share: 1\.5; wanted is a number from 0 to 1"),
+        (["stream.share=1.5"], r"stream\.share: expected a number >= 0 and <= 1, got 1\.5"),
         (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
         (["stream.excess=drop"], r"stream\.excess: 'drop'"),
         (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),
@@ -373,7 +368,7 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(tmp_path):
     assert len(rows) == 5 and [row["stream/scenes"] for row in rows][-1] == len(told["draws"])
     for row, other in zip(rows, others, strict=True):
         assert {name: row[name] for name in row if name not in CLOCK} == {name: other[name] for name in other if name not in CLOCK}
-    np.testing.assert_array_equal(told["record"], [whole.state.record.episodes, whole.state.record.successes])
+    np.testing.assert_array_equal(told["record"], [whole.state.scene_stats.episodes, whole.state.scene_stats.successes])
 
 
 def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
@@ -386,4 +381,4 @@ def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
     assert table[0] == "| shuffled | 4 of 64 | 0.2 | 9 | 1,900 | 5.0 % of `in memory` | 12.3 | 4,096 | 3 and 1 |"
     assert "of `in memory`" not in table[1] and throughput_report.streaming_table({"rows": [row]}) == ""
     with pytest.raises(ConfigError, match=r"stream: scenes are exchanged while training; scope=physics has stream=none"):
-        streaming.measure(hydra_config.load_config("bench", "stream=shuffled", "scope=physics"), mesh=None)
+        streaming.measure(hydra_config.load_config("benchmark", "stream=shuffled", "scope=physics"), mesh=None)

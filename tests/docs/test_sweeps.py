@@ -29,6 +29,7 @@ def test_values_that_commas_divide_are_runs_of_their_own(tmp_path):
     assert sorted(run["seed"] for run in found) == [0, 1] and len({run["name"] for run in found}) == 1
 
 
+@pytest.mark.slow
 def test_joblib_runs_them_at_a_time(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs hydra-joblib-launcher: pip install scenefactory_jax[sweeps]")
     found = sweep(tmp_path, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1")
@@ -43,6 +44,7 @@ def test_runs_that_begin_in_one_second_do_not_share_a_folder(tmp_path, monkeypat
         assert len(set(folders)) == 4 and all(folder.is_dir() for folder in folders)
 
 
+@pytest.mark.slow
 def test_the_optuna_loop_of_the_page(tmp_path, monkeypatch, capsys):
     pytest.importorskip("optuna", reason="needs Optuna: pip install scenefactory_jax[sweeps]")
     code = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL).group(1)

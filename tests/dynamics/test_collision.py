@@ -319,12 +319,12 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"stiffness": -1e6}, "dynamics.contact.stiffness: -1e.06; wanted is a number above 0"),
+        ({"stiffness": -1e6}, "dynamics.contact.stiffness: expected a number > 0, got -1e.06"),
         ({"damping": -1.0}, "dynamics.contact.damping"),
         ({"friction": -0.3}, "dynamics.contact.friction"),
         ({"mass": 0.0}, "dynamics.contact.mass"),
         ({"momentum_transfer_s": 0.0}, "dynamics.contact.momentum_transfer_s"),
-        ({"nearest": -1}, "dynamics.contact.nearest: -1; wanted is a number of at least 0"),
+        ({"nearest": -1}, "dynamics.contact.nearest: expected a number >= 0, got -1"),
         ({"stiffness": 1e9}, "stiffness 1e.09 and damping 30000 cannot be integrated: .* at physics_dt 0.00833"),
         ({"damping": 3e5}, "cannot be integrated"),
         ({"mass": 500.0}, "cannot be integrated"),

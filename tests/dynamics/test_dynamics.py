@@ -126,7 +126,7 @@ def test_braked_cars_hold_still(braking):
 def test_tyres_use_no_more_than_their_grip(braking):
     _, (_, motion) = braking
     assert motion.friction_utilization.max() < 1.01
-    np.testing.assert_allclose(motion.grip[0], MU, rtol=1e-6)
+    np.testing.assert_allclose(motion.mu[0], MU, rtol=1e-6)
     sliding = motion.friction_utilization[CHUNK, (MU <= 0.5)]
     np.testing.assert_allclose(sliding, 1.0, atol=0.01)
     slip = motion.slip[:, np.isclose(MU, 0.1)]

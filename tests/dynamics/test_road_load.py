@@ -190,7 +190,7 @@ def test_brakes_distance_counts_all_that_slows():
     ("changes", "named"),
     [
         ({"brakes": "latched", "car": {"rolling_torque": 10.0}}, "dynamics.car.rolling_torque: 10 N m; it must be 0 with latched"),
-        ({"car": {"tyre_slip_speed": 0.0}}, "dynamics.car.tyre_slip_speed: 0; wanted is a number above 0"),
+        ({"car": {"tyre_slip_speed": 0.0}}, "dynamics.car.tyre_slip_speed: expected a number > 0, got 0"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(changes, named):

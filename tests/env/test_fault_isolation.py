@@ -98,7 +98,7 @@ def test_a_fault_that_spreads_is_seen():
     yaw = np.zeros((8, 2, 4), np.float32)
 
     def run(numerical_error=quiet, active=away, yaw=yaw):
-        traces = Traces(active, yaw, Faults(fault))
+        traces = Traces(active, yaw, Faults(numerical_error))
         return traces, traces._replace(active=quiet)
 
     def judge(hurt):

@@ -28,7 +28,7 @@ UNUSABLE = {
     "start inf": ("position", jnp.inf),
     "yaw nan": ("yaw", jnp.nan),
     "speed inf": ("speed", jnp.inf),
-    "route nan": ("route", jnp.nan),
+    "route nan": ("route_length", jnp.nan),
 }
 
 
@@ -151,7 +151,7 @@ def agents(**fields):
         (agents(goal=jnp.zeros((2, 2))), r"scene.agents.goal: expected shape \(3, 2\), got \(2, 2\)"),
         (agents(goal=jnp.zeros((3, 2), int)), "scene.agents.goal: expected float, got int32"),
         (agents(present=jnp.ones(3)), "scene.agents.present: expected bool, got float32"),
-        (agents(route=None), r"scene.agents.route: missing; expected float of shape \(A\)"),
+        (agents(route_length=None), r"scene.agents.route_length: missing; expected float of shape \(A\)"),
         (lambda scene: replace(scene, weather=None), "scene.weather: expected a Weather, got NoneType"),
         (lambda scene: jax.tree.map(lambda leaf: leaf[None], scene), r"scene.road.midpoint: .* many worlds map over them with jax.vmap"),
         (lambda scene: (scene, None), "scene: expected a Scene, got tuple"),
@@ -178,7 +178,7 @@ def test_scenes_that_do_not_fit_are_refused_by_name(env, given, change, message)
 )
 def test_actions_that_do_not_fit_are_refused_by_name(env, given, action, message):
     scene, state, _ = given
-    for name in ("step", "transition"):
+    for name in ("step", "control_step"):
         with pytest.raises(ValueError, match=f"env.{name}: {message}"):
             jax.eval_shape(getattr(env, name), scene, state, action)
     worlds = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((2, *leaf.shape), leaf.dtype), (scene, state, jnp.zeros((1, 3))))

@@ -226,12 +226,12 @@ def test_encounters_meet_when_they_should(entry):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"speed_max": 0.5}, "speed_max: 0.5; wanted is a number above 1"),
-        ({"closing_min": 25.0}, "speed_max: 20; wanted is a number above 25"),
+        ({"speed_max": 0.5}, "speed_max: expected a number > 1, got 0.5"),
+        ({"closing_min": 25.0}, "speed_max: expected a number > 25, got 20"),
         ({"closing_min": -1.0}, "closing_min"),
-        ({"lead_max_s": 0.1}, "lead_max_s: 0.1; wanted is a number of at least 0.3"),
+        ({"lead_max_s": 0.1}, "lead_max_s: expected a number >= 0.3, got 0.1"),
         ({"friction_max": 0.01}, "friction_max"),
-        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+        ({"count": 0}, "count: expected a number >= 1, got 0"),
     ],
 )
 def test_encounters_that_cannot_be_are_refused(changes, named):
@@ -243,11 +243,11 @@ def test_encounters_that_cannot_be_are_refused(changes, named):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"hold_min_s": 0.0}, "hold_min_s: 0; wanted is a number above 0"),
-        ({"hold_min_s": 2.0}, "hold_max_s: 1; wanted is a number of at least 2"),
+        ({"hold_min_s": 0.0}, "hold_min_s: expected a number > 0, got 0"),
+        ({"hold_min_s": 2.0}, "hold_max_s: expected a number >= 2, got 1"),
         ({"friction_max": 0.01}, "friction_max"),
         ({"speed_max": -1.0}, "speed_max"),
-        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+        ({"count": 0}, "count: expected a number >= 1, got 0"),
     ],
 )
 def test_drives_that_cannot_be_are_refused(changes, named):

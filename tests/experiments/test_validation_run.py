@@ -237,8 +237,8 @@ def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, caps
 def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
     for override, message in {
         "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws, extremes, faults, costs",
-        "workers=0": "workers: 0; wanted is at least 1",
-        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: 'fast' is of type str, wanted float",
+        "workers=0": "workers: expected an integer >= 1, got 0",
+        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: expected a number, got 'fast'",
         "validation.drives.draw.seconds=0.4": "validation.drives.draw.seconds: 0.4; at least 0.5, validation.bound.horizon_s",
     }.items():
         with pytest.raises(ConfigError, match=message):

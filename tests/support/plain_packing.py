@@ -227,7 +227,8 @@ def corners(centre, yaw, length, width):
 
 def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
     """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
-    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")} | {name: np.zeros(slots) for name in ("yaw", "speed", "route")}
+    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")}
+    rows |= {name: np.zeros(slots) for name in ("yaw", "speed", "route_length")}
     sizes = np.array([car_size_m or track.size[:2] for track in tracks], float).reshape(-1, 2)
     absent = car_size_m or (sizes.mean(axis=0) if len(sizes) else np.ones(2))
     size = np.concatenate([sizes, np.tile(absent, (slots - len(tracks), 1))])
@@ -238,7 +239,7 @@ def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
         rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-        rows["route"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
+        rows["route_length"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(tracks)
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 

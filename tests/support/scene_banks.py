@@ -1,4 +1,4 @@
-"""Banks of scenes that tests make up: procedural ones, and pieces and copies of them."""
+"""Banks of scenes that tests make up: generated ones, and pieces and copies of them."""
 
 import functools
 from dataclasses import replace
@@ -10,15 +10,15 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import features
 
-PROCEDURAL = hydra_config.load_config("convert", "scenes=procedural")["scenes"]
+STREETS = hydra_config.load_config("convert", "scenes=streets")["scenes"]
 FEATURES = instantiate(hydra_config.load_config("scenes")["features"], builtins=features, where="features")
 
 
 @functools.cache
 def generated(index, seed=3):
-    """A procedural scene; the kinds take turns: straight, curve, T, crossing, roundabout, merge."""
-    builtins = "scenefactory_jax.data.generators.procedural.procedural_scene"
-    return instantiate(PROCEDURAL["generate"], builtins=builtins, where="scenes.generate")(seed, index)
+    """A generated scene; the kinds take turns: straight, curve, T, crossing, roundabout, motorway."""
+    builtins = "scenefactory_jax.data.generators.town.town_scene"
+    return instantiate(STREETS["generate"], builtins=builtins, where="scenes.generate")(seed, index)
 
 
 def banked(folder, raws, *, described=True):
@@ -39,7 +39,8 @@ def rounded(raw, metres=0.01, **changes):
     rough = lambda xyz: np.round(xyz / metres) * metres  # noqa: E731
     roads = tuple(replace(line, xyz=rough(line.xyz)) for line in reversed(raw.roads))
     tracks = tuple(replace(track, xyz=rough(track.xyz)) for track in reversed(raw.tracks))
-    return replace(raw, roads=roads, tracks=tracks, **changes)
+    sdc = None if raw.sdc is None else len(tracks) - 1 - raw.sdc
+    return replace(raw, **{"roads": roads, "tracks": tracks, "sdc": sdc} | changes)
 
 
 def window(raw, x, side, **changes):

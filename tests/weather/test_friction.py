@@ -131,8 +131,8 @@ def test_draw_follows_the_weights_and_keep_keeps():
         ({"tyre": {k: v for k, v in BASE["grip"]["tyre"].items() if k != "load"}}, "tyre.load"),
         ({"surfaces": {"AC": SURFACE["AC"]}}, "SMA"),
         ({"surfaces": {**SURFACE, "AC": {"theta": 1.0}}}, "surfaces.AC.texture_mm"),
-        ({"floor": 0.0}, "weather.grip.floor: 0; wanted is a number above 0"),
-        ({"slip_static": -0.15}, "weather.grip.slip_static: -0.15; wanted is a number of at least 0"),
+        ({"floor": 0.0}, "weather.grip.floor: expected a number > 0, got 0"),
+        ({"slip_static": -0.15}, "weather.grip.slip_static: expected a number >= 0, got -0.15"),
         ({"reference_speed": -1.0}, "weather.grip.reference_speed"),
         ({"tyre": {**BASE["grip"]["tyre"], "load": -3469.0}}, "weather.grip.tyre.load"),
         ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"weather.grip.tyre.stribeck_velocity\[3\]"),
@@ -153,7 +153,7 @@ def test_grip_refuses_by_name(change, named):
         ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
         ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
         ({"surface": "AC", "weight": 1.0}, "film_mm"),
-        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: nan; wanted is a finite number of at least 0"),
+        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: expected a finite number >= 0, got nan"),
     ],
 )
 def test_draw_refuses_by_name(case, named):
@@ -183,20 +183,20 @@ def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
 
 
 def test_the_command_tells_what_the_model_says(tmp_path):
-    found = command.weather(load_config("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
+    found = command.physics(load_config("physics", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
     for name, row in PUBLISHED.items():
         wanted = [mu for film, mu in zip(FILMS, row, strict=True) if film in (0.0, 0.3, 1.0)]
         np.testing.assert_allclose(found["table"][name]["static"], wanted, atol=1e-3)
     assert found == result_file.read(tmp_path / "weather.json") and (tmp_path / "weather.png").is_file()
     text = (tmp_path / "weather.md").read_text()
     assert "| AC | 1.105 (1.144) | 0.959 (0.830) | 0.000 (0.000) |" in text and "| SMA | 1.204 / 1.204 | 1.046 / 1.046 |" in text
-    with pytest.raises(ConfigError, match=r"slips: \[0.5, 0.1\]; wanted is \[least, most\]"):
-        command.weather(load_config("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
+    with pytest.raises(ConfigError, match=r"slips: expected \[min, max\], got \[0.5, 0.1\]"):
+        command.physics(load_config("physics", f"out={tmp_path}", "slips=[0.5,0.1]"))
 
 
 def test_what_is_committed_is_what_the_model_says(tmp_path):
     committed = result_file.read(ROOT / "experiments" / "weather" / "weather.json")
-    found = command.weather(load_config("weather", f"out={tmp_path}"))
+    found = command.physics(load_config("physics", f"out={tmp_path}"))
     for name, row in committed["table"].items():
         for kind in row:
             np.testing.assert_allclose(found["table"][name][kind], row[kind], atol=1e-4)

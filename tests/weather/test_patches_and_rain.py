@@ -232,7 +232,7 @@ def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     middle, half = np.asarray(scene.lanes.midpoint)[rows], (scene.lanes.half_length[:, None] * scene.lanes.direction)[rows]
     lanes = shapely.MultiLineString([[m - h, m + h] for m, h in zip(middle, np.asarray(half), strict=True)])
     apart = lambda points: shapely.distance(lanes, shapely.points(points))  # noqa: E731
-    assert laid.present.all() and (laid.surface == ICE).all() and (laid.follows == 0.5).all()
+    assert laid.present.all() and (laid.surface == ICE).all() and (laid.open_road_film_fraction == 0.5).all()
     assert 0.1 <= laid.film_mm.min() < 0.15 and 0.35 < laid.film_mm.max() <= 0.4
     vertices = np.asarray(laid.vertices, float)
     if name == "circles":
@@ -310,7 +310,7 @@ def test_every_option_resets_steps_and_traces_once(option):
     for _ in range(3):
         states, outcome = step(scenes, states, jnp.zeros((6, 2, 3)))
     assert len(traces) == 1 and seen["weather"].shape == (6, 2, 4)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.facts.grip, outcome.observation, states.weather)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.metrics.mu, outcome.observation, states.weather)))
     np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
     later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(states.weather)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
@@ -336,7 +336,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     for _ in range(30):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
         tokens.append(outcome.observation["weather"])
-        friction.append(outcome.facts.grip)
+        friction.append(outcome.metrics.mu)
     tokens, film, friction = np.array(tokens), 0.1 + 0.3 * np.arange(1, 31) / 30, np.array(friction)
     wet = np.array([4.0 * step / 30 for step in range(1, 31)]) < 1.9  # the bearings' drag takes little of 4 m/s
     np.testing.assert_allclose(tokens[:, 1, 0], film, atol=1e-5)
@@ -382,12 +382,12 @@ def test_the_report_says_how_the_film_changed():
         ("+weather.patches.ice.cuont=3", r"weather\.patches\.ice\.cuont: unknown key of polygons; valid: chance, corners, count"),
         ("~weather.patches.ice.chance", r"weather\.patches\.ice\.chance: missing; polygons needs"),
         ("weather.patches.ice.surface=MUD", r"weather\.patches\.ice\.surface: 'MUD'; valid: AC, SMA, OGFC, GRAVEL, SNOW, ICE"),
-        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: 1\.5; wanted is a number from 0 to 1"),
-        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: \[3\.0, 1\.0\]; wanted is \[least, most\]"),
+        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: expected a number >= 0 and <= 1, got 1\.5"),
+        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: expected \[min, max\], got \[3\.0, 1\.0\]"),
         ("weather.patches.ice.film_mm=[-1.0,1.0]", r"weather\.patches\.ice\.film_mm: .*nothing below 0"),
-        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: 2; wanted is at least 3"),
-        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: -1\.0; wanted is at least 0"),
-        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: 'many' is of type str, wanted int"),
+        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: expected an integer >= 3, got 2"),
+        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: expected an integer >= 0, got -1\.0"),
+        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: expected an integer, got 'many'"),
         ("weather.patches=wet", r"weather\.patches: 'wet'"),
         ("+weather.rian=3", r"weather\.rian: unknown key; valid: draw, grip, patches, rain"),
         ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: drying, onset, pass_time, schedule"),
@@ -411,7 +411,7 @@ def test_refuses_by_name(override, message):
         ({**SHAPES[0], "strip": [[0, 0], [1, 0]]}, r"shapes\[0\]: .*one of circle"),
         ({**SHAPES[0], "width": 1.0}, r"shapes\[0\]\.width: unknown; a circle has circle, radius, surface"),
         ({k: v for k, v in SHAPES[0].items() if k != "radius"}, r"shapes\[0\]\.radius: missing; a circle has"),
-        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: -1\.0; wanted is at least 0"),
+        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: expected an integer >= 0, got -1\.0"),
         ({**SHAPES[0], "circle": [[0, 0]]}, r"shapes\[0\]\.circle: .*wanted tuple\[float, float\]"),
         ({**SHAPES[1], "polygon": [[0, 0], [1, 0]]}, r"shapes\[0\]\.polygon: 2 points; wanted are at least 3"),
         ({**SHAPES[1], "surface": "MUD"}, r"shapes\[0\]\.surface: 'MUD'; valid: AC"),

@@ -14,7 +14,8 @@ import numpy as np
 
 from experiments.validation.measurements import Spread
 from scenefactory_jax.core.parallel.gpu_processes import end_with_the_first
-from scenefactory_jax.learning.interrupt import STOPPING
+
+STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows has no SIGHUP
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import find_differences
+from scenefactory_jax.core.config import find_differences
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats.reader_selection import BANK_INDEX as INDEX
 

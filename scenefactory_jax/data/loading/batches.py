@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
@@ -71,7 +70,7 @@ def open(config: Mapping[str, Any]) -> Source:
         ConfigError: neither path nor generator, or a key that does not fit.
         SceneError: nothing at the path.
     """
-    schema.check_scenes(config)
+    scene_source.check_config(config)
     if (config.get("take") or {}).get("count") is not None:
         count = config["take"]["count"]
         raise ConfigError(f"scenes.take.count: {count}; a stream draws from all scenes: `scenes op=sample` makes a smaller bank")

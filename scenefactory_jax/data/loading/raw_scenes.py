@@ -2,10 +2,8 @@
 
 import itertools
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import bank_reader
@@ -29,21 +27,6 @@ def scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[R
         return itertools.islice(found, limit)
     generate = scene_source.make_generator(config)
     return (generate(config["seed"], index) for index in range(config["count"] if limit is None else limit))
-
-
-def read(path: Path | str) -> Iterator[RawScene | str]:
-    """Every scene of a bank, a file or a folder, whole and in float64, in any of the formats that come along.
-
-        for raw in scenefactory_jax.read("scenes.tfrecord"):
-            print(raw if isinstance(raw, str) else raw.name)
-
-    Returns:
-        The scenes one after another; in place of one that cannot be read, the reason.
-
-    Raises:
-        SceneError: no such path.
-    """
-    return scenes(configs.load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
 
 
 def _of_bank(config: Mapping[str, Any]) -> Iterator[RawScene]:

@@ -5,17 +5,17 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.cli import schema
-from scenefactory_jax.core import sharding
+from scenefactory_jax.core import schema, sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, Reject
 from scenefactory_jax.core.safe_names import escape_for_terminal
+from scenefactory_jax.core.schema import Count, Seed
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import bank_reader
@@ -25,6 +25,58 @@ from scenefactory_jax.data.packing.stack import describe, stack
 from scenefactory_jax.roadgraph import spatial_grid
 
 CACHE = "SCENEFACTORY_CACHE"  # environment variable: folder of compiled programs; empty switches the cache off
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Scenes for evaluation: those at a path, or generated ones of another seed."""
+
+    path: str | None
+    seed: Seed
+    count: Count
+
+
+@dataclass(frozen=True)
+class RoadGrid:
+    """Grid for the road observation; without a radius there is none."""
+
+    radius_m: Annotated[float, schema.Bounds(min=0)] | None
+    size_m: Annotated[float, schema.Bounds(min=0.1)]
+
+
+@dataclass(frozen=True)
+class Take:
+    """How many scenes are drawn to train on; null: all."""
+
+    count: Count | None
+    seed: Seed
+
+
+@dataclass(frozen=True)
+class ScenesConfig:
+    """The group `scenes`; entries with a `_target_` are checked by the functions that they select."""
+
+    path: str | None
+    seed: Seed
+    count: Count
+    workers: Count
+    heldout: HeldOut
+    cells: RoadGrid
+    generate: dict[str, Any] | None
+    formats: dict[str, Any]
+    check: dict[str, Any]
+    pack: dict[str, Any]
+    capacity: dict[str, int | None]
+    take: Take | None = None  # missing in old runs
+
+
+def check_config(config: Mapping[str, Any]) -> None:
+    """Checks the group `scenes`.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    schema.check(config, ScenesConfig, where="scenes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +101,7 @@ def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
         ConfigError: neither is given.
         SceneError: nothing usable at the path, with the reasons.
     """
-    schema.check_scenes(config)
+    check_config(config)
     return take_scenes(load_all_scenes(config), config)
 
 
@@ -66,7 +118,7 @@ def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     Raises:
         ConfigError: more than there are.
     """
-    schema.check_scenes(config)
+    check_config(config)
     take: Mapping[str, Any] = config.get("take") or {"count": None}  # runs from before there was a choice have none
     count = take["count"]
     if count is None or count == len(scenes):
@@ -86,7 +138,7 @@ def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scene
         ConfigError: the config names none.
         SceneError: nothing usable at the path, with the reasons.
     """
-    schema.check_scenes(config)
+    check_config(config)
     path = path if path is not None else config["heldout"]["path"]
     if path is not None:
         return from_path(config, path)
@@ -102,7 +154,7 @@ def check_heldout(config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: naming the key.
     """
-    schema.check_scenes(config)
+    check_config(config)
     path, own = config["heldout"]["path"], config["path"]
     if path is not None and not Path(path).exists():
         raise ConfigError(f"scenes.heldout.path: {path}: no such file or folder; give held-out scenes, or null for none")
@@ -169,8 +221,8 @@ def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
         ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
     """
     if not _has_generator(config):
-        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
-    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
+        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=streets")
+    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="scenes.generate")
 
 
 def make_readers(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,10 +4,10 @@
         scenes = flow.scenes()                                # for all worlds, on their devices
         for iteration in range(iterations):
             if iteration:
-                state, scenes = flow.exchange(trainer.swap, state, scenes)
-            state, metrics = trainer.iterate(state, scenes)
+                state, scenes = flow.exchange(trainer.replace_scenes, state, scenes)
+            state, metrics = trainer.train_iteration(state, scenes)
             flow.draw()                                       # while the devices work
-            flow.note(*jax.device_get((state.record.episodes, state.record.successes)))
+            flow.note(*jax.device_get((state.scene_stats.episodes, state.scene_stats.successes)))
 
 What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
 state, it makes a resumed run the unbroken one, bit for bit.
@@ -15,6 +15,7 @@ state, it makes a resumed run the unbroken one, bit for bit.
 
 import contextlib
 import functools
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +35,7 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
 from scenefactory_jax.data.loading.batches import Batch
 
+LOG = logging.getLogger(__name__)
 SHOWN = 10  # scenes left out that are told by name
 
 
@@ -192,7 +194,7 @@ class SceneStream:
         for name, reason in taken.batch.refused.items():
             if name not in self._told and len(self._told) < SHOWN:
                 self._told.add(name)
-                print(escape_for_terminal(f"left out {name}: {reason}"), flush=True)
+                LOG.info(escape_for_terminal(f"left out {name}: {reason}"))
         return taken
 
 
@@ -245,5 +247,5 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         held = _new(source, sizes, config["worlds"]) if before is None else before
         flow = SceneStream(source, entry, lambda indices: thread.submit(placed, indices), held)
         what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
-        print(f"stream of {source.line}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}", flush=True)
+        LOG.info(f"stream of {source.line}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}")
         yield flow

@@ -299,7 +299,8 @@ def _agents(
     chosen: list[int], logs: Logs, current: int, slots: int, car_size_m: list[float] | None, start_speed: str
 ) -> dict[str, np.ndarray]:
     """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
-    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")} | {name: np.zeros(slots) for name in ("yaw", "speed", "route")}
+    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")}
+    rows |= {name: np.zeros(slots) for name in ("yaw", "speed", "route_length")}
     sizes = np.tile(car_size_m, (len(chosen), 1)) if car_size_m else logs.size[chosen, :2]
     absent = car_size_m or (sizes.mean(axis=0) if len(sizes) else np.ones(2))
     size = np.concatenate([sizes.reshape(-1, 2), np.tile(absent, (slots - len(chosen), 1))])
@@ -309,7 +310,7 @@ def _agents(
         along = float(logs.velocity[index, current] @ np.array([np.cos(yaw), np.sin(yaw)]))
         rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
-        rows["route"][slot] = max(segment_lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
+        rows["route_length"][slot] = max(segment_lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(chosen)
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 

@@ -255,7 +255,7 @@ def read(plant: CompiledCar, body: Body) -> Motion:
         upright=rotation[2][2],
         steer=body.qpos[:, plant.places.steer_q].mean(-1),
         contact_force=body.contact_force,
-        grip=tyres.mu.mean(-1),
+        mu=tyres.mu.mean(-1),
         friction_utilization=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
         slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
     )

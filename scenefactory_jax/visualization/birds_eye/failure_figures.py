@@ -31,7 +31,7 @@ class Case(NamedTuple):
     hit: int | None
 
 
-def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
+def failures_figure(cases: Sequence[Case], *, before_s: float | int) -> Figure:
     """Draws a column per failure: above the complete trajectory and the goal, below the surroundings at the time of the failure.
 
     Args:
@@ -97,7 +97,7 @@ def _find_step(case: Case) -> int:
     return int(np.clip(round(case.failure.moment_s * case.trajectory.control_hz) - 1, 0, len(case.trajectory.active) - 1))
 
 
-def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float, whole: bool) -> None:
+def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float | int, whole: bool) -> None:
     trajectory, step, agent = case.trajectory, _find_step(case), case.failure.agent
     figures.draw_road(axes, trajectory.scene, window, inches=_INCHES)
     axes.set(xticks=[], yticks=[])

@@ -26,7 +26,7 @@ _ROAD = (  # of the legend: label, colour, width
 )  # fmt: skip
 
 
-def scene_figure(scene: Scene, *, goal_radius_m: float, title: str = "", all_road: bool = False) -> Figure:
+def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", all_road: bool = False) -> Figure:
     """Draws a scene at its start: road, cars, goals of the same colour and number, logged traffic.
 
     Args:
@@ -52,7 +52,7 @@ def scene_figure(scene: Scene, *, goal_radius_m: float, title: str = "", all_roa
     return figure
 
 
-def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: float) -> Figure:
+def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: float | int) -> Figure:
     """Draws many scenes at their starts as small squares, each at its own scale.
 
     Args:
@@ -114,7 +114,7 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     return figure
 
 
-def draw_road(axes: Axes, scene: Scene, window: tuple[float, float, float], *, inches: float) -> float:
+def draw_road(axes: Axes, scene: Scene, window: tuple[float, float, float], *, inches: float | int) -> float:
     """Draws road and patches in a window (left, bottom, side), `inches` wide on paper; returns the scale in points per metre."""
     left, bottom, side = window
     scale = inches * 72 / side
@@ -157,7 +157,7 @@ def _make_axes(scene: Scene, window: tuple[float, float, float], *, title: str) 
     return figure, axes, draw_road(axes, scene, window, inches=_INCHES * _AXES_FRACTION)
 
 
-def _draw_goal(axes: Axes, place: np.ndarray, agent: int, radius_m: float, scale: float) -> None:
+def _draw_goal(axes: Axes, place: np.ndarray, agent: int, radius_m: float | int, scale: float) -> None:
     """A circle of the goal's radius with the agent's number, in its colour."""
     x, y = (float(value) for value in place)
     axes.add_patch(Circle((x, y), radius_m, fill=False, edgecolor=rgb(drawing.colour_of(agent)), linewidth=1.3, zorder=3.5))
@@ -168,19 +168,19 @@ def _draw_goal(axes: Axes, place: np.ndarray, agent: int, radius_m: float, scale
 def _add_legend(figure: Figure, events: Iterable[str], *, car: str, scene: Scene, road: bool, traffic: bool) -> None:
     """Meaning of the shapes, below the axes."""
 
-    def point(marker: Any, colour: Colour, label: str, **look: Any) -> Line2D:
-        return Line2D([], [], marker=marker, linestyle="none", color=rgb(colour), label=label, **{"markersize": 8} | look)
+    def point(marker: Any, colour: Colour, label: str, *, markersize: float = 8.0, **look: Any) -> Line2D:
+        return Line2D([], [], marker=marker, linestyle="none", color=rgb(colour), label=label, markersize=markersize, **look)
 
     box, first = (4, 0, 45), drawing.AGENTS[0]
-    handles = [point(box, first, f"car at its {car}", markersize=7), point("o", first, "its goal", markerfacecolor="none")]
+    handles = [point(box, first, f"car at its {car}", markersize=7.0), point("o", first, "its goal", markerfacecolor="none")]
     if road:
         drawn = {stroke.colour for stroke in drawing.strokes(scene.road)}
         handles += [Line2D([], [], color=rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
     for area in {area.label: area for area in patch_overlay.areas(scene.weather)}.values():
         handles.append(point("s", area.colour, area.label, markeredgecolor=rgb(area.edge), markeredgewidth=0.6))
     if traffic:
-        handles.append(point(box, MOVING, "traffic", markersize=7))
+        handles.append(point(box, MOVING, "traffic", markersize=7.0))
     handles += [point(MARKS[name].marker, MARKS[name].colour, MARKS[name].label) for name in events]
     rows = 2 if len(handles) > 6 else 1
-    look = {"fontsize": 7.5, "labelspacing": 0.25, "borderpad": 0.0} if rows == 2 else {}
+    look: dict[str, Any] = {"fontsize": 7.5, "labelspacing": 0.25, "borderpad": 0.0} if rows == 2 else {}
     figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // rows), handletextpad=0.5, columnspacing=1.4, **look)

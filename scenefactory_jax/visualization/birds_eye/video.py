@@ -104,7 +104,9 @@ def shown_steps(length: int, stride: int) -> list[int]:
     return steps if steps[-1] == length - 1 else [*steps, length - 1]
 
 
-def _draw_sheets(panels: list[_Panel], *, fps: float, stride: int, columns: int, side: int, trail_s: float) -> Iterator[np.ndarray]:
+def _draw_sheets(
+    panels: list[_Panel], *, fps: float | int, stride: int, columns: int, side: int, trail_s: float | int
+) -> Iterator[np.ndarray]:
     """Pastes panels on a sheet, frame by frame."""
     bar = _bar(side)
     across, down = side + _GAP, side + 2 * bar + _GAP

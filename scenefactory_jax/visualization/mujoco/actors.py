@@ -88,7 +88,7 @@ def add_goals(
         add_geom(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (radius_m, GOAL_M / 2, 0.0), (*goal[agent].tolist(), GOAL_M / 2), 0.0, colour)
 
 
-def add_trails(scene: mujoco.MjvScene, world: ActorTrajectories, step: int, *, trail_s: float) -> None:
+def add_trails(scene: mujoco.MjvScene, world: ActorTrajectories, step: int, *, trail_s: float | int) -> None:
     """Adds each car's positions in the last seconds, fading with age, in about ten pieces per second."""
     count, stride = round(trail_s * world.hz), max(round(world.hz / 10), 1)
     first = max(step - count, 0)

@@ -4,8 +4,9 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal
 
 import imageio.v3 as imageio
 import jax
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from scenefactory_jax.core.schema import Bounds, Count, NonNegative
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
 from scenefactory_jax.visualization import video_file
@@ -25,28 +27,30 @@ FINE = 2  # supersampling in each direction: multisampling does not smooth the e
 FOVY = 45.0  # degrees, of MuJoCo's free camera
 
 
-class Camera(NamedTuple):
-    """Camera behind a car."""
+@dataclass(frozen=True)
+class Camera:
+    """Camera behind a car; `conf/command/view.yaml` describes the fields of all settings."""
 
-    distance_m: float
-    pitch_deg: float
-    lag_s: float
+    distance_m: Annotated[float, Bounds(min=1)]
+    pitch_deg: Annotated[float, Bounds(min=-90, max=90)]
+    lag_s: NonNegative
 
 
-class FilmSettings(NamedTuple):
-    """Settings of a film, as in `conf/command/view.yaml`."""
+@dataclass(frozen=True)
+class FilmSettings:
+    """Settings of a film."""
 
     view: Literal["chase", "bird", "both"]
-    width: int
-    height: int
-    fps: float
-    stride: int
-    at_s: float
-    trail_s: float
+    width: Annotated[int, Bounds(min=64)]
+    height: Annotated[int, Bounds(min=64)]
+    fps: Annotated[float, Bounds(min=0.1)]
+    stride: Count
+    at_s: NonNegative
+    trail_s: NonNegative
 
 
 def write(
-    path: Path | str, recording: Recording, *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float,
+    path: Path | str, recording: Recording, *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float | int,
     slot: int | None = None, world: int = 0,
 ) -> Path:  # fmt: skip
     """Writes one moment as `.png`, or the episode as `.gif` or `.mp4` (extra `video`).
@@ -85,7 +89,7 @@ def write(
 
 
 def frames(
-    world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float,
+    world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float | int,
     slot: int,
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:  # fmt: skip
     """Draws the pictures of some steps; view `both` has the chase camera on the left and the view from above on the right.

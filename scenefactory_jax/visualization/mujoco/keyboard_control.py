@@ -2,7 +2,8 @@
 
 import functools
 from collections.abc import Callable, Mapping, Set
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,24 +11,40 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import Bounds
 from scenefactory_jax.core.types import Env, Observation, Scene, State
 from scenefactory_jax.env.rollout import Act, StepRecord, make_step_record
 from scenefactory_jax.roadgraph import queries
 
-COMMANDS = ("throttle", "brake", "left", "right", "stop", "reset", "pause", "camera")
-PEDALS = COMMANDS[:5]  # act while their key is down; the others act once per press
+PEDALS = ("throttle", "brake", "left", "right", "stop")  # act while their key is down; the others act once per press
+Duration = Annotated[float, Bounds(min=0.01)]
 FAR_M = 1e5  # coordinate of a goal that is never reached
 
 
-class KeyboardResponse(NamedTuple):
-    """Response times of pedals and steering wheel, as in `conf/command/view.yaml`."""
+@dataclass(frozen=True)
+class Keys:
+    """Name of the key of each command."""
 
-    rise_s: float
-    fall_s: float
-    turn_s: float
-    centre_s: float
-    half_steer_mps: float
-    tap_s: float
+    throttle: str
+    brake: str
+    left: str
+    right: str
+    stop: str
+    reset: str
+    pause: str
+    camera: str
+
+
+@dataclass(frozen=True)
+class KeyboardResponse:
+    """Response times of pedals and steering wheel; `conf/command/view.yaml` describes them."""
+
+    rise_s: Duration
+    fall_s: Duration
+    turn_s: Duration
+    centre_s: Duration
+    half_steer_mps: Annotated[float, Bounds(min=0.01)]
+    tap_s: Duration
 
 
 class Controls(NamedTuple):
@@ -95,11 +112,11 @@ class Drive(NamedTuple):
     steps: int  # since the last start
 
 
-def make_world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: float, off_map_m: float) -> World:
+def make_world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: float, off_map_m: float | int) -> World:
     """Compiles one world in which the keyboard controls the car in slot `car` and `act` the other cars."""
 
     def begin(scene: Scene, key: PRNGKeyArray) -> tuple[State, Observation]:
-        state = env.start(key, scene)
+        state = env.init_state(key, scene)
         goal = state.agents.goal.at[car].set(FAR_M)
         state = replace(state, agents=replace(state.agents, goal=goal))
         return state, env.observe(scene, state)
@@ -108,7 +125,7 @@ def make_world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, d
         scene: Scene, parameters: Any, state: State, observation: Observation, key: PRNGKeyArray, action: Float[Array, "3"]
     ) -> tuple[State, Observation, StepRecord, Float[Array, ""]]:
         actions = act(parameters, observation, key).at[car].set(action)
-        after, outcome = env.transition(scene, state, actions)
+        after, outcome = env.control_step(scene, state, actions)
         squared = queries.squared_segment_distance(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
         distance = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
         return after, env.observe(scene, after), make_step_record(env, scene, state, after, outcome), distance
@@ -128,7 +145,7 @@ def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, re
     """Computes one control step, unless paused. The command `reset`, an inactive car and a car off the map restart the drive.
 
     Args:
-        pressed: commands (`COMMANDS`) of the keys that went down since the last call.
+        pressed: commands (fields of `Keys`) of the keys that went down since the last call.
         held: commands of the keys that are down.
     """
     drive = drive._replace(paused=drive.paused ^ ("pause" in pressed), chasing=drive.chasing ^ ("camera" in pressed))

@@ -15,7 +15,6 @@ from importlib import import_module
 import mujoco
 import numpy as np
 from jaxtyping import UInt8
-from mujoco import gl_context
 
 BACKENDS = ("egl", "osmesa", "glfw", "cgl")
 BY_PLATFORM = {"linux": "egl", "darwin": "cgl"}  # otherwise glfw
@@ -51,20 +50,30 @@ def make_painter(model: mujoco.MjModel, data: mujoco.MjData, *, width: int, heig
         raise OpenGLError(f"MUJOCO_GL: expected {', '.join(BACKENDS)} or nothing, got {backend!r}")
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     try:
-        gl_context.GLContext = import_module(f"mujoco.{backend}").GLContext
-        renderer = mujoco.Renderer(model, height, width, max_geom=MAX_GEOMS)
+        context = import_module(f"mujoco.{backend}").GLContext(width, height)
+        context.make_current()
+        renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:  # whatever the platform's OpenGL raises
         reason = " ".join((str(error) or type(error).__name__).split())
         raise OpenGLError(f"no OpenGL through {backend} here ({reason}); {_suggest(backend)}") from None
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
+    renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+    scene, options, window = mujoco.MjvScene(model, MAX_GEOMS), mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
+    scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
 
     def paint(camera: mujoco.MjvCamera, decorate: Callable[[mujoco.MjvScene], None]) -> UInt8[np.ndarray, "H W 3"]:
-        renderer.update_scene(data, camera)
-        decorate(renderer.scene)
-        return renderer.render()
+        mujoco.mjv_updateScene(model, data, options, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+        decorate(scene)
+        mujoco.mjr_render(window, scene, renderer)
+        pixels = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, window, renderer)
+        return pixels[::-1]
 
-    with contextlib.closing(renderer):
+    try:
         yield paint
+    finally:
+        renderer.free()
+        context.free()
 
 
 def _suggest(backend: str) -> str:

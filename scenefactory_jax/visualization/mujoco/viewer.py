@@ -22,7 +22,7 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
 from scenefactory_jax.visualization.mujoco.film import Camera
-from scenefactory_jax.visualization.mujoco.keyboard_control import COMMANDS, PEDALS, Drive, KeyboardResponse, World
+from scenefactory_jax.visualization.mujoco.keyboard_control import PEDALS, Drive, KeyboardResponse, Keys, World
 from scenefactory_jax.visualization.mujoco.scene_model import RenderModel
 
 NAMED_KEYS = ("up", "down", "left", "right", "space", "enter", "home", "end", "insert", "delete")
@@ -31,18 +31,14 @@ KEY_CODES |= {chr(code).lower(): code for code in range(glfw.KEY_A, glfw.KEY_Z +
 MAX_LAG_S = 0.5  # of the display; a slower machine drives in slow motion
 
 
-def read_keys(keys: Mapping[str, str]) -> dict[int, str]:
+def read_keys(keys: Keys) -> dict[int, str]:
     """Key code -> command.
-
-    Args:
-        keys: command -> name of the key.
 
     Raises:
         ConfigError: an unknown key, or one key for two commands.
     """
     codes: dict[int, str] = {}
-    for command in COMMANDS:
-        key = keys[command]
+    for command, key in vars(keys).items():
         if key not in KEY_CODES:
             raise ConfigError(f"keys.{command}: expected a letter, {', '.join(NAMED_KEYS)}, got {key!r}")
         if KEY_CODES[key] in codes:

@@ -32,7 +32,9 @@ STRAIGHT_M = 0.05  # neighbouring segments become one box where that moves no po
 VISUAL = {"contype": 0, "conaffinity": 0}
 
 
-def build(scene: Scene, dynamics: Mapping[str, Any], *, physics_hz: float, scene_size_m: float, goal_radius_m: float) -> mujoco.MjSpec:
+def build(
+    scene: Scene, dynamics: Mapping[str, Any], *, physics_hz: float | int, scene_size_m: float | int, goal_radius_m: float | int
+) -> mujoco.MjSpec:
     """Builds a scene with articulated cars, their tyre contacts and the solver's options.
 
     Args:
@@ -50,7 +52,7 @@ def build(scene: Scene, dynamics: Mapping[str, Any], *, physics_hz: float, scene
 
 
 def build_world(
-    scene: Scene, car: mujoco.MjSpec, *, scene_size_m: float, goal_radius_m: float, straight_m: float | None = STRAIGHT_M
+    scene: Scene, car: mujoco.MjSpec, *, scene_size_m: float | int, goal_radius_m: float | int, straight_m: float | None = STRAIGHT_M
 ) -> mujoco.MjSpec:
     """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}` and boxes `traffic{row}`.
 
@@ -104,7 +106,7 @@ def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float
         yield points, int(kind[begin])
 
 
-def _build_ground(scene_size_m: float) -> mujoco.MjSpec:
+def _build_ground(scene_size_m: float | int) -> mujoco.MjSpec:
     """Ground, light, a camera `above`, and the viewer's scale."""
     model = mujoco.MjSpec()
     model.modelname = "scene"

@@ -20,8 +20,8 @@ PROTOCOLS = {
 }
 KEY_NUMBERS = (
     "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.draw", "weather.patches",
-    "weather.rain", "weather.grip.mode", "spawning.sampler", "step_metrics.goal_radius_m", "step_metrics.collision_force_n", "termination.ending", "ppo",
-    "policy._target_", "scenes",
+    "weather.rain", "weather.grip.mode", "spawning.sampler", "step_metrics.goal_radius_m", "step_metrics.collision_force_n",
+    "termination.ending", "ppo", "policy._target_", "scenes",
 )  # fmt: skip
 _GROUPS, _FAILURES = 20, 40  # the longest tables that a reader still reads; the CSV holds everything
 
