@@ -72,7 +72,7 @@ def write(
         video_file.check(path, fps=settings.fps)
     shown = actors.make_actors(jax.device_get(recording), world, car)
     slot = choose_slot(shown, slot)
-    last = int(np.flatnonzero(shown.active[:, slot])[-1])  # with a chase camera, a film ends one second after the followed car
+    last = int(np.flatnonzero(shown.active[:, slot])[-1])  # a film from behind ends one second after the followed car
     length = len(shown.yaw) if settings.view == "bird" else min(last + 1 + round(shown.hz), len(shown.yaw))
 
     def draw(steps: Sequence[int]) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
