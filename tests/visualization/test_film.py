@@ -135,13 +135,13 @@ def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
 
 
 def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path):
-    look = settings(width=128, height=72, stride=15, view="both")
+    look = settings(width=64, height=64, stride=30, view="both")
     for slot in (0, 2):
         out = film.write(tmp_path / f"{slot}.gif", recording, settings=look, slot=slot, **LOOK)
         whole = actors.make_actors(recording, 0, CAR)
         end = min(np.flatnonzero(whole.active[:, slot])[-1] + 1 + 30, STEPS)
         with Image.open(out) as image:
-            assert image.n_frames == len(range(0, end, 15)) and image.size == (256, 72)
+            assert image.n_frames == len(range(0, end, 30)) and image.size == (128, 64)
 
 
 def test_mp4_wants_its_extra_or_is_written(opened, recording, tmp_path):

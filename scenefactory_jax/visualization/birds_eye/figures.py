@@ -72,7 +72,7 @@ def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: 
             points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
             window = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
             draw_road(axes, scene, window, inches=inches)
-            draw_traffic(axes, traffic_shapes.shapes_at_start(scene))
+            draw_traffic(axes, traffic_shapes.shapes_at_start(scene), linewidth=0.15)
             agents = scene.agents
             for agent in np.flatnonzero(np.asarray(agents.present)).tolist():
                 box, _ = drawing.car_shape(np.asarray(agents.position[agent]), float(agents.yaw[agent]), np.asarray(agents.size[agent]))
@@ -128,7 +128,7 @@ def draw_road(axes: Axes, scene: Scene, window: tuple[float, float, float], *, i
             axes.add_collection(PolyCollection(area.pieces, **look, zorder=below + 0.004 * (rank + above) / len(patches)))
     for order, stroke in enumerate(lines):
         width = max(stroke.width * scale, 0.08 * inches * stroke.thinnest)
-        look = {"linewidths": width, "capstyle": "round" if width > 4 else "butt", "zorder": 1 + order / 100}
+        look = {"linewidths": width, "capstyle": "round", "zorder": 1 + order / 100}  # round ends close the gaps between segments
         axes.add_collection(LineCollection(list(stroke.lines), colors=[rgb(stroke.colour)], **look))
     return scale
 
@@ -141,10 +141,10 @@ def draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, col
     axes.add_patch(Polygon(arrow, facecolor=rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
 
 
-def draw_traffic(axes: Axes, shapes: Iterable[Shape]) -> None:
+def draw_traffic(axes: Axes, shapes: Iterable[Shape], *, linewidth: float = 0.6) -> None:
     """Draws background traffic."""
     for shape in shapes:
-        axes.add_patch(Polygon(shape.points, facecolor=rgb(shape.fill), edgecolor=rgb(shape.outline), linewidth=0.6, zorder=2.5))
+        axes.add_patch(Polygon(shape.points, facecolor=rgb(shape.fill), edgecolor=rgb(shape.outline), linewidth=linewidth, zorder=2.5))
 
 
 def _make_axes(scene: Scene, window: tuple[float, float, float], *, title: str) -> tuple[Figure, Axes, float]:

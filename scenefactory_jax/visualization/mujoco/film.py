@@ -89,8 +89,8 @@ def write(
 
 
 def frames(
-    world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float | int,
-    slot: int,
+    world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera,
+    goal_radius_m: float | int, slot: int,
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:  # fmt: skip
     """Draws the pictures of some steps; view `both` has the chase camera on the left and the view from above on the right.
 
