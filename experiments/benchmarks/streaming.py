@@ -42,7 +42,7 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
                 seconds.append(time.perf_counter() - begun)
                 rows.append(row)
         swapped = flow.swapped
-    return _row(config, state.worlds.active.shape, mesh, seconds, rows) | {
+    return _row(config, state.worlds.state.active.shape, mesh, seconds, rows) | {
         "compile_s": compile_s,
         "memory_gib": phase_timing.memory_gib(compiled),
         "stream": {

@@ -38,6 +38,7 @@ from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment as device
 from scenefactory_jax.env.step_metrics import StepMetricsConfig
@@ -171,7 +172,7 @@ def make(config: Mapping[str, Any]) -> Task:
             numbers = {key: value for key, value in entry.items() if key != "weight"}
             terms.append((entry["weight"], bound(numbers, where=f"reward.{name}")))
     parts = device.make_parts(config)
-    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    grip = instantiate(config["weather"]["friction"], builtins="scenefactory_jax.weather.friction", where="weather.friction")
 
     def draw(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Any, Any]:
         agents_key, weather_key, _ = jax.random.split(key, 3)  # as in `environment._init_state`
@@ -198,7 +199,8 @@ def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
 def _refuse(config: Mapping[str, Any]) -> None:
     """Rejects parts that only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
-    if not dynamics["_target_"].endswith("articulated_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
+    is_articulated = dynamics["_target_"].endswith("articulated_car.make")
+    if not is_articulated or dynamics["brakes"] != "friction" or dynamics["randomization"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
         raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
@@ -206,7 +208,7 @@ def _refuse(config: Mapping[str, Any]) -> None:
         raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has no_traffic")
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
-    if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":
+    if any(weather["patches"].values()) or weather["rain"] is not None or weather["friction"]["mode"] == "speed":
         raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
     for group in ("observations", "reward"):
         for name, entry in config[group].items():
@@ -217,16 +219,16 @@ def _refuse(config: Mapping[str, Any]) -> None:
 def _engine(config: Mapping[str, Any]) -> Engine:
     """The articulated car with Newton's method; `solve.newton` is the same for one car on the device."""
     car, solver = cars.read_parameters(config["dynamics"])
-    newton = dataclasses.replace(solver, algorithm="Newton")
+    newton = dataclasses.replace(solver, algorithm="newton")
     timing = config["timing"]
     limits = {"physics_dt": 1.0 / timing["physics_hz"], "iterations": solver.iterations, "line_search": solver.line_search}
     # the spring law of two cars in MuJoCo's terms, with the impedance that validation has found to be it
     impedance = configs.load_config("validate")["validation"]["encounters"]["impedances"]["spring"]
     touch = engines.touch(config["dynamics"], impedance=impedance)
-    alone = mujoco_c.simulate_one(car, newton, **limits)
+    alone = mujoco_c.make_one(car, newton, **limits)
     return Engine(
         rig=functools.cache(lambda count: mujoco_c.make_encounter(car, newton, touch, count=count, **limits)),
-        still=cars.find_rest_pose(alone.model, car),
+        still=models.find_rest_pose(alone.model, car),
         substeps=round(timing["physics_hz"] / timing["control_hz"]),
         apart_m=config["step_metrics"]["scene_size_m"],
     )
@@ -276,7 +278,7 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
             rig.qpos[row], rig.qvel[row] = engine.still, 0.0
             rig.qpos[row, :3] = engine.apart_m * (row + 1), 0.0, engine.apart_m
     force = mujoco_c.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
-    if mujoco_c.is_broken(rig):
+    if mujoco_c.has_failed(rig):
         rig.qpos[:] = np.nan
     world.step += 1
     for row, agent in enumerate(world.agents):

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
-from experiments.validation.measurements import Spread
+from experiments.validation.measurements import Spread, spread_cases
 from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.parallel.process_pool import make_task_map
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.visualization.report import verdicts
 
 DIGITS = 5  # more than anybody reads
 
@@ -56,12 +56,12 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     scene_source.use_compilation_cache()
     out = Path(config["out"])
     (out / "results").mkdir(parents=True, exist_ok=True)
-    with make_task_map(config["workers"]) as spread:
+    with spread_cases(config["workers"]) as spread:
         for name in (name for name in PARTS if name in config["parts"]):
             _measure(name, config, out, spread)
     found, targets = read(out), config["validation"]["targets"]
     if found:
-        print(f"{report.write(out, found, targets)}\n{target_check.text(target_check.of(found, targets))}", flush=True)
+        print(f"{report.write(out, found, targets)}\n{verdicts.text(target_check.of(found, targets))}", flush=True)
     return found
 
 

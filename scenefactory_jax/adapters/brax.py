@@ -127,7 +127,7 @@ def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn
         ConfigError: a randomisation; the config's weather, fleet and spawn are those.
     """
     if randomization_fn is not None:
-        raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/fleet=spread, weather=mixed")
+        raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/randomization=spread, weather=mixed")
     return AutoResetWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 

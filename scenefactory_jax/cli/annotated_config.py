@@ -30,7 +30,7 @@ def annotate(command: str, *overrides: str) -> str:
 
 
 def _place(group: str) -> Place:
-    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/fleet`."""
+    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/randomization`."""
     name, _, package = group.partition("@")
     return tuple((package or name.replace("/", ".")).split("."))
 

@@ -205,7 +205,7 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
         if not separator:
             raise ConfigError(f"overrides: expected key=value, got {override!r}")
         if not parents and (find_conf() / last).is_dir():
-            *outer, inner = last.split("/")  # `dynamics/fleet=spread`: a group within a group
+            *outer, inner = last.split("/")  # `dynamics/randomization=spread`: a group within a group
             fresh, node = copy.deepcopy(_task(override)), result
             for name in outer:
                 fresh, node = fresh[name], node[name]

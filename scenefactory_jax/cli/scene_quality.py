@@ -49,7 +49,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
     rng = np.random.default_rng(numbers["seed"])
     counts, chosen = dict.fromkeys(rules, Count(0, 0, 0)), {name: [] for name in rules}
     scenes, refused, dropped, unread = 0, 0, 0, []
-    check = scene_source.make_readers(config["scenes"])["check"]
+    check = scene_source.make_packing(config["scenes"])["check"]
     for raw in raw_scenes.scenes(config["scenes"]):
         if isinstance(raw, str):
             unread.append(raw)

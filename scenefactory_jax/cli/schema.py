@@ -181,7 +181,9 @@ class Physics:
     films_mm: list[float]
     speeds_mps: list[float]
     slips: list[float]
-    film_most_mm: NonNegative
+    max_film_mm: NonNegative
+    backends: Group
+    comparison: Group | None
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
         entry: mapping with `_target_`, and a value for every keyword-only parameter of the target.
         builtins: module of targets without a dot.
         where: key of the entry, for messages ("reward.progress").
-        context: values that the program supplies to targets that declare them (time steps, grip): they need no key.
+        context: values that the program supplies to targets that declare them (time steps, friction): they need no key.
 
     Raises:
         ConfigError: no or unknown target, an unknown or missing key, a value of the wrong type.

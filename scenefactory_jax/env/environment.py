@@ -129,10 +129,10 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     """
     read = schema.read({name: config[name] for name in GROUPS if name in config}, EnvConfig)
     context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
-    mu = friction.make(config["weather"]["grip"])
+    mu = friction.make(config["weather"]["friction"])
     package = __name__.rpartition(".")[0]
     return EnvParts(
-        dynamics=instantiate(read.dynamics, builtins="scenefactory_jax.dynamics", where="dynamics", grip=mu, **context)(),
+        dynamics=instantiate(read.dynamics, builtins="scenefactory_jax.dynamics", where="dynamics", friction=mu, **context)(),
         map_action=instantiate(read.actions.command, builtins=f"{package}.actions", where="actions.command"),
         action_repeat=read.actions.action_repeat,
         sample_agents=spawning.make(read.spawning.sampler),

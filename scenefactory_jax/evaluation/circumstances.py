@@ -49,9 +49,9 @@ def _starts(draw: Mapping[str, Any]) -> str:
 
 def _weather(weather: Mapping[str, Any]) -> str:
     """Surfaces and films with their shares, then patches and rain."""
-    cases = weather["draw"].get("cases")
+    cases = weather["sampler"].get("cases")
     if cases is None:
-        told = f"`{weather['draw']['_target_']}`"
+        told = f"`{weather['sampler']['_target_']}`"
     else:
         whole = sum(case["weight"] for case in cases)
         shares = [f"{case['weight'] / whole:.0%} " if len(cases) > 1 else "" for case in cases]
@@ -66,4 +66,4 @@ def _dynamics(dynamics: Mapping[str, Any]) -> str:
     target = dynamics["_target_"]
     name = target.removeprefix("scenefactory_jax.dynamics.").removesuffix(".make")
     told = f"`{name}`" + (f", brakes {dynamics['brakes']}" if "brakes" in dynamics else "")
-    return told + (", every car another" if dynamics.get("fleet") else "")
+    return told + (", every car another" if dynamics.get("randomization") else "")

@@ -183,7 +183,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_describe(weather, seconds=end / control_hz),
-        traffic=TrafficBoxes.from_boxes(boxes).clip(0, end),
+        traffic=TrafficBoxes.from_boxes(boxes).clip(0, int(end)),
     )
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
-from scenefactory_jax.core.parallel.process_pool import STOPPING
+from scenefactory_jax.core.parallel.worker import STOP_SIGNALS
 
 LOG = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ def defer_interrupt() -> Iterator[Callable[[], int | None]]:
     SIGHUP under `nohup`.
     """
     received: list[int] = []
-    before = {one: signal.getsignal(one) for one in STOPPING}
+    before = {one: signal.getsignal(one) for one in STOP_SIGNALS}
     handled = [one for one, handler in before.items() if handler not in (None, signal.SIG_IGN)]
     if threading.current_thread() is not threading.main_thread():
         handled = []

@@ -43,7 +43,7 @@ def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> ShownS
         SceneError: a path that cannot be read.
     """
     scene_source.check_config(config)
-    parts = scene_source.make_readers(config)
+    parts = scene_source.make_packing(config)
     packed: list[tuple[Packed, RoadPosts]] = []
     reasons: list[str] = []
     for raw in raw_scenes.scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):

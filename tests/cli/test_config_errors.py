@@ -13,6 +13,7 @@ from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.cli.view import view
 from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.loading import batches, scene_source
@@ -57,7 +58,8 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
     printed = capsys.readouterr().out
     assert (summary.files, summary.scenes, len(summary.rejects)) == (8, 2, 6) and "2 scenes" in printed and "6 rejected" in printed
     assert "packing with these numbers refuses: 1 no agent left" in printed
-    account = scene_source.from_path(hydra_config.load_config("scenes", "scenes=womd")["scenes"], tmp_path / "bank").account
+    config = hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={tmp_path / 'bank'}")
+    account = scene_source.load_all_scenes(config["scenes"]).account
     assert "goalless.json (street): tracks: no agent is left of 1: 1 too_short" in account and "refuses: 1 no agent left" in account
     reasons = {reject["source"]: reject["reason"] for reject in bank_reader.open(tmp_path / "bank").rejects}
     for name, (_, reason) in files.items():
@@ -70,7 +72,7 @@ def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
     path = written(tmp_path, document(objects=[thing(0, id=7, speed=40), far]))
     summary = convert(hydra_config.load_config("convert", f"source={path}", f"out={tmp_path / 'bank'}", *HERE))
     assert summary.agents_kept == 1 and summary.agents_dropped["goal_outside_box"] == 1
-    scene, report = bank_reader.pack_scenes(bank_reader.open(tmp_path / "bank"), [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(tmp_path / "bank"), [0], check=checker(), pack=packer())[0]
     assert report.track_ids == (7,) and scene.agents.present.sum() == 1
 
     alone = written(tmp_path, document(objects=[thing(0, kind="pedestrian"), far]), "alone.json")
@@ -80,7 +82,7 @@ def test_a_goal_outside_the_box_is_dropped_by_reason(tmp_path):
     message = refused("train", "scenes=womd", f"scenes.path={tmp_path / 'none'}", f"out={tmp_path / 'run'}")
     assert "no agent is left of 2: 1 not_a_vehicle, 1 goal_outside_box" in message
     unforced = hydra_config.load_config("scenes", "scenes=womd", "scenes.pack.require_agents=false")["scenes"]
-    assert not scene_source.from_path(unforced, tmp_path / "none").scene.agents.present.any()
+    assert not scene_source.load_all_scenes(unforced | {"path": tmp_path / "none"}).scene.agents.present.any()
 
 
 def test_nothing_to_train_on_says_why(tmp_path):
@@ -109,9 +111,11 @@ def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, 
 
 
 def test_a_mistake_in_the_config_is_no_scene_s_fault_in_a_stream():
-    source = batches.open(hydra_config.load_config("scenes", "scenes.pack.scene_size_m=-1.0")["scenes"])
+    config = hydra_config.load_config("scenes", "scenes.pack.scene_size_m=-1.0")["scenes"]
+    source, grid = scene_source.open_source(config), {"radius_m": None}
+    loader = batches.BatchLoader(source, **scene_source.make_packing(config), grid=grid, task_map=task_map.in_process)
     with pytest.raises(ConfigError, match=r"^scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
-        batches.measure(source, None, grid={"radius_m": None}, sample=1, headroom=1.0, given={}, seed=0)
+        batches.measure(loader, sample=1, headroom=1.0, given={}, seed=0)
 
 
 def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
@@ -219,8 +223,8 @@ def test_a_wrong_value_of_a_commands_own_key_is_named(command, override, message
         ("timing.control_hz=0", "timing.control_hz: expected a number > 0, got 0"),
         ("timing.episode_s=long", "timing.episode_s: expected a number > 0, got 'long'"),
         ("spawning.respawn_clearance_m=near", "spawning.respawn_clearance_m: expected a number >= 0 or null, got 'near'"),
-        ("dynamics.wheelbase=long", "dynamics.wheelbase: expected a number, got 'long'"),
-        ("weather.grip.mode=sticky", "weather.grip.mode: expected"),
+        ("dynamics.wheelbase=long", "dynamics.wheelbase: expected a number > 0, got 'long'"),
+        ("weather.friction.mode=sticky", "weather.friction.mode: expected"),
         (
             "termination.ending=[goal_reached,bored]",
             "termination.ending: expected a list, each one of numerical_error, goal_reached, ",

@@ -296,7 +296,7 @@ def test_both_protocols_and_the_same_records_twice(whole, tmp_path):
 
 
 def test_other_settings_of_a_run(whole, tmp_path):
-    short = "overrides=[timing.episode_s=1, weather.grip.mode=dynamic]"
+    short = "overrides=[timing.episode_s=1, weather.friction.mode=dynamic]"
     small = ["video.seconds=0.5", "video.panel=120", "video.worlds=1"]
     changed = judged(whole, tmp_path / "short", *small, "protocol.termination=[goal_only]", short)
     assert set(changed.records) == {"goal_only"} and changed.records["goal_only"]["time_s"].max() <= 1.0
@@ -555,7 +555,7 @@ def options():
 def builds(whole_config):
     env, policy = environment.make_env(whole_config), make_policy(whole_config)
     assert make_trainer(whole_config, env, policy).train_iteration
-    assert {"gpudrive", "scenefactory"} <= set(scene_source.make_readers(whole_config["scenes"])["formats"])
+    assert {"gpudrive", "scenefactory"} <= set(whole_config["scenes"]["formats"])
     if scene_source.has_heldout(whole_config["scenes"]):
         instantiate(
             whole_config["scenes"]["generate"],

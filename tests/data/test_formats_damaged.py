@@ -20,9 +20,9 @@ from support.format_documents import (
 )
 from support.scene_documents import FORMATS, document, scenefactory_document, thing
 
-from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.data import conversion
+from scenefactory_jax.core.raw_scene import Reject, SceneError
 from scenefactory_jax.data.formats import json_documents, reader_selection, tfrecord
+from scenefactory_jax.data.loading import scene_source
 
 JSON_JUNK = tuple(value for value in fuzzing.JUNK if not isinstance(value, (bytes, set, np.ndarray)))
 PEAK_BYTES = 30_000_000
@@ -57,8 +57,8 @@ def test_damaged_bytes(files, readers, name):
     path.write_bytes(content)
     assert fuzzing.attempt(readers[name], path) == "read"
     verdicts = fuzzing.attack(readers[name], path, content)
-    assert verdicts["OtherFormat"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
-    assert set(verdicts) <= {"read", "OtherFormat", "SceneError"}
+    assert verdicts["FormatMismatch"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
+    assert set(verdicts) <= {"read", "FormatMismatch", "SceneError"}
 
 
 @pytest.mark.parametrize("whole", [scenarionet_document(), in_spring_2023(scenarionet_document()), in_march_2023(scenarionet_document()),
@@ -136,8 +136,8 @@ def test_a_file_is_unpacked_once_however_many_readers_try_it(tmp_path, monkeypat
     path, read, counts = tmp_path / "a.xz", json_documents._read, []
     path.write_bytes(lzma.compress(encoded(document)))
     monkeypatch.setattr(json_documents, "_read", lambda path, count: counts.append(count) or read(path, count))
-    found = conversion.examine(path, readers, rejects := [], [])
-    assert (len(list(found)), len(rejects)) == ((1, 0) if "road" in document else (0, 1))
+    [found] = scene_source.read_file(path, readers)
+    assert isinstance(found, Reject) == ("road" not in document)
     assert sum(count > json_documents.HEAD for count in counts) == 1
 
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from support.scene_banks import FEATURES, STREETS, banked, generated, moved, rounded, window
 
-from scenefactory_jax import __main__ as command_line
+from scenefactory_jax.cli import entry as command_line
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.core.instantiate import ConfigError
@@ -20,7 +20,7 @@ from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import duplicates, filter_expressions, geographic_split, operations
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading import batches
+from scenefactory_jax.data.loading import scene_source
 
 SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
 TOWN = {"metadata": {"dataset": "windows", "town": "one"}}  # scenes of one frame
@@ -341,7 +341,7 @@ def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
     command(bank, "op=dedupe")
     command(bank, "op=export", "export.format=gpudrive", f"out={tmp_path / 'out'}")
     with pytest.raises(SystemExit) as ended:
-        command_line._end(SceneError(f"scenes.path: no scene\n{name}"))
+        command_line.end(SceneError(f"scenes.path: no scene\n{name}"))
     told = capsys.readouterr()
     assert ended.value.code == 2 and told.err == f"error: scenes.path: no scene\n{spelled.replace(chr(92) + 'n', chr(10), 1)}\n"
     assert told.out.count(spelled) >= 5 and "\x1b" not in told.out + told.err and "\x9b" not in told.out + told.err
@@ -367,7 +367,7 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     assert "whose conversion was stopped" in capsys.readouterr().err
     assert (
         "whose conversion was stopped"
-        in batches.open(hydra_config.load_config("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+        in scene_source.open_bank(tmp_path / "sample").description
     )
 
 
@@ -392,8 +392,8 @@ def test_banks_are_judged_and_compared(town, tmp_path):
         (["op=filter", "filter='cars > 3'"], "filter: unknown column 'cars'"),
         (["op=filter", "filter='vehicles > 300'"], "none of 12 scenes meets it"),
         (["op=split"], "split.shares: null; give the parts' shares"),
-        (["op=split", "split.by=road"], "split.by: 'road'"),
-        (["op=split", "split.shares={a: 1, b: much}"], "split.shares: .* is of type dict, wanted dict"),
+        (["op=split", "split.by=road"], "split.by: expected scene or streets, got 'road'"),
+        (["op=split", "split.shares={a: 1, b: much}"], "split.shares.b: expected a number, got 'much'"),
         (["op=split", "split.shares={a: 1}"], "two parts or more"),
         (["op=sample"], "give one of the two"),
         (["op=sample", "+sample.size=3"], "sample.size: unknown key; valid: count, share, stratify"),
@@ -419,5 +419,5 @@ def test_scenes_are_simulated(capsys):
     )
     clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
     assert clean == [True] * 3
-    assert "3 scenes, 6 steps each; 3 without any of these" in capsys.readouterr().out
+    assert "3 scenes; 3 without any of these" in capsys.readouterr().out
     assert STREETS["count"] > 3

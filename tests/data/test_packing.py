@@ -85,7 +85,7 @@ def test_generated_scenes_whole_and_damaged():
         lines, scenes = assert_same(damaged(raw, index))
         told |= {line.split(":")[0].split(" (")[0] for line in lines}
         for scene, report in scenes:
-            for reasons in (report.agents_dropped, report.others_dropped, report.segments_cut):
+            for reasons in (report.agents_dropped, report.traffic_dropped, report.segments_cut):
                 dropped |= {reason: dropped.get(reason, 0) + count for reason, count in reasons.items()}
             assert_same_grid(scene)
     assert len(told) == 6 and [reason for reason, count in dropped.items() if not count] == ["degenerate"]  # which checks removed

@@ -15,6 +15,7 @@ from scenefactory_jax.data import conversion
 from scenefactory_jax.data.curation import quality_gate
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.generators.town import town_scene
+from scenefactory_jax.data.packing import summary
 from scenefactory_jax.roadgraph import lane_topology
 
 QUALITY = hydra_config.load_config("scenes")["quality"]
@@ -185,8 +186,8 @@ def test_a_jitter_is_repaired_and_counted_and_a_missing_step_is_refused():
     later = lambda seconds: street(times=street().times + seconds * (np.arange(LOG) >= 40))  # noqa: E731
     passed = gate(later(0.011), reject=QUALITY["reject"])
     assert passed.metadata["quality"] == {} and passed.times[-1] == pytest.approx(9.011)  # the bank has the log as it was
-    summary = conversion.summarise([prepared(passed).report], files=1, rejects=[])
-    assert "in 1 scenes: logs of uneven steps resampled" in conversion.describe(summary)
+    found = summary.summarise_packed([prepared(passed).report], [], files=1)
+    assert "in 1 scenes: logs of uneven steps resampled" in summary.describe(found)
     with pytest.raises(SceneError, match=r"times: 1 steps of the log are not 0\.1 s long; step 39 is 0\.2 s"):
         gate(later(0.1), reject=QUALITY["reject"])
 

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from support.probes import make_trainer, probe, scenes
 from support.running import smoke
+from support.scene_banks import stacked_scenes
 from support.scene_documents import document, thing, written
 from support.streets import street
 
 from experiments.benchmarks import streaming
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
-from scenefactory_jax.data.loading import batches, samplers, stream
+from scenefactory_jax.data.loading import batches, samplers, scene_source, stream
 from scenefactory_jax.learning import checkpoint
 from scenefactory_jax.learning.training_loop import train as run_train
 from scenefactory_jax.loggers import metrics_csv
@@ -27,7 +29,7 @@ from scenefactory_jax.visualization.report import throughput_report
 pytestmark = pytest.mark.usefixtures("quickly")
 
 WORLDS = 8
-SHORT = ("stream.workers=0", "stream.sample=4", "stream.share=0.5")
+SHORT = ("stream.workers=0", "stream.sample=4", "stream.swap_fraction=0.5")
 CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
 
 
@@ -205,15 +207,17 @@ def flowing(found):
 
 def alone(found, index, sizes):
     """One street, stacked by itself at the stream's sizes."""
-    return batches.load(batches.open(found["scenes"]), None, [index], fit(found, sizes)).scene
+    return batches.load(loader_of(found), [index], sizes, on_overflow="cut").scene
 
 
-def fit(found, sizes, excess="cut"):
-    return batches.BoxSizes(sizes, found["scenes"]["cells"], excess)
+def loader_of(found):
+    config = found["scenes"]
+    packing = scene_source.make_packing(config)
+    return batches.BatchLoader(scene_source.open_source(config), **packing, grid=config["road_grid"], task_map=task_map.in_process)
 
 
-def measured(found, source, *, sample=8, **given):
-    return batches.measure(source, None, grid=found["scenes"]["cells"], sample=sample, headroom=1.0, given=given, seed=0)
+def measured(loader, *, sample=8, **given):
+    return batches.measure(loader, sample=sample, headroom=1.0, given=given, seed=0)
 
 
 def test_every_world_holds_the_scene_that_the_stream_says():
@@ -239,19 +243,16 @@ def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     plain = {"unusable": [], "broken": [], "deadly": [], "endless": []}
     written_bank = bank_reader.write(tmp_path / "bank", [street(0, index, **plain) for index in range(5)], settings={})
     banked = {**found, "scenes": {**found["scenes"], "path": str(tmp_path / "bank")}}
-    sources = [batches.open(one["scenes"]) for one in (found, banked)]
-    sizes = [measured(found, one, sample=5, side=60) for one in sources]
+    loaders = [loader_of(one) for one in (found, banked)]
+    sources, sizes = [one.source for one in loaders], [measured(one, sample=5, side=60) for one in loaders]
     assert [one.count for one in sources] == [None, 5] and sizes[0] == sizes[1] and sources[1].name(3) == "street 3"
-    generated, loaded = (batches.load(one, None, [4, 1, 4], fit(found, sizes[0])) for one in sources)
+    generated, loaded = (batches.load(one, [4, 1, 4], sizes[0], on_overflow="cut") for one in loaders)
     same(generated.scene, loaded.scene)
-    whole, _ = bank_reader.load(
-        written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, workers=1,
-        check=instantiate(found["scenes"]["check"], builtins="scenefactory_jax.data.packing.validation", where="check"),
-        pack=instantiate(found["scenes"]["pack"], builtins="scenefactory_jax.data.packing.pack", where="pack"),
-    )  # fmt: skip
+    packing = scene_source.make_packing(found["scenes"])
+    whole, _ = stacked_scenes(written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, **packing)
     same(
         loaded.scene,
-        spatial_grid.attach_grid(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
+        spatial_grid.attach_grid(whole, **found["scenes"]["road_grid"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
     )
 
 
@@ -260,20 +261,20 @@ def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
         written(tmp_path, document(name=name, objects=[thing(0, id=7, speed=40)]), f"{name}.json")
     (tmp_path / "broken.json").write_text("{}")
     found = hydra_config.load_config("train", "experiment=smoke", "scenes=womd", f"scenes.path={tmp_path}")
-    files = batches.open(found["scenes"])
-    assert files.count == 3 and files.name(0).endswith("broken.json")
-    sizes = measured(found, files)
-    batch = batches.load(files, None, [0, 1, 2], fit(found, sizes))
+    files = loader_of(found)
+    assert files.source.count == 3 and files.source.name(0).endswith("broken.json")
+    sizes = measured(files)
+    batch = batches.load(files, [0, 1, 2], sizes, on_overflow="cut")
     assert list(batch.indices) == [1, 1, 2] and list(batch.refused) == [str(tmp_path / "broken.json")]
     with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*no reader knows this format"):
-        batches.load(files, None, [0], fit(found, sizes))
+        batches.load(files, [0], sizes, on_overflow="cut")
 
 
 def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
     found = entry()
-    streets = batches.open(found["scenes"])
-    sizes = measured(found, streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
-    load = lambda excess, **changes: batches.load(streets, None, range(8), fit(found, sizes | changes, excess))  # noqa: E731
+    streets = loader_of(found)
+    sizes = measured(streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
+    load = lambda how, **changes: batches.load(streets, range(8), sizes | changes, on_overflow=how)  # noqa: E731
     cut, skipped = load("cut"), load("skip")
     assert (cut.cut, list(cut.indices), cut.refused) == (5, list(range(8)), {})
     assert (skipped.cut, list(skipped.indices[:3]), len(skipped.refused)) == (0, [0, 1, 2], 5) and set(skipped.indices) == {0, 1, 2}
@@ -284,7 +285,7 @@ def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
 
 def test_room_for_more_changes_no_look_up():
     found = entry()
-    sizes = measured(found, batches.open(found["scenes"]))
+    sizes = measured(loader_of(found))
     places = np.random.default_rng(0).uniform(-90.0, 90.0, (200, 2)).astype(np.float32)
     seen = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "most": 400}):
@@ -299,12 +300,12 @@ def test_room_for_more_changes_no_look_up():
     [
         (["stream.capacity.road=8"], r"stream\.capacity\.road: 8; all 4 scenes of the sample need more: 177 to 213"),
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
-        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
+        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected 1 or more"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
-        (["stream.share=1.5"], r"stream\.share: expected a number >= 0 and <= 1, got 1\.5"),
-        (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
-        (["stream.excess=drop"], r"stream\.excess: 'drop'"),
-        (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),
+        (["stream.swap_fraction=1.5"], r"stream\.swap_fraction: expected a number >= 0 and <= 1, got 1\.5"),
+        (["stream.prefetch=0"], r"stream\.prefetch: expected a number >= 1, got 0"),
+        (["stream.on_overflow=drop"], r"stream\.on_overflow: expected cut or skip, got 'drop'"),
+        (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*; valid: .*prioritize_failures, .*shuffled"),
         (["+stream.speed=2"], r"stream\.speed: unknown key"),
     ],
 )
@@ -331,10 +332,10 @@ def test_errors_of_the_loader_surface_by_name_and_never_hang(capsys):
 @pytest.mark.slow
 def test_processes_that_die_or_hang_end_the_run_by_name():
     context, swap = flowing(entry("stream.workers=1", deadly=[5]))
-    with pytest.raises(RuntimeError, match=r"generated scene [45]: cannot be loaded: BrokenProcessPool"), context as flow:
+    with pytest.raises(RuntimeError, match=r"generated scene 5: cannot be loaded: its process ended with code 1"), context as flow:
         flow.exchange(swap, None, flow.scenes())
     context, swap = flowing(entry("stream.workers=1", "stream.wait_s=20.0", endless=[5]))
-    with pytest.raises(RuntimeError, match=r"stream\.wait_s: no scenes after 20 s from scenes from the generator"), context as flow:
+    with pytest.raises(RuntimeError, match=r"stream\.wait_s: no scenes after 20 s from generated scenes of seed"), context as flow:
         flow.exchange(swap, None, flow.scenes())
 
 

@@ -122,7 +122,7 @@ def test_cars_meet(scenes):
 
 def test_nothing_is_lost_when_scenes_are_packed(scenes):
     config = hydra_config.load_config("train", "scenes=streets")["scenes"]
-    parts = scene_source.make_readers(config)
+    parts = scene_source.make_packing(config)
     for scene in scenes[: len(KINDS)]:
         report = prepare(scene, check=parts["check"], pack=parts["pack"]).report
         assert report.agents_kept >= 2 and report.repairs == ()

@@ -229,13 +229,13 @@ def _on(lanes, lines, place):
 
 
 def test_nothing_is_repaired_or_lost_when_scenes_are_packed(scenes):
-    parts = scene_source.make_readers(hydra_config.load_config("train", "scenes=town")["scenes"])
+    parts = scene_source.make_packing(hydra_config.load_config("train", "scenes=town")["scenes"])
     agents = 0
     for scene in scenes[::3]:
         report = prepare(scene, check=parts["check"], pack=parts["pack"]).report
         assert report.repairs == () and report.centred_on == "sdc"
         assert report.segments_cut["gap"] == report.segments_cut["degenerate"] == 0
-        assert report.agents_dropped["overlaps"] == report.others_dropped["overlaps_agent"] == 0
+        assert report.agents_dropped["overlaps"] == report.traffic_dropped["overlaps_agent"] == 0
         agents += report.agents_kept
     assert agents >= 3 * len(scenes[::3])
 

@@ -14,6 +14,7 @@ from support.scene_documents import checker, packer
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.data.bank import bank_reader
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -71,5 +72,5 @@ def test_the_reader_of_the_page_converts_a_table(page, tmp_path):
     summary = convert(hydra_config.load_config("convert", f"source={tmp_path / 'in'}", f"out={tmp_path / 'bank'}", "progress=false", *own))
     assert (summary.files, summary.scenes) == (2, 1)
     opened = bank_reader.open(tmp_path / "bank")
-    scene, report = bank_reader.pack_scenes(opened, [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(opened), [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)

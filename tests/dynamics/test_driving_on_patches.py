@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches
 from scenefactory_jax.weather.friction import make_uniform
-from scenefactory_jax.weather.patches import condition_at
+from scenefactory_jax.weather.patches import read_condition
 
 G, CARS, CHUNK = 9.81, 8, 30
 LANES = 500.0 * np.arange(CARS)
@@ -26,8 +26,8 @@ MU = {"AC": 1.1048, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
 @functools.cache
 def backend():
     config = load_config("task")
-    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
-    context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
+    grip = instantiate(config["weather"]["friction"], builtins="scenefactory_jax.weather.friction", where="weather.friction")
+    context = {"friction": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
     dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
     @jax.jit
@@ -141,4 +141,4 @@ def test_the_condition_is_asked_where_the_wheels_are():
     motion = drive({0: coin, 1: ([[1.3, -1.0]], 0.2, "ICE", 0.0), 2: ([[0.0, 0.0]], 0.5, "ICE", 0.0)}, speed=0.0, seconds=1)
     one = (3 * MU["AC"] + MU["ICE"]) / 4
     np.testing.assert_allclose(motion.mu[0, :4], [one, one, MU["AC"], MU["AC"]], atol=2e-3)
-    assert condition_at(make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)
+    assert read_condition(make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)

@@ -125,8 +125,8 @@ def test_an_unknown_distance_is_not_short():
 @pytest.mark.usefixtures("unchecked_annotations")
 @pytest.mark.parametrize("mode", ["static", "speed"])
 def test_whole_numbers_are_numbers_to_friction(mode):
-    entry = load_config("task")["weather"]["grip"] | {"mode": mode}
-    grip = instantiate(entry, builtins=friction, where="weather.grip")
+    entry = load_config("task")["weather"]["friction"] | {"mode": mode}
+    grip = instantiate(entry, builtins=friction, where="weather.friction")
     road = lambda film: friction.make_uniform(film, jnp.int32(0))  # noqa: E731
     whole = grip(road(jnp.int32(0)), jnp.zeros((2, 2), int), jnp.array([10, 20]))
     np.testing.assert_array_equal(whole, grip(road(jnp.float32(0)), jnp.zeros((2, 2)), jnp.array([10.0, 20.0])))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.gliding import CIRCLES, build_env, drive
 from support.hand_scenes import road_of, scene_of
+from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import STEPS, checker, document, packer, parsed, prepared, thing
 
 import scenefactory_jax
@@ -246,7 +247,7 @@ def test_a_real_car_stops_at_a_wall_and_drives_on_past_a_person():
     place = np.stack([np.zeros(4), lanes], 1)
     scene = replace(scene_of(place, place, speeds=[10.0] * 4), traffic=boxes)
     entry, mu = load_config("task", "dynamics=articulated")["dynamics"], lambda weather, position, speed: jnp.full(position.shape[:-1], 0.8)
-    context = {"grip": mu, "physics_dt": 1 / 120, "control_dt": CONTROL}
+    context = {"friction": mu, "physics_dt": 1 / 120, "control_dt": CONTROL}
     dynamics = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
     @jax.jit
@@ -290,19 +291,19 @@ def logged(tmp_path):
 
 def test_everybody_is_kept_or_counted(logged):
     scene, report = prepared(logged)
-    assert report.track_ids == (1,) and report.others_kept == 4
+    assert report.track_ids == (1,) and report.traffic_kept == 4
     wanted = {"absent_from_start_on": 1, "outside_box": 1, "overlaps_agent": 1}
-    assert report.others_dropped == {reason: wanted.get(reason, 0) for reason in pack.OTHER_DROPS}
-    assert report.agents_kept + report.others_kept + sum(report.others_dropped.values()) == len(logged.tracks)
+    assert report.traffic_dropped == {reason: wanted.get(reason, 0) for reason in pack.TRAFFIC_DROPS}
+    assert report.agents_kept + report.traffic_kept + sum(report.traffic_dropped.values()) == len(logged.tracks)
     assert scene.traffic_log.kind.tolist() == [0, 1, 2, 3], "nearest to the agent's start first"
     np.testing.assert_allclose(scene.traffic_log.position[0, 10], [30 - 40, 3], atol=1e-5)
     np.testing.assert_allclose(scene.traffic_log.size[0], [4.5, 1.9], rtol=1e-6)
     assert scene.traffic_log.valid.sum(1).tolist() == [STEPS, STEPS, 1, STEPS]
-    scene, report = prepared(logged, traffic=2, others_least_m=2.0, log_from="current")
-    assert report.others_kept == 2 and report.others_dropped["over_capacity"] == 2 and scene.traffic_log.valid.shape == (2, 2)
+    scene, report = prepared(logged, traffic=2, min_traffic_size_m=2.0, log_from="current")
+    assert report.traffic_kept == 2 and report.traffic_dropped["over_capacity"] == 2 and scene.traffic_log.valid.shape == (2, 2)
     np.testing.assert_allclose(scene.traffic_log.size, [[4.5, 2.0]] * 2)
     assert len(prepared(logged, traffic=0).scene.traffic_log.kind) == 0
-    assert packer(traffic=0)(amend(logged, tracks=logged.tracks[:1]))[1].others_kept == 0
+    assert packer(traffic=0)(amend(logged, tracks=logged.tracks[:1]))[1].traffic_kept == 0
 
 
 def test_banks_and_stacks_carry_others(tmp_path, logged):
@@ -310,8 +311,8 @@ def test_banks_and_stacks_carry_others(tmp_path, logged):
     full, less = prepared(logged), prepared(logged, traffic=1, agents=3)
     tools = {"check": checker(), "pack": packer(), "workers": 1}
     for name, leaf in columns.flatten(full.scene).items():
-        np.testing.assert_array_equal(columns.flatten(bank_reader.pack_scenes(opened, [0], **tools)[0].scene)[name], leaf)
-    stacked, report = bank_reader.load(opened, [1, 0, 1], capacity={}, **tools)
+        np.testing.assert_array_equal(columns.flatten(packed_scenes(opened, [0], **tools)[0].scene)[name], leaf)
+    stacked, report = stacked_scenes(opened, [1, 0, 1], capacity={}, **tools)
     assert report.capacity["traffic"] == 4 and stacked.traffic_log.valid.any(-1).sum(1).tolist() == [1, 4, 1]
     assert stacked.traffic.present.shape == (3, 0)
     cut, report = stack.stack([full.scene, less.scene], capacity={"traffic": 2})
@@ -329,12 +330,12 @@ def real(shared_data, count=None):
 
 
 def assert_sound(packed):
-    kept = np.array([one.report.others_kept for one in packed])
+    kept = np.array([one.report.traffic_kept for one in packed])
     assert np.median(kept) > 20 and kept.max() <= 64
     for scene, report in packed:
         log = scene.traffic_log
-        assert report.others_kept == len(log.kind) and log.valid.any(1).all() and np.isfinite(log.position).all()
-        assert sum(report.agents_dropped.values()) == report.others_kept + sum(report.others_dropped.values())
+        assert report.traffic_kept == len(log.kind) and log.valid.any(1).all() and np.isfinite(log.position).all()
+        assert sum(report.agents_dropped.values()) == report.traffic_kept + sum(report.traffic_dropped.values())
         seen = log.valid & (np.abs(log.position).max(-1) <= 100.0)
         assert seen.any(1).all() and (log.size >= 0.3 - 1e-6).all()
     people = np.concatenate([one.scene.traffic_log.size[one.scene.traffic_log.kind == KINDS["pedestrian"]] for one in packed])

@@ -21,12 +21,12 @@ PLACES = 256
 @pytest.fixture(scope="module", params=["streets", "womd"])
 def scenes(request):
     """Stacked scenes without cells."""
-    overrides = ["scenes.count=3", "scenes.generate.kinds=[intersection]", "scenes.cells.radius_m=null"]
+    overrides = ["scenes.count=3", "scenes.generate.kinds=[intersection]", "scenes.road_grid.radius_m=null"]
     if request.param == "womd":
         if not WOMD.is_dir():
             pytest.skip(f"no data at {WOMD}")
         first = sorted(WOMD.iterdir())[0]
-        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.cells.radius_m=null"]
+        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.road_grid.radius_m=null"]
     return scene_source.load_training_scenes(load_config("train", *overrides)["scenes"]).scene
 
 
@@ -85,6 +85,6 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
 
 
 def test_configs_look_as_far_as_their_observation():
-    assert load_config("train", "experiment=paper")["scenes"]["cells"]["radius_m"] == 10.0
-    assert load_config("train", "observations.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
-    assert load_config("convert")["scenes"]["cells"]["radius_m"] is None
+    assert load_config("train", "experiment=paper")["scenes"]["road_grid"]["radius_m"] == 10.0
+    assert load_config("train", "observations.road.radius_m=25")["scenes"]["road_grid"]["radius_m"] == 25
+    assert load_config("convert")["scenes"]["road_grid"]["radius_m"] is None

@@ -194,7 +194,9 @@ def towns() -> Any:
 
 CASES: dict[str, Callable[[], Any]] = {
     **{f"environment dynamics={name}": functools.partial(environment, f"dynamics={name}", *BUSY) for name in BACKENDS},
-    "environment by mjx.step": functools.partial(environment, "dynamics=articulated", "dynamics.solver.algorithm=Newton", *BUSY),
+    "environment by mjx.step": functools.partial(
+        environment, "dynamics=mjx", "dynamics.solver.iterations=6", "dynamics.solver.line_search=6", *BUSY
+    ),
     **{f"environment traffic={name}": functools.partial(environment, f"traffic={name}") for name in TRAFFIC},
     **{f"environment weather={name}": functools.partial(environment, f"weather={name}") for name in WEATHERS},
     "training smoke": functools.partial(training, *SMALL),

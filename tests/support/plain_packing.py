@@ -11,7 +11,7 @@ import numpy as np
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
 from scenefactory_jax.data.packing import columns
-from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS, PackReport, _centre, overlaps
+from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _centre, overlaps
 from scenefactory_jax.data.packing.validation import DUPLICATE_M, _some
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
 
@@ -98,7 +98,7 @@ def pack(
     log_from,
     require_agents,
     traffic,
-    others_least_m,
+    min_traffic_size_m,
 ):
     origin, centred_on = _centre(raw, centre)
     half = scene_size_m / 2
@@ -108,7 +108,7 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, others_least_m)
+    beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
     leaves |= beside
     report = PackReport(
         name=raw.name,
@@ -120,8 +120,8 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
-        others_kept=len(beside["traffic_log.kind"]),
-        others_dropped=others_dropped,
+        traffic_kept=len(beside["traffic_log.kind"]),
+        traffic_dropped=traffic_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
@@ -273,7 +273,7 @@ def _choose_others(raw, agents, leaves, origin, half, limit, least):
     rows = [leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")]
     boxes = np.array([corners(place, float(yaw), *size) for place, yaw, size in zip(*rows, strict=True)]).reshape(-1, 4, 2)
     starts = rows[0] if len(rows[0]) else np.zeros((1, 2))
-    dropped, candidates = dict.fromkeys(OTHER_DROPS, 0), []
+    dropped, candidates = dict.fromkeys(TRAFFIC_DROPS, 0), []
     for index in sorted(set(range(len(raw.tracks))) - set(agents)):
         track = raw.tracks[index]
         now = track.valid[raw.current :]

@@ -9,6 +9,8 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import features
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing.stack import stack
 
 STREETS = hydra_config.load_config("convert", "scenes=streets")["scenes"]
 FEATURES = instantiate(hydra_config.load_config("scenes")["features"], builtins=features, where="features")
@@ -24,6 +26,17 @@ def generated(index, seed=3):
 def banked(folder, raws, *, described=True):
     """A bank of scenes."""
     return banks.write(folder, raws, settings={"made": "up"}, features=FEATURES if described else None)
+
+
+def packed_scenes(bank, indices, **packing):
+    """Scenes of a bank, packed, and a reject in place of each that cannot be."""
+    return scene_source.pack_scenes(scene_source.open_bank(bank), indices, **packing)
+
+
+def stacked_scenes(bank, indices, *, capacity, check, pack, workers=1):
+    """Scenes of a bank, packed and stacked, and the report of what a capacity cut."""
+    packed = packed_scenes(bank, indices, check=check, pack=pack, workers=workers)
+    return stack([one.scene for one in packed], capacity=capacity)
 
 
 def moved(raw, by, **changes):

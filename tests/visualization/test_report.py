@@ -469,9 +469,9 @@ def test_report_refuses_what_does_not_fit(tmp_path):
 
 def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
     spots = [
-        {"circle": [-20, 0], "radius": 3.0, "surface": None, "film_mm": 0.3, "follows": 1.0},
-        {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "follows": 0.0},
-        {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "follows": 0.0},
+        {"circle": [-20, 0], "radius": 3.0, "surface": None, "film_mm": 0.3, "open_road_film_fraction": 1.0},
+        {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "open_road_film_fraction": 0.0},
+        {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "open_road_film_fraction": 0.0},
     ]
     road = jax.tree.map(jnp.asarray, trajectory.scene.weather)
     laid = patch_layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=spots)

@@ -56,7 +56,7 @@ def read(
         file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
-        OtherFormat: no parquet file of such columns, and no such map.
+        FormatMismatch: no parquet file of such columns, and no such map.
         Companion: the map.
         SceneError: the map is missing, or a value is missing, of a wrong type or not finite, naming its column or key.
     """

@@ -41,7 +41,7 @@ def read(
         file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
-        OtherFormat: the file has no `objects` and `roads`.
+        FormatMismatch: the file has no `objects` and `roads`.
         SceneError: it has, but a value is missing, of a wrong type or not finite, naming its key.
     """
     document = json_documents.load(path, file_limit_mb=file_limit_mb)

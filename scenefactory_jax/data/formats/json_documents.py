@@ -44,7 +44,7 @@ def load(path: Path, *, file_limit_mb: int) -> dict[str, Any]:
 
     Raises:
         SceneError: unreadable, damaged or truncated, or larger than the limit.
-        OtherFormat: no JSON object at all.
+        FormatMismatch: no JSON object at all.
     """
     start = read_head(path)
     if not start.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):

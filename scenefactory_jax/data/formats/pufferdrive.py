@@ -49,7 +49,7 @@ def read(
         file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
-        OtherFormat: the head and the first object are not of this layout.
+        FormatMismatch: the head and the first object are not of this layout.
         SceneError: they are, but the file is cut short, has more than its head says, or a value that cannot be.
     """
     _require_start(path)

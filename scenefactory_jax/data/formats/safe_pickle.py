@@ -100,7 +100,7 @@ def load(path: Path, *, file_limit_mb: int, opcode_limit: int) -> Any:
         opcode_limit: longer programs are refused; an opcode makes one object at most.
 
     Raises:
-        OtherFormat: no pickle.
+        FormatMismatch: no pickle.
         SceneError: too large, damaged, cut short, or more than data, naming the global or the opcode that was refused.
     """
     data = _content(path, file_limit_mb)

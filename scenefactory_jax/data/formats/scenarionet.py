@@ -76,7 +76,7 @@ def read(
         opcode_limit: longer pickles are refused.
 
     Raises:
-        OtherFormat: no pickle, or no scenario in it.
+        FormatMismatch: no pickle, or no scenario in it.
         Companion: a database's summary or mapping, told by its name: those of large databases are larger than any scenario.
         SceneError: more than data in it, or a value that is missing, of a wrong type or not finite, naming its key.
     """

@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import OtherContent, Polyline, RawScene, Sc
 from scenefactory_jax.core.types import ROAD_USERS
 from scenefactory_jax.data.formats import json_documents
 
-STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.steps_most` less the first step
+STEPS_MOST = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.max_steps` less the first step
 TYPES = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 
 
@@ -35,7 +35,7 @@ def read(
         file_limit_mb: files that hold more, unpacked if they are compressed, are refused; the configs of older runs do not say it.
 
     Raises:
-        OtherFormat: the file has no `road.polylines`.
+        FormatMismatch: the file has no `road.polylines`.
         SceneError: it has, but a value is missing, of a wrong type or not finite, naming its key.
     """
     document = json_documents.load(path, file_limit_mb=file_limit_mb)

@@ -54,7 +54,7 @@ def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
         record_limit_mb: a longer record is rejected unread, and what follows it with it.
 
     Raises:
-        OtherFormat: the file does not begin as a TFRecord.
+        FormatMismatch: the file does not begin as a TFRecord.
         SceneError: the file cannot be opened.
     """
     try:

@@ -16,7 +16,7 @@ def read(path: Path, *, jump_m: float, record_limit_mb: int = 64) -> Iterator[Ra
         record_limit_mb: longer records are rejected unread; the configs of older runs do not say it.
 
     Raises:
-        OtherFormat: no TFRecord, or its first record holds neither message.
+        FormatMismatch: no TFRecord, or its first record holds neither message.
     """
     for record in tfrecord.read(path, record_limit_mb=record_limit_mb):
         if isinstance(record, Reject):

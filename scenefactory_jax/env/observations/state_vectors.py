@@ -7,7 +7,7 @@ from scenefactory_jax.core.geometry import safe_norm, to_frame
 from scenefactory_jax.core.schema import ConfigError, Positive
 from scenefactory_jax.core.types import SURFACES, Scene, State
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
-from scenefactory_jax.weather.patches import condition_at
+from scenefactory_jax.weather.patches import read_condition
 
 
 @bound_observation(ANY, ANY, SIGNED, SIGNED, LENGTH, ANY, ANY)
@@ -35,7 +35,7 @@ def weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: li
     """
     if unknown := [name for name in surfaces if name not in SURFACES]:
         raise ConfigError(f"observations.weather.surfaces: expected names of {', '.join(SURFACES)}, got {unknown[0]!r}")
-    film_mm, surface = condition_at(state.weather, state.motion.position[:, :2])
+    film_mm, surface = read_condition(state.weather, state.motion.position[:, :2])
     columns = jnp.array([SURFACES.index(name) for name in surfaces], jnp.int32)
     one_hot = (surface[:, None] == columns).astype(jnp.float32)
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.mujoco import ground_meshes
@@ -129,6 +129,6 @@ def _add_mesh(model: mujoco.MjSpec, surface: Surface) -> None:
 
 def _build_car(car: CarParameters, slot: int) -> mujoco.MjSpec:
     """A car in the colour of its slot."""
-    spec = cars.build_mjspec(car, visual=True, brake_rows=False)
+    spec = models.build_mjspec(car, visual=True, brake_rows=False)
     spec.geom("hull").rgba = [*rgb(colour_of(slot)), 1.0]
     return spec

@@ -12,6 +12,7 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Road, Scene
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 
@@ -43,11 +44,11 @@ def build(
         scene_size_m: side of the drawn ground; the physical plane is infinite.
     """
     parameters, solver = cars.read_parameters(dynamics)
-    car = cars.build_mjspec(parameters, visual=True, brake_rows=False)
+    car = models.build_mjspec(parameters, visual=True, brake_rows=False)
     model = build_world(scene, car, scene_size_m=scene_size_m, goal_radius_m=goal_radius_m)
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):
-        cars.add_ground_pairs(model, parameters, ground="ground", prefix=f"agent{slot}/")
-    cars.set_options(model, solver, physics_dt=1.0 / physics_hz)
+        models.add_ground_pairs(model, parameters, ground="ground", prefix=f"agent{slot}/")
+    models.set_options(model, solver, physics_dt=1.0 / physics_hz)
     return model
 
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from scenefactory_jax.core.parallel import process_pool
+from scenefactory_jax.core.parallel.task_map import open_pool
 
 
 def interrupted(seconds):
@@ -19,14 +19,14 @@ def interrupted(seconds):
 
 
 def test_an_interrupt_is_for_the_process_that_started_them():
-    with process_pool.open_pool(1) as processes:
-        assert processes.submit(interrupted, 0.2).result(timeout=120) == "done"
+    with open_pool(1) as task_map:
+        assert list(task_map(interrupted, [0.2])) == ["done"]
 
 
 def lead(beat):
     """Starts a worker that works on and on, and tells it by a file."""
-    with process_pool.open_pool(1) as processes:
-        processes.submit(beats, beat).result()
+    with open_pool(1) as task_map:
+        list(task_map(beats, [beat]))
 
 
 def beats(beat):
@@ -58,10 +58,30 @@ def until(true, seconds=120.0):
         time.sleep(0.05)
 
 
-def test_an_error_ends_them_whatever_they_are_at():
-    with pytest.raises(KeyboardInterrupt), process_pool.map_tasks(2) as over:
-        results = iter(over(interrupted, [0.0, 600.0, 600.0, 600.0]))
-        assert next(results) == "done"
+def note(folder_and_seconds):
+    """Leaves its process's number in a file, then works."""
+    folder, seconds = folder_and_seconds
+    (folder / str(os.getpid())).touch()
+    time.sleep(seconds)
+
+
+def test_an_error_ends_them_whatever_they_are_at(tmp_path):
+    with pytest.raises(KeyboardInterrupt), open_pool(2) as task_map:
+        results = iter(task_map(note, [(tmp_path, 0.0), *[(tmp_path, 600.0)] * 3]))
+        assert next(results) is None
+        until(lambda: len(list(tmp_path.iterdir())) == 2)
         begun = time.monotonic()
         raise KeyboardInterrupt
-    assert time.monotonic() - begun < 60.0 and not multiprocessing.active_children()
+    assert time.monotonic() - begun < 60.0
+    for path in tmp_path.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.name), 0)
+
+
+def twice(item):
+    return 2 * item
+
+
+def test_processes_stay_between_calls():
+    with open_pool(1) as task_map:
+        assert [list(task_map(twice, items)) for items in ([1, 2], [], [3])] == [[2, 4], [], [6]]
