@@ -20,7 +20,7 @@ $(STAMP): pyproject.toml constraints.txt
 comma := ,
 
 demo: $(STAMP) ## a page of the package's policy driving; then train cars on generated roads, and judge them on unseen ones
-	$(BIN)/python -m scenefactory_jax replay run=town out=runs/town.html
+	$(BIN)/python -m scenefactory_jax view run=town out=runs/town.html
 	$(BIN)/python -m scenefactory_jax train experiment=demo
 
 test: $(STAMP) ## the fast tests
@@ -31,7 +31,7 @@ test-slow: $(STAMP) ## the tests that take minutes
 
 test-browser: $(STAMP) ## the replay's page in a headless browser; needs Chromium or Chrome
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[browser]'
-	$(BIN)/python -m pytest tests/test_replay_browser.py
+	$(BIN)/python -m pytest tests/visualization/test_replay_browser.py
 
 check: $(STAMP) ## style and types
 	$(BIN)/ruff check .

@@ -31,14 +31,14 @@ from scenefactory_jax.env.environment import make_env as make
 
 if TYPE_CHECKING:
     from scenefactory_jax.cli.evaluate import evaluate
-    from scenefactory_jax.cli.replay import replay
     from scenefactory_jax.cli.train import train
+    from scenefactory_jax.cli.view import replay
     from scenefactory_jax.learning.policy_io import load_policy
+    from scenefactory_jax.visualization.birds_eye.video import draw_frame
 
 __version__ = "0.1.0"
-__all__ = ["ConfigError", "EnvParts", "__version__", "apply_overrides", "assemble", "evaluate", "load_config", "load_policy", "load_scenes"]
-__all__ += ["make", "read", "replay"]
-__all__ += ["train"]
+__all__ = ["ConfigError", "EnvParts", "__version__", "apply_overrides", "assemble", "draw_frame", "evaluate", "load_config"]
+__all__ += ["load_policy", "load_scenes", "make", "read", "replay", "train"]
 
 
 def read(path: Path | str) -> Iterator[RawScene | str]:
@@ -61,8 +61,9 @@ def __getattr__(name: str) -> Any:
     places = {
         "train": "cli.train",
         "evaluate": "cli.evaluate",
-        "replay": "cli.replay",
+        "replay": "cli.view",
         "load_policy": "learning.policy_io",
+        "draw_frame": "visualization.birds_eye.video",
     }
     if name not in places:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,10 +6,9 @@
     with learning():                                                # Brax 0.14 and JAX 0.10 need it to go together
         make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
 
-`done` is an event that ended the car. That the time is up is for Brax's EpisodeWrapper to say, which calls it truncation: give it
-`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events
-(`events/goal_reached`) of the step; what Brax
-reports of them are sums over an episode.
+`done` is an event that ended the car. That the time is up is truncation, which Brax's EpisodeWrapper adds: give it
+`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events (`events/goal_reached`) of the step; Brax
+reports their sums over an episode.
 
 Brax's own `wrap` repeats the first episode of each world for ever, the same scene and start; `wrap` of this module goes on to others.
 
@@ -61,12 +60,12 @@ class Drive(Env):
 
     def step(self, state: State, action: Array) -> State:
         """One action."""
-        episode, moment = episodes.step_worlds(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
-        told = {f"reward/{name}": term[0] for name, term in moment.terms.items()}
-        told |= {f"events/{name}": event[0].astype(jnp.float32) for name, event in moment.events.items()}
-        ended = (moment.over & ~moment.truncated[0]).astype(jnp.float32)
+        episode, result = episodes.step_worlds(self.pool.env, self.pool.scenes, self.episode_of(state), action[None])
+        metrics = {f"reward/{name}": term[0] for name, term in result.terms.items()}
+        metrics |= {f"events/{name}": event[0].astype(jnp.float32) for name, event in result.events.items()}
+        ended = (result.over & ~result.truncated[0]).astype(jnp.float32)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            pipeline_state=episode, obs=moment.observation[0], reward=moment.reward[0], done=ended, metrics={**state.metrics, **told}
+            pipeline_state=episode, obs=result.observation[0], reward=result.reward[0], done=ended, metrics={**state.metrics, **metrics}
         )
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Episodes of one world after the other, each in a scene drawn from a pool: what all the adapters stand on."""
+"""Runs episodes of one world, each in a scene sampled from a pool; all adapters are built on it."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ ANY = -1  # in place of a scene's index: draw one
 
 
 class Pool(NamedTuple):
-    """An environment, the scenes that its episodes are drawn from, and the sizes of what it gives."""
+    """An environment, the scenes of its episodes, and the sizes of its results."""
 
     env: Env
     scenes: Scene  # along the first axis, on the device
@@ -34,6 +34,7 @@ class Pool(NamedTuple):
     terms: tuple[str, ...]  # of the reward, sorted
     steps: int  # after which a world's time is up; a step is an action, with all control steps that it stands for
     step_hz: float
+    goal_radius_m: float
 
     @property
     def columns(self) -> int:
@@ -48,7 +49,7 @@ class Pool(NamedTuple):
 
 @pytree_dataclass
 class Episode:
-    """What changes while one world runs through its episodes."""
+    """State of one world over its episodes."""
 
     scene: Int[Array, ""]  # index into the pool
     state: State
@@ -57,16 +58,16 @@ class Episode:
 
 @pytree_dataclass
 class WorldStep:
-    """What one step gave the cars of one world. The observation is the one after the step, before anything begins anew."""
+    """Results of one step for the cars of one world; the observation is from before a new episode."""
 
     observation: Float[Array, "A F"]
     reward: Float[Array, " A"]
     terms: dict[str, Float[Array, " A"]]
     events: dict[str, Bool[Array, " A"]]
     terminated: Bool[Array, " A"]  # ended by an event in this step
-    truncated: Bool[Array, " A"]  # driving when the time was up
-    active: Bool[Array, " A"]  # still driving after the step
-    over: Bool[Array, ""]  # nobody drives any more, or the time is up
+    truncated: Bool[Array, " A"]  # active at the time limit
+    active: Bool[Array, " A"]  # after the step
+    over: Bool[Array, ""]  # no active car, or time limit
 
 
 def make_pool(
@@ -78,8 +79,8 @@ def make_pool(
         config: as `load("train", ...)` gives it; None: that, with one agent if `alone`.
         overrides: of the config.
         scenes: to draw from; None: the config's.
-        alone: one car a world is wanted.
-        lives: cars may begin anew while their world goes on.
+        alone: one car per world is required.
+        lives: cars may respawn.
 
     Raises:
         ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
@@ -89,60 +90,59 @@ def make_pool(
     elif overrides:
         config = scenefactory_jax.apply_overrides(config, overrides)
     if not lives and config["spawning"]["respawn_clearance_m"] is not None:
-        raise ConfigError(
-            f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null"
-        )
+        clearance = config["spawning"]["respawn_clearance_m"]
+        raise ConfigError(f"spawning.respawn_clearance_m: expected null, for cars of this interface do not respawn, got {clearance}")
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
         raise ConfigError(f"scenes.pack.agents: {config['scenes']['pack']['agents']}; this environment drives one car: set {ALONE}")
     scene_source.use_compilation_cache()
     parts = environment.make_parts(config)
     env = environment.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
     found = scene_source.load_training_scenes(config["scenes"]) if scenes is None else scenes
-    held = jax.device_put(found.scene)
-    slots = held.agents.present.shape[1]
+    on_device = jax.device_put(found.scene)
+    slots = on_device.agents.present.shape[1]
     if alone and slots != 1:
         where = "the scenes given" if scenes is not None else f"scenes.capacity.agents={config['scenes']['capacity']['agents']}"
         raise ConfigError(f"{where}: {slots} slots a scene; this environment drives one car: set {ALONE} scenes.capacity.agents=null")
-    episode = jax.eval_shape(functools.partial(start_episodes, env), held, jax.random.key(0))
-    seen = jax.eval_shape(lambda scenes, at: env.observe(_one(scenes, at.scene), at.state), held, episode)
-    low, high = bounds.flat_bounds(parts.groups, seen)
-    moment = jax.eval_shape(functools.partial(step_worlds, env), held, episode, jnp.zeros((slots, 3)))[1]
-    timing, terms = config["timing"], tuple(sorted(moment.terms))
+    episode = jax.eval_shape(functools.partial(start_episodes, env), on_device, jax.random.key(0))
+    observation = jax.eval_shape(lambda scenes, at: env.observe(_select(scenes, at.scene), at.state), on_device, episode)
+    low, high = bounds.flat_bounds(parts.groups, observation)
+    result = jax.eval_shape(functools.partial(step_worlds, env), on_device, episode, jnp.zeros((slots, 3)))[1]
+    timing, terms = config["timing"], tuple(sorted(result.terms))
     steps, step_hz = environment.episode_steps(timing) // env.action_repeat, timing["control_hz"] / env.action_repeat
-    return Pool(env, held, found.names, slots, low, high, terms, steps, step_hz)
+    return Pool(env, on_device, found.names, slots, low, high, terms, steps, step_hz, config["step_metrics"]["goal_radius_m"])
 
 
 def begin_episode(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
-    """A fresh episode of one world, in a scene drawn from all or in the given one, and what its cars see."""
+    """Starts an episode of one world, in a sampled scene or the given one; returns its first observation, too."""
     episode = start_episodes(env, scenes, key, scene)
     return episode, observe(env, scenes, episode)
 
 
 def start_episodes(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> Episode:
-    """`begin` without the observation."""
+    """`begin_episode` without the observation."""
     scene_key, start_key, key = jax.random.split(key, 3)
     drawn = jax.random.randint(scene_key, (), 0, len(scenes.agents.present))
     index = jnp.where(jnp.asarray(scene) < 0, drawn, scene).astype(jnp.int32)
-    return Episode(index, env.init_state(start_key, _one(scenes, index)), key)
+    return Episode(index, env.init_state(start_key, _select(scenes, index)), key)
 
 
 def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
-    """What the cars of one world see."""
-    return flatten_observation(env.observe(_one(scenes, episode.scene), episode.state))
+    """Observation of the cars of one world."""
+    return flatten_observation(env.observe(_select(scenes, episode.scene), episode.state))
 
 
 def step_worlds(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
-    """One action of one world, which may end the episode; nothing begins anew."""
-    episode, moment = transition(env, scenes, episode, action)
-    return episode, _seen(moment, observe(env, scenes, episode))
+    """Applies one action in one world; no new episode starts."""
+    episode, result = transition(env, scenes, episode, action)
+    return episode, _with_observation(result, observe(env, scenes, episode))
 
 
 def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
-    """`advance` with an empty observation, [A, 0]."""
-    scene = _one(scenes, episode.scene)
+    """`step_worlds` with an empty observation, [A, 0]."""
+    scene = _select(scenes, episode.scene)
     control = lambda state: env.control_step(scene, state, action)  # noqa: E731
     state, _, outcome, _ = environment.repeat_action(control, episode.state, action_repeat=env.action_repeat)
-    moment = WorldStep(
+    result = WorldStep(
         observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
@@ -152,11 +152,11 @@ def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "
         active=state.active,
         over=outcome.world_done,
     )
-    return Episode(episode.scene, state, episode.key), moment
+    return Episode(episode.scene, state, episode.key), result
 
 
 class CarStep(NamedTuple):
-    """What one step gave one car, on the host."""
+    """Results of one step for one car, on the host."""
 
     observation: np.ndarray
     reward: float
@@ -167,32 +167,32 @@ class CarStep(NamedTuple):
 
 
 def pack_observation(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Float[Array, "A N"]]:
-    """`advance` with all that it gave in one array: a host fetches one far sooner than thirty. `told` takes a row of it apart."""
-    after, moment = step_worlds(env, scenes, episode, action)
-    shared = [jnp.full_like(moment.reward, moment.over), jnp.full_like(moment.reward, after.scene)]
-    columns = [moment.reward, moment.terminated, moment.truncated, *shared]
-    columns += [*(moment.terms[name] for name in sorted(moment.terms)), *(moment.events[name] for name in EVENTS)]
-    return after, jnp.concatenate([moment.observation, jnp.stack([one.astype(jnp.float32) for one in columns], axis=1)], axis=1)
+    """`step_worlds` with all results in one array, which a host fetches faster than thirty; `unpack_car_step` splits a row."""
+    after, result = step_worlds(env, scenes, episode, action)
+    same_for_all = [jnp.full_like(result.reward, result.over), jnp.full_like(result.reward, after.scene)]
+    columns = [result.reward, result.terminated, result.truncated, *same_for_all]
+    columns += [*(result.terms[name] for name in sorted(result.terms)), *(result.events[name] for name in EVENTS)]
+    return after, jnp.concatenate([result.observation, jnp.stack([one.astype(jnp.float32) for one in columns], axis=1)], axis=1)
 
 
 def unpack_car_step(pool: Pool, row: np.ndarray) -> CarStep:
-    """One car's row of `packed`."""
+    """Results of one car from a row of `pack_observation`."""
     reward, terminated, truncated, over, scene, *rest = row[pool.columns :].tolist()
     terms, events = dict(zip(pool.terms, rest, strict=False)), rest[len(pool.terms) :]
     info = {"scene": int(scene), "terms": terms, "events": {name: bool(new) for name, new in zip(EVENTS, events, strict=True)}}
     return CarStep(row[: pool.columns], reward, bool(terminated), bool(truncated), bool(over), info)
 
 
-def _seen(moment: WorldStep, observation: Float[Array, "A F"]) -> WorldStep:
-    return WorldStep(**{**vars(moment), "observation": observation})
+def _with_observation(result: WorldStep, observation: Float[Array, "A F"]) -> WorldStep:
+    return WorldStep(**{**vars(result), "observation": observation})
 
 
-def _one(scenes: Scene, index: Int[Array, ""]) -> Scene:
+def _select(scenes: Scene, index: Int[Array, ""]) -> Scene:
     return jax.tree.map(lambda leaf: leaf[index], scenes)
 
 
 def make_key(seed: int) -> np.uint32:
-    """A seed of any size as what `jax.random.key` takes on the device."""
+    """A seed of any size as `jax.random.key` takes it."""
     return np.uint32(seed % 2**32)
 
 
@@ -211,10 +211,10 @@ def choose_scene(options: Mapping[str, Any] | None, count: int, worlds: int | No
 
 
 def check_action(action: Any, shape: tuple[int, ...] | None, *, where: str = "action") -> None:
-    """Refuse an action of another shape than the environment's: one that broadcasts would drive cars that nobody meant.
+    """Checks the shape of an action, so that none broadcasts.
 
     Raises:
         ConfigError: naming both shapes.
     """
     if np.shape(action) != shape:
-        raise ConfigError(f"{where}: shape {np.shape(action)}; wanted is {shape}, the last axis throttle, steer, brake")
+        raise ConfigError(f"{where}: expected shape {shape}, the last axis throttle, steer, brake, got {np.shape(action)}")

@@ -94,8 +94,8 @@ class Drive(gymnasium.Env):
             raise ResetNeeded("step: no episode has begun; call reset first")
         episodes.check_action(action, self.action_space.shape)
         self._episode, rows = self._advance(self.pool.scenes, self._episode, np.asarray(action, np.float32)[None])
-        told = episodes.unpack_car_step(self.pool, np.array(rows)[0])
-        return told.observation, told.reward, told.over and not told.truncated, told.truncated, told.info
+        result = episodes.unpack_car_step(self.pool, np.array(rows)[0])
+        return result.observation, result.reward, result.over and not result.truncated, result.truncated, result.info
 
     def render(self) -> np.ndarray | None:
         """The world from above around its car, [H, W, 3] from 0 to 255; None without a render mode.

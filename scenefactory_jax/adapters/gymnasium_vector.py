@@ -136,8 +136,8 @@ class DriveVector(VectorEnv):
         return tuple(self._painter.draw(self._worlds))
 
     def _info(self, step: "StepArrays") -> dict[str, Any]:
-        """Gymnasium's layout of what is known beside observation and reward."""
-        info = _paired(step.told, step.told_for) | _paired({"scene": step.scene}, step.every)
+        """`info` in Gymnasium's layout."""
+        info = _paired(step.terms_and_events, step.info_mask) | _paired({"scene": step.scene}, step.every)
         if self.mode is not AutoresetMode.SAME_STEP or (self.arrays == "numpy" and not step.ended.any()):
             return info
         last = step.last
@@ -145,11 +145,11 @@ class DriveVector(VectorEnv):
             last = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(step.ended):
                 last[index] = step.last[index]
-        final = _paired({**step.told, "scene": step.scene_before}, step.ended)
+        final = _paired({**step.terms_and_events, "scene": step.scene_before}, step.ended)
         return info | {"final_obs": last, "_final_obs": step.ended, "final_info": final, "_final_info": step.ended}
 
     def _out(self, tree: Any) -> Any:
-        """On the host as copies, which may be written to."""
+        """Writable copies on the host, with numpy arrays."""
         return jax.tree.map(np.array, jax.device_get(tree)) if self.arrays == "numpy" else tree
 
 
@@ -162,7 +162,7 @@ def _begin(
     mask: Bool[Any, " W"],
     scene: Int[Any, " W"],
 ) -> tuple[Episode, Float[Array, "W F"]]:
-    """Fresh episodes where `mask` says, of the seeds where `anew` says, else the next ones of their worlds."""
+    """Starts episodes in worlds of `mask`: from the seeds where `anew` is true, else the next episode of the world."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     keys = keys if worlds is None else jnp.where(anew, keys, worlds.key)
     fresh = jax.vmap(functools.partial(episodes.start_episodes, env, scenes))(keys, jnp.asarray(scene))
@@ -171,28 +171,28 @@ def _begin(
 
 
 class StepArrays(NamedTuple):
-    """What a step of all worlds gave, every array once: a host fetches each on its own."""
+    """Results of a step of all worlds."""
 
     observation: Array  # [W, F]
     reward: Array  # [W]
     terminated: Array
     truncated: Array
     ended: Array  # terminated or truncated
-    told: dict[str, dict[str, Array]]  # terms and events
-    told_for: Array  # worlds of which the step told something: not those that began anew before or after it
+    terms_and_events: dict[str, dict[str, Array]]
+    info_mask: Array  # worlds whose terms and events are of this step: not those that started an episode in it
     every: Array  # all worlds
     scene: Array
     scene_before: Array  # of those that ended
-    last: Array | None  # [W, F], in mode SAME_STEP: what was seen before anything began anew, if something ended
+    last: Array | None  # [W, F], in mode SAME_STEP: observation before new episodes, if an episode ended
 
 
 def _step(
     env: Env, mode: AutoresetMode, scenes: Scene, worlds: Episode, ended: Bool[Any, " W"], actions: Float[Array, "W 3"]
 ) -> tuple[Episode, StepArrays]:
-    """One action, and what begins anew."""
-    after, moment = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
-    ended, late, every = jnp.asarray(ended), moment.truncated[:, 0], jnp.ones(len(actions), bool)
-    anew = {AutoresetMode.SAME_STEP: moment.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]
+    """Applies one action and starts new episodes."""
+    after, result = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
+    ended, late, every = jnp.asarray(ended), result.truncated[:, 0], jnp.ones(len(actions), bool)
+    anew = {AutoresetMode.SAME_STEP: result.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]
     now = after
     if mode is not AutoresetMode.DISABLED:
         now = tree_where(anew, jax.vmap(lambda key: episodes.start_episodes(env, scenes, key))(after.key), after)
@@ -200,16 +200,16 @@ def _step(
     if mode is AutoresetMode.SAME_STEP:
         last = jax.lax.cond(jnp.any(anew), lambda: _observe(env, scenes, after), lambda: observation)
     counts = ~ended if mode is AutoresetMode.NEXT_STEP else every
-    over = moment.over & counts
-    told = {"terms": moment.terms, "events": moment.events}
+    over = result.over & counts
+    terms_and_events = {"terms": result.terms, "events": result.events}
     return now, StepArrays(
         observation=observation,
-        reward=jnp.where(counts, moment.reward[:, 0], 0.0),
+        reward=jnp.where(counts, result.reward[:, 0], 0.0),
         terminated=over & ~late,
         truncated=over & late,
         ended=over,
-        told=jax.tree.map(lambda leaf: leaf[:, 0], told),
-        told_for=~anew,
+        terms_and_events=jax.tree.map(lambda leaf: leaf[:, 0], terms_and_events),
+        info_mask=~anew,
         every=every,
         scene=now.scene,
         scene_before=after.scene,

@@ -81,16 +81,16 @@ class Drive(MultiAgentEnv):
     ) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
         """One action; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
         place of two."""
-        after, moment = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
+        after, result = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
         fresh = episodes.start_episodes(self.pool.env, self.scenes, key) if reset_state is None else reset_state
-        now = jax.tree.map(lambda new, old: jnp.where(moment.over, new, old), fresh, after)
-        return self.get_obs(now), now, *self._told(state, moment)
+        now = jax.tree.map(lambda new, old: jnp.where(result.over, new, old), fresh, after)
+        return self.get_obs(now), now, *self._outputs(state, result)
 
     def step_env(self, key: Array, state: Episode, actions: Named) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
         """One action, without beginning anew."""
         del key  # the environment draws nothing in a step
-        after, moment = episodes.step_worlds(self.pool.env, self.scenes, state, self._stacked(actions))
-        return self._named(moment.observation), after, *self._told(state, moment)
+        after, result = episodes.step_worlds(self.pool.env, self.scenes, state, self._stacked(actions))
+        return self._named(result.observation), after, *self._outputs(state, result)
 
     def get_obs(self, state: Episode) -> Named:
         """What the cars see."""
@@ -106,10 +106,10 @@ class Drive(MultiAgentEnv):
         """All cars are of one kind."""
         return {"cars": self.agents}
 
-    def _told(self, before: Episode, moment: WorldStep) -> tuple[Named, Named, dict[str, Any]]:
-        done = ~moment.active | moment.truncated
-        info = {"terms": moment.terms, "events": moment.events, "truncated": moment.truncated, "acted": before.state.active}
-        return self._named(moment.reward), {**self._named(done), "__all__": moment.over}, info
+    def _outputs(self, before: Episode, result: WorldStep) -> tuple[Named, Named, dict[str, Any]]:
+        done = ~result.active | result.truncated
+        info = {"terms": result.terms, "events": result.events, "truncated": result.truncated, "acted": before.state.active}
+        return self._named(result.reward), {**self._named(done), "__all__": result.over}, info
 
     def _stacked(self, actions: Named) -> Array:
         return jnp.stack([actions[name] for name in self.agents])

@@ -79,9 +79,9 @@ class Drive(ParallelEnv):
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
         active, scene = jax.device_get((episode.state.active, episode.scene))
-        seen = np.array(observation)
+        observation = np.array(observation)
         self.agents = [name for name in self.possible_agents if active[self._slot[name]]]
-        return {name: seen[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
+        return {name: observation[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
 
     def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """One action. Actions of cars that have ended count for nothing.
@@ -94,21 +94,22 @@ class Drive(ParallelEnv):
         if not self.agents:
             return {}, {}, {}, {}, {}
         if wrong := [name for name in self.agents if name not in actions] + [name for name in actions if name not in self._slot]:
-            raise ConfigError(f"actions: {wrong[0]!r}: wanted is one of each that drives: {', '.join(self.agents)}")
+            raise ConfigError(f"actions: {wrong[0]!r}: expected one for each of {', '.join(self.agents)}")
         given = np.zeros((self.pool.agents, 3), np.float32)
         for name in self.agents:
             episodes.check_action(actions[name], (3,), where=f"actions: {name!r}")
             given[self._slot[name]] = actions[name]
         self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
         rows = np.array(rows)  # a copy: what a caller gets may be written to
-        told = {name: episodes.unpack_car_step(self.pool, rows[self._slot[name]]) for name in self.agents}
-        self.agents = [name for name, one in told.items() if not one.terminated and not one.truncated]
+        results = {name: episodes.unpack_car_step(self.pool, rows[self._slot[name]]) for name in self.agents}
+        self.agents = [name for name, result in results.items() if not result.terminated and not result.truncated]
         names = ("observation", "reward", "terminated", "truncated", "info")
-        observations, rewards, terminations, truncations, infos = ({car: getattr(one, name) for car, one in told.items()} for name in names)
+        columns = ({car: getattr(result, name) for car, result in results.items()} for name in names)
+        observations, rewards, terminations, truncations, infos = columns
         return observations, rewards, terminations, truncations, infos
 
     def render(self) -> None:
-        """Nothing: `report.video` draws trajectories."""
+        """Returns None; `visualization.birds_eye.video` draws trajectories."""
 
     def close(self) -> None:
         """Nothing to release."""

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, UInt8
 
+import scenefactory_jax
 from scenefactory_jax.adapters.episodes import Episode, Pool
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import Agents, Boxes, Env, Events, Motion, Scene, Weather
-from scenefactory_jax.visualization.birds_eye import video
 
 MODES = ("rgb_array",)
 _PIXELS, _SIDE_M = 400, 80.0  # side of a picture, and of the square around the car that it shows
@@ -54,6 +54,7 @@ class Painter:
             events={name: (past_events & ~shown.active)[None] for name, past_events in vars(shown.past_events).items()},
             size=shown.agents.size,
             goal=shown.agents.goal,
+            goal_radius_m=self._pool.goal_radius_m,
             present=shown.agents.present,
             control_hz=self._pool.step_hz,
             title="",
@@ -61,7 +62,7 @@ class Painter:
             traffic=TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(shown.boxes))),
         )
         left, bottom = place[0] - _SIDE_M / 2
-        return video.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
+        return scenefactory_jax.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
 
     def _scene(self, index: int) -> Scene:
         if index not in self._scenes:

@@ -82,12 +82,12 @@ class Drive(VecEnv):
             See `DriveVector.advance`.
         """
         step: Any = self.worlds.advance(self._actions)  # of numpy arrays, with all that mode SAME_STEP gives
-        columns = {place: {name: column.tolist() for name, column in step.told[place].items()} for place in ("terms", "events")}
+        columns = {place: {name: column.tolist() for name, column in step.terms_and_events[place].items()} for place in ("terms", "events")}
         scenes, before, late = (column.tolist() for column in (step.scene, step.scene_before, step.truncated))
         infos = []
         for world in range(self.num_envs):
-            told = {place: {name: column[world] for name, column in named.items()} for place, named in columns.items()}
-            infos.append({"scene": before[world], **told, "TimeLimit.truncated": late[world]})
+            info = {place: {name: column[world] for name, column in named.items()} for place, named in columns.items()}
+            infos.append({"scene": before[world], **info, "TimeLimit.truncated": late[world]})
         for world in np.flatnonzero(step.ended):
             infos[world]["terminal_observation"] = step.last[world]
             self.reset_infos[world] = {"scene": scenes[world]}

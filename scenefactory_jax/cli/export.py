@@ -21,7 +21,7 @@ from scenefactory_jax.visualization.report import policy_card
 def export(config: Mapping[str, Any]) -> Path:
     """Write the policy's numbers, the run's config, the versions it was made with, and a card (`load("export", "run=...", "out=...")`).
 
-    The folder stands for the run wherever a policy is wanted (`evaluate`, `replay`, `drive`, `sf.load_policy`); training cannot go on from
+    The folder stands for the run wherever a policy is wanted (`evaluate`, `view`, `sf.load_policy`); training cannot go on from
     it.
 
     Raises:

@@ -14,7 +14,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import scene_simulation
-from scenefactory_jax.visualization.birds_eye import contact_sheet, figures
+from scenefactory_jax.visualization.birds_eye import figures
 from scenefactory_jax.visualization.report import plots
 
 Operation = Callable[[Mapping[str, Any]], Any]
@@ -54,21 +54,22 @@ def sheet(config: Mapping[str, Any]) -> scene_source.Scenes:
     if config["out"] is None:
         raise ConfigError("out: null; give a folder for the pictures")
     loaded, out = check(config), Path(config["out"])
-    paths = draw(loaded, out, limit=config["limit"])
+    paths = draw(loaded, out, limit=config["limit"], goal_radius_m=config["step_metrics"]["goal_radius_m"])
     shown = [(name, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)) for index, name in enumerate(loaded.names)]
-    figure = contact_sheet.contact_sheet(shown[: config["limit"]], **config["sheet"])
+    figure = figures.contact_sheet(shown[: config["limit"]], **config["sheet"])
     for path in [*paths, plots.save(figure, out / "sheet.png")]:
         print(path)
     return loaded
 
 
-def draw(loaded: scene_source.Scenes, folder: Path, *, limit: int) -> list[Path]:
+def draw(loaded: scene_source.Scenes, folder: Path, *, limit: int, goal_radius_m: float | int) -> list[Path]:
     """A bird's-eye picture of each of the first scenes."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for index, name in enumerate(loaded.names[:limit]):
         scene = jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)
-        paths.append(plots.save(figures.scene_figure(scene, title=name), folder / f"{to_file_name(name)}.png"))
+        figure = figures.scene_figure(scene, goal_radius_m=goal_radius_m, title=name)
+        paths.append(plots.save(figure, folder / f"{to_file_name(name)}.png"))
     return paths
 
 

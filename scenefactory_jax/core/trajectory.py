@@ -44,6 +44,7 @@ class Trajectory(NamedTuple):
     size: Float[np.ndarray, "A 2"]
     goal: Float[np.ndarray, "*T A 2"]
     present: Bool[np.ndarray, " A"]
+    goal_radius_m: float
     control_hz: float
     title: str
     weather: str

@@ -29,6 +29,7 @@ class Recording(NamedTuple):
     weather: Weather  # at the start
     names: list[str]
     control_hz: float
+    goal_radius_m: float
 
 
 def make_episode_runner(
@@ -93,7 +94,8 @@ def make_episode_runner(
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
-        return records, Recording(batch, boxes, recorded, state, first.weather, names, control_hz)
+        goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
+        return records, Recording(batch, boxes, recorded, state, first.weather, names, control_hz, goal_radius_m)
 
     return run
 
@@ -179,6 +181,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         size=agents.size,
         goal=frames.goal,
         present=agents.present,
+        goal_radius_m=recording.goal_radius_m,
         control_hz=control_hz,
         title=recording.names[index],
         weather=_format_weather(weather, seconds=end / control_hz),

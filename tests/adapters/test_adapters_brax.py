@@ -68,7 +68,9 @@ def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_
     ("train", "plan", "loss"),
     [
         (ppo.train, {"num_timesteps": 64, "unroll_length": 4, "num_minibatches": 1, "num_updates_per_batch": 1, **EVALS}, "total_loss"),
-        (sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss"),
+        pytest.param(
+            sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss", marks=pytest.mark.slow
+        ),
     ],
     ids=["ppo", "sac"],
 )

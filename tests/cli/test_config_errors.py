@@ -9,9 +9,9 @@ from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli.benchmark import benchmark
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate
-from scenefactory_jax.cli.render import render
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
+from scenefactory_jax.cli.view import view
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
@@ -21,7 +21,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
 HERE = ["progress=false", "spread.timeout_s=null"]  # of a conversion in this process
-COMMANDS = {"train": train, "benchmark": benchmark, "render": render, "scenes": scenes, "convert": convert, "evaluate": evaluate}
+COMMANDS = {"train": train, "benchmark": benchmark, "view": view, "scenes": scenes, "convert": convert, "evaluate": evaluate}
 
 
 def refused(command, *overrides):
@@ -194,7 +194,7 @@ def test_an_unknown_config_is_named():
         ("train", "scenes.path=3", "scenes.path: expected a text or null, got 3"),
         ("train", "scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
         ("benchmark", "repeats=0", "repeats: expected an integer >= 1, got 0"),
-        ("render", "index=first", "index: expected an integer >= 0, got 'first'"),
+        ("view", "skip=first", "skip: expected an integer >= 0, got 'first'"),
         ("scenes", "limit=few", "limit: expected an integer >= 0, got 'few'"),
         ("convert", "source=3", "source: expected a text or null, got 3"),
         ("evaluate", "repeats=0", "repeats: expected an integer >= 1, got 0"),

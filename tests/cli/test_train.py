@@ -21,14 +21,12 @@ from support.scene_documents import document, thing, written
 import scenefactory_jax
 from scenefactory_jax import __main__ as command_line
 from scenefactory_jax.cli import hydra_config, schema
-from scenefactory_jax.cli import render as rendering
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
 from scenefactory_jax.cli.export import export, named
-from scenefactory_jax.cli.render import render
-from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
+from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.bank import bank_reader
@@ -39,7 +37,6 @@ from scenefactory_jax.evaluation.records import begin_folder, read_records, read
 from scenefactory_jax.learning import checkpoint, interrupt, policy_io, run_folder
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer, prepare
 from scenefactory_jax.loggers import metrics_csv
-from scenefactory_jax.visualization.mujoco import offscreen_renderer
 from scenefactory_jax.visualization.report import evaluation_files, tables
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -377,7 +374,7 @@ def test_a_damaged_config_is_named(tmp_path):
 
 
 def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
-    page = replay(hydra_config.load_config("replay", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
+    page = replay(hydra_config.load_config("view", f"run={whole.folder}", "worlds=3", f"out={tmp_path / 'page.html'}")).read_text()
     head = json.loads(re.search(r'id="head">(.*?)</script>', page, re.DOTALL).group(1))
     records = read_records(whole.folder / "agents-strict.csv")
     assert head["title"] == whole.folder.name and [one["name"] for one in head["worlds"]] == list(dict.fromkeys(records["scene"]))
@@ -392,7 +389,7 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
             records["goal_reached"][row] for row in rows.values()
         )
     with pytest.raises(ConfigError, match=r"dynamics: decided by the run .*; to change it: overrides='\[dynamics=\.\.\.\]'"):
-        replay(hydra_config.load_config("replay", f"run={whole.folder}", "dynamics=articulated"))
+        replay(hydra_config.load_config("view", f"run={whole.folder}", "dynamics=articulated"))
 
 
 # ---- convert -> bank -> train
@@ -462,24 +459,12 @@ def test_scenes_lists_and_draws(tmp_path, capsys):
         scenes(hydra_config.load_config("scenes", "op=draw"))
 
 
-def test_render_writes_a_model_that_opens(tmp_path, capsys, monkeypatch):
+def test_view_writes_a_model_that_steps(tmp_path):
     import mujoco
 
-    settings = hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", "weather=split")
-    monkeypatch.setattr(rendering, "photograph", lambda model, **size: np.zeros((4, 6, 3), np.uint8))
-    xml = render(settings)
-    assert {str(xml), str(tmp_path / "mujoco.png")} <= set(capsys.readouterr().out.replace(": ", "\n").split("\n"))
+    xml = replay(hydra_config.load_config("view", "scenes.count=1", f"out={tmp_path / 'world.xml'}"))
     model = mujoco.MjModel.from_xml_path(str(xml))  # pyright: ignore[reportAttributeAccessIssue]
-    assert model.nu >= 0 and model.nbody > 10 and len(list(tmp_path.glob("*.png"))) == 2
-
-    def blind(model, **size):
-        raise offscreen_renderer.OpenGLError("no OpenGL through egl here")
-
-    monkeypatch.setattr(rendering, "photograph", blind)
-    assert render(settings) == xml and "no OpenGL through egl here" in capsys.readouterr().out
-    for override, message in {"index=1": "index: 1; valid: 0 to 0", "dynamics=bicycle": "has no car to show; valid: articulated"}.items():
-        with pytest.raises(ConfigError, match=message):
-            render(hydra_config.load_config("render", "scenes.count=1", f"out={tmp_path}", override))
+    assert model.nu >= 0 and model.nbody > 10
 
 
 # ---- command line

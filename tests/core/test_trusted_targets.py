@@ -7,11 +7,10 @@ import yaml
 
 import scenefactory_jax as sf
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli import replay as replays
 from scenefactory_jax.cli.compare import _read
 from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.export import export
-from scenefactory_jax.cli.replay import load_run_config
+from scenefactory_jax.cli.view import load_run_config, replay
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import policy_io, run_folder
@@ -63,10 +62,10 @@ def test_a_run_names_parts_of_the_package_alone(folder, target):
         lambda run, out: sf.load_policy(run),
         lambda run, out: export(hydra_config.load_config("export", f"run={run}", f"out={out}")),
         lambda run, out: evaluate(hydra_config.load_config("evaluate", f"run={run}", f"out={out}")),
-        lambda run, out: replays.replay(hydra_config.load_config("replay", f"run={run}", f"out={out}.html")),
-        lambda run, out: load_run_config(hydra_config.load_config("drive", f"run={run}"), command="drive"),
+        lambda run, out: replay(hydra_config.load_config("view", f"run={run}", f"out={out}.html")),
+        lambda run, out: load_run_config(hydra_config.load_config("view", f"run={run}")),
     ],
-    ids=["load_policy", "export", "evaluate", "replay", "drive"],
+    ids=["load_policy", "export", "evaluate", "replay", "run config"],
 )
 def test_every_door_is_the_same(folder, tmp_path, door):
     change(folder, lambda own: own["scenes"]["formats"].update(mine={"_target_": "planted.make", "more": [{"_target_": "os.system"}]}))

@@ -16,7 +16,7 @@ from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.learning.training_loop import train
 
 PAGES = ["README.md", "docs/commands.md", "docs/extending.md", "docs/sweeps.md"]
-INTERACTIVE = {"drive"}  # a window and a keyboard: tests/test_drive.py
+WINDOW = "window=true"  # and a keyboard: tests/visualization/test_keyboard_control.py
 SHORTER = {  # words of the pages, and what stands for them here
     **{f"experiment={name}": "experiment=smoke" for name in ("demo", "quick", "published", "laptop")},
     "scenes.workers=8": "scenes.workers=2",
@@ -30,7 +30,7 @@ SMALL = {
     "train": ["progress=false", "iterations=1", "evaluation.video.enable=false", "evaluation.untrained=false"],
     "benchmark": ["worlds=4", "warmup=0", "repeats=1"],
     "evaluate": ["bootstrap=20", "chunk_steps=30"],
-    "replay": ["seconds=0.5", "film.at_s=0.2", "film.width=160", "film.height=90"],
+    "view": ["seconds=0.5", "film.at_s=0.2", "film.width=160", "film.height=90"],
     "study": ["study.base=[experiment=smoke,worlds=2,reward=safe_smooth]", "study.seeds=[0]", "evaluation.bootstrap=20", "progress=false"],
     "validate": ["validation.drives.draw.count=3", "validation.drives.draw.seconds=2.0", "parts=[drives]"],
     "sysid": [
@@ -82,9 +82,9 @@ def name_of(line):
 @pytest.mark.parametrize("line", [(page, words) for page in PAGES for words in commands(ROOT / page)], ids=name_of)
 def test_a_command_of_the_pages_runs(desk, line):
     command, *words = line[1]
-    if command in INTERACTIVE:
-        pytest.skip(f"{command}: needs a window and somebody at the keyboard; tests/test_drive.py drives it")
-    if "out=drive.mp4" in words:
+    if WINDOW in words:
+        pytest.skip(f"{command}: needs a window and a keyboard")
+    if "out=film.mp4" in words:
         pytest.importorskip("imageio_ffmpeg", reason="needs ffmpeg: pip install scenefactory_jax[video]")
     if any(word.startswith("hydra/launcher") for word in words):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the launcher: pip install scenefactory_jax[sweeps]")

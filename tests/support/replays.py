@@ -10,7 +10,7 @@ from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics.articulated.tyres import Tyres
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import Recording, record
-from scenefactory_jax.visualization.web.replay_data import Light, RoadPosts
+from scenefactory_jax.visualization.web.road_posts import Light, RoadPosts
 from support.hand_scenes import scene_of
 
 STEPS, HZ = 90, 30

@@ -1,5 +1,7 @@
 """Recorded worlds in three dimensions: surfaces enclose what they should, cars stand where they were, and pictures show them there."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,16 +12,22 @@ from support.replays import STEPS, changed, made
 from support.scene_documents import document, written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.replay import replay
+from scenefactory_jax.cli.view import replay
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye import drawing
-from scenefactory_jax.visualization.mp4_writer import VideoError
 from scenefactory_jax.visualization.mujoco import actors, film, ground_meshes, offscreen_renderer, scene_model
-from scenefactory_jax.visualization.mujoco.film import FilmSettings
+from scenefactory_jax.visualization.mujoco.film import Camera, FilmSettings
 from scenefactory_jax.visualization.mujoco.offscreen_renderer import OpenGLError
+from scenefactory_jax.visualization.video_file import VideoError
 
 CAR = cars.read_parameters(hydra_config.load_config("task")["dynamics"])[0]
-LOOK = FilmSettings(**hydra_config.load_config("replay")["film"], goal_radius_m=3.0)._replace(width=320, height=180)
+VIEW = hydra_config.load_config("view")
+SETTINGS = dataclasses.replace(FilmSettings(**VIEW["film"]), width=320, height=180)
+LOOK = {"car": CAR, "camera": Camera(**VIEW["camera"]), "goal_radius_m": 3.0}
+
+
+def settings(**changes):
+    return dataclasses.replace(SETTINGS, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,7 @@ def test_cars_stand_and_steer_as_they_are_put():
     data = mujoco.MjData(built.model)
     yaw, steer = np.array([0.5, -2.0]), np.array([0.3, 0.0])
     joints = scene_model.set_posture(CAR, np.array([[1.0, 2.0], [30.0, -4.0]]), yaw, steer, np.array([0.7, 0.0]))
-    scene_model.place_actor(built, data, joints, np.array([1.0, 0.0]))
+    scene_model.place_actors(built, data, joints, np.array([1.0, 0.0]))
     for slot in range(2):
         ahead = data.body(f"agent{slot}/chassis").xmat.reshape(3, 3)[:, 0]
         np.testing.assert_allclose(ahead, [np.cos(yaw[slot]), np.sin(yaw[slot]), 0.0], atol=1e-9)
@@ -76,7 +84,7 @@ def test_cars_stand_and_steer_as_they_are_put():
     box = built.model.geom("agent0/box")
     np.testing.assert_allclose(2 * box.size[:2], [5.0, 2.2])
     opacity = [built.model.geom_rgba[built.geoms[row], 3] for row in range(2)]
-    assert not opacity[1].any() and (opacity[0] == built.paint[built.geoms[0], 3]).all()
+    assert not opacity[1].any() and (opacity[0] == built.colours[built.geoms[0], 3]).all()
 
 
 def test_recorded_joints_are_shown_as_they_are(recording):
@@ -105,9 +113,9 @@ def hue(colour):
 
 
 def test_from_above_every_car_is_seen_where_it_is(opened, recording):
-    whole, look = actors.make_actors(recording, 0, CAR), LOOK._replace(view="bird", width=960, height=540)
-    [picture] = film.frames(whole, [20], car=CAR, look=look)
-    camera = film._above(whole, aspect=look.width / look.height)
+    whole, look = actors.make_actors(recording, 0, CAR), settings(view="bird", width=960, height=540)
+    [picture] = film.frames(whole, [20], settings=look, slot=0, **LOOK)
+    camera = film.look_from_above(whole, aspect=look.width / look.height)
     scale = look.height / (2 * camera.distance * np.tan(np.radians(film.FOVY / 2)))
     for slot in range(3):
         yaw = whole.yaw[20, slot]
@@ -120,25 +128,25 @@ def test_from_above_every_car_is_seen_where_it_is(opened, recording):
 def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
     whole = actors.make_actors(recording, 0, CAR)
     for slot in (0, 2):
-        [picture] = film.frames(whole, [20], car=CAR, look=LOOK._replace(car=slot, trail_s=0.0))
+        [picture] = film.frames(whole, [20], settings=settings(trail_s=0.0), slot=slot, **LOOK)
         middle = picture[90:135, 130:190].reshape(-1, 3)
         same = [np.abs(hue(pixel) - hue(drawing.colour_of(slot))).max() < 0.2 for pixel in middle]
         assert np.mean(same) > 0.2, slot
 
 
 def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path):
-    look = LOOK._replace(width=128, height=72, stride=15, view="both")
+    look = settings(width=64, height=64, stride=30, view="both")
     for slot in (0, 2):
-        out = film.write(tmp_path / f"{slot}.gif", recording, car=CAR, look=look._replace(car=slot))
+        out = film.write(tmp_path / f"{slot}.gif", recording, settings=look, slot=slot, **LOOK)
         whole = actors.make_actors(recording, 0, CAR)
         end = min(np.flatnonzero(whole.active[:, slot])[-1] + 1 + 30, STEPS)
         with Image.open(out) as image:
-            assert image.n_frames == len(range(0, end, 15)) and image.size == (256, 72)
+            assert image.n_frames == len(range(0, end, 30)) and image.size == (128, 64)
 
 
 def test_mp4_wants_its_extra_or_is_written(opened, recording, tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
-    out = film.write(tmp_path / "film.mp4", recording, car=CAR, look=LOOK._replace(width=128, height=72, stride=20))
+    out = film.write(tmp_path / "film.mp4", recording, settings=settings(width=128, height=72, stride=20), **LOOK)
     assert out.stat().st_size > 500
 
 
@@ -146,22 +154,22 @@ def test_mp4_wants_its_extra_or_is_written(opened, recording, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "look", "message"),
+    ("name", "fps", "slot", "message"),
     [
-        ("film.avi", LOOK, "suffix '.avi' is no film; valid are .gif, .mp4, .png"),
-        ("film.gif", LOOK._replace(fps=60.0), "fps: 60"),
-        ("film.png", LOOK._replace(car=9), "film.car: 9; the world's cars are 0, 1, 2"),
+        ("film.avi", 15.0, 0, "expected the suffix .png, .gif, .mp4, got '.avi'"),
+        ("film.gif", 60.0, 0, "fps: expected a number > 0, for a .gif <= 50, got 60"),
+        ("film.png", 15.0, 9, "car: expected one of 0, 1, 2, got 9"),
     ],
 )
-def test_a_film_that_cannot_be_is_refused(recording, tmp_path, name, look, message):
+def test_a_film_that_cannot_be_is_refused(recording, tmp_path, name, fps, slot, message):
     with pytest.raises(VideoError, match=message):
-        film.write(tmp_path / name, recording, car=CAR, look=look)
+        film.write(tmp_path / name, recording, settings=settings(fps=fps), slot=slot, **LOOK)
     assert not list(tmp_path.iterdir())
 
 
 def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
-    with pytest.raises(OpenGLError, match="MUJOCO_GL: 'vulkan'; valid: egl, osmesa, glfw, cgl, or not set"):
+    with pytest.raises(OpenGLError, match="MUJOCO_GL: expected egl, osmesa, glfw, cgl or nothing, got 'vulkan'"):
         offscreen_renderer.check()
 
     def missing(name):
@@ -171,7 +179,7 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(offscreen_renderer, "import_module", missing)
     monkeypatch.setattr(offscreen_renderer.sys, "platform", "linux")
     with pytest.raises(OpenGLError) as caught:
-        replay(hydra_config.load_config("replay", f"out={tmp_path / 'a.gif'}"))
+        replay(hydra_config.load_config("view", f"out={tmp_path / 'a.gif'}"))
     text = str(caught.value)
     assert text.startswith("no OpenGL through osmesa here (no library for mujoco.osmesa); on Debian") and "libegl1" in text
     assert "\n" not in text
@@ -181,13 +189,13 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(("override", "message"), [
-    ("out=a.avi", "out: a.avi; valid endings: .html, .gif, .mp4, .png, .rrd"),
+    ("out=a.avi", "out: expected a file .html, .png, .gif, .mp4, .rrd, .xml, got a.avi"),
     ("film.view=side", "film.view: expected one of chase, bird, both, got 'side'"),
     ("film.stride=0", "film.stride: expected an integer >= 1, got 0"),
 ])  # fmt: skip
 def test_a_wrong_setting_is_named(override, message):
     with pytest.raises(ValueError) as caught:
-        replay(hydra_config.load_config("replay", override))
+        replay(hydra_config.load_config("view", override))
     assert message in str(caught.value)
 
 
@@ -195,7 +203,7 @@ def test_replay_writes_a_picture(opened, tmp_path):
     path = written(tmp_path, document())
     small = ["film.width=128", "film.height=72", "film.at_s=0.2"]
     out = replay(
-        hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'one.png'}", *small)
+        hydra_config.load_config("view", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'one.png'}", *small)
     )
     with Image.open(out) as image:
         assert image.size == (128, 72) and len(image.getcolors(10_000)) > 30

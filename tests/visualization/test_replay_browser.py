@@ -38,7 +38,8 @@ def recording():
 
 @pytest.fixture(scope="module")
 def file(recording, tmp_path_factory):
-    return replay_page.write(tmp_path_factory.mktemp("replay") / "page.html", recording, names=NAMES, posts=POSTS, title="test")
+    path = tmp_path_factory.mktemp("replay") / "page.html"
+    return replay_page.write(path, recording, names=NAMES, posts=POSTS, title="test", goal_radius_m=3.0)
 
 
 @pytest.fixture
@@ -265,11 +266,11 @@ def test_terms_and_things_on_the_map_have_legends(opened, recording):
     pictures = page.eval_on_selector_all(".terms .swatch", "all => all.map((one) => one.toDataURL())")
     assert len(set(pictures)) == len(recording.shots.terms) + 1  # and the sum
     assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == [
-        "stop sign", "traffic light", "other road user"
+        "stop sign", "traffic light", "traffic"
     ]  # fmt: skip
     page.keyboard.press("w")
     page.wait_for_function("() => document.getElementById('world').value === '1'")
-    assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == ["other road user"]
+    assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == ["traffic"]
 
 
 def test_a_phone_has_room(opened):
@@ -298,7 +299,7 @@ def test_a_notebook_shows_it_inline(browser, recording):
     page = browser.new_page()
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.set_content(replay_page.show(recording).data)
+    page.set_content(replay_page.show(recording, goal_radius_m=3.0).data)
     frame = page.frame_locator("iframe")
     frame.locator("#cars button").first.wait_for()
     assert frame.locator("#who").text_content().startswith("Car 0") and not errors

@@ -16,12 +16,13 @@ from support.scene_documents import document as scene_document
 from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.replay import replay
+from scenefactory_jax.cli.view import replay
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene
 from scenefactory_jax.core.types import SURFACES, Events
 from scenefactory_jax.visualization.web import replay_data, replay_page
 from scenefactory_jax.visualization.web.array_packing import Packer
 from scenefactory_jax.visualization.web.replay_page import ReplayError
+from scenefactory_jax.visualization.web.road_posts import find_posts
 from scenefactory_jax.visualization.web.term_styles import TermLook, term_looks
 
 
@@ -32,7 +33,7 @@ def recording():
 
 @pytest.fixture(scope="module")
 def page(recording):
-    return replay_page.document(recording, names=NAMES, posts=POSTS, title="a <title>")
+    return replay_page.document(recording, names=NAMES, posts=POSTS, title="a <title>", goal_radius_m=3.0)
 
 
 def unpacked(page: str) -> list[dict]:
@@ -98,11 +99,11 @@ def test_the_page_holds_the_recording(page, recording):
             resolution = replay_data.RESOLUTION.get(name, replay_data.TERM_RESOLUTION if name in terms else 0.001)
             step = max(resolution, world["arrays"][name].get("step", 0.0))
             assert np.abs(world["array"][name].T - values)[shots.active].max() <= 0.51 * step, name
-        near = np.where(shots.ttc <= replay_data.TTC_MOST_S, shots.ttc, np.nan)[shots.active]
+        near = np.where(shots.ttc <= replay_data.MAX_TTC_S, shots.ttc, np.nan)[shots.active]
         assert np.allclose(world["array"]["ttc"].T[shots.active], near, atol=0.006, equal_nan=True)
 
 
-def test_cars_events_and_others(page, recording):
+def test_cars_events_and_traffic(page, recording):
     first, second = unpacked(page)
     events, active = recording.shots.events, recording.shots.active
     for index, world in enumerate((first, second)):
@@ -141,13 +142,13 @@ def test_the_page_needs_nothing_from_outside(page):
 def test_broken_cars_stay_where_they_last_were(recording):
     position = recording.shots.position.copy()
     position[0, 40:, 1] = np.nan
-    world = unpacked(replay_page.document(changed(recording, position=position)))[0]
+    world = unpacked(replay_page.document(changed(recording, position=position), goal_radius_m=3.0))[0]
     assert np.isfinite(world["array"]["x"]).all() and abs(world["array"]["x"][1, 60] - position[0, 39, 1, 0]) < 0.01
 
 
 def test_a_notebook_gets_the_page_inline(recording):
     pytest.importorskip("IPython")
-    shown = replay_page.show(recording, height=500, title="mine")
+    shown = replay_page.show(recording, height=500, title="mine", goal_radius_m=3.0)
     inner = html.unescape(re.search(r'srcdoc="([^"]*)"', shown.data).group(1))
     assert "height:500px" in shown.data and len(unpacked(inner)) == 2 and "<title>mine</title>" in inner
 
@@ -158,16 +159,16 @@ def test_lights_stand_where_cars_stop_and_change_with_the_log():
     unseen = np.array([True, True, True, True, False])
     lights = (Light(7, states, unseen), Light(7, states, unseen, stop=np.array([10.0, 8.0, 0.0])), Light(99, states, unseen))
     raw = RawScene("s", "s", (lane,), (), 0.5 * np.arange(5), 1, lights=lights)
-    first, second = replay_data.find_posts(raw, (10.0, 0.0, 0.0)).lights  # the third one's lane is on no map
+    first, second = find_posts(raw, (10.0, 0.0, 0.0)).lights  # the third one's lane is on no map
     assert first.place == (0.0, 5.0) and second.place == (0.0, 8.0) and np.isclose(first.yaw, np.pi / 2)
     assert first.shown == [(0.0, "go"), (0.5, "caution"), (1.0, "stop"), (1.5, "unknown")]
 
 
 def test_what_cannot_be_shown_is_named(recording):
-    with pytest.raises(ReplayError, match="names: 1 for 2 worlds; wanted is one for each, or none"):
-        replay_page.document(recording, names=("one",))
-    with pytest.raises(ReplayError, match="recording: 0 worlds of 0 steps"):
-        replay_page.document(jax.tree.map(lambda leaf: leaf[0], recording))
+    with pytest.raises(ReplayError, match="names: expected 2, one per world, or none, got 1"):
+        replay_page.document(recording, names=("one",), goal_radius_m=3.0)
+    with pytest.raises(ReplayError, match="got 0 worlds of 0 steps"):
+        replay_page.document(jax.tree.map(lambda leaf: leaf[0], recording), goal_radius_m=3.0)
 
 
 # ---- the command
@@ -178,7 +179,7 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
     signed["roads"].append({"geometry": [{"x": 5.0, "y": 4.0, "z": 0.0}], "type": "stop_sign", "map_element_id": 17, "id": 90})
     path = written(tmp_path, signed)
     out = replay(
-        hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'page.html'}")
+        hydra_config.load_config("view", "scenes=womd", f"scenes.path={path}", "seconds=0.5", f"out={tmp_path / 'a' / 'page.html'}")
     )
     [world] = unpacked(out.read_text())
     assert len(world["cars"]) == 2 and [-31.0, 4.0] in world["signs"] and out.stat().st_size < 200_000  # around the car that logged
@@ -190,7 +191,7 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
         (["run=nowhere"], "config.yaml not found in nowhere"),
         (["run=nowhere", "dynamics=bicycle"], "dynamics: decided by the run nowhere; to change it: overrides='[dynamics=...]'"),
         (["overrides=[weather=wet]"], "overrides: ['weather=wet'] without a run"),
-        (["out=."], "out: . is a folder; give the page's own name, such as replay.html"),
+        (["out=."], "out: expected a file, got the folder .; for example view.html"),
         (["act=wild"], "act: expected one of policy, coast, random, got 'wild'"),
         (["worlds=0"], "worlds: expected an integer >= 1, got 0"),
         (["scenes=womd"], "scenes.path: null; give a bank, a scene file or a folder"),
@@ -198,11 +199,11 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
 )
 def test_a_wrong_setting_is_named(overrides, message):
     with pytest.raises(ValueError) as caught:
-        replay(hydra_config.load_config("replay", *overrides))
+        replay(hydra_config.load_config("view", *overrides))
     assert message in str(caught.value)
 
 
 def test_skipping_all_scenes_says_how_many_there_are(tmp_path):
     path = written(tmp_path, scene_document())
-    with pytest.raises(ValueError, match="skip: 3; valid: 0 to 0, for 1 scenes can be used"):
-        replay(hydra_config.load_config("replay", "scenes=womd", f"scenes.path={path}", "skip=3"))
+    with pytest.raises(ValueError, match="skip: expected 0 to 0, the number of usable scenes less one, got 3"):
+        replay(hydra_config.load_config("view", "scenes=womd", f"scenes.path={path}", "skip=3"))

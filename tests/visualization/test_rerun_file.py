@@ -6,7 +6,7 @@ import pytest
 from support.replays import NAMES, STEPS, made
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.replay import replay
+from scenefactory_jax.cli.view import replay
 from scenefactory_jax.visualization import rerun_file
 from scenefactory_jax.visualization.rerun_file import RerunError
 from scenefactory_jax.visualization.web import replay_data
@@ -59,7 +59,7 @@ def test_series_hold_the_numbers(chunks, recording):
         rows = column(chunks[f"/world1/series/{name}/car1"], "Scalars:scalars")
         steps = [step for step, _ in rows]
         np.testing.assert_allclose([value[0] for _, value in rows], values[1, steps, 1], rtol=1e-6)
-    near = np.flatnonzero(recording.shots.active[0, :, 1] & (recording.shots.ttc[0, :, 1] <= replay_data.TTC_MOST_S))
+    near = np.flatnonzero(recording.shots.active[0, :, 1] & (recording.shots.ttc[0, :, 1] <= replay_data.MAX_TTC_S))
     rows = column(chunks["/world0/series/ttc/car1"], "Scalars:scalars") if len(near) else []
     assert [step for step, _ in rows] == near.tolist()
 
@@ -69,7 +69,7 @@ def test_map_goals_others_and_events_are_there(chunks, recording):
     [(step, ring)] = column(chunks["/world0/car0/goal"], "LineStrips3D:strips")
     assert step == 0
     np.testing.assert_allclose(np.mean(np.asarray(ring[0])[:-1, :2], axis=0), [-8.0, 0.0], atol=1e-5)
-    counts = [len(value or []) for _, value in column(chunks["/world0/others"], "Boxes3D:half_sizes")]
+    counts = [len(value or []) for _, value in column(chunks["/world0/traffic"], "Boxes3D:half_sizes")]
     assert counts == [1] * (STEPS // 2) + [2] * (STEPS - STEPS // 2)
     told = {value[0] for _, value in column(chunks["/world0/events"], "TextLog:text")}
     assert {"car 0: goal", "car 1: road edge"} <= told
@@ -86,5 +86,5 @@ def test_rewards_are_the_sum_of_their_terms_and_what_is_not_there_is_nan(recordi
 def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setattr(rerun_file.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RerunError, match=r"writing \.rrd needs rerun; `pip install scenefactory_jax\[rerun\]`, or choose out=NAME\.html"):
-        replay(hydra_config.load_config("replay", f"out={tmp_path / 'a.rrd'}"))
+        replay(hydra_config.load_config("view", f"out={tmp_path / 'a.rrd'}"))
     assert not list(tmp_path.iterdir())

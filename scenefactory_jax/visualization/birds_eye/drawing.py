@@ -1,11 +1,12 @@
-"""What pictures and videos share: a trajectory, a window on the plane, road strokes, car shapes and colours."""
+"""Elements of figures and videos from above: window on the plane, road strokes, car shapes, event marks, colours."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from scenefactory_jax.core.trajectory import Trajectory
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road
 
 Colour = tuple[int, int, int]
@@ -22,10 +23,9 @@ DRIVEWAY_LINE: Colour = (206, 208, 211)
 CROSSWALK_LINE: Colour = (178, 190, 206)
 BUMP: Colour = (190, 160, 120)
 STOP: Colour = (208, 28, 40)
-GOAL_RADIUS = 3.0  # m, of the goal's circle: the reference task's goal radius
 
-# One colour an agent, repeated after 16: Okabe and Ito's and Tol's colour-blind safe sets without their palest and without pure red,
-# green and orange, which mean events. Sixteen hues cannot all be told apart, so cars also carry their number where there is room.
+# One colour per agent, repeated after 16: the colour-blind safe sets of Okabe and Ito and of Tol, without the palest colours and without
+# pure red, green and orange, which mark events.
 AGENTS: tuple[Colour, ...] = (
     (0, 114, 178), (204, 121, 167), (51, 34, 136), (86, 180, 233), (136, 34, 85), (68, 170, 153), (153, 153, 51), (102, 17, 0),
     (120, 94, 240), (0, 90, 90), (190, 150, 20), (17, 119, 200), (170, 68, 153), (96, 110, 60), (90, 90, 110), (160, 110, 90),
@@ -33,7 +33,7 @@ AGENTS: tuple[Colour, ...] = (
 
 
 class Mark(NamedTuple):
-    """How an event looks: its label, colour, and a matplotlib marker that the video's shape repeats."""
+    """Label, colour and matplotlib marker of an event."""
 
     label: str
     colour: Colour
@@ -45,54 +45,55 @@ MARKS: dict[str, Mark] = {
     "collision": Mark("collision", (208, 28, 40), "*"),
     "road_edge_contact": Mark("road edge", (230, 126, 0), "X"),
     "out_of_bounds": Mark("crash", (0, 0, 0), "D"),
-    "numerical_error": Mark("numerical_error", (198, 0, 190), "s"),
+    "numerical_error": Mark("numerical error", (198, 0, 190), "s"),
 }
 
 
 class TrajectoryError(ValueError):
-    """A trajectory that cannot be drawn; the message names the array and what would be valid."""
+    """A trajectory that cannot be drawn; the message names the array and the expected shape."""
 
 
 def check(trajectory: Trajectory) -> None:
-    """Refuse arrays that do not belong together.
+    """Checks that the arrays of a trajectory belong together.
 
     Raises:
         TrajectoryError: naming the array.
     """
     t, a = trajectory.active.shape
-    goal = (t, a, 2) if np.ndim(trajectory.goal) == 3 else (a, 2)
-    wanted = {"position": (t, a, 2), "yaw": (t, a), "speed": (t, a), "size": (a, 2), "goal": goal, "present": (a,)}
-    for name, shape in wanted.items():
-        if np.shape(getattr(trajectory, name)) != shape:
-            raise TrajectoryError(f"trajectory.{name}: shape {np.shape(getattr(trajectory, name))}; with active {t, a} it must be {shape}")
-    for name, past_events in trajectory.events.items():
-        if name not in MARKS or np.shape(past_events) != (t, a):
-            raise TrajectoryError(
-                f"trajectory.events: {name!r} {np.shape(past_events)}; valid are {', '.join(MARKS)}, each of shape {t, a}"
-            )
-    if trajectory.traffic is not None:
-        boxes = trajectory.traffic.present.shape[1]
-        for name, wanted in {"position": (t, boxes, 2), "yaw": (t, boxes), "size": (t, boxes, 2), "present": (t, boxes)}.items():
-            if np.shape(getattr(trajectory.traffic, name)) != wanted:
-                raise TrajectoryError(
-                    f"trajectory.traffic.{name}: shape {np.shape(getattr(trajectory.traffic, name))}; it must be {wanted}"
-                )
     if t == 0:
-        raise TrajectoryError(f"trajectory {trajectory.title!r}: no steps, so there is nothing to draw")
+        raise TrajectoryError(f"trajectory {trajectory.title!r}: expected at least one step")
+    goal = (t, a, 2) if np.ndim(trajectory.goal) == 3 else (a, 2)
+    agents = {"position": (t, a, 2), "yaw": (t, a), "speed": (t, a), "size": (a, 2), "goal": goal, "present": (a,)}
+    _check_shapes(trajectory, agents, where="trajectory")
+    if unknown := [name for name in trajectory.events if name not in MARKS]:
+        raise TrajectoryError(f"trajectory.events: expected some of {', '.join(MARKS)}, got {unknown[0]!r}")
+    for name, new in trajectory.events.items():
+        if np.shape(new) != (t, a):
+            raise TrajectoryError(f"trajectory.events.{name}: expected shape {(t, a)}, got {np.shape(new)}")
+    if trajectory.traffic is not None:
+        n = trajectory.traffic.present.shape[1]
+        boxes = {"position": (t, n, 2), "yaw": (t, n), "size": (t, n, 2), "present": (t, n)}
+        _check_shapes(trajectory.traffic, boxes, where="trajectory.traffic")
+
+
+def _check_shapes(columns: Trajectory | TrafficBoxes, shapes: Mapping[str, tuple[int, ...]], *, where: str) -> None:
+    for name, shape in shapes.items():
+        if np.shape(getattr(columns, name)) != shape:
+            raise TrajectoryError(f"{where}.{name}: expected shape {shape}, got {np.shape(getattr(columns, name))}")
 
 
 def sanitize_trajectory(trajectory: Trajectory) -> Trajectory:
-    """Checked, and without numbers that cannot be drawn: after a fault of the simulation a car stays, inactive, where it last was.
+    """Checks a trajectory and replaces states that are not finite: the car stays, inactive, at its last finite state.
 
     Raises:
         TrajectoryError: see `check`.
     """
     check(trajectory)
-    sound = np.isfinite(trajectory.position).all(axis=-1) & np.isfinite(trajectory.yaw)
-    last = np.maximum.accumulate(np.where(sound, np.arange(len(sound))[:, None], 0), axis=0)
-    agents = np.arange(sound.shape[1])
+    finite = np.isfinite(trajectory.position).all(axis=-1) & np.isfinite(trajectory.yaw)
+    last = np.maximum.accumulate(np.where(finite, np.arange(len(finite))[:, None], 0), axis=0)
+    agents = np.arange(finite.shape[1])
     position, yaw = (np.nan_to_num(column[last, agents]) for column in (trajectory.position, trajectory.yaw))
-    return trajectory._replace(position=position, yaw=yaw, active=trajectory.active & sound)
+    return trajectory._replace(position=position, yaw=yaw, active=trajectory.active & finite)
 
 
 class View(NamedTuple):
@@ -113,15 +114,15 @@ def to_pixels(view: View, points: Num[np.ndarray, "*n 2"]) -> Float[np.ndarray, 
 
 
 def fit_view(points: Num[np.ndarray, "n 2"], *, margin: float, smallest: float) -> tuple[float, float, float]:
-    """(left, bottom, side) of the square around points with a margin, no side below `smallest`; metres."""
+    """(left, bottom, side) in metres of the square around points with a margin; `smallest` is the minimum side."""
     low, high = points.min(axis=0), points.max(axis=0)
     side = max(float((high - low).max()) + 2 * margin, smallest)
     left, bottom = (low + high) / 2 - side / 2
     return float(left), float(bottom), side
 
 
-def places(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
-    """Every place that a picture of the trajectory must show: present agents' ways while active, and their goals."""
+def shown_points(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
+    """Points that a picture of the trajectory contains: positions of active agents, and their goals."""
     shown = trajectory.active & trajectory.present
     goals = np.broadcast_to(trajectory.goal, trajectory.position.shape)
     points = np.concatenate([trajectory.position[shown], goals[shown]])
@@ -129,28 +130,34 @@ def places(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
 
 
 def goal_at(trajectory: Trajectory, step: int) -> Float[np.ndarray, "A 2"]:
-    """Goals in force at a step."""
+    """Goals at a step."""
     return trajectory.goal[step] if np.ndim(trajectory.goal) == 3 else trajectory.goal
 
 
 def find_respawns(trajectory: Trajectory) -> bool:
-    """Whether finished agents start again: goals change."""
+    """Whether agents respawn, with other goals."""
     return np.ndim(trajectory.goal) == 3 and bool((trajectory.goal != trajectory.goal[:1]).any())
 
 
 def colour_of(agent: int) -> Colour:
-    """The colour of an agent, its goal and its trail."""
+    """Colour of an agent, its goal and its trail."""
     return AGENTS[agent % len(AGENTS)]
 
 
-def blend(colour: Colour, base: Colour, share: float) -> Colour:
-    """`share` of the colour over the rest of `base`."""
-    red, green, blue = (round(share * c + (1 - share) * b) for c, b in zip(colour, base, strict=True))
+def blend(colour: Colour, base: Colour, opacity: float) -> Colour:
+    """A colour over `base`."""
+    red, green, blue = (round(opacity * c + (1 - opacity) * b) for c, b in zip(colour, base, strict=True))
+    return red, green, blue
+
+
+def rgb(colour: Colour) -> tuple[float, float, float]:
+    """A colour as matplotlib and MuJoCo take it: channels in [0, 1]."""
+    red, green, blue = (channel / 255 for channel in colour)
     return red, green, blue
 
 
 def car_shape(position: Num[np.ndarray, "2"], yaw: float, size: Num[np.ndarray, "2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a car's oriented box, and of the arrowhead inside that shows its heading; world coordinates."""
+    """Corners of a car's box, and of the arrowhead inside that shows its heading; world coordinates."""
     length, width = size
     box = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
     arrow = np.array([[0.44, 0.0], [0.06, 0.34], [0.06, -0.34]])
@@ -159,16 +166,13 @@ def car_shape(position: Num[np.ndarray, "2"], yaw: float, size: Num[np.ndarray, 
 
 
 def is_moving(trajectory: Trajectory) -> Bool[np.ndarray, "T A"]:
-    """True where the way from the step before to this one was driven: active at both ends, and no respawn between (no car does 100 m/s)."""
+    """Whether an agent drove from the step before to this one: active before, and no respawn between, which is a jump above 100 m/s."""
     jump = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=-1) > 100.0 / trajectory.control_hz
-    driven = trajectory.active[1:] & trajectory.active[:-1] & ~jump & trajectory.present
-    # the step at which an agent ends belongs to its way, too: it is no longer active, but it was until then
-    ended = ~trajectory.active[1:] & trajectory.active[:-1] & ~jump & trajectory.present
-    return np.concatenate([np.zeros((1, len(trajectory.present)), bool), driven | ended])
+    return np.concatenate([np.zeros((1, len(trajectory.present)), bool), trajectory.active[:-1] & ~jump & trajectory.present])
 
 
 class Stroke(NamedTuple):
-    """Lines of one look: width in metres, but never thinner than `thinnest` pixels (or points)."""
+    """Lines of one colour; width in metres, drawn at least `thinnest` pixels (or points) wide."""
 
     lines: Float[np.ndarray, "n 2 2"]
     colour: Colour
@@ -191,11 +195,11 @@ _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
     ((15, 16), EDGE, 0.35, 1.4, False),
     ((STOP_SIGN,), STOP, 0.8, 3.0, False),
 )
-_DASH, _PERIOD = 3.0, 9.0  # m; dashes and their repetition on US roads are 10 and 40 feet, too sparse for a picture
+_DASH, _PERIOD = 3.0, 9.0  # m
 
 
 def strokes(road: Road) -> list[Stroke]:
-    """A road as lines to draw, bottom first. Broken lines are 3 m dashes with 6 m gaps along the polyline, continued across segments."""
+    """Lines of a road, bottom first. Broken lines have 3 m dashes and 6 m gaps along the polyline, across segments."""
     valid = np.asarray(road.valid, bool)
     kind, arc, half = (np.asarray(column)[valid] for column in (road.kind, road.arc, road.half_length))
     midpoint, direction = np.asarray(road.midpoint, float)[valid], np.asarray(road.direction, float)[valid]
@@ -216,13 +220,11 @@ def strokes(road: Road) -> list[Stroke]:
 
 def _dashes(arc: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(segment, from, to) of each dash, measured along its segment from its midpoint."""
-    owner, start, stop = [], [], []
-    for index, (middle, reach) in enumerate(zip(arc, half, strict=True)):
-        first, last = np.floor((middle - reach) / _PERIOD), np.floor((middle + reach) / _PERIOD)
-        for number in np.arange(first, last + 1):
+    dashes = []
+    for segment, (middle, reach) in enumerate(zip(arc, half, strict=True)):
+        for number in np.arange(np.floor((middle - reach) / _PERIOD), np.floor((middle + reach) / _PERIOD) + 1):
             low, high = max(number * _PERIOD, middle - reach), min(number * _PERIOD + _DASH, middle + reach)
             if high > low:
-                owner.append(index)
-                start.append(low - middle)
-                stop.append(high - middle)
-    return np.array(owner, int), np.array(start), np.array(stop)
+                dashes.append((segment, low - middle, high - middle))
+    owner, start, stop = np.array(dashes, float).reshape(-1, 3).T
+    return owner.astype(int), start, stop

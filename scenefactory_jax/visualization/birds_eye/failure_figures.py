@@ -1,4 +1,4 @@
-"""Pictures of failures: the worst of a kind side by side, each whole (way, goal) and near (the moment at which it failed)."""
+"""Figures of failures: the worst of a kind side by side, each with its complete trajectory and with the surroundings of the failure."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,39 +6,37 @@ from typing import NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation.failures import FAILURE_TYPES, FLAGS, Failure
-from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import INK, QUIET, Colour, View
-from scenefactory_jax.visualization.birds_eye.video import road_image
+from scenefactory_jax.visualization.birds_eye import drawing, figures, traffic_shapes
+from scenefactory_jax.visualization.birds_eye.drawing import INK, QUIET, Colour, rgb
 from scenefactory_jax.visualization.report.plots import STYLE
 
 FAILED: Colour = (208, 28, 40)
 PARTNER: Colour = (0, 90, 181)
 CAR: Colour = (150, 156, 163)
 GOAL: Colour = (0, 138, 82)
-_NEAR_M, _PIXELS, _INCHES = 32.0, 560, 3.1
+_NEAR_M, _INCHES = 32.0, 3.1
 
 
 class Case(NamedTuple):
-    """A failure, the world in which it happened, and the number of whom the car hit first (boxes are counted on from the last agent)."""
+    """A failure, its world, and the index of the road user that the car hit first (traffic is counted on from the last agent)."""
 
     failure: Failure
     trajectory: Trajectory
     hit: int | None
 
 
-def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
-    """A column a failure: above its whole way and goal, below what was around it at the moment of the failure.
+def failures_figure(cases: Sequence[Case], *, before_s: float | int) -> Figure:
+    """Draws a column per failure: above the complete trajectory and the goal, below the surroundings at the time of the failure.
 
     Args:
         cases: failures of one kind.
-        before_s: seconds of the others' ways before the moment.
+        before_s: seconds of the other cars' trajectories before the failure.
 
     Raises:
         TrajectoryError: arrays that do not belong together.
@@ -52,120 +50,94 @@ def failures_figure(cases: Sequence[Case], *, before_s: float) -> Figure:
         figure.text(0.01 / len(cases), 1 - 0.04 / height, kind.label, fontsize=9, fontweight="bold", va="top")
         for column, case in enumerate(cases):
             case = case._replace(trajectory=drawing.sanitize_trajectory(case.trajectory))
-            for row, window in enumerate((_whole(case), _near(case))):
+            for row, window in enumerate((_find_whole_window(case), _find_near_window(case))):
                 width, tall = 1 / len(cases), _INCHES / height
                 place = ((column + 0.01) * width, 1 - head / height - (row + 0.99) * tall, 0.98 * width, 0.98 * tall)
                 axes = figure.add_axes(place)
                 _draw(axes, case, window, before_s=before_s, whole=row == 0)
                 if row == 0:
                     axes.set_title(_title(case.failure), fontsize=7.5, fontweight="normal", loc="left", pad=3)
+        hollow = {"markerfacecolor": "none", "linestyle": "none", "markersize": 8}
         handles = [
-            Line2D([], [], color=_rgb(FAILED), linewidth=2.2, label="its way (dashed: afterwards)"),
-            Line2D([], [], color=_rgb(INK), marker="s", markerfacecolor="none", linestyle="none", markersize=8, label="where: seen below"),
-            Line2D([], [], color=_rgb(GOAL), marker="o", markerfacecolor="none", linestyle="none", markersize=8, label="its goal"),
-            Line2D([], [], color=_rgb(CAR), linewidth=1.2, label="other cars"),
+            Line2D([], [], color=rgb(FAILED), linewidth=2.2, label="its trajectory (dashed: afterwards)"),
+            Line2D([], [], color=rgb(INK), marker="s", label="area below", **hollow),
+            Line2D([], [], color=rgb(GOAL), marker="o", label="its goal", **hollow),
+            Line2D([], [], color=rgb(CAR), linewidth=1.2, label="other cars"),
         ]
         if any(case.hit is not None for case in cases):
-            handles.insert(2, Line2D([], [], color=_rgb(PARTNER), linewidth=1.6, label="whom it met"))
+            handles.insert(2, Line2D([], [], color=rgb(PARTNER), linewidth=1.6, label="collision partner"))
         figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // rows), fontsize=7.5, handletextpad=0.5, borderpad=0.0)
     return figure
 
 
 def _title(failure: Failure) -> str:
-    """Who, where, when, how bad, and what else is true: a line for what is known of every failure, and one more for the rest."""
+    """Scene, car, time and severity; the other flags in a third line."""
     kind, name = FAILURE_TYPES[failure.kind], failure.scene
     name = name if len(name) <= 42 else f"…{name[-41:]}"
-    also = ", ".join(FLAGS[flag] for flag in failure.flags)
+    flags = ", ".join(FLAGS[flag] for flag in failure.flags)
     line = f"{failure.moment_s:.1f} s · {kind.measure} {failure.severity:.1f} {kind.unit}"
-    return f"{name} · car {failure.agent}\n{line}" + (f"\nalso {also}" if also else "")
+    return f"{name} · car {failure.agent}\n{line}" + (f"\nalso {flags}" if flags else "")
 
 
-def _whole(case: Case) -> tuple[float, float, float]:
-    """The square that shows the car's way, its goal and the place."""
+def _find_whole_window(case: Case) -> tuple[float, float, float]:
+    """The square that shows the car's trajectory, its goal and the place of the failure."""
     agent, trajectory = case.failure.agent, case.trajectory
-    way = trajectory.position[trajectory.active[:, agent], agent]
-    points = np.concatenate([way, drawing.goal_at(trajectory, _step(case))[[agent]], [case.failure.position]])
+    track = trajectory.position[trajectory.active[:, agent], agent]
+    points = np.concatenate([track, drawing.goal_at(trajectory, _find_step(case))[[agent]], [case.failure.position]])
     return drawing.fit_view(points, margin=9.0, smallest=50.0)
 
 
-def _near(case: Case) -> tuple[float, float, float]:
+def _find_near_window(case: Case) -> tuple[float, float, float]:
     x, y = case.failure.position
     return x - _NEAR_M / 2, y - _NEAR_M / 2, _NEAR_M
 
 
-def _step(case: Case) -> int:
-    """The frame of the moment: the first frame is what one step led to."""
+def _find_step(case: Case) -> int:
+    """The frame of the failure; the first frame is the state after one step."""
     return int(np.clip(round(case.failure.moment_s * case.trajectory.control_hz) - 1, 0, len(case.trajectory.active) - 1))
 
 
-def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float, whole: bool) -> None:
-    """One picture."""
-    trajectory, step, agent = case.trajectory, _step(case), case.failure.agent
-    left, bottom, side = window
-    road = road_image(drawing.strokes(trajectory.scene.road), View(*window, _PIXELS), patches=patch_overlay.areas(trajectory.scene.weather))
-    axes.imshow(np.asarray(road), extent=(left, left + side, bottom, bottom + side), interpolation="antialiased", zorder=0)
-    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), xticks=[], yticks=[])
+def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float | int, whole: bool) -> None:
+    trajectory, step, agent = case.trajectory, _find_step(case), case.failure.agent
+    figures.draw_road(axes, trajectory.scene, window, inches=_INCHES)
+    axes.set(xticks=[], yticks=[])
     axes.grid(False)
     for spine in axes.spines.values():
-        spine.set(visible=True, color=_rgb(QUIET), linewidth=0.6)
-    cars = len(trajectory.present)
-    if trajectory.traffic is not None:
-        _draw_others(axes, case, step, partner=None if case.hit is None else case.hit - cars)
+        spine.set(visible=True, color=rgb(QUIET), linewidth=0.6)
+    _draw_traffic(axes, case, step)
     driven, since = drawing.is_moving(trajectory), max(step - round(before_s * trajectory.control_hz), 0)
-    for other in np.flatnonzero(trajectory.present & (trajectory.active[: step + 1].any(axis=0))):
-        met = case.hit == other
-        if other == agent or not trajectory.active[step, other]:
-            continue
-        colour = PARTNER if met else CAR
-        _draw_way(axes, trajectory, driven, int(other), since, step, colour, width=1.6 if met else 1.0, dashed=False)
-        _draw_car(axes, trajectory, int(other), step, colour)
-    _draw_way(axes, trajectory, driven, agent, step, len(driven) - 1, FAILED, width=1.1, dashed=True)
-    _draw_way(axes, trajectory, driven, agent, 0, step, FAILED, width=2.2 if whole else 1.6, dashed=False)
-    _draw_car(axes, trajectory, agent, step, FAILED)
-    goal = drawing.goal_at(trajectory, step)[agent]
-    axes.add_patch(Circle((float(goal[0]), float(goal[1])), drawing.GOAL_RADIUS, fill=False, edgecolor=_rgb(GOAL), linewidth=1.8, zorder=6))
+    for other in np.flatnonzero(trajectory.present & trajectory.active[step]).tolist():
+        if other != agent:
+            colour, width = (PARTNER, 1.6) if other == case.hit else (CAR, 1.0)
+            _draw_track(axes, trajectory, driven, other, since, step, colour, linewidth=width)
+            figures.draw_car(axes, trajectory.position[step, other], float(trajectory.yaw[step, other]), trajectory.size[other], colour)
+    _draw_track(axes, trajectory, driven, agent, step, len(driven) - 1, FAILED, linewidth=1.1, linestyle=(0, (3, 2)))
+    _draw_track(axes, trajectory, driven, agent, 0, step, FAILED, linewidth=2.2 if whole else 1.6)
+    figures.draw_car(axes, trajectory.position[step, agent], float(trajectory.yaw[step, agent]), trajectory.size[agent], FAILED)
+    x, y = (float(value) for value in drawing.goal_at(trajectory, step)[agent])
+    axes.add_patch(Circle((x, y), trajectory.goal_radius_m, fill=False, edgecolor=rgb(GOAL), linewidth=1.8, zorder=6))
     if whole:
-        left, bottom, side = _near(case)
-        look = {"fill": False, "edgecolor": _rgb(INK), "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 7}
+        left, bottom, side = _find_near_window(case)
+        look = {"fill": False, "edgecolor": rgb(INK), "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 7}
         axes.add_patch(Rectangle((left, bottom), side, side, **look))
 
 
-def _draw_others(axes: Axes, case: Case, step: int, *, partner: int | None) -> None:
-    """Everybody who is no agent; whom the car hit in the partner's colour."""
+def _draw_traffic(axes: Axes, case: Case, step: int) -> None:
+    """Background traffic; the outline of the collision partner in its colour."""
     boxes = case.trajectory.traffic
-    assert boxes is not None
-    still = traffic_shapes.shapes_at_rest(boxes)
-    for shape in traffic_shapes.shapes(boxes, step, still):
-        look = {"facecolor": _rgb(shape.fill), "edgecolor": _rgb(shape.outline), "linewidth": 0.6, "zorder": 2.5}
-        axes.add_patch(Polygon(shape.points, **look))
-    if partner is not None and 0 <= partner < boxes.present.shape[1]:
+    if boxes is None:
+        return
+    figures.draw_traffic(axes, traffic_shapes.shapes(boxes, step, traffic_shapes.find_parked(boxes)))
+    partner = -1 if case.hit is None else case.hit - len(case.trajectory.present)
+    if 0 <= partner < boxes.present.shape[1]:
         box, _ = drawing.car_shape(boxes.position[step, partner], float(boxes.yaw[step, partner]), boxes.size[step, partner])
-        axes.add_patch(Polygon(box, fill=False, edgecolor=_rgb(PARTNER), linewidth=1.6, zorder=5))
+        axes.add_patch(Polygon(box, fill=False, edgecolor=rgb(PARTNER), linewidth=1.6, zorder=5))
 
 
-def _draw_way(
-    axes: Axes, trajectory: Trajectory, driven: np.ndarray, agent: int, first: int, last: int, colour: Colour, *, width: float, dashed: bool
-) -> None:
-    """A car's way between two steps."""
-    steps = np.flatnonzero(driven[:, agent])
-    steps = steps[(steps > first) & (steps <= last)]
-    if not len(steps):
-        return
-    way = trajectory.position[:, agent]
-    if dashed:  # one line, or the dashes would start anew at every step
-        axes.plot(*way[np.r_[steps[0] - 1, steps]].T, color=_rgb(colour), linewidth=width, linestyle=(0, (3, 2)), zorder=3)
-        return
-    segments = np.stack([way[steps - 1], way[steps]], axis=1)
-    axes.add_collection(LineCollection(list(segments), colors=[_rgb(colour)], linewidths=width, capstyle="round", zorder=3))
-
-
-def _draw_car(axes: Axes, trajectory: Trajectory, agent: int, step: int, colour: Colour) -> None:
-    """An oriented box with an arrowhead."""
-    box, arrow = drawing.car_shape(trajectory.position[step, agent], float(trajectory.yaw[step, agent]), trajectory.size[agent])
-    axes.add_patch(Polygon(box, facecolor=_rgb(colour), edgecolor=_rgb(drawing.blend(INK, colour, 0.5)), linewidth=0.8, zorder=4))
-    axes.add_patch(Polygon(arrow, facecolor="white", edgecolor="none", alpha=0.9, zorder=5))
-
-
-def _rgb(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (channel / 255 for channel in colour)
-    return red, green, blue
+def _draw_track(
+    axes: Axes, trajectory: Trajectory, driven: np.ndarray, agent: int, first: int, last: int, colour: Colour, **look
+) -> None:  # fmt: skip
+    """A car's trajectory between two steps, with a gap at each respawn."""
+    steps = np.flatnonzero(driven[first + 1 : last + 1, agent]) + first + 1
+    for run in np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1) if len(steps) else ():
+        axes.plot(*trajectory.position[np.r_[run[0] - 1, run], agent].T, color=rgb(colour), zorder=3, **look)

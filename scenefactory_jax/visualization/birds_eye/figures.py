@@ -1,4 +1,7 @@
-"""Still bird's-eye pictures: a scene as it starts, and the ways that cars took through it."""
+"""Still bird's-eye figures: one scene or many at their starts, and the trajectories of an episode."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -8,15 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, GROUND, INK, MARKS, Colour
-from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
-from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING as OTHERS
+from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, GROUND, INK, MARKS, WHITE, Colour, rgb
+from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING, Shape
 from scenefactory_jax.visualization.report.plots import STYLE
 
-_INCHES, _SHARE = 6.4, 0.84  # side of the figure, and the axes' share of it
+_INCHES, _AXES_FRACTION = 6.4, 0.84  # side of the figure, and the axes' fraction of it
 _ROAD = (  # of the legend: label, colour, width
     ("lane", ASPHALT, 6.0), ("bike lane", drawing.BIKE_LANE, 6.0), ("road edge", drawing.EDGE, 1.5), ("yellow line", drawing.YELLOW, 1.5),
     ("crosswalk", drawing.CROSSWALK_LINE, 1.5), ("speed bump", drawing.BUMP, 1.5), ("driveway", drawing.DRIVEWAY_LINE, 1.5),
@@ -24,145 +26,161 @@ _ROAD = (  # of the legend: label, colour, width
 )  # fmt: skip
 
 
-def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figure:
-    """A scene as it starts: road, cars as oriented boxes, goals as circles of the same colour and number, and who else was there.
+def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", all_road: bool = False) -> Figure:
+    """Draws a scene at its start: road, cars, goals of the same colour and number, logged traffic.
 
     Args:
         scene: one packed world with numpy or JAX arrays.
-        title: above the picture.
-        whole: show the whole road; otherwise the square around starts and goals.
+        all_road: show the complete road; otherwise the square around starts and goals.
     """
     agents = scene.agents
     present = np.flatnonzero(np.asarray(agents.present))
     start, goal = np.asarray(agents.position, float), np.asarray(agents.goal, float)
     points = np.concatenate([start[present], goal[present]])
-    if whole or not len(present):
+    if all_road or not len(present):
         points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
     with matplotlib.rc_context(STYLE):
-        figure, axes, scale = _stage(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
-        recorded, still = traffic_shapes.shapes_at_start(scene)
-        _draw_traffic(axes, recorded, 0, still)
+        figure, axes, scale = _make_axes(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
+        traffic = traffic_shapes.shapes_at_start(scene)
+        draw_traffic(axes, traffic)
         for agent in present.tolist():
             look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
-            axes.plot(*np.stack([start[agent], goal[agent]]).T, color=_rgb(drawing.colour_of(agent)), **look)
-            _draw_goal(axes, goal[agent], agent, scale)
-            _draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), agent)
-        _legend(figure, [], car="start", scene=scene, road=True, beside=bool(recorded.present.any()))
+            axes.plot(*np.stack([start[agent], goal[agent]]).T, color=rgb(drawing.colour_of(agent)), **look)
+            _draw_goal(axes, goal[agent], agent, goal_radius_m, scale)
+            draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), drawing.colour_of(agent))
+        _add_legend(figure, [], car="start", scene=scene, road=True, traffic=bool(traffic))
+    return figure
+
+
+def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: float | int) -> Figure:
+    """Draws many scenes at their starts as small squares, each at its own scale.
+
+    Args:
+        scenes: names and packed worlds with numpy arrays.
+        columns: maximum per row.
+        inches: side of each square.
+    """
+    across = max(min(columns, len(scenes)), 1)
+    down = max(-(-len(scenes) // across), 1)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(across * inches, down * (inches + 0.22)))
+        grid = figure.subplots(down, across, squeeze=False)
+        figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=1 - 0.2 / figure.get_figheight(), wspace=0.04, hspace=0.22 / inches)
+        for axes in grid.flat:
+            axes.set_axis_off()
+        for axes, (name, scene) in zip(grid.flat, scenes, strict=False):
+            points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
+            window = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
+            draw_road(axes, scene, window, inches=inches)
+            draw_traffic(axes, traffic_shapes.shapes_at_start(scene), linewidth=0.15)
+            agents = scene.agents
+            for agent in np.flatnonzero(np.asarray(agents.present)).tolist():
+                box, _ = drawing.car_shape(np.asarray(agents.position[agent]), float(agents.yaw[agent]), np.asarray(agents.size[agent]))
+                axes.add_patch(Polygon(box, facecolor=rgb(drawing.colour_of(agent)), edgecolor="none", zorder=3))
+            axes.set_title(name if len(name) <= 28 else f"...{name[-25:]}", fontsize=6, pad=2)
     return figure
 
 
 def trajectory_figure(trajectory: Trajectory) -> Figure:
-    """The ways of an episode's cars from hollow start to filled end, their goals, and where events happened.
+    """Draws the trajectories of an episode's cars from outlined start to filled end, their goals, and events.
 
     Raises:
         TrajectoryError: arrays that do not belong together.
     """
     trajectory = drawing.sanitize_trajectory(trajectory)
-    driven = drawing.is_moving(trajectory)
+    driven, traffic = drawing.is_moving(trajectory), trajectory.traffic
+    boxes = [] if traffic is None else list(traffic_shapes.shapes(traffic, 0, traffic_shapes.find_parked(traffic)))
     with matplotlib.rc_context(STYLE):
-        view = drawing.fit_view(drawing.places(trajectory), margin=12.0, smallest=50.0)
+        view = drawing.fit_view(drawing.shown_points(trajectory), margin=12.0, smallest=50.0)
         title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
-        figure, axes, scale = _stage(trajectory.scene, view, title=title)
-        if trajectory.traffic is not None:
-            _draw_traffic(axes, trajectory.traffic, 0, traffic_shapes.shapes_at_rest(trajectory.traffic))
+        figure, axes, scale = _make_axes(trajectory.scene, view, title=title)
+        draw_traffic(axes, boxes)
         for agent in np.flatnonzero(trajectory.present).tolist():
-            steps = np.flatnonzero(driven[:, agent])
-            way = trajectory.position[:, agent]
-            segments = np.stack([way[steps - 1], way[steps]], axis=1)
+            steps, active = np.flatnonzero(driven[:, agent]), np.flatnonzero(trajectory.active[:, agent])
+            track, colour = trajectory.position[:, agent], drawing.colour_of(agent)
+            segments = np.stack([track[steps - 1], track[steps]], axis=1)
             look = {"linewidths": 1.6, "capstyle": "round", "zorder": 3}
-            axes.add_collection(LineCollection(list(segments), colors=[_rgb(drawing.colour_of(agent))], **look))
-            shown = np.flatnonzero(trajectory.active[:, agent])
-            for step, hollow in ((shown[0], True), (steps[-1] if len(steps) else shown[-1], False)) if len(shown) else ():
-                place, yaw = way[step], float(trajectory.yaw[step, agent])
-                _draw_car(axes, place, yaw, trajectory.size[agent], agent, hollow=hollow)
-            last = int(shown[-1]) if len(shown) else 0
-            _draw_goal(axes, drawing.goal_at(trajectory, last)[agent], agent, scale)
-        seen = [name for name in MARKS if name in trajectory.events and (trajectory.events[name] & trajectory.present).any()]
-        for name in seen:
-            if name != "goal_reached":
-                points = trajectory.position[trajectory.events[name] & trajectory.present]
-                look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
-                axes.plot(*points.T, color=_rgb(MARKS[name].colour), **look)
-        beside = trajectory.traffic is not None and bool(trajectory.traffic.present[0].any())
-        shown = [name for name in seen if name != "goal_reached"]
-        _legend(figure, shown, car="end (start: outline)", scene=trajectory.scene, road=False, beside=beside)
+            axes.add_collection(LineCollection(list(segments), colors=[rgb(colour)], **look))
+            for step, hollow in ((active[0], True), (steps[-1] if len(steps) else active[-1], False)) if len(active) else ():
+                draw_car(axes, track[step], float(trajectory.yaw[step, agent]), trajectory.size[agent], colour, hollow=hollow)
+            goal = drawing.goal_at(trajectory, int(active[-1]) if len(active) else 0)[agent]
+            _draw_goal(axes, goal, agent, trajectory.goal_radius_m, scale)
+        events = {name: new & trajectory.present for name, new in trajectory.events.items() if name != "goal_reached"}
+        events = {name: events[name] for name in MARKS if name in events and events[name].any()}
+        for name, new in events.items():
+            look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
+            axes.plot(*trajectory.position[new].T, color=rgb(MARKS[name].colour), **look)
+        _add_legend(figure, events, car="end (start: outline)", scene=trajectory.scene, road=False, traffic=bool(boxes))
     return figure
 
 
-def _stage(scene: Scene, window: tuple[float, float, float], *, title: str) -> tuple[Figure, Axes, float]:
-    """A square figure with the road; also its scale in points a metre."""
+def draw_road(axes: Axes, scene: Scene, window: tuple[float, float, float], *, inches: float | int) -> float:
+    """Draws road and patches in a window (left, bottom, side), `inches` wide on paper; returns the scale in points per metre."""
     left, bottom, side = window
+    scale = inches * 72 / side
+    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal", facecolor=rgb(GROUND))
+    lines = drawing.strokes(scene.road)
+    below = 1 + (patch_overlay.count_strokes_below(lines) - 0.5) / 100
+    patches = patch_overlay.areas(scene.weather)
+    for rank, area in enumerate(patches):  # all pieces with their edge first, then filled: the edge surrounds their union
+        for colour, width, above in ((area.edge, 1.0, 0.0), (area.colour, 0.1, 0.5)):
+            look = {"facecolors": [rgb(colour)], "edgecolors": [rgb(colour)], "linewidths": width}
+            axes.add_collection(PolyCollection(area.pieces, **look, zorder=below + 0.004 * (rank + above) / len(patches)))
+    for order, stroke in enumerate(lines):
+        width = max(stroke.width * scale, 0.08 * inches * stroke.thinnest)
+        look = {"linewidths": width, "capstyle": "round", "zorder": 1 + order / 100}  # round ends close the gaps between segments
+        axes.add_collection(LineCollection(list(stroke.lines), colors=[rgb(stroke.colour)], **look))
+    return scale
+
+
+def draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, colour: Colour, *, hollow: bool = False) -> None:
+    """Draws an oriented box with an arrowhead."""
+    box, arrow = drawing.car_shape(np.asarray(position), yaw, size)
+    fill, edge = (WHITE, colour) if hollow else (colour, drawing.blend(INK, colour, 0.5))
+    axes.add_patch(Polygon(box, facecolor=rgb(fill), edgecolor=rgb(edge), linewidth=0.9, zorder=4))
+    axes.add_patch(Polygon(arrow, facecolor=rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
+
+
+def draw_traffic(axes: Axes, shapes: Iterable[Shape], *, linewidth: float = 0.6) -> None:
+    """Draws background traffic."""
+    for shape in shapes:
+        axes.add_patch(Polygon(shape.points, facecolor=rgb(shape.fill), edgecolor=rgb(shape.outline), linewidth=linewidth, zorder=2.5))
+
+
+def _make_axes(scene: Scene, window: tuple[float, float, float], *, title: str) -> tuple[Figure, Axes, float]:
+    """A square figure with the road; also its scale in points per metre."""
     figure = Figure(figsize=(_INCHES, _INCHES))
-    axes = figure.add_axes((0.11, 0.115, _SHARE, _SHARE))
-    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal", xlabel="x, m", ylabel="y, m", facecolor=_rgb(GROUND))
+    axes = figure.add_axes((0.11, 0.115, _AXES_FRACTION, _AXES_FRACTION))
+    axes.set(xlabel="x, m", ylabel="y, m")
     axes.grid(False)
     axes.set_title(title)
-    scale = _INCHES * _SHARE * 72 / side
-    lines = drawing.strokes(scene.road)
-    _draw_areas(axes, patch_overlay.areas(scene.weather), zorder=1 + (patch_overlay.draw_areas_below(lines) - 0.5) / 100)
-    for order, stroke in enumerate(lines):
-        width = max(stroke.width * scale, 0.5 * stroke.thinnest)
-        look = {"linewidths": width, "capstyle": "round" if width > 4 else "butt", "zorder": 1 + order / 100}
-        axes.add_collection(LineCollection(list(stroke.lines), colors=[_rgb(stroke.colour)], **look))
-    return figure, axes, scale
+    return figure, axes, draw_road(axes, scene, window, inches=_INCHES * _AXES_FRACTION)
 
 
-def _draw_areas(axes: Axes, patches: list[Area], *, zorder: float) -> None:
-    """Patches with an edge about the union of each one's pieces: all pieces with their edge first, then filled once more without."""
-    for rank, area in enumerate(patches):
-        for colour, width, above in ((area.edge, 1.0, 0.0), (area.colour, 0.1, 0.5)):
-            look = {"facecolors": [_rgb(colour)], "edgecolors": [_rgb(colour)], "linewidths": width}
-            axes.add_collection(PolyCollection(area.pieces, **look, zorder=zorder + 0.004 * (rank + above) / len(patches)))
-
-
-def _draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, agent: int, *, hollow: bool = False) -> None:
-    """An oriented box with an arrowhead, as in the videos."""
-    colour = drawing.colour_of(agent)
-    box, arrow = drawing.car_shape(np.asarray(position), yaw, size)
-    fill, edge = ((255, 255, 255), colour) if hollow else (colour, drawing.blend(INK, colour, 0.5))
-    axes.add_patch(Polygon(box, facecolor=_rgb(fill), edgecolor=_rgb(edge), linewidth=0.9, zorder=4))
-    axes.add_patch(Polygon(arrow, facecolor=_rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
-
-
-def _draw_traffic(axes: Axes, boxes: TrafficBoxes, step: int, still: np.ndarray) -> None:
-    """Everybody who is no agent at one step."""
-    for shape in traffic_shapes.shapes(boxes, step, still):
-        look = {"facecolor": _rgb(shape.fill), "edgecolor": _rgb(shape.outline), "linewidth": 0.6, "zorder": 2.5}
-        axes.add_patch(Polygon(shape.points, **look))
-
-
-def _draw_goal(axes: Axes, place: np.ndarray, agent: int, scale: float) -> None:
+def _draw_goal(axes: Axes, place: np.ndarray, agent: int, radius_m: float | int, scale: float) -> None:
     """A circle of the goal's radius with the agent's number, in its colour."""
     x, y = (float(value) for value in place)
-    colour = _rgb(drawing.blend(drawing.colour_of(agent), INK, 0.8))
-    axes.add_patch(Circle((x, y), drawing.GOAL_RADIUS, fill=False, edgecolor=_rgb(drawing.colour_of(agent)), linewidth=1.3, zorder=3.5))
-    size = min(max(drawing.GOAL_RADIUS * scale * 0.9, 4.5), 9.0)
-    axes.text(x, y, str(agent), color=colour, fontsize=size, ha="center", va="center_baseline", zorder=3.6, clip_on=True)
+    axes.add_patch(Circle((x, y), radius_m, fill=False, edgecolor=rgb(drawing.colour_of(agent)), linewidth=1.3, zorder=3.5))
+    look: dict[str, Any] = {"fontsize": min(max(radius_m * scale * 0.9, 4.5), 9.0), "ha": "center", "va": "center_baseline"}
+    axes.text(x, y, str(agent), color=rgb(drawing.blend(drawing.colour_of(agent), INK, 0.8)), zorder=3.6, clip_on=True, **look)
 
 
-def _legend(figure: Figure, events: list[str], *, car: str, scene: Scene, road: bool, beside: bool) -> None:
-    """What the shapes mean, below the axes."""
-    handles = [
-        Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(drawing.AGENTS[0]), markersize=7, label=f"car at its {car}"),
-        Line2D([], [], marker="o", linestyle="none", color=_rgb(drawing.AGENTS[0]), markerfacecolor="none", markersize=8, label="its goal"),
-    ]
+def _add_legend(figure: Figure, events: Iterable[str], *, car: str, scene: Scene, road: bool, traffic: bool) -> None:
+    """Meaning of the shapes, below the axes."""
+
+    def point(marker: Any, colour: Colour, label: str, *, markersize: float = 8.0, **look: Any) -> Line2D:
+        return Line2D([], [], marker=marker, linestyle="none", color=rgb(colour), label=label, markersize=markersize, **look)
+
+    box, first = (4, 0, 45), drawing.AGENTS[0]
+    handles = [point(box, first, f"car at its {car}", markersize=7.0), point("o", first, "its goal", markerfacecolor="none")]
     if road:
         drawn = {stroke.colour for stroke in drawing.strokes(scene.road)}
-        handles += [Line2D([], [], color=_rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
+        handles += [Line2D([], [], color=rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
     for area in {area.label: area for area in patch_overlay.areas(scene.weather)}.values():
-        look = {"color": _rgb(area.colour), "markeredgecolor": _rgb(area.edge), "markeredgewidth": 0.6}
-        handles.append(Line2D([], [], marker="s", linestyle="none", markersize=8, label=area.label, **look))
-    if beside:
-        handles.append(Line2D([], [], marker=(4, 0, 45), linestyle="none", color=_rgb(OTHERS), markersize=7, label="traffic"))
-    for name in events:
-        mark = MARKS[name]
-        handles.append(Line2D([], [], marker=mark.marker, linestyle="none", color=_rgb(mark.colour), markersize=8, label=mark.label))
-    crowded = len(handles) > 6  # two rows below the axes, in smaller print
-    look = {"fontsize": 7.5, "labelspacing": 0.25, "borderpad": 0.0} if crowded else {}
-    columns = -(-len(handles) // (2 if crowded else 1))
-    figure.legend(handles=handles, loc="lower center", ncols=columns, handletextpad=0.5, columnspacing=1.4, **look)
-
-
-def _rgb(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (channel / 255 for channel in colour)
-    return red, green, blue
+        handles.append(point("s", area.colour, area.label, markeredgecolor=rgb(area.edge), markeredgewidth=0.6))
+    if traffic:
+        handles.append(point(box, MOVING, "traffic", markersize=7.0))
+    handles += [point(MARKS[name].marker, MARKS[name].colour, MARKS[name].label) for name in events]
+    rows = 2 if len(handles) > 6 else 1
+    look: dict[str, Any] = {"fontsize": 7.5, "labelspacing": 0.25, "borderpad": 0.0} if rows == 2 else {}
+    figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // rows), handletextpad=0.5, columnspacing=1.4, **look)

@@ -67,6 +67,6 @@ def outline(vertices: Float[np.ndarray, "v 2"], radius: float, *, closed: bool) 
     return pieces
 
 
-def draw_areas_below(strokes: list[Stroke]) -> int:
-    """How many of a road's strokes lie below its patches: the lanes' own area, which comes first."""
+def count_strokes_below(strokes: list[Stroke]) -> int:
+    """Number of strokes that lie below the patches: the area of the lanes, which comes first."""
     return sum(stroke.colour == ASPHALT for stroke in strokes)

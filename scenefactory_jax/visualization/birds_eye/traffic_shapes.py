@@ -1,4 +1,4 @@
-"""How everybody who is no agent looks in pictures and videos: grey, hollow where it never moves; people are discs, cycles are lenses."""
+"""Outlines and colours of background traffic: grey, pale where parked; people are discs, cycles are hexagons."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -13,8 +13,12 @@ from scenefactory_jax.visualization.birds_eye.drawing import WHITE, Colour, blen
 MOVING: Colour = (105, 109, 115)
 PARKED: Colour = (214, 216, 219)
 OUTLINE: Colour = (84, 88, 94)
-STILL_M = 0.5  # who stays within this distance counts as parked
-PERSON_M, CYCLE_M = 1.2, 1.05  # shorter than the one is a person; longer, and narrower than the other, a cycle
+PARKED_M = 0.5  # a road user that stays within this distance is parked
+PERSON_M, CYCLE_M = 1.2, 1.05  # a road user shorter than the first is a person; a longer one narrower than the second is a cycle
+
+CYCLE = np.array([[0.5, 0.0], [0.1, 0.5], [-0.1, 0.5], [-0.5, 0.0], [-0.1, -0.5], [0.1, -0.5]])
+VEHICLE = np.array([[0.42, 0.5], [0.5, 0.25], [0.5, -0.25], [0.42, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # its front is narrower
+DISC = 0.5 * np.stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)], axis=-1)
 
 
 class Shape(NamedTuple):
@@ -25,40 +29,36 @@ class Shape(NamedTuple):
     outline: Colour
 
 
-def shapes_at_start(scene: Scene) -> tuple[TrafficBoxes, Bool[np.ndarray, " O"]]:
-    """The recorded others of a packed scene at the logged step at which its agents start, as one step; and who never moves in the log."""
+def shapes_at_start(scene: Scene) -> list[Shape]:
+    """Logged traffic of a packed scene at the logged step at which its agents start."""
     log, present = scene.log, np.asarray(scene.agents.present)
     apart = np.linalg.norm(np.asarray(log.position) - np.asarray(scene.agents.position)[:, None], axis=-1)
     apart = np.where(np.asarray(log.valid), apart, np.inf)[present]
-    row = int(np.argmin(apart.sum(axis=0))) if len(apart) else 0
-    position, yaw, valid = (
-        np.asarray(leaf).swapaxes(0, 1) for leaf in (scene.traffic_log.position, scene.traffic_log.yaw, scene.traffic_log.valid)
-    )
-    whole = TrafficBoxes(position, yaw, np.broadcast_to(np.asarray(scene.traffic_log.size), position.shape), valid)
-    return TrafficBoxes(*(leaf[row : row + 1] for leaf in whole)), shapes_at_rest(whole)
+    step = int(np.argmin(apart.sum(axis=0))) if len(apart) else 0
+    columns = (scene.traffic_log.position, scene.traffic_log.yaw, scene.traffic_log.valid)
+    position, yaw, valid = (np.asarray(leaf).swapaxes(0, 1) for leaf in columns)
+    traffic = TrafficBoxes(position, yaw, np.broadcast_to(np.asarray(scene.traffic_log.size), position.shape), valid)
+    return list(shapes(traffic, step, find_parked(traffic)))
 
 
-def shapes_at_rest(traffic: TrafficBoxes) -> Bool[np.ndarray, " O"]:
-    """Who, as far as it is there, never leaves its place."""
+def find_parked(traffic: TrafficBoxes) -> Bool[np.ndarray, " O"]:
+    """Road users that do not move while present."""
     first = np.argmax(traffic.present, axis=0)
     begin = traffic.position[first, np.arange(traffic.present.shape[1])]
     moved = np.where(traffic.present, np.linalg.norm(traffic.position - begin, axis=-1), 0.0)
-    return moved.max(axis=0, initial=0.0) < STILL_M
+    return moved.max(axis=0, initial=0.0) < PARKED_M
 
 
-def shapes(traffic: TrafficBoxes, step: int, still: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
-    """What to draw at a step, bottom first; `still` as `parked` tells it."""
+def shapes(traffic: TrafficBoxes, step: int, parked: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
+    """Outlines at a step, bottom first.
+
+    Args:
+        parked: see `find_parked`.
+    """
     for row in np.flatnonzero(traffic.present[step]):
         size = traffic.size[step, row]
-        angle = np.linspace(0.0, 2 * np.pi, 17)[:-1]
-        round_ = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * 0.5
-        if size[0] < PERSON_M:
-            local = round_ * max(size[0], 0.7)
-        elif size[1] < CYCLE_M:
-            local = np.array([[0.5, 0.0], [0.1, 0.5], [-0.1, 0.5], [-0.5, 0.0], [-0.1, -0.5], [0.1, -0.5]]) * size
-        else:  # a nose tells front from back
-            local = np.array([[0.42, 0.5], [0.5, 0.25], [0.5, -0.25], [0.42, -0.5], [-0.5, -0.5], [-0.5, 0.5]]) * size
+        person = size[0] < PERSON_M
+        local = DISC * max(size[0], 0.7) if person else (CYCLE if size[1] < CYCLE_M else VEHICLE) * size
         cos, sin = np.cos(traffic.yaw[step, row]), np.sin(traffic.yaw[step, row])
         points = local @ np.array([[cos, sin], [-sin, cos]]) + traffic.position[step, row]
-        vehicle_at_rest = still[row] and size[0] >= PERSON_M
-        yield Shape(points, blend(PARKED, WHITE, 0.5) if vehicle_at_rest else MOVING, OUTLINE)
+        yield Shape(points, blend(PARKED, WHITE, 0.5) if parked[row] and not person else MOVING, OUTLINE)

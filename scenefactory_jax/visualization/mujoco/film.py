@@ -1,169 +1,161 @@
 # pyright: reportAttributeAccessIssue=false
 # (the compiled parts of mujoco carry no types)
-"""A recorded world in three dimensions through MuJoCo's renderer: a picture, or a film, from behind one car or from above."""
+"""Draws a recorded world in three dimensions through MuJoCo's renderer: a picture, or a film, from behind one car or from above."""
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal
 
 import imageio.v3 as imageio
 import jax
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
+from scenefactory_jax.core.schema import Bounds, Count, NonNegative
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
-from scenefactory_jax.visualization import gif_writer, mp4_writer
-from scenefactory_jax.visualization.mp4_writer import VideoError
+from scenefactory_jax.visualization import video_file
 from scenefactory_jax.visualization.mujoco import actors, offscreen_renderer, scene_model
 from scenefactory_jax.visualization.mujoco.actors import ActorTrajectories
+from scenefactory_jax.visualization.video_file import VideoError
 
-SUFFIXES = (".gif", ".mp4", ".png")
-SAMPLES = 6  # frames that a GIF's colours are taken from
-FINE = 2  # pixels drawn for one that is shown, in each direction: multisampling smooths outlines, but not the edges of shadows
-FOVY = 45.0  # MuJoCo's, of cameras that no model names
+SUFFIXES = (".png", *video_file.SUFFIXES)
+FINE = 2  # supersampling in each direction: multisampling does not smooth the edges of shadows
+FOVY = 45.0  # degrees, of MuJoCo's free camera
 
 
-class FilmSettings(NamedTuple):
-    """How a film is seen; `conf/replay.yaml` says what each means."""
+@dataclass(frozen=True)
+class Camera:
+    """Camera behind a car; `conf/command/view.yaml` describes the fields of all settings."""
+
+    distance_m: Annotated[float, Bounds(min=1)]
+    pitch_deg: Annotated[float, Bounds(min=-90, max=90)]
+    lag_s: NonNegative
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """Settings of a film."""
 
     view: Literal["chase", "bird", "both"]
-    car: int | None
-    width: int
-    height: int
-    fps: float
-    stride: int
-    at_s: float
-    trail_s: float
-    distance_m: float
-    pitch_deg: float
-    lag_s: float
-    goal_radius_m: float
+    width: Annotated[int, Bounds(min=64)]
+    height: Annotated[int, Bounds(min=64)]
+    fps: Annotated[float, Bounds(min=0.1)]
+    stride: Count
+    at_s: NonNegative
+    trail_s: NonNegative
 
 
-def write(path: Path | str, recording: Recording, *, car: CarParameters, look: FilmSettings, world: int = 0) -> Path:
-    """Write `.png`, one moment; or `.gif`, or `.mp4` (extra `video`), the whole episode.
+def write(
+    path: Path | str, recording: Recording, *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float | int,
+    slot: int | None = None, world: int = 0,
+) -> Path:  # fmt: skip
+    """Writes one moment as `.png`, or the episode as `.gif` or `.mp4` (extra `video`).
 
     Args:
-        recording: of one or several worlds, see `recording.record`.
-        car: how cars look, and whose joints the recorded ones are.
-        world: which of them.
+        recording: of one or several worlds, see `env.rollout.record`.
+        car: parameters of the drawn cars, and of the recorded joints.
+        slot: of the car that the camera follows; None: the car with the longest trajectory.
+        world: index of the shown world.
 
     Raises:
-        VideoError: another suffix, a number out of range, a car that the world does not have, or no ffmpeg for an .mp4.
-        OpenGLError: nothing here to draw with; the message says what to install or set.
+        VideoError: another suffix, a number out of range, an empty slot, or no ffmpeg for an .mp4.
+        OpenGLError: no OpenGL on this machine.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
-        raise VideoError(f"{path}: suffix {path.suffix!r} is no film; valid are {', '.join(SUFFIXES)}")
+        raise VideoError(f"{path}: expected the suffix {', '.join(SUFFIXES)}, got {path.suffix!r}")
     if path.suffix != ".png":
-        mp4_writer.check(path, fps=look.fps)
-    whole = actors.make_actors(jax.device_get(recording), world, car)
-    followed = _followed(whole, look.car)
-    steps = list(range(0, _length(whole, followed, look), look.stride))
+        video_file.check(path, fps=settings.fps)
+    shown = actors.make_actors(jax.device_get(recording), world, car)
+    slot = choose_slot(shown, slot)
+    last = int(np.flatnonzero(shown.active[:, slot])[-1])  # a film from behind ends one second after the followed car
+    length = len(shown.yaw) if settings.view == "bird" else min(last + 1 + round(shown.hz), len(shown.yaw))
+
+    def draw(steps: Sequence[int]) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        return frames(shown, steps, car=car, settings=settings, camera=camera, goal_radius_m=goal_radius_m, slot=slot)
+
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
-        last = int(np.flatnonzero(whole.active[:, followed])[-1])
-        moment = min(round(look.at_s * whole.hz), len(whole.yaw) - 1 if look.view == "bird" else last)
-        imageio.imwrite(path, next(frames(whole, [moment], car=car, look=look)))
+        moment = min(round(settings.at_s * shown.hz), len(shown.yaw) - 1 if settings.view == "bird" else last)
+        imageio.imwrite(path, next(draw([moment])))
         return path
-    pictures = frames(whole, steps, car=car, look=look)
-    if path.suffix == ".mp4":
-        mp4_writer.write(path, pictures, fps=look.fps)
-        return path
-    few = list(frames(whole, steps[:: max(len(steps) // SAMPLES, 1)], car=car, look=look))
-    gif_writer.write(path, pictures, colours=_palette(few), fps=look.fps)
-    return path
+    steps = range(0, length, settings.stride)
+    samples = list(draw(steps[:: max(len(steps) // video_file.SAMPLES, 1)])) if path.suffix == ".gif" else []
+    return video_file.write(path, draw(steps), fps=settings.fps, samples=samples)
 
 
 def frames(
-    whole: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, look: FilmSettings
-) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    """The pictures of some steps, one after the other; `both` puts the view from behind to the left of the one from above.
+    world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera,
+    goal_radius_m: float | int, slot: int,
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:  # fmt: skip
+    """Draws the pictures of some steps; view `both` has the chase camera on the left and the view from above on the right.
 
     Raises:
-        VideoError, OpenGLError: see `write`.
+        OpenGLError: see `write`.
     """
-    followed = _followed(whole, look.car)
-    built = scene_model.build(whole.scene, car)
-    data = mujoco.MjData(built.model)
-    heading = smooth(np.unwrap(whole.yaw[:, followed]), lag=look.lag_s * whole.hz)
-    views = ("chase", "bird") if look.view == "both" else (look.view,)
-    above = _above(whole, aspect=look.width / look.height)
-    with offscreen_renderer.make_painter(built.model, data, width=FINE * look.width, height=FINE * look.height) as paint:
+    built = scene_model.build(world.scene, car)
+    data, width, height = mujoco.MjData(built.model), settings.width, settings.height
+    heading = smooth(np.unwrap(world.yaw[:, slot]), lag=camera.lag_s * world.hz)
+    above = look_from_above(world, aspect=width / height)
+    with offscreen_renderer.make_painter(built.model, data, width=FINE * width, height=FINE * height) as paint:
         for step in steps:
-            scene_model.place_actor(built, data, whole.joints[step], whole.opacity[step])
-            behind = chase(whole.joints[step, followed, :3], float(heading[step]), distance_m=look.distance_m, pitch_deg=look.pitch_deg)
+            scene_model.place_actors(built, data, world.joints[step], world.opacity[step])
+            behind = look_from_behind(world.joints[step, slot, :3], float(heading[step]), camera)
 
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
-                actors.add_goals(scene, whole.goal[step], whole.opacity[step], radius_m=look.goal_radius_m)
-                actors.add_trails(scene, whole, step, trail_s=look.trail_s)
-                actors.add_traffic(scene, whole.traffic, step)
+                actors.add_goals(scene, world.goal[step], world.opacity[step], radius_m=goal_radius_m)
+                actors.add_trails(scene, world, step, trail_s=settings.trail_s)
+                actors.add_traffic(scene, world.traffic, step)
 
-            shown = []
-            for camera in (behind if view == "chase" else above for view in views):
-                scene_model.place_light(data, camera.lookat)
-                fine = paint(camera, decorate).reshape(look.height, FINE, look.width, FINE, 3)
-                shown.append(fine.mean(axis=(1, 3)).round().astype(np.uint8))
-            yield np.concatenate(shown, axis=1)
-
-
-def chase(place: Float[np.ndarray, "3"], yaw: float, *, distance_m: float, pitch_deg: float) -> mujoco.MjvCamera:
-    """From behind a car and above it, looking past it."""
-    camera = mujoco.MjvCamera()
-    ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    camera.lookat[:] = place + 0.25 * distance_m * ahead
-    camera.distance, camera.azimuth, camera.elevation = distance_m * 1.25, np.degrees(yaw), -pitch_deg
-    return camera
+            views = []
+            for view in {"chase": [behind], "bird": [above], "both": [behind, above]}[settings.view]:
+                scene_model.place_light(data, view.lookat)
+                fine = paint(view, decorate).reshape(height, FINE, width, FINE, 3)
+                views.append(fine.mean(axis=(1, 3)).round().astype(np.uint8))
+            yield np.concatenate(views, axis=1)
 
 
-def _above(whole: ActorTrajectories, *, aspect: float) -> mujoco.MjvCamera:
-    """Straight down on everything that is driven, north up."""
-    places = np.concatenate([whole.joints[whole.active][:, :2], whole.goal[whole.active]])
-    low, high = places.min(axis=0) - 12.0, places.max(axis=0) + 12.0
-    camera = mujoco.MjvCamera()
-    camera.lookat[:2] = (low + high) / 2
+def look_from_behind(place: Float[np.ndarray, "3"], yaw: float, camera: Camera) -> mujoco.MjvCamera:
+    """A camera behind and above a car that looks past it."""
+    view = mujoco.MjvCamera()
+    view.lookat[:] = place + 0.25 * camera.distance_m * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    view.distance, view.azimuth, view.elevation = 1.25 * camera.distance_m, np.degrees(yaw), -camera.pitch_deg
+    return view
+
+
+def look_from_above(world: ActorTrajectories, *, aspect: float) -> mujoco.MjvCamera:
+    """A camera straight above all trajectories and goals, north up."""
+    points = np.concatenate([world.joints[world.active][:, :2], world.goal[world.active]])
+    low, high = points.min(axis=0) - 12.0, points.max(axis=0) + 12.0
+    view = mujoco.MjvCamera()
+    view.lookat[:2] = (low + high) / 2
     side = max(high[1] - low[1], (high[0] - low[0]) / aspect)
-    camera.distance, camera.azimuth, camera.elevation = side / 2 / np.tan(np.radians(FOVY / 2)), 90.0, -90.0
-    return camera
+    view.distance, view.azimuth, view.elevation = side / 2 / np.tan(np.radians(FOVY / 2)), 90.0, -90.0
+    return view
 
 
 def smooth(values: Float[np.ndarray, " T"], *, lag: float) -> Float[np.ndarray, " T"]:
-    """What follows the values exponentially, `lag` steps behind."""
-    share = 1.0 / (1.0 + lag)
-    return np.array(list(itertools.accumulate(values, lambda before, now: before + share * (now - before))))
+    """Exponential moving average with a time constant of `lag` steps."""
+    gain = 1.0 / (1.0 + lag)
+    return np.array(list(itertools.accumulate(values, lambda before, now: before + gain * (now - before))))
 
 
-def _followed(whole: ActorTrajectories, slot: int | None) -> int:
-    """The slot that was asked for, or the one whose car drives farthest.
+def choose_slot(world: ActorTrajectories, slot: int | None) -> int:
+    """The given slot, or that of the car with the longest trajectory.
 
     Raises:
-        VideoError: no such car in the world.
+        VideoError: the slot has no active car.
     """
-    driven = np.flatnonzero(whole.active.any(axis=0))
+    driven = np.flatnonzero(world.active.any(axis=0))
     if not len(driven):
-        raise VideoError("recording: no car is ever active in this world, so there is nothing to film")
+        raise VideoError("recording: expected at least one active car")
     if slot is None:
-        moved = np.linalg.norm(np.diff(whole.joints[..., :2], axis=0), axis=-1) * whole.active[1:]
+        moved = np.linalg.norm(np.diff(world.joints[..., :2], axis=0), axis=-1) * world.active[1:]
         return int(driven[np.argmax(moved.sum(axis=0)[driven])])
     if slot not in driven:
-        raise VideoError(f"film.car: {slot}; the world's cars are {', '.join(map(str, driven))}")
+        raise VideoError(f"car: expected one of {', '.join(map(str, driven))}, got {slot}")
     return slot
-
-
-def _length(whole: ActorTrajectories, followed: int, look: FilmSettings) -> int:
-    """Steps of the film: from behind a car it ends a second after that car is done."""
-    if look.view == "bird":
-        return len(whole.yaw)
-    return min(int(np.flatnonzero(whole.active[:, followed])[-1]) + 1 + round(whole.hz), len(whole.yaw))
-
-
-def _palette(pictures: Sequence[UInt8[np.ndarray, "H W 3"]]) -> UInt8[np.ndarray, "255 3"]:
-    """255 colours that the pictures need most (median cut)."""
-    sheet = Image.fromarray(np.concatenate([picture[::2, ::2] for picture in pictures]))
-    table = sheet.quantize(colors=255, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    colours = np.array(table[: 3 * 255], np.uint8).reshape(-1, 3)
-    return np.concatenate([colours, np.zeros((255 - len(colours), 3), np.uint8)])

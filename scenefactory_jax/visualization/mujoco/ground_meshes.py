@@ -1,4 +1,4 @@
-"""A road's plan as solid surfaces to see in three dimensions: asphalt under the lanes, paint, kerbs, and the weather's patches."""
+"""Builds the surfaces of a road for pictures: asphalt under the lanes, paint, kerbs, and patches of the weather."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,17 +10,18 @@ from shapely import ops
 
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, SPEED_BUMP, Road, Scene
 from scenefactory_jax.visualization.birds_eye import patch_overlay
+from scenefactory_jax.visualization.birds_eye.drawing import rgb
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 STRAIGHT_M = 0.03
-LANE_M, CLOSING_M = 2.0, 1.5  # half a lane, and half the width of what is closed between two
+LANE_M, CLOSING_M = 2.0, 1.5  # half the width of a lane, and of a gap between lanes that is filled
 DASH_M, GAP_M = 3.0, 4.5  # of broken lines
 Colour = tuple[float, float, float, float]
 WHITE, YELLOW = world_mjcf.WHITE, world_mjcf.YELLOW
 
 
 class Surface(NamedTuple):
-    """Prisms of one colour that stand on the ground."""
+    """Prisms of one colour on the ground."""
 
     name: str
     vertices: Float[np.ndarray, "N 3"]
@@ -29,14 +30,14 @@ class Surface(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """How lines of some kinds become a surface."""
+    """Shape and colour of the surface of some kinds of lines."""
 
     kinds: tuple[int, ...]
-    half_m: float  # of the line's width
+    half_m: float  # half the width of the line
     height_m: float
     colour: Colour
     broken: bool = False
-    area: bool = False  # closed lines are areas
+    area: bool = False  # closed lines are filled
 
 
 LAYERS: dict[str, Layer] = {
@@ -54,7 +55,7 @@ ASPHALT, ASPHALT_M, PATCH_M = (0.20, 0.21, 0.23, 1.0), 0.008, 0.014
 
 
 def find_surfaces(scene: Scene) -> list[Surface]:
-    """Everything flat of one world, on the host."""
+    """Surfaces of one world on the host."""
     lines = [
         (shapely.simplify(shapely.LineString(points), STRAIGHT_M), kind) for points, kind in world_mjcf.join_segments(scene.road, None)
     ]
@@ -67,7 +68,7 @@ def find_surfaces(scene: Scene) -> list[Surface]:
             found.append(prism(name, shapely.union_all(shapes), layer.height_m, layer.colour))
     for number, area in enumerate(patch_overlay.areas(scene.weather)):
         whole = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
-        colour = (*(channel / 255 for channel in area.colour), 0.75)
+        colour = (*rgb(area.colour), 0.75)
         found.append(prism(f"patch{number}", whole, PATCH_M + 0.001 * number, colour))
     return [surface for surface in found if len(surface.faces)]
 
@@ -83,15 +84,15 @@ def _shape(line: shapely.LineString, layer: Layer) -> shapely.Geometry:
 
 
 def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[float]) -> Surface:
-    """A plan's polygons raised from the ground: tops that look up, walls that look outwards, no bottoms."""
+    """Extrudes polygons from the ground: tops face up, walls face outwards, no bottoms."""
     vertices: list[Float[np.ndarray, "n 3"]] = [np.zeros((0, 3))]
     faces: list[Int[np.ndarray, "n 3"]] = [np.zeros((0, 3), int)]
     count = 0
     for polygon in shapely.get_parts(shape):
         if polygon.geom_type != "Polygon" or polygon.area < 1e-4:
             continue
-        whole = shapely.orient_polygons(polygon)  # outside counter-clockwise, holes clockwise: walls look outwards
-        tops = [_upwards(np.asarray(triangle.exterior.coords)[:3]) for triangle in shapely.constrained_delaunay_triangles(whole).geoms]
+        whole = shapely.orient_polygons(polygon)  # exterior counter-clockwise, holes clockwise
+        tops = [_face_up(np.asarray(triangle.exterior.coords)[:3]) for triangle in shapely.constrained_delaunay_triangles(whole).geoms]
         corners = np.concatenate(tops)
         vertices.append(np.c_[corners, np.full(len(corners), height_m)])
         faces.append(count + np.arange(len(corners)).reshape(-1, 3))
@@ -107,13 +108,13 @@ def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[
     return Surface(name, np.concatenate(vertices), np.concatenate(faces), (colour[0], colour[1], colour[2], colour[3]))
 
 
-def _upwards(triangle: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "3 2"]:
+def _face_up(triangle: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "3 2"]:
     (ax, ay), (bx, by) = triangle[1] - triangle[0], triangle[2] - triangle[0]
     return triangle if ax * by > ay * bx else triangle[::-1]
 
 
 def extent(road: Road) -> tuple[Float[np.ndarray, "2"], float]:
-    """Middle of a road's box, and half its longer side."""
+    """Centre of a road's bounding box, and half its longer side."""
     places = np.asarray(road.midpoint, float)[np.asarray(road.valid, bool)]
     low, high = places.min(axis=0), places.max(axis=0)
     return (low + high) / 2, float((high - low).max() / 2)

@@ -1,9 +1,9 @@
 # pyright: reportAttributeAccessIssue=false
 # (the compiled parts of mujoco carry no types)
-"""MuJoCo's renderer without a window: a context of the machine's OpenGL, and pictures through it.
+"""MuJoCo's renderer without a window.
 
-`mujoco.Renderer` decides on the kind of context when mujoco is imported, and wrongly on a Linux machine without a display. This asks when
-the first picture is wanted: what MUJOCO_GL names, otherwise EGL on Linux, which needs no display.
+`mujoco.Renderer` takes the OpenGL backend that was chosen when mujoco was imported: GLFW, unless MUJOCO_GL was set, which fails on Linux
+without a display. Here the backend is chosen for the first picture: that of MUJOCO_GL, or EGL on Linux, which needs no display.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 BACKENDS = ("egl", "osmesa", "glfw", "cgl")
 BY_PLATFORM = {"linux": "egl", "darwin": "cgl"}  # otherwise glfw
-MOST = 20_000  # geoms of a picture
+MAX_GEOMS = 20_000
 
 Paint = Callable[[mujoco.MjvCamera, Callable[[mujoco.MjvScene], None]], UInt8[np.ndarray, "H W 3"]]
 
@@ -27,23 +27,11 @@ class OpenGLError(ValueError):
     """No OpenGL to draw with; the message says what to install or set."""
 
 
-def backend() -> str:
-    """Which kind of context to make.
-
-    Raises:
-        OpenGLError: MUJOCO_GL names none.
-    """
-    named = os.environ.get("MUJOCO_GL", "").lower().strip() or BY_PLATFORM.get(sys.platform, "glfw")
-    if named not in BACKENDS:
-        raise OpenGLError(f"MUJOCO_GL: {named!r}; valid: {', '.join(BACKENDS)}, or not set")
-    return named
-
-
 def check() -> None:
-    """Draw one picture of nothing, before anybody waits for others.
+    """Draws an empty picture.
 
     Raises:
-        OpenGLError: see `painter`.
+        OpenGLError: see `make_painter`.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with make_painter(model, mujoco.MjData(model), width=8, height=8) as paint:
@@ -52,44 +40,46 @@ def check() -> None:
 
 @contextlib.contextmanager
 def make_painter(model: mujoco.MjModel, data: mujoco.MjData, *, width: int, height: int) -> Iterator[Paint]:
-    """A function (camera, decorate) -> picture of `data` as it then is; `decorate` may add geoms to the scene.
+    """A function (camera, decorate) -> picture of the present `data`; `decorate` may add geoms to the scene.
 
     Raises:
-        OpenGLError: no OpenGL here, with the reason and the way out in one line.
+        OpenGLError: an unknown MUJOCO_GL, or a backend that fails on this machine.
     """
-    named = backend()
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip() or BY_PLATFORM.get(sys.platform, "glfw")
+    if backend not in BACKENDS:
+        raise OpenGLError(f"MUJOCO_GL: expected {', '.join(BACKENDS)} or nothing, got {backend!r}")
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     try:
-        context = import_module(f"mujoco.{named}").GLContext(width, height)
+        context = import_module(f"mujoco.{backend}").GLContext(width, height)
         context.make_current()
-        drawing = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:  # whatever the platform's OpenGL raises
         reason = " ".join((str(error) or type(error).__name__).split())
-        raise OpenGLError(f"no OpenGL through {named} here ({reason}); {_way_out(named)}") from None
+        raise OpenGLError(f"no OpenGL through {backend} here ({reason}); {_suggest(backend)}") from None
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
+    renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+    scene, options, window = mujoco.MjvScene(model, MAX_GEOMS), mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
+    scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+
+    def paint(camera: mujoco.MjvCamera, decorate: Callable[[mujoco.MjvScene], None]) -> UInt8[np.ndarray, "H W 3"]:
+        mujoco.mjv_updateScene(model, data, options, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+        decorate(scene)
+        mujoco.mjr_render(window, scene, renderer)
+        pixels = np.empty((height, width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, window, renderer)
+        return pixels[::-1]
+
     try:
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawing)
-        drawing.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        scene, options, window = mujoco.MjvScene(model, MOST), mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
-        scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
-
-        def paint(camera: mujoco.MjvCamera, decorate: Callable[[mujoco.MjvScene], None]) -> UInt8[np.ndarray, "H W 3"]:
-            mujoco.mjv_updateScene(model, data, options, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
-            decorate(scene)
-            mujoco.mjr_render(window, scene, drawing)
-            pixels = np.empty((height, width, 3), np.uint8)
-            mujoco.mjr_readPixels(pixels, None, window, drawing)
-            return pixels[::-1]
-
         yield paint
     finally:
-        drawing.free()
+        renderer.free()
         context.free()
 
 
-def _way_out(named: str) -> str:
+def _suggest(backend: str) -> str:
     if sys.platform != "linux":
         return "a 3D picture needs a display here; out=NAME.html needs no OpenGL"
-    other = "osmesa" if named == "egl" else "egl"
+    other = "osmesa" if backend == "egl" else "egl"
     return (
         f"on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri (MUJOCO_GL=egl), or libosmesa6 (MUJOCO_GL=osmesa); "
         f"try MUJOCO_GL={other}; out=NAME.html needs no OpenGL"

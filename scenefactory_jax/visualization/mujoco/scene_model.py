@@ -1,8 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
 # (the compiled parts of mujoco carry no types)
-"""A world as a MuJoCo model that is only looked at: its road, and its cars where they are put. Nothing is stepped.
+"""Builds a world as a MuJoCo model for pictures: surfaces are meshes, cars are placed by their joints, nothing is stepped.
 
-`scenes.mjcf` builds the same world to be simulated, with lines as thin boxes; here surfaces are meshes, which draw fast.
+`world_mjcf` builds the same world for simulation.
 """
 
 import dataclasses
@@ -15,41 +15,41 @@ from jaxtyping import Float, Int
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
-from scenefactory_jax.visualization.birds_eye import drawing
+from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.mujoco import ground_meshes
 from scenefactory_jax.visualization.mujoco.ground_meshes import Surface
 
 GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
-SUN = (0.45, 0.3, -1.0)  # way of its light
-SHADOWS_M, SHADOW_PIXELS = 150.0, 8192  # how far from what is looked at shadows fall; just beyond, MuJoCo speckles the ground
+SUN = (0.45, 0.3, -1.0)  # direction of its light
+SHADOWS_M, SHADOW_PIXELS = 150.0, 8192  # radius of shadows; just beyond, MuJoCo speckles the ground
 JOINTS = 17  # of a car: 7 of the chassis; suspension, steering and spin of the front wheels; suspension and spin of the rear ones
 STEER, SPIN = np.array([8, 11]), np.array([9, 12, 14, 16])
 
 
 class RenderModel(NamedTuple):
-    """The compiled model and where its cars stand in it."""
+    """The compiled model and the addresses of its cars."""
 
     model: mujoco.MjModel
-    slots: Int[np.ndarray, " C"]  # of the cars that the world has
-    joints: Int[np.ndarray, "C 17"]  # of each in qpos
-    geoms: list[Int[np.ndarray, " n"]]  # of each
-    paint: Float[np.ndarray, "G 4"]  # every geom's own colour
+    slots: Int[np.ndarray, " C"]  # of the present cars
+    joints: Int[np.ndarray, "C 17"]  # addresses in qpos
+    geoms: list[Int[np.ndarray, " n"]]  # of each car
+    colours: Float[np.ndarray, "G 4"]  # of all geoms
 
 
 def build(scene: Scene, car: CarParameters) -> RenderModel:
-    """The world of an episode.
+    """Builds the world of an episode.
 
     Args:
-        scene: one world on the host, with the weather that is to be seen.
-        car: how cars look; each is as long and as wide as its agent, its wheels in proportion.
+        scene: one world on the host, with the weather to draw.
+        car: parameters of the cars; each gets its agent's length and width, its wheels in proportion.
     """
     model = _empty(scene)
     for surface in ground_meshes.find_surfaces(scene):
-        _mesh(model, surface)
+        _add_mesh(model, surface)
     slots = np.flatnonzero(np.asarray(scene.agents.present))
     for slot in slots:
         length, width = (float(side) for side in np.asarray(scene.agents.size)[slot])
-        model.attach(_painted(fit_buffers(car, length, width), int(slot)), prefix=f"agent{slot}/", frame=model.worldbody.add_frame())
+        model.attach(_build_car(resize(car, length, width), int(slot)), prefix=f"agent{slot}/", frame=model.worldbody.add_frame())
     compiled = model.compile()
     bodies = [compiled.body(f"agent{slot}/chassis").id for slot in slots]
     first = [int(compiled.joint(f"agent{slot}/root").qposadr[0]) for slot in slots]
@@ -58,8 +58,8 @@ def build(scene: Scene, car: CarParameters) -> RenderModel:
     return RenderModel(compiled, slots, joints, geoms, compiled.geom_rgba.copy())
 
 
-def fit_buffers(car: CarParameters, length: float, width: float) -> CarParameters:
-    """The car drawn longer and wider, its wheels in proportion."""
+def resize(car: CarParameters, length: float, width: float) -> CarParameters:
+    """Scales a car to a length and a width, its wheels in proportion."""
     along, across = length / car.length, width / car.width
     return dataclasses.replace(car, length=length, width=width, wheelbase=car.wheelbase * along, track=car.track * across)
 
@@ -71,11 +71,11 @@ def set_posture(
     steer: Float[np.ndarray, "*n"],
     spin: Float[np.ndarray, "*n"],
 ) -> Float[np.ndarray, "*n 17"]:
-    """Joints of level cars that stand on their wheels, for dynamics that have no joints.
+    """Joints of level cars that stand on their wheels, for dynamics without joints.
 
     Args:
-        steer: of the front wheels.
-        spin: angle by which the wheels have turned.
+        steer: angle of the front wheels.
+        spin: rotation angle of all wheels.
     """
     joints = np.zeros((*np.shape(yaw), JOINTS))
     joints[..., :2], joints[..., 2] = position, car.wheel_radius - car.wheel_height
@@ -84,23 +84,23 @@ def set_posture(
     return joints
 
 
-def place_actor(stage: RenderModel, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
-    """Every car where its joints say, all slots given; what is wholly transparent is not drawn."""
-    for row, slot in enumerate(stage.slots):
-        data.qpos[stage.joints[row]] = joints[slot]
-        geoms = stage.geoms[row]
-        stage.model.geom_rgba[geoms, 3] = stage.paint[geoms, 3] * opacity[slot]
-    mujoco.mj_kinematics(stage.model, data)
-    mujoco.mj_camlight(stage.model, data)
+def place_actors(built: RenderModel, data: mujoco.MjData, joints: Float[np.ndarray, "A 17"], opacity: Float[np.ndarray, " A"]) -> None:
+    """Sets joints and opacity of the present cars; both arrays hold all slots."""
+    for row, slot in enumerate(built.slots):
+        data.qpos[built.joints[row]] = joints[slot]
+        geoms = built.geoms[row]
+        built.model.geom_rgba[geoms, 3] = built.colours[geoms, 3] * opacity[slot]
+    mujoco.mj_kinematics(built.model, data)
+    mujoco.mj_camlight(built.model, data)
 
 
 def place_light(data: mujoco.MjData, place: Float[np.ndarray, "3"]) -> None:
-    """Move the sun to where shadows are to be sharp."""
+    """Moves the sun so that shadows are sharp around a place."""
     data.light_xpos[0] = place - 0.5 * SHADOWS_M * np.array(SUN)
 
 
 def _empty(scene: Scene) -> mujoco.MjSpec:
-    """Ground, sky and sun around the road."""
+    """Ground, sky and sun."""
     model = mujoco.MjSpec()
     model.modelname = "world"
     (x, y), half = ground_meshes.extent(scene.road)
@@ -119,16 +119,16 @@ def _empty(scene: Scene) -> mujoco.MjSpec:
     return model
 
 
-def _mesh(model: mujoco.MjSpec, surface: Surface) -> None:
-    """A surface to see, that nothing touches."""
+def _add_mesh(model: mujoco.MjSpec, surface: Surface) -> None:
+    """Adds a surface without contacts."""
     mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
     kind = mujoco.mjtGeom.mjGEOM_MESH
     model.worldbody.add_geom(name=surface.name, type=kind, meshname=surface.name, rgba=list(surface.colour), contype=0, conaffinity=0)
 
 
-def _painted(car: CarParameters, slot: int) -> mujoco.MjSpec:
-    """A car in its slot's colour."""
+def _build_car(car: CarParameters, slot: int) -> mujoco.MjSpec:
+    """A car in the colour of its slot."""
     spec = models.build_mjspec(car, visual=True, brake_rows=False)
-    spec.geom("hull").rgba = [*(channel / 255 for channel in drawing.colour_of(slot)), 1.0]
+    spec.geom("hull").rgba = [*rgb(colour_of(slot)), 1.0]
     return spec

@@ -1,16 +1,20 @@
-"""A whole scene as one MuJoCo model: ground, road, cars and goals, to look at and to check against the C engine."""
+"""Builds a scene as one MuJoCo model that can be simulated: ground, road lines, cars, goals and traffic."""
 # pyright: reportAttributeAccessIssue=false
 # mujoco is an extension module without stubs
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Boxes, Road, Scene
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Road, Scene
+from scenefactory_jax.dynamics.articulated import model as models
+from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 
 WHITE, YELLOW = (0.95, 0.95, 0.95, 1.0), (0.95, 0.75, 0.15, 1.0)
 PAINT = dict.fromkeys(LINES[:3], WHITE) | dict.fromkeys(LINES[3:], YELLOW)  # WOMD: 6-8 white, 9-13 yellow
@@ -22,82 +26,71 @@ COLOURS = PAINT | {
     SPEED_BUMP: (0.90, 0.50, 0.10, 1.0),
     DRIVEWAY: (0.55, 0.45, 0.60, 1.0),
 }
-OTHER = (0.5, 0.5, 0.5, 1.0)
-JOINED_M = 1e-3  # float32 ends of neighbouring segments differ by less than that
-GOALS = ((0.90, 0.20, 0.20), (0.20, 0.70, 0.30), (0.20, 0.45, 0.90), (0.95, 0.65, 0.10), (0.60, 0.30, 0.75), (0.10, 0.70, 0.70))
+GREY = (0.5, 0.5, 0.5, 1.0)
+JOINED_M = 1e-3  # float32 ends of neighbouring segments differ by less
+LINE_HALF_M, LINE_M, TRAFFIC_M = 0.05, 0.02, 1.5  # half width and height of lines, height of traffic
+STRAIGHT_M = 0.05  # neighbouring segments become one box where that moves no point farther
+VISUAL = {"contype": 0, "conaffinity": 0}
 
 
-def world(
-    scene: Scene,
-    car: mujoco.MjSpec,
-    *,
-    merge_tolerance_m: float | None,
-    half_width_m: float,
-    height_m: float,
-    goal_radius_m: float,
-    other_height_m: float,
-    scene_size_m: float,
+def build(
+    scene: Scene, dynamics: Mapping[str, Any], *, physics_hz: float | int, scene_size_m: float | int, goal_radius_m: float | int
 ) -> mujoco.MjSpec:
-    """Ground plane `ground`, road as thin visual boxes, car `agent{slot}/...` at each present agent's start, and `goal{slot}` discs.
+    """Builds a scene with articulated cars, their tyre contacts and the solver's options.
 
-    Present boxes of the scene stand fixed as `other{row}`. Only they, the ground and the cars can collide. Wheel contacts that are explicit
-    pairs are the car's business: add them to the result with the prefix `agent{slot}/`. Each car stands at the height that its own spec
-    gives it above z = 0.
+    Args:
+        scene: one world; its `traffic` stands fixed.
+        dynamics: config of the articulated car.
+        scene_size_m: side of the drawn ground; the physical plane is infinite.
+    """
+    parameters, solver = cars.read_parameters(dynamics)
+    car = models.build_mjspec(parameters, visual=True, brake_rows=False)
+    model = build_world(scene, car, scene_size_m=scene_size_m, goal_radius_m=goal_radius_m)
+    for slot in np.flatnonzero(np.asarray(scene.agents.present)):
+        models.add_ground_pairs(model, parameters, ground="ground", prefix=f"agent{slot}/")
+    models.set_options(model, solver, physics_dt=1.0 / physics_hz)
+    return model
+
+
+def build_world(
+    scene: Scene, car: mujoco.MjSpec, *, scene_size_m: float | int, goal_radius_m: float | int, straight_m: float | None = STRAIGHT_M
+) -> mujoco.MjSpec:
+    """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}` and boxes `traffic{row}`.
+
+    Only ground, cars and traffic can collide. Contacts that are explicit pairs are not added.
 
     Args:
         scene: one world.
-        car: one car whose top body has a free joint; it is left as it was.
-        merge_tolerance_m: neighbouring segments become one box where that moves no point farther; null: a box a segment.
-        half_width_m: of the boxes in the plane (the published road's half width is 0.05).
-        height_m: of the boxes.
-        goal_radius_m: of the discs.
-        other_height_m: of the others.
-        scene_size_m: side of the ground that is drawn, and the viewer's scale; physically the plane is infinite.
+        car: one car whose top body has a free joint, at its height above z = 0; it is copied.
+        straight_m: tolerance within which neighbouring segments are merged; None: a box per segment.
 
     Raises:
         ValueError: the spec has no body with a free joint at the top.
     """
     if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in car.worldbody.bodies for joint in body.joints):
-        raise ValueError("car: no body with a free joint at the top of the spec; a car must be able to move")
-    model = _stage(scene_size_m)
-    for points, kind in join_segments(scene.road, merge_tolerance_m):
-        _add_boxes(model, points, COLOURS.get(kind, OTHER), half_width_m, height_m)
+        raise ValueError("car: expected a spec whose top body has a free joint")
+    model = _build_ground(scene_size_m)
+    for points, kind in join_segments(scene.road, straight_m):
+        delta, middle = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
+        size = np.c_[np.linalg.norm(delta, axis=1) / 2, np.tile([LINE_HALF_M, LINE_M / 2], (len(delta), 1))]
+        for place, yaw, half in zip(middle, np.arctan2(delta[:, 1], delta[:, 0]), size, strict=True):
+            _add_box(model, place, float(yaw), half, COLOURS.get(kind, GREY), **VISUAL)
     agents = scene.agents
-    for slot in np.flatnonzero(np.asarray(agents.present)):
+    for slot in np.flatnonzero(np.asarray(agents.present)).tolist():
         x, y, yaw = (float(value) for value in (*np.asarray(agents.position)[slot], np.asarray(agents.yaw)[slot]))
-        frame = model.worldbody.add_frame(pos=[x, y, 0.0], quat=[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-        model.attach(car.copy(), prefix=f"agent{slot}/", frame=frame)
-        goal = np.asarray(agents.goal)[slot]
-        model.worldbody.add_geom(
-            name=f"goal{slot}",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[float(goal[0]), float(goal[1]), 0.0],
-            size=[goal_radius_m, height_m, 0.0],
-            rgba=[*GOALS[slot % len(GOALS)], 0.4],
-            contype=0,
-            conaffinity=0,
-        )
-    _add_others(model, scene.traffic, other_height_m)
+        model.attach(car.copy(), prefix=f"agent{slot}/", frame=model.worldbody.add_frame(pos=[x, y, 0.0], quat=_quaternion(yaw)))
+        place, disc = [*np.asarray(agents.goal, float)[slot].tolist(), 0.0], mujoco.mjtGeom.mjGEOM_CYLINDER
+        look = {"type": disc, "size": [goal_radius_m, LINE_M, 0.0], "rgba": [*rgb(colour_of(slot)), 0.4], **VISUAL}
+        model.worldbody.add_geom(name=f"goal{slot}", pos=place, **look)
+    boxes = scene.traffic
+    for row in np.flatnonzero(np.asarray(boxes.present)):
+        half = np.r_[np.asarray(boxes.size, float)[row] / 2, TRAFFIC_M / 2]
+        _add_box(model, np.asarray(boxes.position, float)[row], float(boxes.yaw[row]), half, GREY, name=f"traffic{row}")
     return model
 
 
-def _add_others(model: mujoco.MjSpec, boxes: Boxes, height_m: float) -> None:
-    """Everybody who is there besides the cars, as boxes on the ground that cars can hit."""
-    for row in np.flatnonzero(np.asarray(boxes.present)):
-        (x, y), (length, width) = np.asarray(boxes.position, float)[row].tolist(), np.asarray(boxes.size, float)[row].tolist()
-        yaw = float(boxes.yaw[row])
-        model.worldbody.add_geom(
-            name=f"other{row}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[x, y, height_m / 2],
-            quat=[np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)],
-            size=[length / 2, width / 2, height_m / 2],
-            rgba=[*OTHER[:3], 1.0],
-        )
-
-
 def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float[np.ndarray, "N 2"], int]]:
-    """The valid segments joined into polylines again, simplified within a tolerance (Douglas-Peucker), and their kinds."""
+    """Joins valid segments into polylines, simplified within a tolerance (Douglas-Peucker); yields points and kind."""
     valid = np.asarray(road.valid)
     midpoint, direction = np.asarray(road.midpoint, np.float64)[valid], np.asarray(road.direction, np.float64)[valid]
     half = direction * np.asarray(road.half_length, np.float64)[valid, None]
@@ -114,8 +107,8 @@ def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float
         yield points, int(kind[begin])
 
 
-def _stage(scene_size_m: float) -> mujoco.MjSpec:
-    """Ground, light, a camera from above, and the viewer's scale."""
+def _build_ground(scene_size_m: float | int) -> mujoco.MjSpec:
+    """Ground, light, a camera `above`, and the viewer's scale."""
     model = mujoco.MjSpec()
     model.modelname = "scene"
     model.stat.center, model.stat.extent = [0.0, 0.0, 0.0], scene_size_m / 2
@@ -125,28 +118,17 @@ def _stage(scene_size_m: float) -> mujoco.MjSpec:
     headlight.ambient, headlight.diffuse, headlight.specular = [0.5, 0.5, 0.5], [0.2, 0.2, 0.2], [0.0, 0.0, 0.0]
     light = model.worldbody.add_light(type=sun, pos=[0, 0, 50], dir=[0.3, 0.2, -1.0], castshadow=False)
     light.diffuse, light.specular = [0.4, 0.4, 0.4], [0.0, 0.0, 0.0]
-    side = scene_size_m / 2
-    ground = mujoco.mjtGeom.mjGEOM_PLANE
-    model.worldbody.add_geom(name="ground", type=ground, size=[side, side, 1.0], rgba=[0.22, 0.23, 0.25, 1.0])
-    height = side / np.tan(np.deg2rad(22.5)) * 1.02
-    model.worldbody.add_camera(name="above", pos=[0.0, 0.0, height], fovy=45.0)
+    side, plane = scene_size_m / 2, mujoco.mjtGeom.mjGEOM_PLANE
+    model.worldbody.add_geom(name="ground", type=plane, size=[side, side, 1.0], rgba=[0.22, 0.23, 0.25, 1.0])
+    model.worldbody.add_camera(name="above", pos=[0.0, 0.0, side / np.tan(np.deg2rad(22.5)) * 1.02], fovy=45.0)
     return model
 
 
-def _add_boxes(
-    model: mujoco.MjSpec, points: Float[np.ndarray, "N 2"], rgba: tuple[float, ...], half_width_m: float, height_m: float
-) -> None:
-    """One box on the ground for each step of a polyline."""
-    delta = np.diff(points, axis=0)
-    length, yaw = np.linalg.norm(delta, axis=1), np.arctan2(delta[:, 1], delta[:, 0])
-    middle = (points[1:] + points[:-1]) / 2
-    for (x, y), span, angle in zip(middle.tolist(), length.tolist(), yaw.tolist(), strict=True):
-        model.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[x, y, height_m / 2],
-            quat=[np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)],
-            size=[span / 2, half_width_m, height_m / 2],
-            rgba=list(rgba),
-            contype=0,
-            conaffinity=0,
-        )
+def _add_box(model: mujoco.MjSpec, place: np.ndarray, yaw: float, half: np.ndarray, rgba: tuple[float, ...], **geom: Any) -> None:
+    """Adds a box on the ground."""
+    (x, y), look = place.tolist(), {"size": half.tolist(), "rgba": list(rgba), "quat": _quaternion(yaw)}
+    model.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=[x, y, half[2]], **look, **geom)
+
+
+def _quaternion(yaw: float) -> list[float]:
+    return [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]

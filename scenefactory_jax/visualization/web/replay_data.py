@@ -1,14 +1,11 @@
-"""A recording as the replay's page reads it: for every world a head of plain JSON and packed arrays."""
+"""Converts a recording to the data of the web page: for every world a head of plain JSON and packed arrays."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from scenefactory_jax.core.raw_scene import LIGHT_STATES, RawScene
 from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import (
     CROSSWALK,
@@ -18,24 +15,25 @@ from scenefactory_jax.core.types import (
     LANE_BIKE,
     ROAD_USERS,
     SPEED_BUMP,
-    STOP_SIGN,
     SURFACES,
     Road,
     Scene,
 )
 from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.recorded_episodes import cut_world
 from scenefactory_jax.visualization.web.array_packing import Packer
+from scenefactory_jax.visualization.web.road_posts import RoadPosts
 
-# how a kind of segment looks (`map.js`); kinds as in `types`
+# name in `map.js` -> kinds of segments
 LAYERS: dict[str, tuple[int, ...]] = {
     "driveway": (DRIVEWAY,), "lane": DRIVABLE, "bike": (LANE_BIKE,), "crosswalk": (CROSSWALK,), "bump": (SPEED_BUMP,),
     "white-broken": (6,), "white": (7, 8), "yellow-broken": (9, 10, 13), "yellow": (11, 12), "edge": EDGES,
 }  # fmt: skip
-STRAIGHT_M = 0.03  # a point of a line that is nearer than this to the straight way between its neighbours is left out
-GAP_M = 0.02  # consecutive segments of a polyline that are farther apart than this are two lines
-TTC_MOST_S = 20.0  # a longer time to collision is shown as none
-# what is kept of every car at every step, and how finely
+STRAIGHT_M = 0.03  # points of a line nearer than this to the straight line between their neighbours are left out
+GAP_M = 0.02  # consecutive segments of a polyline that are farther apart are two lines
+MAX_TTC_S = 20.0  # a longer time to collision is shown as missing
+# per-agent columns and their resolution
 RESOLUTION: dict[str, float] = {
     "x": 0.01, "y": 0.01, "yaw": 0.002, "speed": 0.01, "steer": 0.001, "throttle": 0.002, "turn": 0.002, "brake": 0.002, "ttc": 0.01,
     "edge_ttc": 0.01, "goal_distance": 0.02, "grip": 0.001, "friction_utilization": 0.002, "slip": 0.005, "contact_force": 20.0,
@@ -44,78 +42,30 @@ TERM_RESOLUTION = 2e-4
 WHEELS = ("FL", "FR", "RL", "RR")  # the order of `dynamics.car.WHEELS`
 
 
-class Light(NamedTuple):
-    """A traffic light as logged: from each time on it shows that state."""
-
-    place: tuple[float, float]  # where cars stop for it
-    yaw: float  # of the lane there
-    shown: list[tuple[float, str]]  # (seconds since the episode began, one of LIGHT_STATES)
-
-
-class RoadPosts(NamedTuple):
-    """What stands on the map and is in no packed scene, in its coordinates."""
-
-    lights: tuple[Light, ...] = ()
-    signs: tuple[tuple[float, float], ...] = ()  # stop signs
-
-
-def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
-    """Lights and stop signs of a scene as its source holds it.
-
-    Args:
-        centre: of the packed scene in the source's coordinates (`PackReport.centre`).
-    """
-    origin = np.asarray(centre[:2])
-    signs = [line.xyz[:, :2].mean(axis=0) - origin for line in raw.roads if line.kind == STOP_SIGN and len(line.xyz)]
-    lanes = {line.id: line.xyz[:, :2] for line in raw.roads if len(line.xyz) >= 2}
-    lights = []
-    for light in raw.lights:
-        lane = lanes.get(light.lane)
-        place = light.stop[:2] if light.stop is not None else None if lane is None else lane[0]
-        if place is None:
-            continue
-        ahead = np.array([1.0, 0.0]) if lane is None else _direction(lane, place)
-        states = np.where(light.valid, light.state, 0)[raw.current :]
-        times = raw.times[raw.current :] - raw.times[raw.current]
-        begins = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
-        shown = [(float(times[i]), LIGHT_STATES[int(states[i])]) for i in begins]
-        x, y = place - origin
-        lights.append(Light((float(x), float(y)), float(np.arctan2(ahead[1], ahead[0])), shown))
-    return RoadPosts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
-
-
-def _direction(line: Float[np.ndarray, "N 2"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    nearest = min(int(np.argmin(np.linalg.norm(line - place, axis=1))), len(line) - 2)
-    return line[nearest + 1] - line[nearest]
-
-
 def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> tuple[dict[str, Any], str]:
-    """Head and arrays of one world, cut one second after its last car is done.
+    """Head and arrays of one world, until one second after its last active step.
 
     Args:
         recording: on the host.
         index: of the world.
     """
-    scene, shots = (jax.tree.map(lambda leaf: np.asarray(leaf)[index], part) for part in (recording.scene, recording.shots))
-    hz = 1.0 / max(float(np.median(np.diff(shots.time_s))), 1e-6) if len(shots.time_s) > 1 else 1.0
-    active = shots.active & scene.agents.present
-    live = np.flatnonzero(active.any(axis=1))
-    length = min((int(live[-1]) if len(live) else 0) + 1 + round(hz), len(active))
-    shots, active = jax.tree.map(lambda leaf: leaf[:length], shots), active[:length]
-    packer, sound = Packer(), _sound(shots, active)
-    held = _held(sound)
-    _add_cars(packer, shots, active, held)
+    scene, shots, active, hz = cut_world(recording, index)
+    steps = np.arange(len(active))[:, None]
+    last = np.maximum.accumulate(np.where(active, steps, 0), axis=0)
+    row = np.maximum(last, np.argmax(active, axis=0))  # the last active step, before the first one the first
+    packer = Packer()
+    _add_cars(packer, shots, active, row)
     layers = _add_road(packer, scene.road)
-    users = _add_others(packer, scene, shots)
+    traffic = _add_traffic(packer, scene, shots)
     packer.add("film", shots.film_mm[None], resolution=0.001)
     head = {
         "name": name,
-        "steps": length,
+        "steps": len(active),
         "start": float(shots.time_s[0]),
         "dt": 1.0 / hz,
         "surface": SURFACES[int(scene.weather.surface)],
-        "cars": _cars(scene, shots, active, held),
-        "events": _events(shots, active, held),
+        "cars": _cars(scene, shots, active, row),
+        "events": _events(shots, active, row),
         "terms": list(shots.terms),
         "wheels": list(WHEELS) if shots.wheels is not None else [],
         "layers": layers,
@@ -123,7 +73,7 @@ def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> t
             {"label": area.label, "colour": list(area.colour), "pieces": [np.round(piece, 2).tolist() for piece in area.pieces]}
             for area in patch_overlay.areas(scene.weather)
         ],
-        "traffic": users,
+        "traffic": traffic,
         "lights": [light._asdict() for light in posts.lights],
         "signs": [[round(x, 2), round(y, 2)] for x, y in posts.signs],
         "arrays": packer.directory,
@@ -131,20 +81,8 @@ def world(recording: Recording, index: int, *, name: str, posts: RoadPosts) -> t
     return head, packer.text()
 
 
-def _sound(shots: StepRecord, active: Bool[np.ndarray, "T A"]) -> Bool[np.ndarray, "T A"]:
-    """Where a car's numbers mean something: in its own steps, as far as they are finite."""
-    return active & np.isfinite(shots.position).all(axis=-1) & np.isfinite(shots.yaw)
-
-
-def _held(sound: Bool[np.ndarray, "T A"]) -> Int[np.ndarray, "T A"]:
-    """The step whose numbers a car shows at each step: its last sound one, or its first."""
-    steps = np.arange(len(sound))[:, None]
-    first = np.argmax(sound, axis=0)
-    return np.maximum(np.maximum.accumulate(np.where(sound, steps, 0), axis=0), first)
-
-
-def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> None:
-    """Every car's numbers, car by car; steps that are not its own repeat the last that is, which costs nothing."""
+def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"], row: Int[np.ndarray, "T A"]) -> None:
+    """Adds the columns of all cars, car by car; inactive steps repeat the last active one, which deflates to nothing."""
     ever, agents = active.any(axis=0), np.arange(active.shape[1])
     columns = {
         "x": shots.position[..., 0], "y": shots.position[..., 1], "yaw": shots.yaw, "speed": shots.speed, "steer": shots.steer,
@@ -153,23 +91,23 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
         "friction_utilization": shots.friction_utilization,
         "slip": shots.slip, "contact_force": shots.contact_force,
     }  # fmt: skip
-    finely = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
-    finely |= {f"term:{name}": (values, TERM_RESOLUTION) for name, values in shots.terms.items()}
+    resolved = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
+    resolved |= {f"term:{name}": (values, TERM_RESOLUTION) for name, values in shots.terms.items()}
     if shots.wheels is not None:
-        finely |= {f"mu:{wheel}": (shots.wheels.mu[..., i], RESOLUTION["grip"]) for i, wheel in enumerate(WHEELS)}
-    for name, (values, resolution) in finely.items():
-        packer.add(name, np.where(ever, values[held, agents], 0.0).T, resolution=resolution)
+        resolved |= {f"mu:{wheel}": (shots.wheels.mu[..., i], RESOLUTION["grip"]) for i, wheel in enumerate(WHEELS)}
+    for name, (values, resolution) in resolved.items():
+        packer.add(name, np.where(ever, values[row, agents], 0.0).T, resolution=resolution)
 
 
 def _near(time: Float[np.ndarray, "T A"]) -> Float[np.ndarray, "T A"]:
-    return np.where(time <= TTC_MOST_S, time, np.nan)
+    return np.where(time <= MAX_TTC_S, time, np.nan)
 
 
-def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
-    """Every present car: its slot, size, the spans of steps in which it drives, and its goals, each with the step from which it counts."""
+def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], row: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
+    """Slot, size, spans of active steps, and goals with their first step, of every present car."""
     found = []
     for car in np.flatnonzero(np.asarray(scene.agents.present) | active.any(axis=0)):
-        goal = shots.goal[held[:, car], car]
+        goal = shots.goal[row[:, car], car]
         begins = np.flatnonzero(np.r_[True, (goal[1:] != goal[:-1]).any(axis=1)])
         size = [round(float(side), 2) for side in scene.agents.size[car]]
         goals = [[int(step), *(round(float(v), 2) for v in goal[step])] for step in begins]
@@ -178,43 +116,47 @@ def _cars(scene: Scene, shots: StepRecord, active: Bool[np.ndarray, "T A"], held
 
 
 def spans(true: Bool[np.ndarray, " T"]) -> list[list[int]]:
-    """[first, last] of each run of steps at which something is true."""
+    """[first, last] of each run of true steps."""
     edges = np.diff(np.r_[False, true, False].astype(np.int8))
     return [[int(first), int(end) - 1] for first, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)]
 
 
-def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
-    """What happened, in order. A car that starts again in the step of its end has left the place: the step before tells it."""
+def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], row: Int[np.ndarray, "T A"]) -> list[dict[str, Any]]:
+    """Events in order. A car that respawns in the step of an event has jumped; its place is that of the step before."""
     found = []
-    for name, past_events in vars(shots.events).items():
-        for step, car in np.argwhere(past_events & active):
-            row = held[step, car]
-            place, before = shots.position[row, car], shots.position[max(row - 1, 0), car]
-            apart = np.linalg.norm(place - before) > 100.0 * max(float(shots.time_s[row] - shots.time_s[max(row - 1, 0)]), 1e-3)
-            x, y = before if apart and active[max(row - 1, 0), car] else place
+    for name, new in vars(shots.events).items():
+        for step, car in np.argwhere(new & active):
+            now, before = row[step, car], max(row[step, car] - 1, 0)
+            place, earlier = shots.position[now, car], shots.position[before, car]
+            jumped = np.linalg.norm(place - earlier) > 100.0 * max(float(shots.time_s[now] - shots.time_s[before]), 1e-3)
+            x, y = earlier if jumped and active[before, car] else place
             found.append({"step": int(step), "car": int(car), "name": name, "x": round(float(x), 2), "y": round(float(y), 2)})
     return sorted(found, key=lambda event: (event["step"], event["car"]))
 
 
-def _add_others(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[str, Any]]:
-    """Everybody else who is ever there: size, kind, spans, and whether it only stands."""
-    whole = TrafficBoxes.from_boxes(shots.traffic)
-    seen = np.flatnonzero(whole.present.any(axis=0))
-    still, held = traffic_shapes.shapes_at_rest(whole), _held(whole.present)
-    kinds = np.asarray(scene.traffic_log.kind) if len(scene.traffic_log.kind) == whole.present.shape[1] else None
-    take = lambda leaf: np.stack([leaf[held[:, row], row] for row in seen]) if len(seen) else np.zeros((0, len(held)))  # noqa: E731
-    for name, leaf in {"other:x": whole.position[..., 0], "other:y": whole.position[..., 1], "other:yaw": whole.yaw}.items():
-        packer.add(name, take(leaf), resolution=RESOLUTION[name.removeprefix("other:")])
-    found = []
-    for row in seen:
-        size = [round(float(side), 2) for side in whole.size[held[0, row], row]]
-        kind = "vehicle" if kinds is None else ROAD_USERS[int(kinds[row])]
-        found.append({"size": size, "kind": kind, "spans": spans(whole.present[:, row]), "parked": bool(still[row])})
-    return found
+def _add_traffic(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[str, Any]]:
+    """Adds the poses of background traffic; returns size, kind, spans and whether it is parked, of each that is ever present."""
+    traffic = TrafficBoxes.from_boxes(shots.traffic)
+    rows = np.flatnonzero(traffic.present.any(axis=0))
+    present, steps = traffic.present[:, rows], np.arange(len(traffic.present))[:, None]
+    last = np.maximum(np.maximum.accumulate(np.where(present, steps, 0), axis=0), np.argmax(present, axis=0))
+    for name, column in {"x": traffic.position[..., 0], "y": traffic.position[..., 1], "yaw": traffic.yaw}.items():
+        packer.add(f"traffic:{name}", column[last, rows].T, resolution=RESOLUTION[name])
+    kinds, parked = np.asarray(scene.traffic_log.kind), traffic_shapes.find_parked(traffic)
+    logged = len(kinds) == traffic.present.shape[1]
+    return [
+        {
+            "size": [round(float(side), 2) for side in traffic.size[last[0, index], row]],
+            "kind": ROAD_USERS[int(kinds[row])] if logged else "vehicle",
+            "spans": spans(traffic.present[:, row]),
+            "parked": bool(parked[row]),
+        }
+        for index, row in enumerate(rows)
+    ]
 
 
 def _add_road(packer: Packer, road: Road) -> dict[str, list[int]]:
-    """Lines of every layer one after another as one array of points; returns how many points each line of a layer has."""
+    """Adds the points of all lines, layer by layer, as one array; returns the number of points of each line."""
     valid = np.asarray(road.valid, bool)
     kind, polyline = np.asarray(road.kind)[valid], np.asarray(road.polyline)[valid]
     middle, reach = np.asarray(road.midpoint, float)[valid], (road.half_length[:, None] * road.direction)[valid].astype(float)
@@ -232,7 +174,7 @@ def _add_road(packer: Packer, road: Road) -> dict[str, list[int]]:
 def _lines(
     starts: Float[np.ndarray, "N 2"], ends: Float[np.ndarray, "N 2"], polyline: Int[np.ndarray, " N"]
 ) -> list[Float[np.ndarray, "n 2"]]:
-    """Segments joined where one begins at the other's end, without the points that a straight line does not need."""
+    """Joins segments into lines and leaves out points on straight pieces."""
     if not len(starts):
         return []
     breaks = (polyline[1:] != polyline[:-1]) | (np.linalg.norm(starts[1:] - ends[:-1], axis=1) > GAP_M)

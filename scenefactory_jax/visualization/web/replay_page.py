@@ -1,7 +1,6 @@
-"""A recording as one HTML file that needs nothing else: no network, no server, no library. Browsers open it, notebooks show it.
+"""Writes a recording as one HTML file that needs no network, server or library, for browsers and notebooks.
 
-The page itself is `replay/`: its parts are put into one document beside the worlds' data, with a content policy under which a browser
-loads nothing from anywhere.
+The parts of `page/` and the data are joined to one document, whose content policy forbids loading anything else.
 """
 
 import html
@@ -14,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 
 from scenefactory_jax.env.rollout import Recording
-from scenefactory_jax.visualization.birds_eye.drawing import AGENTS, GOAL_RADIUS, MARKS
+from scenefactory_jax.visualization.birds_eye.drawing import AGENTS, MARKS
 from scenefactory_jax.visualization.web import replay_data
-from scenefactory_jax.visualization.web.replay_data import RoadPosts
+from scenefactory_jax.visualization.web.road_posts import RoadPosts
 from scenefactory_jax.visualization.web.term_styles import term_looks
 
 if TYPE_CHECKING:
@@ -37,28 +36,29 @@ def write(
     names: Sequence[str] = (),
     posts: Sequence[RoadPosts] = (),
     title: str = "replay",
-    goal_radius_m: float = GOAL_RADIUS,
+    goal_radius_m: float | int,
 ) -> Path:
-    """Write the page, about 0.1 to 1 MB a world.
+    """Writes the page, about 0.1 to 1 MB per world.
 
     Args:
-        recording: of one or several worlds, see `recording.record`.
-        names: of the worlds; none: numbers.
-        posts: lights and stop signs of the worlds (`replay_data.posts`); none: not shown.
+        recording: of one or several worlds, see `env.rollout.record`.
+        names: of the worlds; empty: numbers.
+        posts: lights and stop signs of the worlds (`road_posts.find_posts`); empty: not shown.
         title: of the page.
         goal_radius_m: of the goals' circles.
 
     Raises:
-        ReplayError: names or posts that are not as many as the worlds, or nothing recorded.
+        ReplayError: another number of names or posts than of worlds, or an empty recording.
     """
+    text = document(recording, names=names, posts=posts, title=title, goal_radius_m=goal_radius_m)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(document(recording, names=names, posts=posts, title=title, goal_radius_m=goal_radius_m), encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     return path
 
 
 def show(recording: Recording, *, height: int = 720, **options: Any) -> "HTML":
-    """The page inline in a notebook, `height` pixels tall; the other options are those of `write`.
+    """The page inline in a notebook, `height` pixels high; the other options are those of `write`.
 
     Raises:
         ReplayError: see `write`.
@@ -76,16 +76,16 @@ def document(
     names: Sequence[str] = (),
     posts: Sequence[RoadPosts] = (),
     title: str = "replay",
-    goal_radius_m: float = GOAL_RADIUS,
+    goal_radius_m: float | int,
 ) -> str:
     """The page as text; arguments and errors as `write`."""
     recording = jax.device_get(recording)
     count, steps = recording.shots.time_s.shape if recording.shots.time_s.ndim == 2 else (0, 0)
     if not count or not steps:
-        raise ReplayError(f"recording: {count} worlds of {steps} steps; wanted is at least one of each, worlds along the first axis")
+        raise ReplayError(f"recording: expected worlds along the first axis, of at least one step, got {count} worlds of {steps} steps")
     for what, given in (("names", names), ("posts", posts)):
         if given and len(given) != count:
-            raise ReplayError(f"{what}: {len(given)} for {count} worlds; wanted is one for each, or none")
+            raise ReplayError(f"{what}: expected {count}, one per world, or none, got {len(given)}")
     worlds = [
         replay_data.world(recording, index, name=names[index] if names else f"world {index}", posts=posts[index] if posts else RoadPosts())
         for index in range(count)
@@ -96,7 +96,7 @@ def document(
         "colours": [list(colour) for colour in AGENTS],
         "marks": {name: {"label": mark.label, "colour": list(mark.colour)} for name, mark in MARKS.items()},
         "terms": {name: look._asdict() for name, look in term_looks(recording.shots.terms).items()},
-        "ttc_most": replay_data.TTC_MOST_S,
+        "ttc_most": replay_data.MAX_TTC_S,
         "worlds": [one for one, _ in worlds],
     }
     arrays = "\n".join(f'<script type="text/plain" class="arrays">{text}</script>' for _, text in worlds)

@@ -16,7 +16,7 @@ async function openAddress() {
   seek(Math.round((asked("t") - app.world.start) / app.world.dt));
 }
 
-/** The address follows what is shown, in place, so that the browser's history stays as it is. In a frame nobody sees it. */
+/** The address follows time, car and world without new entries in the browser's history. In a frame it is not visible. */
 function keepAddress(stamp) {
   if (window.parent !== window || stamp - address.at < ADDRESS_MS) return;
   const time = Number(seconds(app.world, now()).toFixed(2));

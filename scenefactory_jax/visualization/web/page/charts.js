@@ -72,7 +72,7 @@ function chartsOf(world) {
       lines: [{ array: "contact_force", label: "", colour: "#d62839" }],
     },
     {
-      title: "Way to the goal",
+      title: "Distance to the goal",
       unit: "m",
       low: 0,
       least: 10,

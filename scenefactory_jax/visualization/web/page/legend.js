@@ -8,7 +8,7 @@ const ON_THE_MAP = {
   bump: ["speed bump", (world) => world.road.bump.length],
   bike: ["bike lane", (world) => world.road.bike.length],
   driveway: ["driveway", (world) => world.road.driveway.length],
-  other: ["other road user", (world) => world.traffic.length],
+  traffic: ["traffic", (world) => world.traffic.length],
 };
 
 function showLegend() {

@@ -29,7 +29,7 @@ function drawMap() {
   pen.setTransform(...metres);
   drawRoad();
   drawPosts();
-  drawOthers();
+  drawTraffic();
   drawGoals();
   pen.setTransform(...pixels);
   drawLabels(goalLabel);
@@ -125,26 +125,26 @@ function box(length, width, radius) {
   pen.roundRect(-length / 2, -width / 2, length, width, Math.min(radius, length / 2, width / 2));
 }
 
-function drawOthers() {
+function drawTraffic() {
   const step = now();
   pen.strokeStyle = css("outline");
   pen.lineWidth = Math.max(0.06, 0.6 / app.view.scale);
-  app.world.traffic.forEach((other, row) => {
-    if (!within(other.spans, step)) return;
-    const { x, y, yaw } = pose(app.world, "other:", row, app.time);
-    const [length, width] = other.size;
+  app.world.traffic.forEach((user, row) => {
+    if (!within(user.spans, step)) return;
+    const { x, y, yaw } = pose(app.world, "traffic:", row, app.time);
+    const [length, width] = user.size;
     pen.save();
     pen.translate(x, y);
     pen.rotate(yaw);
-    pen.fillStyle = css(other.parked && other.kind === "vehicle" ? "parked" : "other");
-    outlineOf(other.kind, length, width);
+    pen.fillStyle = css(user.parked && user.kind === "vehicle" ? "parked" : "traffic");
+    outlineOf(user.kind, length, width);
     pen.fill();
     pen.stroke();
     pen.restore();
   });
 }
 
-/** People are discs, cyclists lenses, everybody else boxes with a nose. */
+/** People are discs, cyclists ellipses, vehicles boxes with round front corners. */
 function outlineOf(kind, length, width) {
   if (kind === "pedestrian") {
     pen.beginPath();

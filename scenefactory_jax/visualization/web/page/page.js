@@ -132,7 +132,7 @@ function showFacts() {
     ["speed", number(3.6 * get("speed"), 1), "km/h"],
     ["steer", number((get("steer") * 180) / Math.PI, 1), "°"],
     ["goal", number(get("goal_distance"), 1), "m"],
-    ["grip in use", number(100 * get("friction_utilization"), 0), "%"],
+    ["friction used", number(100 * get("friction_utilization"), 0), "%"],
   ];
   $("facts").replaceChildren(
     ...facts.map(([name]) => element("dt", { textContent: name })),

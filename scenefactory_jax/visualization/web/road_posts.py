@@ -1,0 +1,55 @@
+"""Traffic lights and stop signs of a raw scene, which no packed scene holds, in the packed scene's coordinates."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from scenefactory_jax.core.raw_scene import LIGHT_STATES, RawScene
+from scenefactory_jax.core.types import STOP_SIGN
+
+
+class Light(NamedTuple):
+    """A logged traffic light."""
+
+    place: tuple[float, float]  # stop point of its lane
+    yaw: float  # of the lane there
+    shown: list[tuple[float, str]]  # (seconds since the episode began, one of LIGHT_STATES), at each change
+
+
+class RoadPosts(NamedTuple):
+    """Lights and stop signs of one scene."""
+
+    lights: tuple[Light, ...] = ()
+    signs: tuple[tuple[float, float], ...] = ()
+
+
+def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
+    """Finds lights and stop signs.
+
+    Args:
+        centre: of the packed scene in the source's coordinates (`PackReport.centre`).
+    """
+    origin = np.asarray(centre[:2])
+    signs = [line.xyz[:, :2].mean(axis=0) - origin for line in raw.roads if line.kind == STOP_SIGN and len(line.xyz)]
+    lanes = {line.id: line.xyz[:, :2] for line in raw.roads if len(line.xyz) >= 2}
+    lights = []
+    for light in raw.lights:
+        lane = lanes.get(light.lane)
+        place = light.stop[:2] if light.stop is not None else None if lane is None else lane[0]
+        if place is None:
+            continue
+        ahead = np.array([1.0, 0.0]) if lane is None else _find_direction(lane, place)
+        states = np.where(light.valid, light.state, 0)[raw.current :]
+        times = raw.times[raw.current :] - raw.times[raw.current]
+        changes = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
+        x, y = place - origin
+        shown = [(float(times[i]), LIGHT_STATES[int(states[i])]) for i in changes]
+        lights.append(Light((float(x), float(y)), float(np.arctan2(ahead[1], ahead[0])), shown))
+    return RoadPosts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
+
+
+def _find_direction(line: Float[np.ndarray, "N 2"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    nearest = min(int(np.argmin(np.linalg.norm(line - place, axis=1))), len(line) - 2)
+    return line[nearest + 1] - line[nearest]
