@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.geometry import EPSILON
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import SURFACES, Road, Scene
-from scenefactory_jax.env.surrogate_safety import SMALLEST
 from scenefactory_jax.env.termination import EVENTS
 
 Observation = dict[str, np.ndarray]
@@ -203,7 +203,7 @@ def _collision_times(agent: Agent, crowd: Crowd) -> Float[np.ndarray, " N"]:
     a, b = speed_x * speed_x + speed_y * speed_y, x * speed_x + y * speed_y
     c = x * x + y * y - reach * reach
     discriminant = b * b - a * c
-    meets = (a > SMALLEST) & (discriminant >= 0) & (b < 0) & (c > 0)
+    meets = (a > EPSILON) & (discriminant >= 0) & (b < 0) & (c > 0)
     enter = (-b - np.sqrt(np.where(meets, discriminant, 1.0))) / np.where(meets, a, 1.0)
     time = np.where(c <= 0, 0.0, np.where(meets, np.maximum(enter, 0.0), np.inf))
     time = np.where(math.cos(agent.yaw) * x + math.sin(agent.yaw) * y > 0, time, np.inf).min((1, 2))
@@ -298,10 +298,10 @@ def _edges(edges: Segments, agent: Agent, crowd: Crowd, half_width_m: float, ran
     nearest = math.sqrt((along * along + across * across).min())
 
     distance = np.sqrt(x * x + y * y)
-    closing = (x * agent.velocity[0] + y * agent.velocity[1]) / np.maximum(distance, SMALLEST)
+    closing = (x * agent.velocity[0] + y * agent.velocity[1]) / np.maximum(distance, EPSILON)
     gap = distance - crowd.radius[row]
     seen = (distance <= range_m) & (x * math.cos(agent.yaw) + y * math.sin(agent.yaw) > 0)
-    approaching = seen & (closing > SMALLEST)
+    approaching = seen & (closing > EPSILON)
     time = np.where(approaching, np.maximum(gap, 0.0) / np.where(approaching, closing, 1.0), np.inf)
     return nearest, float(np.where(seen & (gap <= 0), 0.0, time).min())
 
@@ -348,12 +348,12 @@ def idle(facts: Facts, new: str | None) -> float:
 
 def ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
     """Closeness to a collision with another car."""
-    return limit if facts.ttc < floor_s else min(alpha_s / max(facts.ttc, SMALLEST), limit)
+    return limit if facts.ttc < floor_s else min(alpha_s / max(facts.ttc, EPSILON), limit)
 
 
 def edge_ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
     """The same for the road edge ahead."""
-    return limit if facts.edge_ttc < floor_s else min(alpha_s / max(facts.edge_ttc, SMALLEST), limit)
+    return limit if facts.edge_ttc < floor_s else min(alpha_s / max(facts.edge_ttc, EPSILON), limit)
 
 
 def speed(facts: Facts, new: str | None, *, limit_mps: float) -> float:

@@ -5,6 +5,7 @@ from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.types import Road
 
+EPSILON = 1e-6  # distances (m), speeds (m/s) and squared speeds (m^2/s^2) below this count as zero
 CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 

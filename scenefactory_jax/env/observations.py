@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import (
     CONTIGUOUS_M,
+    EPSILON,
     cover_with_circles,
     cross,
     cumulative_length,
@@ -197,7 +198,7 @@ def closest_approach(
     apart = to_frame(everyone.position[order] - motion.position[:, None, :2], facing)
     closing = to_frame(everyone.velocity[order] - motion.velocity[:, None, :2], facing)
     turned = everyone.yaw[order] - facing
-    soonest = jnp.clip(-dot(apart, closing) / jnp.maximum(dot(closing, closing), surrogate_safety.SMALLEST), 0.0, time_scale_s)
+    soonest = jnp.clip(-dot(apart, closing) / jnp.maximum(dot(closing, closing), EPSILON), 0.0, time_scale_s)
     closest = safe_norm(apart + soonest[..., None] * closing)
     columns = [
         _squashed(apart, distance_scale_m),

@@ -5,11 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
+from scenefactory_jax.core.geometry import EPSILON, cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.pytree import is_finite
 from scenefactory_jax.core.types import Boxes, Motion
-
-SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as standing still
 
 
 class RoadUsers(NamedTuple):
@@ -68,13 +66,13 @@ def compare_pairs(
     b = dot(apart, relative)
     c = distance**2 - reach**2
     discriminant = b * b - a * c
-    meets = (a > SMALLEST) & (discriminant >= 0) & (b < 0) & (c > 0)
+    meets = (a > EPSILON) & (discriminant >= 0) & (b < 0) & (c > 0)
     root = jnp.sqrt(jnp.where(meets, discriminant, 1.0))
     enter = (-b - root) / jnp.where(meets, a, 1.0)
     time = jnp.where(c <= 0, 0.0, jnp.where(meets, jnp.maximum(enter, 0.0), jnp.inf))
     ttc = jnp.min(jnp.where(ahead, time, jnp.inf), axis=(2, 3))
 
-    closing = jnp.maximum(-b / jnp.maximum(distance, SMALLEST), 0.0)
+    closing = jnp.maximum(-b / jnp.maximum(distance, EPSILON), 0.0)
     gap = distance - reach
     drac = jnp.max(closing**2 / (2 * jnp.maximum(gap, drac_gap_floor_m)), axis=(2, 3))
 

@@ -177,7 +177,7 @@ def _needed(job: Callable[[], Packed], *, grid: Mapping[str, Any]) -> dict[str, 
         return report.capacity | own
     made = spatial_grid.attach_grid(scene, **grid).road_grid
     assert made is not None
-    return report.capacity | own | {"side": made.side, "rows": made.rows.shape[-1], "most": made.most}
+    return report.capacity | own | {"side": made.side, "rows": made.rows.shape[-1], "longest_list": made.longest_list}
 
 
 def require_memory(sizes: Mapping[str, int], worlds: int, *, gib: float) -> None:
