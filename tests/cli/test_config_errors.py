@@ -95,7 +95,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
     ("override", "message"),
     [
         ("quality.reject=[level]", "quality.reject: 'level' is no rule; valid: missing_map, "),
-        ("lanes.topology.beside_m=[5.0,2.0]", "lanes.topology.beside_m: [5.0, 2.0]; wanted is [least, most]"),
+        ("lanes.topology.neighbour_distance_m=[5.0,2.0]", "lanes.topology.neighbour_distance_m: [5.0, 2.0]; wanted is [least, most]"),
         ("features.streets.one_in=0", "features.streets.one_in: 0; wanted is a number above 0"),
         ("spread.timeout_s=0.0", "spread.timeout_s: 0; wanted is a number above 0"),
         ("scenes.workers=0", "spread.workers: 0; wanted is a number of at least 1"),
