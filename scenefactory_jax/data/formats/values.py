@@ -60,7 +60,7 @@ def check_length(values: Sequence[Any], length: int | None, where: str) -> None:
 def check_index(value: int, names: Sequence[object], what: str, where: str) -> int:
     """`value`, if it is an index into `names`."""
     if not 0 <= value < len(names):
-        raise SceneError(f"{where}: expected the index of a {what}, 0 to {len(names) - 1}, got {value}")
+        raise SceneError(f"{where}: expected a {what}, 0 to {len(names) - 1}, got {value}")
     return value
 
 
