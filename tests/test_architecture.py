@@ -12,7 +12,7 @@ PACKAGE = ROOT / "scenefactory_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = (  # a package imports from itself and from layers before its own; packages of one layer do not import each other
     {"core"}, {"roadgraph", "weather", "loggers"}, {"dynamics", "data"}, {"env"}, {"learning"}, {"evaluation"},
-    {"visualization", "sysid", "adapters"}, {"cli"},
+    {"visualization", "sysid"}, {"adapters"}, {"cli"},  # adapters draw
 )  # fmt: skip
 AT_THE_ROOT = {"__init__.py", "__main__.py"}
 ON_DEVICE = ("roadgraph/queries.py", "roadgraph/spatial_grid.py", "roadgraph/road_kernels.py", "weather", "dynamics", "env", "learning/ppo")

@@ -22,11 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.adapters import episodes, flatten_observation
+from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.hydra_config import versions
 from scenefactory_jax.core import result_file
-from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
@@ -51,12 +50,12 @@ class Case(NamedTuple):
 
 
 def measure(config: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of all adapters whose package is installed, for one car a world and for the config's cars (`load("bench", ...)`).
+    """Rows of all adapters whose package is installed, for one car a world and for the config's cars (`load_config("benchmark", ...)`).
 
     Raises:
         ConfigError: a key that does not fit.
     """
-    schema.check(config, schema.BENCH)
+    schema.check(config, schema.Benchmark)
     scene_source.use_compilation_cache()
     rows = []
     alone = config["scenes"]["pack"]["agents"] == 1
@@ -116,15 +115,15 @@ def _own(config: Mapping[str, Any], scenes: scene_source.Scenes, actions: np.nda
     def step(held: Any, carry: Any) -> tuple[Any, Any]:
         states, given, key = carry
         start_key, key = jax.random.split(key)
-        after, outcome = jax.vmap(env.transition)(held, states, given)
-        fresh = jax.vmap(env.start)(jax.random.split(start_key, len(given)), held)
-        states = tree_where(outcome.over, fresh, after)
+        after, outcome = jax.vmap(env.control_step)(held, states, given)
+        fresh = jax.vmap(env.init_state)(jax.random.split(start_key, len(given)), held)
+        states = tree_where(outcome.world_done, fresh, after)
         return (states, given, key), (
             jax.vmap(lambda scene, state: flatten_observation(env.observe(scene, state)))(held, states),
             outcome.reward,
         )
 
-    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), len(actions)), held)
+    states = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(config["seed"]), len(actions)), held)
     return step, held, (states, jnp.asarray(actions), jax.random.key(config["seed"]))
 
 
@@ -253,7 +252,4 @@ def adapters(config: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    try:
-        adapters(configs.load_config("bench", *sys.argv[1:]))
-    except ConfigError as error:
-        raise SystemExit(f"error: {error}") from None
+    entry.run("benchmark", adapters, about="measure steps per second through the adapters")

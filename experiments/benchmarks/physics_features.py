@@ -65,7 +65,7 @@ def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, s
     parts = environment.make_parts(configs.load_config("task", *overrides))
     env = environment.assemble(parts)
     slots = worlds.agents.present.shape
-    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(seed), slots[0]), worlds)
+    states = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(seed), slots[0]), worlds)
     run = phase_timing.make_acting_phase("physics", parts, env, steps=steps)
     found = phase_timing.time_phase(run, states, lambda repeat: (worlds, jax.random.key(repeat)), warmup=1, repeats=repeats)
     done = slots[0] * slots[1] * steps

@@ -30,8 +30,8 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
         scenes = flow.scenes()
         state = trainer.init(jax.random.key(config["seed"]), scenes)
         begun = time.perf_counter()
-        compiled: Any = trainer.iterate.lower(state, scenes).compile()  # pyright: ignore[reportFunctionMemberAccess]
-        trainer = trainer._replace(iterate=compiled)
+        compiled: Any = trainer.train_iteration.lower(state, scenes).compile()  # pyright: ignore[reportFunctionMemberAccess]
+        trainer = trainer._replace(train_iteration=compiled)
         state, scenes, _ = step(trainer, state, scenes, flow, first=True)
         state, scenes, _ = step(trainer, state, scenes, flow, first=False)  # compiles the exchange
         compile_s, seconds, rows = time.perf_counter() - begun, [], []
@@ -42,7 +42,7 @@ def measure(config: Mapping[str, Any], *, mesh: Mesh | None) -> dict[str, Any]:
                 seconds.append(time.perf_counter() - begun)
                 rows.append(row)
         swapped = flow.swapped
-    return _row(config, state.worlds.active.shape, mesh, seconds, rows) | {
+    return _row(config, state.worlds.state.active.shape, mesh, seconds, rows) | {
         "compile_s": compile_s,
         "memory_gib": phase_timing.memory_gib(compiled),
         "stream": {

@@ -1,8 +1,7 @@
-"""One agent's share of a control step in plain numpy: what it sees, what its policy answers, what happened to it and what it earns.
+"""One agent's control step in plain numpy: observation, policy, step metrics, termination and rewards.
 
-The published task a second time, as one would write it without vectorising: `baseline` loops over agents and worlds. The definitions are
-those of `observations`, `facts`, `ends`, `rewards` and `policy.late_fusion`, whose docstrings say why; the tests hold the two together.
-Arrays are float32, as on the device. Sets have as many rows as the agent sees, without padding.
+The published task a second time, written without vectorising; `baseline_environment` loops over agents and worlds. Definitions and their
+reasons are those of `env` and `networks.late_fusion`; tests compare the two. Arrays are float32, as on the device. Sets are not padded.
 """
 
 import dataclasses
@@ -13,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from scenefactory_jax.core.geometry import EPSILON
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.geometry import SMALLEST
 from scenefactory_jax.core.types import SURFACES, Road, Scene
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
 from scenefactory_jax.env.termination import EVENTS
 
 Observation = dict[str, np.ndarray]
@@ -24,7 +23,7 @@ Observation = dict[str, np.ndarray]
 
 @dataclasses.dataclass
 class Agent:
-    """One car and its life so far; the world's frame."""
+    """One car and its episode so far; the world's frame."""
 
     start: Float[np.ndarray, "2"]
     goal: Float[np.ndarray, "2"]
@@ -42,7 +41,7 @@ class Agent:
 
 
 class Segments(NamedTuple):
-    """Road segments in storage order, without the padding that equal shapes ask for."""
+    """Road segments in storage order, without padding."""
 
     midpoint: Float[np.ndarray, "P 2"]
     direction: Float[np.ndarray, "P 2"]
@@ -51,7 +50,7 @@ class Segments(NamedTuple):
 
 
 class Place(NamedTuple):
-    """What stays as it is in an episode."""
+    """The constants of an episode."""
 
     road: Segments
     lanes: Segments
@@ -61,7 +60,7 @@ class Place(NamedTuple):
 
 
 class Crowd(NamedTuple):
-    """Everybody on stage at one moment, gathered once for all who look at them."""
+    """The active agents as arrays."""
 
     members: list[Agent]
     position: Float[np.ndarray, "N 2"]
@@ -72,8 +71,8 @@ class Crowd(NamedTuple):
     radius: Float[np.ndarray, " N"]
 
 
-class Facts(NamedTuple):
-    """What the published reward and ends read of one agent's step."""
+class AgentMetrics(NamedTuple):
+    """The step metrics that the published reward and termination read."""
 
     speed: float
     progress: float
@@ -98,7 +97,7 @@ def place_of(scene: Scene, film_mm: float, surface: int) -> Place:
 
 
 def gather(agents: Sequence[Agent], *, circles: Mapping[str, float]) -> Crowd:
-    """Those who are on stage."""
+    """Collects the active agents."""
     members = [agent for agent in agents if agent.active]
     around = [_circles(agent, **circles) for agent in members]
 
@@ -116,10 +115,10 @@ def gather(agents: Sequence[Agent], *, circles: Mapping[str, float]) -> Crowd:
     )
 
 
-def _circles(agent: Agent, *, radius_share: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
+def _circles(agent: Agent, *, radius_fraction: float, radius_floor_m: float, spacing_limit_m: float) -> tuple[np.ndarray, float]:
     """Centres [3, 2] of the three circles along a car's axis, and their radius."""
     length, width = agent.size.tolist()
-    radius = max(radius_floor_m, radius_share * width)
+    radius = max(radius_floor_m, radius_fraction * width)
     spacing = min(spacing_limit_m, max(0.0, 0.5 * length - 0.8 * radius))
     ahead = spacing * _heading(agent.yaw)
     return np.array([agent.position + ahead, agent.position, agent.position - ahead]), radius
@@ -130,7 +129,7 @@ def _heading(yaw: float) -> np.ndarray:
 
 
 def _to_frame(vector: np.ndarray, yaw: float) -> np.ndarray:
-    """Vectors [..., 2] as a car with that yaw sees them."""
+    """Vectors [..., 2] in the frame of a car with that yaw."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return vector @ np.array([[cos, -sin], [sin, cos]], np.float32)
 
@@ -140,16 +139,16 @@ def _squared(vectors: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
     return x * x + y * y
 
 
-# ---- observation groups, one for each built-in target of `observe`
+# ---- observation groups, one for each built-in target of `observations`
 
 
 def ego(place: Place, agent: Agent, crowd: Crowd, *, distance_scale_m: float, speed_scale_mps: float) -> np.ndarray:
     """Goal, its bearing and distance, own velocity [7]."""
     x, y = _to_frame(agent.goal - agent.position, agent.yaw)
     distance = math.hypot(x, y)
-    least = max(distance, 1e-6)
+    divisor = max(distance, 1e-6)
     ahead, left = _to_frame(agent.velocity, agent.yaw) / speed_scale_mps
-    goal = [x / distance_scale_m, y / distance_scale_m, y / least, x / least, distance / distance_scale_m]
+    goal = [x / distance_scale_m, y / distance_scale_m, y / divisor, x / divisor, distance / distance_scale_m]
     return np.array([*goal, ahead, left], np.float32)
 
 
@@ -178,7 +177,7 @@ def neighbours(
     ttc_scale_s: float,
     circles: dict[str, float],
 ) -> np.ndarray:
-    """The nearest others on stage [k, 7]; `circles` are in the crowd."""
+    """The nearest other active agents [k, 7]; `circles` are in the crowd."""
     offset = crowd.position - agent.position
     squared = _squared(offset)
     squared[_row(crowd, agent)] = np.inf
@@ -195,7 +194,7 @@ def _row(crowd: Crowd, agent: Agent) -> int:
 
 
 def _collision_times(agent: Agent, crowd: Crowd) -> Float[np.ndarray, " N"]:
-    """TTC with everybody on stage, s; inf where the circles never meet, and with itself."""
+    """TTC with all active agents, s; inf where the circles never meet, and with itself."""
     own = _row(crowd, agent)
     x, y = (crowd.centres[:, None, :, axis] - crowd.centres[own, :, None, axis] for axis in (0, 1))  # [other, own circle, other circle]
     speed_x, speed_y = (crowd.velocity - agent.velocity).T[:, :, None, None]
@@ -203,7 +202,7 @@ def _collision_times(agent: Agent, crowd: Crowd) -> Float[np.ndarray, " N"]:
     a, b = speed_x * speed_x + speed_y * speed_y, x * speed_x + y * speed_y
     c = x * x + y * y - reach * reach
     discriminant = b * b - a * c
-    meets = (a > EPSILON) & (discriminant >= 0) & (b < 0) & (c > 0)
+    meets = (a > SMALLEST) & (discriminant >= 0) & (b < 0) & (c > 0)
     enter = (-b - np.sqrt(np.where(meets, discriminant, 1.0))) / np.where(meets, a, 1.0)
     time = np.where(c <= 0, 0.0, np.where(meets, np.maximum(enter, 0.0), np.inf))
     time = np.where(math.cos(agent.yaw) * x + math.sin(agent.yaw) * y > 0, time, np.inf).min((1, 2))
@@ -211,61 +210,46 @@ def _collision_times(agent: Agent, crowd: Crowd) -> Float[np.ndarray, " N"]:
     return time
 
 
-# ---- facts and ends
+# ---- step metrics and termination
 
 
-def measure(
+def compute_metrics(
     place: Place,
     agent: Agent,
     crowd: Crowd,
     before: Float[np.ndarray, "2"],
     *,
-    circles: dict[str, float],
-    goal_radius_m: float,
-    collision_force_n: float,
-    collision_grace_steps: int,
-    edge_radius_m: float,
-    edge_half_width_m: float,
-    edge_range_m: float,
-    upright_min: float,
-    height_min_m: float,
-    scene_size_m: float,
-    max_start_distance_m: float,
-    stray_ratio: float,
-    off_lane_lateral_m: float,
-    off_lane_distance_m: float,
-    idle_speed_mps: float,
-    drac_gap_floor_m: float,  # no reward reads DRAC
-    gravity_mps2: float,  # nor the way to stop
-) -> Facts:
-    """Facts of the step that brought an agent from `before` to where it is, amid those who were on stage in it.
+    config: StepMetricsConfig,
+) -> AgentMetrics:
+    """Computes the metrics of the step that brought an agent from `before` to its position, among the agents that were active in it.
 
     A car whose state is not finite has the event `numerical_error` and nothing else.
     """
     if not np.isfinite([*agent.position, *agent.velocity, agent.elevation, agent.yaw, agent.upright, agent.contact_force]).all():
-        return Facts(0.0, 0.0, 0.0, 0.0, False, False, False, math.inf, math.inf, {name: name == "numerical_error" for name in EVENTS})
+        events = {name: name == "numerical_error" for name in EVENTS}
+        return AgentMetrics(0.0, 0.0, 0.0, 0.0, False, False, False, math.inf, math.inf, events)
     to_goal = agent.goal - agent.position
     speed, distance_from_start = math.hypot(*agent.velocity), math.hypot(*(agent.position - agent.start))
     progress, offset, distance, alignment = _lane(place.lanes, agent, before, to_goal)
     has_lane = len(place.lanes.kind) > 0
-    edge_gap, edge_ttc = _edges(place.edges, agent, crowd, edge_half_width_m, edge_range_m)
-    fell = agent.upright < upright_min or agent.elevation < height_min_m
-    lost = distance_from_start > max(max_start_distance_m, stray_ratio * agent.route)
+    edge_distance, edge_ttc = _edges(place.edges, agent, crowd, config.edge_half_width_m, config.edge_range_m)
+    fell = agent.upright < config.upright_min or agent.elevation < config.height_min_m
+    lost = distance_from_start > max(config.max_start_distance_m, config.max_start_distance_ratio * agent.route)
     events = {
         "numerical_error": False,
-        "goal_reached": math.hypot(*to_goal) <= goal_radius_m,
-        "collision": agent.contact_force >= collision_force_n and agent.age >= collision_grace_steps,
-        "out_of_bounds": fell or lost or bool(abs(agent.position).max() > 0.5 * scene_size_m),
-        "road_edge_contact": edge_gap <= edge_radius_m,
+        "goal_reached": math.hypot(*to_goal) <= config.goal_radius_m,
+        "collision": agent.contact_force >= config.collision_force_n and agent.age >= config.collision_grace_steps,
+        "out_of_bounds": fell or lost or bool(abs(agent.position).max() > 0.5 * config.scene_size_m),
+        "road_edge_contact": edge_distance <= config.edge_radius_m,
     }
-    return Facts(
+    return AgentMetrics(
         speed=speed,
         progress=progress,
         lane_offset=offset,
         lane_alignment=alignment,
         has_lane=has_lane,
-        off_lane=has_lane and (offset > off_lane_lateral_m or distance > off_lane_distance_m),
-        idle=speed < idle_speed_mps,
+        off_lane=has_lane and (offset > config.off_lane_lateral_m or distance > config.off_lane_distance_m),
+        idle=speed < config.idle_speed_mps,
         ttc=float(_collision_times(agent, crowd).min()),
         edge_ttc=edge_ttc,
         events=events,
@@ -298,67 +282,65 @@ def _edges(edges: Segments, agent: Agent, crowd: Crowd, half_width_m: float, ran
     nearest = math.sqrt((along * along + across * across).min())
 
     distance = np.sqrt(x * x + y * y)
-    closing = (x * agent.velocity[0] + y * agent.velocity[1]) / np.maximum(distance, EPSILON)
+    closing = (x * agent.velocity[0] + y * agent.velocity[1]) / np.maximum(distance, SMALLEST)
     gap = distance - crowd.radius[row]
     seen = (distance <= range_m) & (x * math.cos(agent.yaw) + y * math.sin(agent.yaw) > 0)
-    approaching = seen & (closing > EPSILON)
+    approaching = seen & (closing > SMALLEST)
     time = np.where(approaching, np.maximum(gap, 0.0) / np.where(approaching, closing, 1.0), np.inf)
     return nearest, float(np.where(seen & (gap <= 0), 0.0, time).min())
 
 
-def judge(agent: Agent, facts: Facts, *, ending: list[str]) -> str | None:
-    """The step's new event, which the agent remembers; it leaves the stage if that is an ending one."""
-    new = next((name for name in EVENTS if facts.events[name] and name not in agent.past_events), None)
+def evaluate_termination(agent: Agent, metrics: AgentMetrics, *, ending: list[str]) -> str | None:
+    """Finds the step's new event, and updates the agent's events and whether it is active."""
+    new = next((name for name in EVENTS if metrics.events[name] and name not in agent.past_events), None)
     if new is not None:
         agent.past_events.add(new)
         agent.active = new not in ending
     return new
 
 
-# ---- reward terms, one for each built-in target that reads facts and events
+# ---- reward terms, one for each built-in target that reads metrics and events
 
 
-def event(facts: Facts, new: str | None, *, name: str) -> float:
+def event(metrics: AgentMetrics, new: str | None, *, name: str) -> float:
     """1 in the step in which the named event is new."""
-    if name not in EVENTS:
-        raise ConfigError(f"reward: unknown event {name!r}; valid: {', '.join(EVENTS)}")
     return float(new == name)
 
 
-def progress(facts: Facts, new: str | None, *, limit_m: float) -> float:
+def progress(metrics: AgentMetrics, new: str | None, *, limit_m: float) -> float:
     """Metres along the lane, clamped."""
-    return min(max(facts.progress, -limit_m), limit_m)
+    return min(max(metrics.progress, -limit_m), limit_m)
 
 
-def lane_keeping(facts: Facts, new: str | None, *, sigma_m: float, heading_share: float) -> float:
+def lane_keeping(metrics: AgentMetrics, new: str | None, *, sigma_m: float, heading_fraction: float) -> float:
     """Near the lane's centre and along it."""
-    near = math.exp(-((facts.lane_offset / sigma_m) ** 2))
-    return near * (1 - heading_share + heading_share * max(facts.lane_alignment, 0.0)) if facts.has_lane else 0.0
+    near = math.exp(-((metrics.lane_offset / sigma_m) ** 2))
+    return near * (1 - heading_fraction + heading_fraction * max(metrics.lane_alignment, 0.0)) if metrics.has_lane else 0.0
 
 
-def off_lane(facts: Facts, new: str | None) -> float:
+def off_lane(metrics: AgentMetrics, new: str | None) -> float:
     """1 while off the lane."""
-    return float(facts.off_lane)
+    return float(metrics.off_lane)
 
 
-def idle(facts: Facts, new: str | None) -> float:
-    """1 while the car stands or creeps."""
-    return float(facts.idle)
+def idle(metrics: AgentMetrics, new: str | None) -> float:
+    """1 while the car is slow."""
+    return float(metrics.idle)
 
 
-def ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
-    """Closeness to a collision with another car."""
-    return limit if facts.ttc < floor_s else min(alpha_s / max(facts.ttc, EPSILON), limit)
+def ttc(metrics: AgentMetrics, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
+    """Inverse of the TTC with other cars, clamped."""
+    return limit if metrics.ttc < floor_s else min(alpha_s / max(metrics.ttc, SMALLEST), limit)
 
 
-def edge_ttc(facts: Facts, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
+def edge_ttc(metrics: AgentMetrics, new: str | None, *, alpha_s: float, limit: float, floor_s: float) -> float:
     """The same for the road edge ahead."""
-    return limit if facts.edge_ttc < floor_s else min(alpha_s / max(facts.edge_ttc, EPSILON), limit)
+    return limit if metrics.edge_ttc < floor_s else min(alpha_s / max(metrics.edge_ttc, SMALLEST), limit)
 
 
-def speed(facts: Facts, new: str | None, *, limit_mps: float) -> float:
-    """Speed as a share of a limit."""
-    return min(facts.speed / limit_mps, 1.0)
+def speed(metrics: AgentMetrics, new: str | None, *, limit_mps: float) -> float:
+    """Speed as a fraction of a limit."""
+    return min(metrics.speed / limit_mps, 1.0)
 
 
 # ---- the policy

@@ -1,20 +1,19 @@
 """The same task without vectorising: cars in MuJoCo's C engine, loops over worlds and agents in Python.
 
-What a careful researcher would write for one machine without an accelerator, as the yardstick of a speed-up: one world after the other,
-each with all its cars in one C model (`oracle.meeting`, with the solver settings of the config), and for every agent in turn the
-observation, facts, reward, ends and both towers of the policy in numpy (`baseline_agent`). Work that a loop has no need for is left out:
-padding, absent slots, facts that no reward reads, and friction where the weather does not change.
+The reference of a speed-up, written for one machine without an accelerator: one world after the other, each with all its cars in one C
+model (`mujoco_c.make_encounter`, with the config's solver settings), and for every agent in turn observation, step metrics, reward,
+termination and both towers of the policy in numpy (`baseline_agent`). Left out is what a loop does not need: padding, absent slots, metrics
+that no reward reads, and friction where the weather does not change.
 
-It acts, as a rollout does, with actions drawn as PPO draws them. Learning is not in it: a learner that goes through the agents one by one
-would only make the ratio larger.
+It collects a rollout, with actions sampled as in PPO, and does not learn: learning agent by agent would only increase the ratio.
 
 Differences from the environment on the device:
 - The engine has double precision and stops its solver by tolerance, with the config's iterations as the limit.
-- Contacts between cars are MuJoCo's box-box contacts with the spring's law (`oracle.meeting`). Several at once on one car do not share
-  their strength, as `contact.forces` lets them.
+- Contacts between cars are MuJoCo's box-box contacts with the spring's law (`mujoco_c.make_encounter`). Several at once on one
+  car do not share their strength, as those of `dynamics.collision` do.
 - A car that rolls over sinks through the road, since only tyres touch it; the event `out_of_bounds` comes all the same.
 - A number that is not finite breaks its whole world, not one car: all its agents end with `numerical_error`.
-- Finished cars hang in the air off stage, where nothing touches them.
+- Finished cars are held in the air beside the scene, without contacts.
 """
 
 import contextlib
@@ -35,13 +34,16 @@ from experiments.unvectorised_baseline import baseline_agent as one
 from experiments.unvectorised_baseline.baseline_agent import Agent, Crowd, Observation, Place
 from experiments.validation import engines
 from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment as device
+from scenefactory_jax.env.step_metrics import StepMetricsConfig
 
-PHASES = ("policy", "physics", "facts + rewards + ends", "restart", "observation")
+PHASES = ("policy", "physics", "metrics + rewards + termination", "restart", "observation")
 
 
 class Engine(NamedTuple):
@@ -54,13 +56,13 @@ class Engine(NamedTuple):
 
 
 class Task(NamedTuple):
-    """The parts of a config bound to their numbers."""
+    """The parts of a config, bound to their numbers."""
 
     engine: Engine
     draw: Callable[[PRNGKeyArray, Scene], tuple[Any, Any, Any]]  # -> starts, weather, friction; compiled
     groups: Mapping[str, Callable[..., np.ndarray]]
-    measure: Callable[..., one.Facts]
-    judge: Callable[[Agent, one.Facts], str | None]
+    compute_metrics: Callable[..., one.AgentMetrics]
+    evaluate_termination: Callable[[Agent, one.AgentMetrics], str | None]
     terms: Sequence[tuple[float, Callable[..., float]]]
     circles: Mapping[str, float]
     episode_steps: int
@@ -68,7 +70,7 @@ class Task(NamedTuple):
 
 @dataclasses.dataclass
 class World:
-    """One world in the middle of an episode."""
+    """One world within an episode."""
 
     scene: Scene  # numpy leaves
     place: Place
@@ -81,17 +83,17 @@ class World:
 def measure(
     config: Mapping[str, Any], scenes: Sequence[Scene], parameters: Any, *, steps: int, repeats: int, seed: int
 ) -> dict[str, Any]:  # fmt: skip
-    """Time the loop on a few worlds; one repeat goes unmeasured before the others.
+    """Measures the loop on a few worlds, after one repeat for warming up.
 
     Args:
-        config: as `bench` has it (`load("bench", ...)`).
+        config: as `bench` has it (`load("benchmark", ...)`).
         scenes: one world each, not stacked.
         parameters: of the policy, as `Policy.init` makes them.
         steps: control steps of every world in a repeat.
         repeats: timed ones.
 
     Returns:
-        Control steps of spawned agents a second (median, least and most), the share of them that were active, milliseconds of each phase
+        Control steps of spawned agents a second (median, minimum and maximum), the fraction of active ones, milliseconds of each phase
         and of the whole in a control step of one world (medians), cars a world (mean), and worlds, steps and repeats.
 
     Raises:
@@ -144,10 +146,10 @@ def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGK
         before = [agent.position for agent in world.agents]
         with timed("physics"):
             drive(task.engine, world, actions)
-        with timed("facts + rewards + ends"):
-            _, over = settle(task, world, before)
+        with timed("metrics + rewards + termination"):
+            _, done = settle(task, world, before)
         with timed("restart"):
-            if over:
+            if done:
                 worlds[index] = start(task, world.scene, next(keys))
         with timed("observation"):
             seen[index] = observe(task, worlds[index])
@@ -155,7 +157,7 @@ def _repeat(task: Task, worlds: list[World], act: Callable, keys: Iterator[PRNGK
 
 
 def make(config: Mapping[str, Any]) -> Task:
-    """The parts of a config that has timing, controls, dynamics, weather, spawn, others, facts, ends, reward and observe.
+    """Binds the parts of a config that has the groups of `EnvConfig`.
 
     Raises:
         ConfigError: a part that exists for the vectorised environment only, by name.
@@ -163,26 +165,26 @@ def make(config: Mapping[str, Any]) -> Task:
     _refuse(config)
     bound = functools.partial(instantiate, builtins=one)
     entries = {name: entry for name, entry in config["observations"].items() if entry is not None}
-    groups = {name: bound(_without_kernels(entry), where=f"observe.{name}") for name, entry in entries.items()}
+    groups = {name: bound(_without_kernels(entry), where=f"observations.{name}") for name, entry in entries.items()}
     terms = []
     for name, entry in config["reward"].items():
         if entry is not None:
             numbers = {key: value for key, value in entry.items() if key != "weight"}
             terms.append((entry["weight"], bound(numbers, where=f"reward.{name}")))
     parts = device.make_parts(config)
-    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    grip = instantiate(config["weather"]["friction"], builtins="scenefactory_jax.weather.friction", where="weather.friction")
 
     def draw(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Any, Any]:
-        agents_key, weather_key, _ = jax.random.split(key, 3)  # the draws of `world.make`
-        weather = parts.draw_weather(weather_key, scene)
-        return parts.draw_agents(agents_key, scene), weather, grip(weather, jnp.zeros((1, 2)), jnp.zeros(1))[0]
+        agents_key, weather_key, _ = jax.random.split(key, 3)  # as in `environment._init_state`
+        weather = parts.sample_weather(weather_key, scene)
+        return parts.sample_agents(agents_key, scene), weather, grip(weather, jnp.zeros((1, 2)), jnp.zeros(1))[0]
 
     return Task(
         engine=_engine(config),
         draw=jax.jit(draw),
         groups=groups,
-        measure=bound({"_target_": "compute", **_without_kernels(config["step_metrics"])}, where="step_metrics"),
-        judge=bound({"_target_": "evaluate", **config["termination"]}, where="termination"),
+        compute_metrics=functools.partial(one.compute_metrics, config=schema.read(config["step_metrics"], StepMetricsConfig)),
+        evaluate_termination=functools.partial(one.evaluate_termination, ending=config["termination"]["ending"]),
         terms=terms,
         circles=config["step_metrics"]["circles"],
         episode_steps=parts.episode_steps,
@@ -190,22 +192,23 @@ def make(config: Mapping[str, Any]) -> Task:
 
 
 def _without_kernels(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """An entry of the vectorised environment for its twin here, which has nothing to choose."""
+    """An entry of the vectorised environment for the function of the same name here."""
     return {key: value for key, value in entry.items() if key != "kernels"}
 
 
 def _refuse(config: Mapping[str, Any]) -> None:
-    """Name what only the vectorised environment has."""
+    """Rejects parts that only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
-    if not dynamics["_target_"].endswith("mjx_car.make") or dynamics["brakes"] != "friction" or dynamics["fleet"] is not None:
+    is_articulated = dynamics["_target_"].endswith("articulated_car.make")
+    if not is_articulated or dynamics["brakes"] != "friction" or dynamics["randomization"] is not None:
         raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
-        raise ConfigError(f"controls: {config['actions']}; the baseline has pedals, read at every control step")
-    if config["traffic"]["_target_"] != "ignore":
-        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has ignore")
+        raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
+    if config["traffic"]["_target_"] != "no_traffic":
+        raise ConfigError(f"traffic._target_: {config['traffic']['_target_']}; the baseline has no_traffic")
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
-    if any(weather["patches"].values()) or weather["rain"] is not None or weather["grip"]["mode"] == "speed":
+    if any(weather["patches"].values()) or weather["rain"] is not None or weather["friction"]["mode"] == "speed":
         raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
     for group in ("observations", "reward"):
         for name, entry in config[group].items():
@@ -216,23 +219,23 @@ def _refuse(config: Mapping[str, Any]) -> None:
 def _engine(config: Mapping[str, Any]) -> Engine:
     """The articulated car with Newton's method; `solve.newton` is the same for one car on the device."""
     car, solver = cars.read_parameters(config["dynamics"])
-    newton = dataclasses.replace(solver, algorithm="Newton")
+    newton = dataclasses.replace(solver, algorithm="newton")
     timing = config["timing"]
     limits = {"physics_dt": 1.0 / timing["physics_hz"], "iterations": solver.iterations, "line_search": solver.line_search}
     # the spring law of two cars in MuJoCo's terms, with the impedance that validation has found to be it
     impedance = configs.load_config("validate")["validation"]["encounters"]["impedances"]["spring"]
     touch = engines.touch(config["dynamics"], impedance=impedance)
-    alone = mujoco_c.simulate_one(car, newton, **limits)
+    alone = mujoco_c.make_one(car, newton, **limits)
     return Engine(
         rig=functools.cache(lambda count: mujoco_c.make_encounter(car, newton, touch, count=count, **limits)),
-        still=cars.find_rest_pose(alone.model, car),
+        still=models.find_rest_pose(alone.model, car),
         substeps=round(timing["physics_hz"] / timing["control_hz"]),
         apart_m=config["step_metrics"]["scene_size_m"],
     )
 
 
 def start(task: Task, scene: Scene, key: PRNGKeyArray) -> World:
-    """A fresh episode; the starts and the weather are those that `Env.start` draws from the same key."""
+    """A fresh episode; the starts and the weather are those that `Env.init_state` samples from the same key."""
     scene = jax.tree.map(np.asarray, scene)
     drawn, weather, mu = jax.tree.map(np.asarray, task.draw(key, scene))
     present = np.flatnonzero(drawn.present)
@@ -243,7 +246,7 @@ def start(task: Task, scene: Scene, key: PRNGKeyArray) -> World:
             start=drawn.position[slot],
             goal=drawn.goal[slot],
             size=drawn.size[slot],
-            route=float(drawn.route[slot]),
+            route=float(drawn.route_length[slot]),
             position=drawn.position[slot],
             elevation=float(task.engine.still[2]),
             velocity=np.zeros(2, np.float32),
@@ -265,7 +268,7 @@ def _place(engine: Engine, world: World, speed: Float[np.ndarray, " N"]) -> None
 
 
 def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"] | None]) -> None:
-    """One control step of all cars: throttle, steer and brake in [-1, 1] of each, None for those off stage."""
+    """One control step of all cars: throttle, steer and brake in [-1, 1] of each, None for inactive agents."""
     rig = world.rig
     control = np.zeros((len(actions), 3))
     for row, action in enumerate(actions):
@@ -275,7 +278,7 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
             rig.qpos[row], rig.qvel[row] = engine.still, 0.0
             rig.qpos[row, :3] = engine.apart_m * (row + 1), 0.0, engine.apart_m
     force = mujoco_c.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
-    if mujoco_c.is_broken(rig):
+    if mujoco_c.has_failed(rig):
         rig.qpos[:] = np.nan
     world.step += 1
     for row, agent in enumerate(world.agents):
@@ -285,7 +288,7 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
 
 
 def _read(rig: mujoco_c.CEngineCars, row: int, agent: Agent, contact_force: float) -> None:
-    """What the rest of the world may know of a car of the rig."""
+    """Reads an agent's state from its car of the rig."""
     x, y, z, qw, qx, qy, qz = (float(value) for value in rig.qpos[row, :7])
     agent.position, agent.elevation = np.array([x, y], np.float32), z
     agent.velocity = rig.qvel[row, :2].astype(np.float32)
@@ -295,27 +298,27 @@ def _read(rig: mujoco_c.CEngineCars, row: int, agent: Agent, contact_force: floa
 
 
 def observe(task: Task, world: World) -> list[Observation | None]:
-    """What each agent sees; None for those off stage."""
+    """Computes each agent's observation; None for inactive agents."""
     crowd = one.gather(world.agents, circles=task.circles)
     return [look(task, world.place, agent, crowd) if agent.active else None for agent in world.agents]
 
 
 def look(task: Task, place: Place, agent: Agent, crowd: Crowd) -> Observation:
-    """All groups of one agent."""
+    """Computes all groups of one agent."""
     return {name: group(place, agent, crowd) for name, group in task.groups.items()}
 
 
 def settle(task: Task, world: World, before: Sequence[Float[np.ndarray, "2"]]) -> tuple[list[float], bool]:
-    """Rewards of the step from the positions `before`, who has left the stage, and whether the world is over."""
+    """Computes the rewards of the step from the positions `before`, terminates agents, and finds whether the world is done."""
     crowd = one.gather(world.agents, circles=task.circles)
     rewards = []
     for agent, position in zip(world.agents, before, strict=True):
         if not agent.active:
             rewards.append(0.0)
             continue
-        facts = task.measure(world.place, agent, crowd, position)
-        new = task.judge(agent, facts)
-        rewards.append(sum(weight * term(facts, new) for weight, term in task.terms))
+        metrics = task.compute_metrics(world.place, agent, crowd, position)
+        new = task.evaluate_termination(agent, metrics)
+        rewards.append(sum(weight * term(metrics, new) for weight, term in task.terms))
     return rewards, world.step >= task.episode_steps or not any(agent.active for agent in world.agents)
 
 

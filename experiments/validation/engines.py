@@ -13,11 +13,11 @@ from jaxtyping import Array, Float, Int
 from experiments.validation.encounters import Encounters
 from experiments.validation.random_drives import PATTERNS, Sequences
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
-from scenefactory_jax.core.types import AgentLog, Agents, Dynamics, Road, Scene, Weather
+from scenefactory_jax.core.types import Dynamics, Scene, Weather
 from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
-from scenefactory_jax.weather.friction import make_uniform
+from scenefactory_jax.dynamics.open_ground import make_open_ground
 
 
 class Run(NamedTuple):
@@ -54,45 +54,8 @@ def grip(
 def dynamics(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, slippery: float, friction_min: float) -> Dynamics:
     """The backend of a config, on roads whose friction the cases say."""
     road = functools.partial(grip, slippery=slippery, friction_min=friction_min)
-    context = {"grip": road, "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
+    context = {"friction": road, "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
     return instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
-
-
-def scenes(
-    position: Float[np.ndarray, "N A 2"],
-    yaw: Float[np.ndarray, "N A"],
-    speed: Float[np.ndarray, "N A"],
-    friction: Float[np.ndarray, " N"],
-    pattern: Int[np.ndarray, " N"],
-    *,
-    size: tuple[float, float],
-) -> Scene:
-    """Worlds that hold nothing but cars and a friction."""
-    worlds, count = yaw.shape
-
-    def road() -> Road:
-        empty = {f.name: jnp.zeros((worlds, 0), jnp.float32) for f in dataclasses.fields(Road)}
-        two, whole = jnp.zeros((worlds, 0, 2), jnp.float32), jnp.zeros((worlds, 0), jnp.int32)
-        kinds = {"midpoint": two, "direction": two, "kind": whole, "polyline": whole, "valid": whole.astype(bool)}
-        return jax.vmap(lambda columns: Road(**columns))({**empty, **kinds})
-
-    def world(place: Array, heading: Array, pace: Array, mu: Array, row: Array, lines: Road) -> Scene:
-        agents = Agents(
-            position=place,
-            yaw=heading,
-            speed=pace,
-            size=jnp.tile(jnp.array(size, jnp.float32), (count, 1)),
-            goal=place,
-            route=jnp.zeros_like(heading),
-            present=jnp.ones(count, bool),
-        )
-        none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
-        log = AgentLog(position=place[:, None], yaw=heading[:, None], **none)
-        alone = {"traffic_log": make_empty_log(1), "traffic": make_empty_boxes()}
-        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=make_uniform(mu, row), **alone)
-
-    place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))
-    return jax.vmap(world)(place, heading, pace, mu, jnp.asarray(pattern, jnp.int32), road())
 
 
 def batched(backend: Dynamics, worlds: Scene, controls: Float[np.ndarray, "N T A 3"]) -> Run:
@@ -122,7 +85,7 @@ def drive(
     count = len(cases.speed)
     zero = np.zeros((count, 1), np.float32)
     size = (car.length, car.width)
-    worlds = scenes(np.zeros((count, 1, 2)), zero, cases.speed[:, None], cases.friction, cases.pattern, size=size)
+    worlds = make_open_ground(np.zeros((count, 1, 2)), zero, cases.speed[:, None], cases.friction, cases.pattern, size=size)
     return batched(backend, worlds, cases.controls[:, :, None])
 
 
@@ -131,7 +94,7 @@ def meet(entry: Mapping[str, Any], cases: Encounters, *, physics_hz: float, cont
     car, _ = cars.read_parameters(entry)
     backend = dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, slippery=1.0, friction_min=0.0)
     even = np.zeros(len(cases.kind), np.int32)
-    worlds = scenes(cases.position, cases.yaw, cases.speed, cases.friction, even, size=(car.length, car.width))
+    worlds = make_open_ground(cases.position, cases.yaw, cases.speed, cases.friction, even, size=(car.length, car.width))
     return batched(backend, worlds, cases.controls)
 
 
@@ -157,14 +120,14 @@ def drive_c(
     """
     car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
-    rig = mujoco_c.simulate_one(car, dataclasses.replace(solver, algorithm="Newton"), **settings)
-    still, substeps = cars.find_rest_pose(rig.model, car), round(physics_hz / control_hz)
+    rig = mujoco_c.make_one(car, dataclasses.replace(solver, algorithm="newton"), **settings)
+    still, substeps = models.find_rest_pose(rig.model, car), round(physics_hz / control_hz)
     mu = wheel_friction(jnp.asarray(cases.friction), jnp.asarray(cases.pattern), slippery=slippery, friction_min=friction_min)
     mu = friction_scale * np.asarray(mu, np.float64)
     paths = []
     for index, speed in enumerate(cases.speed.astype(float)):
         mujoco_c.place(rig, still, np.zeros((1, 2)), np.zeros(1), np.array([speed + nudge]))
-        path = mujoco_c.drive(rig, cases.controls[index, :, None].astype(float), mu[index, None], substeps=substeps)
+        path = mujoco_c.simulate_placed(rig, cases.controls[index, :, None].astype(float), mu[index, None], substeps=substeps)
         paths.append([*(column[:, None] for column in path), np.zeros(len(path.qpos))])
     return Run(*(np.array(column) for column in zip(*paths, strict=True)))
 
@@ -188,16 +151,16 @@ def meet_c(
     """
     car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
-    newton = dataclasses.replace(solver, algorithm="Newton")
+    newton = dataclasses.replace(solver, algorithm="newton")
     rig = mujoco_c.make_encounter(car, newton, touch(entry, impedance=impedance), **settings)
-    still, substeps = cars.find_rest_pose(mujoco_c.simulate_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
+    still, substeps = models.find_rest_pose(mujoco_c.make_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
     paths, first = [], []
     for index in range(len(cases.kind)):
         position, yaw, speed = (x[index].astype(float) for x in (cases.position, cases.yaw, cases.speed))
         mujoco_c.place(rig, still, position, yaw, speed + nudge)
         mu = np.full((2, 4), float(cases.friction[index]))
         story = mujoco_c.simulate_encounter(rig, cases.controls[index].astype(float), mu, substeps=substeps)
-        paths.append([*story.path, story.contact_force])
+        paths.append([*story.trajectory, story.contact_force])
         first.append(story.first_contact_s)
     return Run(*(np.array(column) for column in zip(*paths, strict=True))), np.array(first)
 

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.validation import engines
 from experiments.validation.equivalence import SPIN
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Boxes, Dynamics, Scene
+from scenefactory_jax.dynamics import open_ground
 from scenefactory_jax.dynamics.articulated import equations_of_motion, randomization
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
@@ -135,7 +135,7 @@ def heights(*, car: CarParameters, mass_height: list[float]) -> Callable[..., Ca
 
     def draw(key: Array, scene: Scene) -> CarParameters:
         crew = jax.tree.map(lambda leaf: jnp.full((len(mass_height),), leaf, jnp.float32), car)
-        return randomization.with_numbers(car, dict(vars(crew)) | {"mass_height": jnp.array(mass_height, jnp.float32)})
+        return randomization.with_values(car, dict(vars(crew)) | {"mass_height": jnp.array(mass_height, jnp.float32)})
 
     return draw
 
@@ -146,8 +146,8 @@ def _backend(entry: Mapping[str, Any], crowd: Sequence[Case], car: CarParameters
     left = np.array([case.friction if case.left_friction is None else case.left_friction for case in crowd], np.float32)
     mu = np.where(LEFT_WHEELS > 0, left[:, None], right[:, None])
     high = [car.mass_height if case.mass_height is None else case.mass_height for case in crowd]
-    changed = {**entry, "fleet": {"_target_": f"{__name__}.heights", "mass_height": high}}
-    context = {"grip": lambda weather, position, speed: jnp.asarray(mu), "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
+    changed = {**entry, "randomization": {"_target_": f"{__name__}.heights", "mass_height": high}}
+    context = {"friction": lambda weather, position, speed: jnp.asarray(mu), "physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
     return instantiate(changed, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
 
@@ -160,7 +160,7 @@ def _begin(
     place = lanes + np.array([case.position for case in crowd])
     zero = np.zeros((1, len(crowd)))
     size = (car.length, car.width)
-    worlds = engines.scenes(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
+    worlds = open_ground.make_open_ground(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
     scene = jax.tree.map(lambda leaf: leaf[0], worlds)
     body = jax.jit(backend.init)(jax.random.key(0), scene)
     walls = np.flatnonzero(["wall" in case.name for case in crowd])

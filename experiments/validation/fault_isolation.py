@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Env, Scene, State, StepResult
-from scenefactory_jax.learning.ppo.train_iteration import Trainer
+from scenefactory_jax.learning.trainer import Trainer
 
 STEERING = np.array([8, 11])  # the steering hinges in a car's qpos
 BREAKS = ("qpos", "qvel", "qacc_warmstart", "steering", "action")  # what of a car becomes NaN
@@ -171,7 +171,7 @@ def learn(trainer: Trainer, scenes: Scene, seed: int, iterations: int) -> Any:
     """Train state and metrics after some iterations from a seed."""
     train_state, history = trainer.init(jax.random.key(seed), scenes), []
     for _ in range(iterations):
-        train_state, metrics = trainer.iterate(train_state, scenes)
+        train_state, metrics = trainer.train_iteration(train_state, scenes)
         history.append(metrics)
     return train_state, history
 

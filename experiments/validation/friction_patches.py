@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.validation import engines, motion_laws
+from experiments.validation import motion_laws
 from experiments.validation.motion_laws import FULL_BRAKE, Trace
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches, Scene
+from scenefactory_jax.dynamics import open_ground
 
 
 class Patch(NamedTuple):
@@ -28,7 +29,7 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
     count = len(patches)
     zero = np.zeros((count, 1), np.float32)
     dry, asphalt = np.zeros(count), np.full(count, SURFACES.index("AC"), np.int32)
-    worlds = engines.scenes(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
+    worlds = open_ground.make_open_ground(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
     some = [patch or Patch([(0.0, 0.0), (0.0, 0.0)], 0.0, "AC") for patch in patches]
 
     def one(line: Array, radius: Array, surface: Array, present: Array) -> Patches:
@@ -71,7 +72,7 @@ def patches(
         circle of the dry one, m. `split`: for ice on the left, on the right and on no side the yaw [3, T] and the way aside.
     """
     context = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
-    road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.grip")
+    road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.friction")
     backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
     run = motion_laws.tracer(backend, control_hz=control_hz, width=6)
     size = motion_laws.footprint(entry)

@@ -155,7 +155,7 @@ def balance(
     mass = float(rig.model.body_subtreemass[0])
     momentum, angular, lost = [], [], []
     for case, (start, end) in enumerate(zip(before, after, strict=True)):
-        first, last = (mujoco_c.mechanics(rig, run.qpos[case, step], run.qvel[case, step]) for step in (start, end))
+        first, last = (mujoco_c.compute_mechanics(rig, run.qpos[case, step], run.qvel[case, step]) for step in (start, end))
         momentum.append((last.momentum - first.momentum)[:2])
         angular.append((last.angular_momentum - first.angular_momentum)[2])
         lost.append(first.kinetic_energy - last.kinetic_energy)

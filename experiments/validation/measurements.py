@@ -1,18 +1,38 @@
 """The parts of `validate`: each takes the command's config and returns plain numbers, from which the report is written."""
 
+import contextlib
 import functools
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from experiments.validation import encounters as meetings
 from experiments.validation import engines, equivalence, extreme_states, friction_patches, impacts, motion_laws, random_drives
 from experiments.validation.engines import Run
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.parallel.task_map import open_pool, require_results
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 Spread = Callable[..., Any]  # (function, cases) -> what the function makes of all cases, computed in pieces
+
+
+@contextlib.contextmanager
+def spread_cases(workers: int) -> Iterator[Spread]:
+    """A function that runs others over pieces of their cases: in this process if `workers` is 1, else in that many processes."""
+    if workers == 1:
+        yield lambda function, cases: function(cases)
+        return
+    with open_pool(workers) as task_map:
+
+        def spread(function: Callable[[Any], Any], cases: Any) -> Any:
+            edges = np.linspace(0, len(cases[0]), min(workers, len(cases[0])) + 1).round().astype(int)
+            pieces = [type(cases)(*(column[a:b] for column in cases)) for a, b in itertools.pairwise(edges)]
+            return jax.tree.map(lambda *parts: np.concatenate(parts), *require_results(task_map(function, pieces)))
+
+        yield spread
 
 
 def bound(entry: Mapping[str, Any], module: Any, function: str, where: str, **context: Any) -> Callable[..., Any]:
@@ -170,7 +190,7 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "locked_c_m": _locked_in_c(config, spread),
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
         "backends": {name: _obeys(name, settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
-        "patches": on_patches(config["dynamics"], config["weather"]["grip"]),
+        "patches": on_patches(config["dynamics"], config["weather"]["friction"]),
     }
 
 

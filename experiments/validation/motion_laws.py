@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from experiments.validation import engines
 from experiments.validation.random_drives import PATTERN_NAMES, Sequences
 from scenefactory_jax.core.types import Dynamics, Scene
-from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics import mujoco_c, open_ground
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated import parameters as cars
-from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
+from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, total_mass
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY, CarParameters
 
 FULL_BRAKE, FULL_BOTH, COAST = (0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 0.0, 0.0)  # throttle, steer, brake
@@ -53,8 +53,9 @@ def driver(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, sl
 
     def drive(cases: Sequences) -> Trace:
         zero = np.zeros((len(cases.speed), 1), np.float32)
-        return run(engines.scenes(zero[..., None].repeat(2, -1), zero, cases.speed[:, None], cases.friction, cases.pattern, size=size),
-                   cases.controls)  # fmt: skip
+        position = zero[..., None].repeat(2, -1)
+        worlds = open_ground.make_open_ground(position, zero, cases.speed[:, None], cases.friction, cases.pattern, size=size)
+        return run(worlds, cases.controls)
 
     return drive
 
@@ -227,7 +228,7 @@ def ride(drive: Drive, car: CarParameters, *, control_hz: float, friction: float
     """
     trace = drive(held([friction], 0.0, COAST, steps=round(seconds * control_hz)))
     travel = suspension(trace)[0, -1]
-    load = np.array([cars.corner_load(car, front=wheel in cars.FRONT) for wheel in cars.WHEELS])
+    load = compute_loads(car)
     spring = car.suspension_stiffness * travel + car.suspension_preload * load
     stop = car.stop_stiffness * np.sign(travel) * np.maximum(np.abs(travel) - car.suspension_travel, 0.0)
     assert trace.normal is not None
@@ -254,14 +255,14 @@ def rolling(
 ) -> dict[str, np.ndarray]:
     """Rolling without engine: energy over time, and the largest rise between any two times, as shares of the start's kinetic energy."""
     car, solver = cars.read_parameters(entry)
-    rig = mujoco_c.simulate_one(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
+    rig = mujoco_c.make_one(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mu, steer = (x.ravel() for x in np.meshgrid(frictions, steers, indexing="ij"))
     cases = held(mu, speed, COAST, steps=round(seconds * control_hz))
     cases.controls[..., 1] = steer[:, None]
     trace = drive(cases)
     assert trace.qpos is not None and trace.qvel is not None
     energy = np.array([
-        [sum(mujoco_c.mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
+        [sum(mujoco_c.compute_mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
         for path in zip(trace.qpos, trace.qvel, strict=True)
     ])  # fmt: skip
     scale = 0.5 * total_mass(car) * speed**2

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
-from experiments.validation.measurements import Spread
+from experiments.validation.measurements import Spread, spread_cases
+from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.parallel.process_pool import make_task_map
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.visualization.report import verdicts
 
 DIGITS = 5  # more than anybody reads
 
@@ -50,18 +50,18 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: an unknown part, or a number that does not fit, by name.
     """
-    schema.check(config, schema.VALIDATE)
+    schema.check(config, schema.Validate)
     if unknown := [name for name in config["parts"] if name not in PARTS]:
         raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
     scene_source.use_compilation_cache()
     out = Path(config["out"])
     (out / "results").mkdir(parents=True, exist_ok=True)
-    with make_task_map(config["workers"]) as spread:
+    with spread_cases(config["workers"]) as spread:
         for name in (name for name in PARTS if name in config["parts"]):
             _measure(name, config, out, spread)
     found, targets = read(out), config["validation"]["targets"]
     if found:
-        print(f"{report.write(out, found, targets)}\n{target_check.text(target_check.of(found, targets))}", flush=True)
+        print(f"{report.write(out, found, targets)}\n{verdicts.text(target_check.of(found, targets))}", flush=True)
     return found
 
 
@@ -100,3 +100,7 @@ def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
             source, target = source[name], target.setdefault(name, {})
         target[last] = source[last]
     return found
+
+
+if __name__ == "__main__":
+    entry.run("validate", validate, about="validate the physics against the C engine and laws of motion")

@@ -1,22 +1,12 @@
 """Targets of the validation, what was measured, and whether that meets them; from the results of `validate` alone."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.evaluation import agent_metrics
-
-
-class Verdict(NamedTuple):
-    """One line of the table."""
-
-    what: str
-    target: str
-    measured: str
-    met: bool
-
+from scenefactory_jax.visualization.report.verdicts import Verdict
 
 Results = Mapping[str, Mapping[str, Any]]
 Targets = Mapping[str, float]
@@ -28,20 +18,6 @@ def of(results: Results, targets: Targets) -> list[Verdict]:
         "drives": _drives, "encounters": _encounters, "laws": _laws, "extremes": _extremes, "faults": _faults, "costs": _costs,
     }  # fmt: skip
     return [verdict for name, make in makers.items() if name in results for verdict in make(results[name]["result"], targets)]
-
-
-def table(verdicts: list[Verdict]) -> str:
-    """As Markdown."""
-    return agent_metrics.grid(
-        ["What", "Target", "Measured", "Met"], [[v.what, v.target, v.measured, "yes" if v.met else "**no**"] for v in verdicts]
-    )
-
-
-def text(verdicts: list[Verdict]) -> str:
-    """As lines for a terminal."""
-    width = [max((len(str(verdict[i])) for verdict in verdicts), default=0) for i in range(3)]
-    lines = [f"{v.what:{width[0]}}  {v.target:{width[1]}}  {v.measured:{width[2]}}  {'met' if v.met else 'NOT MET'}" for v in verdicts]
-    return "\n".join([*lines, f"{sum(v.met for v in verdicts)} of {len(verdicts)} targets met"])
 
 
 def _drives(result: Mapping[str, Any], targets: Targets) -> list[Verdict]:

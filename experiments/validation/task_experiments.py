@@ -48,7 +48,7 @@ def costs(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Physics alone with its features one by one."""
     del spread
     own = dict(config["validation"]["costs"])
-    scenes = configs.load_config("bench", *own.pop("scenes"))["scenes"]
+    scenes = configs.load_config("benchmark", *own.pop("scenes"))["scenes"]
     worlds, everything = _worlds(scenes, own.pop("worlds"), config["validation"]["seed"]), own.pop("everything")
     rows = bound(own, timing, "costs", "validation.costs", seed=config["validation"]["seed"])(worlds)
     present = worlds.agents.present

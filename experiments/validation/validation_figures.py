@@ -14,7 +14,7 @@ from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 Result = Mapping[str, Any]
 BATCHED, REFERENCE, GREY = COLOURS[0], COLOURS[1], "#777777"
 MARKERS = "osD^vP*X"
-NAMES = {"articulated": "articulated", "latched": "mjx_car, latched brakes", "published": "articulated_paper", "bicycle": "bicycle"}
+NAMES = {"articulated": "articulated", "latched": "articulated, latched brakes", "published": "articulated_paper", "bicycle": "bicycle"}
 
 
 def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:

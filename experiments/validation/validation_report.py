@@ -13,7 +13,7 @@ from experiments.validation import validation_figures as figures
 from experiments.validation.validation_figures import NAMES
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.visualization.report import plots, verdicts
 
 Result = Mapping[str, Any]
 
@@ -30,7 +30,7 @@ def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mappi
         "drives": _drives, "settings": _settings, "encounters": _encounters, "laws": _laws,
         "extremes": robustness_report.extremes, "faults": robustness_report.faults, "costs": robustness_report.costs,
     }  # fmt: skip
-    lines = ["# Validation of the physics", _made(results), "## Verdicts", target_check.table(target_check.of(results, targets))]
+    lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(target_check.of(results, targets))]
     for name, make in makers.items():
         if name in results:
             lines += make(results[name]["result"], folder)
@@ -215,7 +215,7 @@ def _stopping(result: Result) -> Sequence[str]:
     rows = [["v²/(2 μ g), less the air", *(f"{way:.1f}" for way in limit)]]
     for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
         rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
-    rows += [[f"C engine, mjx_car, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
+    rows += [[f"C engine, articulated, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
     return [
         words,
         agent_metrics.grid(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows),

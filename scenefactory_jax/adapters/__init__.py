@@ -18,8 +18,8 @@ What they share:
 - An observation is one vector of float32 (`flat`); `layout` says which columns are what, and all are within finite bounds (`bounds`).
   An action is throttle, steer, brake in [-1, 1].
 - A step is an action: with `actions.action_repeat=3` it is three control steps, and its reward what they paid together.
-- *Terminated* is a car that an event has ended (`config["termination"]`); it observes zeros from then on. *Truncated* is a car that was still
-  driving when the time of its world was up (`timing.episode_s`); its last observation is a real one, to bootstrap from.
+- *Terminated* is a car that an event has ended (`config["termination"]`); it observes zeros from then on. *Truncated* is a car that was
+  still driving when the time of its world was up (`timing.episode_s`); its last observation is a real one, to bootstrap from.
 - `terms` are the weighted reward terms, which sum to the reward; `events` what happened to the car in this step, for the first time.
 - The same seed gives the same bits, and nothing is compiled again while an environment runs.
 

@@ -7,7 +7,8 @@
         make_policy, parameters, metrics = ppo.train(env, 1_000_000, episode_length=env.episode_length, wrap_env_fn=wrap)
 
 `done` is an event that ended the car. That the time is up is for Brax's EpisodeWrapper to say, which calls it truncation: give it
-`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events (`events/goal_reached`) of the step; what Brax
+`episode_length=env.episode_length`. `metrics` holds the reward terms (`reward/goal`) and events
+(`events/goal_reached`) of the step; what Brax
 reports of them are sums over an episode.
 
 Brax's own `wrap` repeats the first episode of each world for ever, the same scene and start; `wrap` of this module goes on to others.
@@ -127,7 +128,7 @@ def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn
         ConfigError: a randomisation; the config's weather, fleet and spawn are those.
     """
     if randomization_fn is not None:
-        raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/fleet=spread, weather=mixed")
+        raise ConfigError("randomization_fn: unknown here; draw cars and roads by the config: dynamics/randomization=spread, weather=mixed")
     return AutoResetWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+import scenefactory_jax
 from scenefactory_jax.adapters import bounds, flatten_observation
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Scene, State
@@ -85,9 +85,9 @@ def make_pool(
         ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
     """
     if config is None:
-        config = configs.load_config("train", *([ALONE] if alone else []), *overrides)
+        config = scenefactory_jax.load_config("train", *([ALONE] if alone else []), *overrides)
     elif overrides:
-        config = configs.apply_overrides(config, overrides)
+        config = scenefactory_jax.apply_overrides(config, overrides)
     if not lives and config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(
             f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; here a car that ended stays so: set it to null"
@@ -108,7 +108,7 @@ def make_pool(
     low, high = bounds.flat_bounds(parts.groups, seen)
     moment = jax.eval_shape(functools.partial(step_worlds, env), held, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(moment.terms))
-    steps, step_hz = environment.episode_steps(timing) // env.hold, timing["control_hz"] / env.hold
+    steps, step_hz = environment.episode_steps(timing) // env.action_repeat, timing["control_hz"] / env.action_repeat
     return Pool(env, held, found.names, slots, low, high, terms, steps, step_hz)
 
 
@@ -123,7 +123,7 @@ def start_episodes(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array,
     scene_key, start_key, key = jax.random.split(key, 3)
     drawn = jax.random.randint(scene_key, (), 0, len(scenes.agents.present))
     index = jnp.where(jnp.asarray(scene) < 0, drawn, scene).astype(jnp.int32)
-    return Episode(index, env.start(start_key, _one(scenes, index)), key)
+    return Episode(index, env.init_state(start_key, _one(scenes, index)), key)
 
 
 def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
@@ -140,17 +140,17 @@ def step_worlds(env: Env, scenes: Scene, episode: Episode, action: Float[Array, 
 def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
     """`advance` with an empty observation, [A, 0]."""
     scene = _one(scenes, episode.scene)
-    control = lambda state: env.transition(scene, state, action)  # noqa: E731
-    state, _, outcome, _ = environment.repeat_action(control, episode.state, hold=env.hold)
+    control = lambda state: env.control_step(scene, state, action)  # noqa: E731
+    state, _, outcome, _ = environment.repeat_action(control, episode.state, action_repeat=env.action_repeat)
     moment = WorldStep(
         observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
         events=vars(outcome.events),
-        terminated=outcome.done,
+        terminated=outcome.terminated,
         truncated=environment.find_truncated_agents(outcome, episode.state.active),
         active=state.active,
-        over=outcome.over,
+        over=outcome.world_done,
     )
     return Episode(episode.scene, state, episode.key), moment
 

@@ -10,8 +10,9 @@ from jaxtyping import Array, UInt8
 from scenefactory_jax.adapters.episodes import Episode, Pool
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import Agents, Boxes, Env, Events, Motion, Scene, Weather
-from scenefactory_jax.visualization.birds_eye import drawing, video
+from scenefactory_jax.visualization.birds_eye import video
 
 MODES = ("rgb_array",)
 _PIXELS, _SIDE_M = 400, 80.0  # side of a picture, and of the square around the car that it shows
@@ -44,7 +45,7 @@ class Painter:
 
     def _picture(self, shown: Any) -> UInt8[np.ndarray, "H W 3"]:  # one world of `Shown`, in numpy arrays
         place = shown.motion.position[:, :2]
-        trajectory = drawing.Trajectory(
+        trajectory = Trajectory(
             scene=replace(self._scene(int(shown.scene)), weather=shown.weather),
             position=place[None],
             yaw=shown.motion.yaw[None],
@@ -57,7 +58,7 @@ class Painter:
             control_hz=self._pool.step_hz,
             title="",
             weather="",
-            traffic=drawing.Others(*(np.asarray(column)[None] for column in _columns(shown.boxes))),
+            traffic=TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(shown.boxes))),
         )
         left, bottom = place[0] - _SIDE_M / 2
         return video.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
@@ -80,9 +81,5 @@ def check_mode(mode: Any) -> None:
 
 def _shown(env: Env, scenes: Scene, world: Episode) -> ShownWorld:
     state = world.state
-    now = env.now(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
+    now = env.current_scene(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
     return ShownWorld(world.scene, state.motion, state.active, state.past_events, state.agents, state.weather, now.traffic)
-
-
-def _columns(boxes: Boxes) -> list[np.ndarray]:
-    return [getattr(boxes, name) for name in drawing.Others._fields]

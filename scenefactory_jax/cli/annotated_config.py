@@ -30,7 +30,7 @@ def annotate(command: str, *overrides: str) -> str:
 
 
 def _place(group: str) -> Place:
-    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/fleet`."""
+    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/randomization`."""
     name, _, package = group.partition("@")
     return tuple((package or name.replace("/", ".")).split("."))
 
@@ -38,7 +38,7 @@ def _place(group: str) -> Place:
 def _files(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[Path, Place]]:
     """The files that a config is composed of and where their keys lie, those that others build on first."""
     root = configs.find_conf()
-    yield from _with_bases(root / f"{command}.yaml", ())
+    yield from _with_bases(configs.find_config(command), ())
     for group, chosen in choices.items():
         for option in chosen if isinstance(chosen, list) else [chosen]:
             yield from _with_bases(root / group.partition("@")[0] / f"{option}.yaml", _place(group))

@@ -1,7 +1,7 @@
-"""`bench`: how fast a configuration runs, where the time of a control step goes, and how that scales.
+"""`benchmark`: measures the throughput of a configuration, the time of the phases of a control step, and how both scale.
 
-CASPS, controlled-agent steps per second, counts the steps of spawned slots (30 Hz ticks) in steady state, with PPO in the loop if the scope
-is `training`. Beside it stands what all slots would make, and the share of spawned steps whose car was still driving.
+Steps per second are control steps of spawned slots in steady state, with PPO in the loop if the scope is `training`. A row also holds the
+steps of all slots, and the fraction of spawned steps whose car was active.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,11 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import Mesh
 
-from experiments.benchmarks import streaming
-from experiments.unvectorised_baseline import baseline_environment
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file, sharding
@@ -21,20 +18,28 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Env, Scene
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import phase_timing
+from scenefactory_jax.learning import phase_timing, rollout
 from scenefactory_jax.learning.phase_timing import PhaseTimes
-from scenefactory_jax.learning.ppo import rollout
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 from scenefactory_jax.visualization.report import throughput_report as report
 
 SCOPES = {"training": "update", "environment": "observation", "physics": "physics"}  # and the last level of each
 DIGITS = 6
 FILE = "bench.json"
+MeasureStream = Callable[..., dict[str, Any]]  # (config, mesh=) -> figures of a training with a stream of scenes
+MeasureBaseline = Callable[[Mapping[str, Any], scene_source.Scenes, Mapping[str, int]], dict[str, Any]]
+PROGRAM = "`python -m experiments.benchmarks.run`, in a checkout"
 ASIDE = ("out", "resume", "variants", "baseline", "name")  # keys of a bench that change nothing about a row
 
 
-def bench(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure a config (`load("bench", "experiment=paper", ...)`) or each of its variants; medians over `repeats`.
+def benchmark(
+    config: Mapping[str, Any], *, measure_stream: MeasureStream | None = None, measure_baseline: MeasureBaseline | None = None
+) -> dict[str, Any]:
+    """Measures a config (`load_config("benchmark", "experiment=paper", ...)`) or each of its variants; medians over `repeats`.
+
+    Args:
+        measure_stream: measures a variant with a stream of scenes; None: such a variant is an error.
+        measure_baseline: measures the unvectorised baseline that `baseline` asks for; None: `baseline` is an error.
 
     Returns:
         The rows, which are also printed and, with `out`, written there as bench.json and throughput.md.
@@ -42,18 +47,20 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key that does not fit, also one of a variant, by name.
     """
-    schema.check(config, schema.BENCH)
+    schema.check(config, schema.Benchmark)
     variants = config["variants"] or {config["name"]: {}}
     tasks = {name: changed(config, changes, where=f"variants.{name}") for name, changes in variants.items()}
-    for task in tasks.values():
-        schema.check(task, schema.BENCH)
-    if config["baseline"] is not None:
-        schema.check(config["baseline"], schema.BASELINE, where="baseline")
+    for name, task in tasks.items():
+        schema.check(task, schema.Benchmark)
+        if task["stream"] is not None and measure_stream is None:
+            raise ConfigError(f"variants.{name}.stream: expected null; a stream is measured by {PROGRAM}")
+    if config["baseline"] is not None and measure_baseline is None:
+        raise ConfigError(f"baseline: expected null; the baseline is measured by {PROGRAM}")
     scene_source.use_compilation_cache()
     meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
     out = None if config["out"] is None else Path(config["out"])
     before = _kept(out) if config["resume"] else {"rows": [], "baseline": None}
-    result = {"command": configs.format_command("bench"), "versions": versions, "rows": [], "baseline": None}
+    result = {"command": configs.format_command("benchmark"), "versions": versions, "rows": [], "baseline": None}
 
     def scenes_of(task: Mapping[str, Any]) -> scene_source.Scenes:
         source = result_file.digest(task["scenes"])
@@ -66,16 +73,16 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
         row = next((row for row in before["rows"] if (row["name"], row["settings"]) == (name, settings)), None)
         if row is None:
             mesh = meshes[name]
-            measured = _measured(name, task, scenes_of, mesh=mesh)
+            measured = _measured(name, task, scenes_of, measure_stream, mesh=mesh)
             row = {"name": name, "changes": variants[name], "settings": settings, **measured}
         print(report.line(row), flush=True)
         result["rows"].append(row)
         _write(out, result)
-    if config["baseline"] is not None:
+    if config["baseline"] is not None and measure_baseline is not None:
         first, loop = next(iter(tasks.values())), before["baseline"]
         settings = result_file.digest({"versions": versions, "scenes": first["scenes"], "baseline": config["baseline"]})
         if loop is None or loop["settings"] != settings:
-            loop = {"settings": settings, **unvectorised(first, scenes_of(first), config["baseline"])}
+            loop = {"settings": settings, **measure_baseline(first, scenes_of(first), config["baseline"])}
         result["baseline"] = loop
     result = result_file.plain(result, digits=DIGITS)
     print(report.text(result), flush=True)
@@ -86,18 +93,18 @@ def bench(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _kept(out: Path | None) -> dict[str, Any]:
-    """What an earlier bench left in the folder.
+    """Reads the result of an earlier benchmark in the folder.
 
     Raises:
         ConfigError: there is no folder, or nothing in it.
     """
     if out is None or not (out / FILE).is_file():
-        raise ConfigError(f"resume=true: out={out}: no {FILE} to go on with; give the folder of the bench that was stopped")
+        raise ConfigError(f"resume=true: out={out}: no {FILE} to go on with; expected the folder of a stopped benchmark")
     return result_file.read(out / FILE)
 
 
 def _write(out: Path | None, result: Mapping[str, Any]) -> None:
-    """After every row, so that a bench that is stopped goes on with `resume=true`."""
+    """Writes the result; after every row, so that a stopped benchmark goes on with `resume=true`."""
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         result_file.write(out / FILE, result, digits=DIGITS)
@@ -118,24 +125,18 @@ def changed(config: Mapping[str, Any], changes: Mapping[str, Any], *, where: str
     return found
 
 
-def unvectorised(config: Mapping[str, Any], scenes: scene_source.Scenes, numbers: Mapping[str, int]) -> dict[str, Any]:
-    """The same task as loops in Python over the C engine, on the scenes with the most cars; acting only."""
-    fullest = np.argsort(-np.asarray(scenes.scene.agents.present).sum(axis=1), kind="stable")[: numbers["worlds"]]
-    chosen = [scenes[int(index)] for index in fullest]
-    env, policy = environment.make_env(config), make_policy(config)
-    seen = env.reset(jax.random.key(config["seed"]), chosen[0])[1]
-    parameters = policy.init(jax.random.key(config["seed"]), seen)
-    timing = {"steps": numbers["steps"], "repeats": numbers["repeats"], "seed": config["seed"]}
-    return baseline_environment.measure(config, chosen, parameters, **timing)
-
-
 def _measured(
-    name: str, config: Mapping[str, Any], scenes_of: Callable[[Mapping[str, Any]], scene_source.Scenes], *, mesh: Mesh | None
+    name: str,
+    config: Mapping[str, Any],
+    scenes_of: Callable[[Mapping[str, Any]], scene_source.Scenes],
+    measure_stream: MeasureStream | None,
+    *,
+    mesh: Mesh | None,
 ) -> dict[str, Any]:
-    """`measure`, or how large the configuration was that did not fit: what fits is one of the things that a bench finds out."""
+    """Measures one configuration; of one that does not fit into memory, returns its size."""
     try:
-        if config["stream"] is not None:
-            return {"fits": True, **streaming.measure(config, mesh=mesh)}
+        if measure_stream is not None and config["stream"] is not None:
+            return {"fits": True, **measure_stream(config, mesh=mesh)}
         worlds, chosen = scene_source.assign_scenes(scenes_of(config), config["worlds"], seed=config["seed"], mesh=mesh)
         print(f"{name}: {chosen}", flush=True)
         return {"fits": True, **measure(config, worlds, mesh=mesh)}
@@ -154,13 +155,13 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
     numbers = {"warmup": config["warmup"], "repeats": config["repeats"]}
 
     def act(level: str) -> PhaseTimes:
-        start = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
+        start = jax.jit(jax.vmap(env.init_state))(jax.random.split(jax.random.key(config["seed"]), slots[0]), worlds)
         run = phase_timing.make_acting_phase(level, parts, env, steps=horizon)
         return phase_timing.time_phase(run, start, lambda repeat: (worlds, jax.random.key(repeat)), **numbers)
 
     if scope == "training":
         whole, metrics, roll = _learn(config, env, worlds, mesh, **numbers)
-        spawned, active = metrics["steps/spawned"], metrics["share/active"]
+        spawned, active = metrics["steps/spawned"], metrics["active_fraction"]
     else:
         whole, roll, active = act(SCOPES[scope]), None, None
         spawned = int(whole.left[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded
@@ -199,17 +200,14 @@ def _learn(
     policy = make_policy(config)
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
-    whole = phase_timing.time_phase(trainer.iterate, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
+    whole = phase_timing.time_phase(trainer.train_iteration, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
     state, metrics = whole.left
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
-        now, seen, lives = carry
-        acted = rollout.collect_rollout(env, policy, parameters, scenes, now, seen, lives, key, horizon=config["ppo"]["horizon"])
-        return acted[:3], acted[3]
+        return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=config["ppo"]["horizon"])[:2]
 
     def roll() -> PhaseTimes:
-        begin = (state.worlds, state.observation, state.lives)
         given = lambda repeat: (state.parameters, worlds, jax.random.key(repeat))  # noqa: E731
-        return phase_timing.time_phase(collect, begin, given, warmup=warmup, repeats=repeats)
+        return phase_timing.time_phase(collect, state.worlds, given, warmup=warmup, repeats=repeats)
 
     return whole, {name: float(value) for name, value in jax.device_get(metrics).items()}, roll

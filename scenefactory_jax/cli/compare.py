@@ -9,10 +9,10 @@ import numpy as np
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
+from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.evaluation import hierarchical_bootstrap
+from scenefactory_jax.evaluation import agent_metrics, hierarchical_bootstrap
 from scenefactory_jax.loggers import metrics_csv
-from scenefactory_jax.visualization.report import evaluation_report
 from scenefactory_jax.visualization.report import run_comparison as report
 
 STEPS = "steps/total"
@@ -42,7 +42,7 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
         ConfigError: no such run, a run without metrics, one that is named twice, two of one setting and seed, or a metric that one of them
             lacks, by name.
     """
-    schema.check(config, schema.COMPARE)
+    schema.check(config, schema.Compare)
     if not config["metrics"]:
         raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/goal_reached")
     runs = [_read(folder) for folder in _find(config["runs"])]
@@ -89,10 +89,18 @@ def _read(folder: Path) -> ReadRun:
     config, metrics = configs.read_values(folder), metrics_csv.read(folder)
     if not metrics:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
-    settings = {
-        key: value for key, value in evaluation_report.flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")
-    }
-    return ReadRun(folder, config, settings, metrics, result_file.records(folder))
+    settings = {key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
+    return ReadRun(folder, config, settings, metrics, read_records(folder))
+
+
+def read_records(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Reads protocol -> records of the trained policy's agents that an evaluation wrote to a folder; empty without an evaluation.
+
+    Raises:
+        RecordsError: a file with other contents.
+    """
+    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
+    return {name: agent_metrics.read_csv(path) for name, path in files.items() if not name.endswith("-untrained")}
 
 
 def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:

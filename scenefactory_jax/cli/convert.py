@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from scenefactory_jax.cli import schema
+from scenefactory_jax.cli.scene_schema import Convert
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.data.conversion import Summary, complete, describe
-from scenefactory_jax.data.conversion import convert as to_bank
+from scenefactory_jax.data import conversion
 from scenefactory_jax.data.curation import quality_gate
+from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing.summary import Summary, describe
 
-NOTHING = RawScene(name="nothing", source="nowhere", roads=(), tracks=(), times=np.zeros(1), current=0)
+EMPTY = RawScene(name="empty", source="empty", roads=(), tracks=(), times=np.zeros(1), current=0)
 
 
 def convert(config: Mapping[str, Any]) -> Summary:
@@ -25,33 +27,31 @@ def convert(config: Mapping[str, Any]) -> Summary:
         ConfigError: source or out is missing, or a number that a part refuses.
         SceneError: no files, `out` is something else than a bank or a bank made with other settings, or not one usable scene.
     """
-    schema.check(config, schema.CONVERT)
-    schema.check(config["bank"], schema.BANK, where="bank")
+    schema.check(config, Convert)
     for key in ("source", "out"):
         if config[key] is None:
             raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")
-    scenes = config["scenes"]
-    features = config["features"]
-    own = ("features", "bank", "quality", "lanes")
-    settings = {key: scenes[key] for key in ("formats", "check", "pack")} | {key: config[key] for key in own}
-    judged = {"rules": quality_gate.make(config["quality"]["rules"]), **{key: config["quality"][key] for key in ("reject", "drop")}}
-    quality_gate.check_names(**judged)
+    scenes, quality = config["scenes"], config["quality"]
+    settings = {key: scenes[key] for key in ("formats", "check", "pack")}
+    settings |= {key: config[key] for key in ("features", "bank", "quality", "lanes")}
+    rules = {"rules": quality_gate.make(quality["rules"]), "reject": quality["reject"], "drop": quality["drop"]}
+    quality_gate.check_names(**rules)
     rebuild = instantiate(config["lanes"]["topology"], builtins="scenefactory_jax.roadgraph.lane_topology", where="lanes.topology")
-    rebuild(NOTHING)  # which refuses numbers that make no sense, before a file is read
-    readers = scene_source.make_readers(scenes)
-    gate = functools.partial(quality_gate.gate, check=readers["check"], **judged)
+    rebuild(EMPTY)  # refuses numbers out of range before a file is read
+    packing, features = scene_source.make_packing(scenes), config["features"]
+    gate = functools.partial(quality_gate.gate, check=packing["check"], **rules)
+    tools = conversion.SceneTools(
+        reader_selection.make(scenes["formats"]),
+        **packing,
+        refine=functools.partial(conversion.complete, check=packing["check"], rebuild=rebuild, gate=gate),
+        features=None if features is None else instantiate(features, builtins="scenefactory_jax.data.bank.catalogue", where="features"),
+    )
     with Progress(disable=not config["progress"]) as bar:
         task = bar.add_task("convert")
-        summary = to_bank(
-            config["source"],
-            config["out"],
-            **readers,
-            refine=functools.partial(complete, check=readers["check"], rebuild=rebuild, gate=gate),
-            features=None if features is None else instantiate(features, builtins="scenefactory_jax.data.bank.catalogue", where="features"),
-            settings=settings,
+        summary = conversion.convert(
+            config["source"], config["out"], tools=tools, settings=settings,
             spread=instantiate(config["spread"], builtins="scenefactory_jax.core.parallel.task_map", where="spread"),
-            **config["bank"],
-            on_file=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+            on_file=lambda done, total: bar.update(task, completed=done, total=total), **config["bank"],
+        )  # fmt: skip
     print("\n".join(describe(summary)), flush=True)
     return summary

@@ -15,13 +15,14 @@ import jax
 import mujoco
 import numpy as np
 
-from scenefactory_jax.cli import schema
-from scenefactory_jax.cli import view as replays
+from scenefactory_jax.cli import replay as replays
+from scenefactory_jax.cli import view_schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment as worlds
-from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
 from scenefactory_jax.visualization.mujoco.keyboard_control import COMMANDS, PEDALS, Drive, KeyboardResponse, World
 
@@ -69,9 +70,7 @@ def drive(config: Mapping[str, Any]) -> Drive:
 
 def _check(config: Mapping[str, Any]) -> tuple[KeyboardResponse, View, dict[int, str]]:
     """What keys feel like, where the camera stands, and which command each key code means."""
-    schema.check(config, schema.DRIVE)
-    for group, own in {"keys": schema.DRIVE_KEYS, "feel": schema.FEEL, "view": schema.VIEW}.items():
-        schema.check(config[group], own, where=group)
+    schema.check(config, view_schema.Drive)
     if config["run"] is None and config["overrides"]:
         raise ConfigError(f"overrides: {config['overrides']} without a run; write them as settings of the command")
     codes: dict[int, str] = {}
@@ -160,7 +159,8 @@ def _window(
 
 
 def _show(
-    viewer: Any, stand: scene_model.RenderModel, data: mujoco.MjData, now: Drive, built: World, *, car: Any, spin: Any, heading: float, view: View
+    viewer: Any, stand: scene_model.RenderModel, data: mujoco.MjData, now: Drive, built: World,
+    *, car: Any, spin: Any, heading: float, view: View
 ) -> float:  # fmt: skip
     """Put everybody where they are and the camera behind the car; returns the camera's heading."""
     seen = now.shot
@@ -172,7 +172,7 @@ def _show(
     scene_model.place_light(data, joints[built.car, :3])
     marks = viewer.user_scn
     marks.ngeom = 0
-    actors.add_others(marks, drawing.Others(*(np.asarray(getattr(seen.traffic, name))[None] for name in drawing.Others._fields)), 0)
+    actors.add_traffic(marks, TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(seen.traffic))), 0)
     turn = (float(yaw[built.car]) - heading + np.pi) % (2 * np.pi) - np.pi
     heading += turn / (1.0 + view.lag_s / built.dt)
     if now.chasing:
@@ -187,7 +187,8 @@ def dashboard(now: Drive, built: World) -> tuple[str, str]:
     seen, car = now.shot, built.car
     assert seen is not None
     lines = {
-        "speed": f"{3.6 * seen.speed[car]:.0f} km/h", "friction": f"{seen.grip[car]:.2f}", "grip used": f"{100 * seen.friction_utilization[car]:.0f} %",
+        "speed": f"{3.6 * seen.speed[car]:.0f} km/h", "friction": f"{seen.grip[car]:.2f}",
+        "friction used": f"{100 * seen.friction_utilization[car]:.0f} %",
         "throttle": f"{now.wheel.throttle:.2f}", "brake": f"{now.wheel.brake:.2f}", "wheel": f"{now.wheel.steer:+.2f}",
         "contact": f"{seen.contact_force[car] / 1000:.0f} kN", "time": f"{now.steps * built.dt:.1f} s" + (", paused" if now.paused else ""),
     }  # fmt: skip

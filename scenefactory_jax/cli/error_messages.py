@@ -1,6 +1,5 @@
-"""What goes wrong past the door, in the user's words: no device, too little memory, weights that do not fit, a reward that is no number."""
+"""Explains errors of the machine and of libraries: no device, too little memory, weights that do not fit."""
 
-import math
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -8,49 +7,27 @@ from typing import Any
 import flax.errors
 import jax
 
-from scenefactory_jax.core.instantiate import ConfigError
-
 
 def explain_error(error: Exception, config: Mapping[str, Any]) -> str | None:
-    """One line for an error of the machine or of a library below, with the way out; None for anything else, whose traceback is of use.
+    """Explains an error of the machine or of a library in one line, with a remedy; None for any other error.
 
     Args:
-        error: what a command raised.
-        config: the command's.
+        error: of a command.
+        config: of the command.
     """
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return _memory(text, config)
     if isinstance(error, flax.errors.ScopeParamShapeError):
-        name, place, wanted, held = re.findall(r'"([^"]+)"|shape (\([^)]*\))', text)[:4]
-        where = f"{place[0].strip('/')}/{name[0]} {held[1]}, this config wants {wanted[1]}"
-        return f"run={config.get('run')}: has weights {where}; `observe` and `policy` must be as they were in training"
+        name, place, expected, got = re.findall(r'"([^"]+)"|shape (\([^)]*\))', text)[:4]
+        weights = f"{place[0].strip('/')}/{name[0]}: expected shape {expected[1]}, got {got[1]}"
+        return f"run={config.get('run')}: weights {weights}; `observations` and `policy` must be those of the training"
     if isinstance(error, AssertionError | RuntimeError) and (platform := _without_device()):
         return (
             f"no device: JAX_PLATFORMS={platform} asks for one that JAX does not find here; unset it to use what there is,"
             " and for an NVIDIA GPU `pip install 'scenefactory_jax[cuda]'`"
         )
     return None
-
-
-def check_finite(row: Mapping[str, float | int]) -> None:
-    """Refuse to go on where a reward term is no number and nothing was learnt: hours of it would leave the policy as it was.
-
-    A car that breaks is no such case: it ends as a fault, and the minibatch that holds it may be left out (`ppo/skipped`).
-
-    Args:
-        row: an iteration's metrics.
-
-    Raises:
-        ConfigError: naming the terms.
-    """
-    broken = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
-    if broken and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
-        named = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in broken)
-        raise ConfigError(
-            f"{named} in iteration {row['iteration']}, so no minibatch could be learnt from;"
-            " look for a division by zero, or a log or root below zero, or leave it out: ~" + broken[0].replace("/", ".")
-        )
 
 
 def _memory(text: str, config: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ import yaml
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.cli.compare import read_records
 from scenefactory_jax.core import result_file, trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import agent_metrics
@@ -27,7 +28,7 @@ def export(config: Mapping[str, Any]) -> Path:
         ConfigError: no such run, no checkpoint in it, code of others in its config without `trust`, a folder that holds something, or
             one of `card.judged` that `evaluate` did not write.
     """
-    schema.check_export(config)
+    schema.check(config, schema.Export)
     out = Path(config["out"])
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"out: {out} holds something already; give a new folder")
@@ -35,6 +36,7 @@ def export(config: Mapping[str, Any]) -> Path:
     judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
     episodes = {named(what, folder): result_file.read_evaluated(folder).get("episodes", {}) for what, folder in folders.items()}
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
+    configs.print_outside_targets(trained.config, trained.folder)
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     own = trained.config
@@ -64,7 +66,7 @@ def named(what: str, folder: Path) -> str:
 
 def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, agent_metrics.Estimate]]:
     """Protocol -> estimates of an evaluation's trained policy."""
-    records = result_file.records(folder)
+    records = read_records(folder)
     if not records:
         raise ConfigError(f"card.judged.{what}: {folder} holds no records of agents; give a folder that `evaluate` wrote")
     return {name: agent_metrics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}

@@ -1,65 +1,49 @@
-"""`weather`: what the friction model says of every surface, water film, speed and slip, as tables and figures."""
+"""`physics`: tables and figures of the friction model, and a short comparison of the car's solvers with MuJoCo's C engine."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
-from scenefactory_jax.core.instantiate import check_range, instantiate
-from scenefactory_jax.visualization.report import friction_tables as report
-from scenefactory_jax.weather import friction as model
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.dynamics import c_engine_comparison
+from scenefactory_jax.evaluation import agent_metrics
+from scenefactory_jax.visualization.report import friction_tables
 
 DIGITS = 5
-POINTS = 200  # of a curve
 
 
-def weather(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Work out and write what a config asks for (`load("weather", "out=...")`).
+def physics(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Computes and writes friction tables, and prints the comparison of solvers (`load_config("physics", "out=...")`).
 
     Returns:
-        What weather.json holds: friction at the reference speed by surface and film, and curves over film, speed and slip.
+        The content of weather.json: friction coefficients at the reference speed by surface and film, and curves over film, speed, slip.
 
     Raises:
         ConfigError: a key that does not fit, by name.
     """
-    schema.check(config, schema.WEATHER)
-    (slowest, fastest), (least, most) = (check_range(config[name], where=name) for name in ("speeds_mps", "slips"))
-    grip = config["weather"]["grip"]
-    tyre = instantiate({**grip["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.grip.tyre")()
-    slips, reference = {"static": grip["slip_static"], "dynamic": grip["slip_dynamic"]}, grip["reference_speed"]
-
-    def friction(surface: str, speed: Any, film_mm: Any, slip: Any) -> np.ndarray:
-        numbers = grip["surfaces"][surface]
-        given = (speed, film_mm, numbers["theta"], numbers["texture_mm"], slip)
-        return np.asarray(model.compute_lugre_friction(*jnp.broadcast_arrays(*(jnp.asarray(x, jnp.float32) for x in given)), tyre=tyre))
-
-    films = np.linspace(0.0, config["film_most_mm"], POINTS)
-    speeds, slip = np.linspace(slowest, fastest, POINTS), np.linspace(least, most, POINTS)
-    first = next(iter(grip["surfaces"]))
-    found = {
-        "command": configs.format_command("weather"),
-        "reference": {"speed_mps": reference, "slips": slips, "films_mm": config["films_mm"], "surface": first},
-        "table": {
-            name: {kind: friction(name, reference, config["films_mm"], value) for kind, value in slips.items()}
-            for name in grip["surfaces"]
-        },
-        "over_film": {
-            "film_mm": films,
-            **{name: {kind: friction(name, reference, films, value) for kind, value in slips.items()} for name in grip["surfaces"]},
-        },
-        "over_speed": {
-            "speed_mps": speeds, **{f"{film:g}": friction(first, speeds, film, slips["static"]) for film in config["films_mm"]}
-        },
-        "over_slip": {"slip": slip, **{f"{film:g}": friction(first, reference, film, slip) for film in config["films_mm"]}},
-    }  # fmt: skip
-    found = result_file.plain(found, digits=DIGITS)
+    schema.check(config, schema.Physics)
+    numbers = {name: config[name] for name in ("films_mm", "speeds_mps", "slips", "max_film_mm")}
+    tables = friction_tables.compute_tables(config["weather"]["friction"], **numbers)
+    found = result_file.plain({"command": configs.format_command("physics"), **tables}, digits=DIGITS)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
     result_file.write(out / "weather.json", found, digits=None)
-    print(f"{report.table(found)}\n{report.write(out, found)}", flush=True)
+    print(f"{friction_tables.table(found)}\n{friction_tables.write(out, found)}", flush=True)
+    if config["comparison"] is not None:
+        scene_source.use_compilation_cache()
+        entry = {**config["comparison"], "_target_": "compare_solvers"}
+        compare = instantiate(entry, builtins=c_engine_comparison, where="comparison")
+        print(_format_distances(compare(config["backends"])), flush=True)
     return found
+
+
+def _format_distances(distances: Mapping[tuple[str, str], np.ndarray]) -> str:
+    """Formats the largest distances of the drives as a table."""
+    rows = [[*pair, *(f"{1e3 * value:.3g}" for value in (np.median(found), found.max()))] for pair, found in distances.items()]
+    return agent_metrics.grid(["Solver", "Compared with", "Distance, mm: median drive", "worst drive"], rows)

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.cli.scenes import draw
+from scenefactory_jax.cli.view_schema import Render
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.mujoco import offscreen_renderer, world_mjcf
 from scenefactory_jax.weather import road_condition
@@ -32,7 +34,7 @@ def render(config: Mapping[str, Any]) -> Path:
         ConfigError: no such scene, or a dynamics without a car to show.
         SceneError: nothing usable at the path.
     """
-    schema.check(config, schema.RENDER)
+    schema.check(config, Render)
     loaded = scene_source.load_training_scenes(config["scenes"])
     index, count = config["index"], len(loaded)
     if not 0 <= index < count:
@@ -67,13 +69,13 @@ def world(config: Mapping[str, Any], scene: Scene) -> mujoco.MjSpec:
     """
     dynamics = config["dynamics"]
     if "car" not in dynamics or "solver" not in dynamics:
-        raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: mjx_car, mjx_published")
+        raise ConfigError(f"dynamics: {dynamics['_target_']} has no car to show; valid: articulated, articulated_paper, mjx")
     parameters, solver = cars.read_parameters(dynamics)
-    car = cars.build_mjspec(parameters, visual=True, brake_rows=False)
+    car = models.build_mjspec(parameters, visual=True, brake_rows=False)
     spec = world_mjcf.world(scene, car, scene_size_m=config["scenes"]["pack"]["scene_size_m"], **config["world"])
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):
-        cars.add_ground_pairs(spec, parameters, ground="ground", prefix=f"agent{slot}/")
-    cars.set_options(spec, solver, physics_dt=1.0 / config["timing"]["physics_hz"])
+        models.add_ground_pairs(spec, parameters, ground="ground", prefix=f"agent{slot}/")
+    models.set_options(spec, solver, physics_dt=1.0 / config["timing"]["physics_hz"])
     return spec
 
 

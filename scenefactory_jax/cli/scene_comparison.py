@@ -7,8 +7,9 @@ from typing import Any
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
-from scenefactory_jax.data.curation import distribution_distance as report
+from scenefactory_jax.data.curation import distribution_distance
 from scenefactory_jax.data.loading import raw_scenes
+from scenefactory_jax.visualization.report import scene_comparison
 
 
 def compare(config: Mapping[str, Any]) -> Path:
@@ -36,12 +37,12 @@ def compare(config: Mapping[str, Any]) -> Path:
     scene_size_m = float(scenes[reference]["pack"]["scene_size_m"])
     sets = {}
     for name, entry in scenes.items():
-        samples = report.collect(_checked(entry, limit), scene_size_m=scene_size_m)
+        samples = distribution_distance.collect(_checked(entry, limit), scene_size_m=scene_size_m)
         if not len(samples["vehicles"]):
             raise SceneError(f"{entry['path']}: no usable scene to compare as {name!r}")
         sets[name] = samples
-    path = report.write(Path(config["out"]), reference, sets, scene_size_m=scene_size_m, command=configs.format_command("scenes"))
-    print(f"{report.table(reference, sets)}\n{path}", flush=True)
+    path = scene_comparison.write(Path(config["out"]), reference, sets, scene_size_m=scene_size_m, command=configs.format_command("scenes"))
+    print(f"{scene_comparison.table(reference, sets)}\n{path}", flush=True)
     return path
 
 

@@ -115,7 +115,7 @@ def export(config: Mapping[str, Any]) -> int:
         raise ConfigError(f"export.format: {name!r}; valid: {', '.join(EXPORTS)}")
     if out is None:
         raise ConfigError("out: null; give a folder for the files")
-    bank, check = _open(_path(config)), scene_source.make_readers(config["scenes"])["check"]
+    bank, check = _open(_path(config)), scene_source.make_packing(config["scenes"])["check"]
     refused: list[str] = []
     repaired: Counter[str] = Counter()
     files.make_folder(Path(out))

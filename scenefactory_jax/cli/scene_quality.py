@@ -1,15 +1,17 @@
 """`scenes op=quality`: what is wrong with the scenes of a bank, a folder or of the generator, rule by rule, with pictures."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli import schema
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
+from scenefactory_jax.core.schema import Seed
 from scenefactory_jax.data.curation import quality_gate as judging
 from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.data.loading import raw_scenes, scene_source
@@ -17,7 +19,14 @@ from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import scene_quality as report
 from scenefactory_jax.visualization.report.scene_quality import Count, Example
 
-REPORT = {"examples": schema.SEED, "seed": schema.SEED, "window_m": schema.Key(float, 1)}
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """The group `quality.report`."""
+
+    examples: Seed
+    seed: Seed
+    window_m: Annotated[float, schema.Bounds(min=1)]
 
 
 def quality(config: Mapping[str, Any]) -> dict[str, Count]:
@@ -30,17 +39,17 @@ def quality(config: Mapping[str, Any]) -> dict[str, Count]:
         ConfigError: no folder for the report, a rule that cannot be built, or neither a path nor a generator.
         SceneError: no scene that can be read.
     """
-    schema.check_scenes(config["scenes"])
+    scene_source.check_config(config["scenes"])
     if config["out"] is None:
         raise ConfigError("out: null; give a folder for the report")
     settings, numbers = config["quality"], config["quality"]["report"]
-    schema.check(numbers, REPORT, where="quality.report")
+    schema.check(numbers, ReportSettings, where="quality.report")
     rules = judging.make(settings["rules"])
     names = {"reject": settings["reject"], "drop": settings["drop"]}
     rng = np.random.default_rng(numbers["seed"])
     counts, chosen = dict.fromkeys(rules, Count(0, 0, 0)), {name: [] for name in rules}
     scenes, refused, dropped, unread = 0, 0, 0, []
-    check = scene_source.make_readers(config["scenes"])["check"]
+    check = scene_source.make_packing(config["scenes"])["check"]
     for raw in raw_scenes.scenes(config["scenes"]):
         if isinstance(raw, str):
             unread.append(raw)

@@ -7,7 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from scenefactory_jax.cli import scene_comparison, scene_operations, scene_quality, schema
+from scenefactory_jax.cli import scene_comparison, scene_operations, scene_quality
+from scenefactory_jax.cli.scene_schema import SceneOperations
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.loading import scene_source
@@ -28,7 +30,7 @@ def scenes(config: Mapping[str, Any]) -> Any:
         ConfigError: an unknown op, or a key of one that cannot be.
         SceneError: nothing usable at the path.
     """
-    schema.check_operations(config)
+    schema.check(config, SceneOperations)
     if config["op"] not in OPERATIONS:
         raise ConfigError(f"op: {config['op']!r}; valid: {', '.join(OPERATIONS)}")
     return OPERATIONS[config["op"]](config)
@@ -70,12 +72,19 @@ def draw(loaded: scene_source.Scenes, folder: Path, *, limit: int) -> list[Path]
     return paths
 
 
+def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """Step every scene for some seconds and print what went wrong."""
+    found = scene_simulation.simulate(config)
+    print(scene_simulation.describe(found), flush=True)
+    return found
+
+
 OPERATIONS: dict[str, Operation] = {
     "check": check,
     "sheet": sheet,
     "quality": scene_quality.quality,
     "compare": scene_comparison.compare,
-    "simulate": scene_simulation.simulate,
+    "simulate": simulate,
     "info": scene_operations.info,
     "filter": scene_operations.filter,
     "sample": scene_operations.sample,
@@ -91,5 +100,5 @@ def _row(scene) -> list[str]:
     """Agents, segments, metres of lane and edge, and the agents' mean route."""
     metres = lambda road: f"{2 * float(np.sum(road.half_length[road.valid])):.0f}"  # noqa: E731
     present = np.asarray(scene.agents.present)
-    route = f"{np.mean(scene.agents.route[present]):.0f}" if present.any() else ""
+    route = f"{np.mean(scene.agents.route_length[present]):.0f}" if present.any() else ""
     return [str(present.sum()), str(int(scene.road.valid.sum())), metres(scene.lanes), metres(scene.edges), route]

@@ -16,20 +16,20 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import study_plan, study_results
+from scenefactory_jax.cli.evaluate import load_terminations, make_training_callback
 from scenefactory_jax.cli.study_plan import Evaluation, Plan, Training
 from scenefactory_jax.cli.study_results import RESULT, TRAINED
 from scenefactory_jax.core import atomic_file, folder_lock, result_file
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import agent_metrics
-from scenefactory_jax.evaluation.protocols import make_evaluator
+from scenefactory_jax.evaluation.protocols import Evaluator, make_evaluator
 from scenefactory_jax.learning import checkpoint, policy_io, training_loop
 
 COMPILING_S = 120.0  # what a training may take beside its minutes, if none has told yet
 LOOKS, COUNTED = "looks.json", ("policies", "curve points", "seconds")
 
 Work = TypeVar("Work", Training, Evaluation)
-Examine = Callable[[Any], tuple[dict[str, np.ndarray], list]]
 
 
 def study(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,7 +114,7 @@ class Looks:
         self._new: dict[str, Any] = {"date": datetime.date.today().isoformat(), "command": command, "cut": cut}
         self._new |= dict.fromkeys(COUNTED, 0)
 
-    def counted(self, examine: Examine, kind: str) -> Examine:
+    def counted(self, examine: Evaluator, kind: str) -> Evaluator:
         """`examine`, noting each call before it begins, and what it took."""
 
         @functools.wraps(examine)
@@ -173,11 +173,12 @@ class Shared:
             print(self._scenes[key].account, flush=True)
         return self._scenes[key]
 
-    def examiner(self, judging: Evaluation, kind: str) -> Examine:
+    def examiner(self, judging: Evaluation, kind: str) -> Evaluator:
         """Plays the held-out scenes under a judging's condition and protocol."""
         settings = {**judging.config["evaluation"], **self.config["evaluation"]}
         scenes = self.heldout(judging.config)
-        return self.looks.counted(make_evaluator(judging.config, scenes, protocol=judging.protocol, settings=settings, film=0), kind)
+        config = {**judging.config, "termination": load_terminations([judging.protocol])[judging.protocol]}
+        return self.looks.counted(make_evaluator(config, scenes, settings=settings), kind)
 
     def wanted(self, variant: str) -> bool:
         return self.config["only"] is None or variant in self.config["only"]
@@ -202,10 +203,10 @@ def _train(plan: Plan, shared: Shared, clock: Clock) -> bool:
             prepared = prepared or training_loop.prepare(one.config)
             watched = study_plan.is_watched(plan, one) if one.config["evaluation"]["every"] else []
             examiners |= {j.program: shared.examiner(j, "curve points") for j in watched if j.program not in examiners}
-            own = prepared._replace(scenes=_scenes_of(one, shared), examiners={j.protocol: examiners[j.program] for j in watched})
+            own, while_training = prepared._replace(scenes=_scenes_of(one, shared)), {j.protocol: examiners[j.program] for j in watched}
             sharing = min(shared.config["per_gpu"], shared.config["processes"])
             try:
-                note = _train_one(one, own) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
+                note = _train_one(one, own, while_training) | {"per_gpu": sharing, "watched": {j.protocol: j.program for j in watched}}
             except folder_lock.Busy:
                 print(f"training {one.variant}, seed {one.seed}: left to the command that trains in {one.folder}", flush=True)
                 continue
@@ -238,12 +239,13 @@ def _estimate(one: Training) -> float:
     return 0.0 if one.config["minutes"] is None else 60.0 * one.config["minutes"] + COMPILING_S
 
 
-def _train_one(one: Training, prepared: training_loop.Prepared) -> dict[str, Any]:
+def _train_one(one: Training, prepared: training_loop.Prepared, evaluators: Mapping[str, Evaluator]) -> dict[str, Any]:
     """One run, from its last checkpoint if there is one, and what there is to note of it."""
     resume = (one.folder / configs.FILE).is_file()
     print(f"training {one.variant}, seed {one.seed}" + (" (goes on)" if resume else ""), flush=True)
     config = {**one.config, "out": str(one.folder), "resume": resume}
-    last = training_loop.train(config, prepared=prepared).metrics[-1]
+    callback = functools.partial(make_training_callback, config, evaluators=evaluators)
+    last = training_loop.train(config, prepared=prepared, make_callback=callback).metrics[-1]
     note = {"digest": one.digest, "seed": one.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
     note |= {"minutes": last["minutes"], "commit": configs.find_commit(), "versions": configs.versions()}
     if prepared.scenes is not None:
@@ -268,7 +270,7 @@ def _judge(plan: Plan, shared: Shared, clock: Clock) -> bool:
             if not clock.fits(longest, what=f"judging {one.row}, {one.condition}, {one.protocol}"):
                 return False
             examine = examine or shared.examiner(one, "policies")
-            records, _ = examine(_weights(one, shared))
+            records = examine(_weights(one, shared))
             with atomic_file.write_atomically(one.file) as half:
                 agent_metrics.write_csv(half, records)
             counts = [f"{name} {100 * np.mean(records[name]):.1f} %" for name in ("goal_reached", "clean", "collision")]

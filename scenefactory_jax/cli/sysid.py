@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from experiments.validation import target_check
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
-from scenefactory_jax.core.parallel.process_pool import map_tasks
+from scenefactory_jax.core.parallel.task_map import open_pool, require_results
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.sysid import (
@@ -37,6 +36,7 @@ from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
 from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
 from scenefactory_jax.sysid.parameter_space import Space
 from scenefactory_jax.visualization.report import sysid_report as report
+from scenefactory_jax.visualization.report import verdicts
 
 DIGITS = 7  # of the numbers in result.json
 
@@ -51,7 +51,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: a key or number that does not fit, by name; a missing teacher package.
     """
-    schema.check(config, schema.SYSID)
+    schema.check(config, schema.Sysid)
     scene_source.use_compilation_cache()
     out, settings = Path(config["out"]), config["sysid"]
     (out / "stages").mkdir(parents=True, exist_ok=True)
@@ -83,7 +83,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     (out / "fitted.yaml").write_text(yaml.safe_dump(result_file.plain(fitted(where, refined.best), digits=5), sort_keys=False))
     result = result_file.read(out / "result.json")
     found = report.verdicts(result, settings["targets"])
-    print(f"{report.write(out, result, settings['targets'])}\n{target_check.text(found)}", flush=True)
+    print(f"{report.write(out, result, settings['targets'])}\n{verdicts.text(found)}", flush=True)
     return result
 
 
@@ -169,7 +169,7 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
     }
     masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
     every, found = config["sysid"]["every"], {}
-    with map_tasks(config["workers"]) as each:
+    with open_pool(config["workers"] if config["workers"] > 1 else 0) as task_map:
         for name, suite in suites.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
             made = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
@@ -180,7 +180,8 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
                 except ConfigError:
                     print(f"{path}: of other settings, recorded anew", flush=True)
             begun = time.perf_counter()
-            found[name] = list(each(functools.partial(reference_recordings.record, teacher=instructor), suite(entries)[::every]))
+            record = functools.partial(reference_recordings.record, teacher=instructor)
+            found[name] = list(require_results(task_map(record, suite(entries)[::every])))
             reference_recordings.save(path, found[name], digest=made)
             print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found

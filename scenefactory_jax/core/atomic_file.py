@@ -1,13 +1,23 @@
-"""Files that are whole or as they were, wherever a process is killed."""
+"""Files that are complete or as they were before, wherever a process is killed."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 
 @contextlib.contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """A place beside `path` to write to; what lies there in the end takes the place of the file."""
-    half = path.with_name(f"{path.name}.part")
-    yield half
-    half.replace(path)
+    """A hidden path beside `path` to write to.
+
+    In the end its file is flushed to the disk and replaces `path`; after an error it is removed.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

@@ -1,50 +1,50 @@
-"""Planar geometry: angles, frames, the three circles that stand for a car, places along lanes."""
+"""Planar geometry: angles, frames, the three circles that stand for a car, points along lanes."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.types import Road
 
-EPSILON = 1e-6  # distances (m), speeds (m/s) and squared speeds (m^2/s^2) below this count as zero
+SMALLEST = 1e-6  # below this, squared speeds (m^2/s^2) and closing speeds (m/s) count as zero
 CONTIGUOUS_M = 0.05  # a lane's arc length may differ by this much from the summed segments before it counts as broken
 
 
 def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The same angle in [-pi, pi)."""
+    """Wraps an angle to [-pi, pi)."""
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
 def heading_vector(yaw: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
-    """Unit vector that a yaw points along."""
+    """Computes the unit vector of a yaw."""
     return jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
 
 
 def rotate(vector: Float[Array, "*n 2"], yaw: Float[Array, "*m"]) -> Float[Array, "*k 2"]:
-    """`vector` turned by `yaw`: from a car's frame to the world's. Leading axes broadcast."""
+    """Rotates `vector` by `yaw`: from a car's frame to the world's. Leading axes broadcast."""
     cos, sin, x, y = jnp.cos(yaw), jnp.sin(yaw), vector[..., 0], vector[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def to_frame(vector: Float[Array, "*n 2"], yaw: Float[Array, "*m"]) -> Float[Array, "*k 2"]:
-    """`vector` as seen from a frame with that `yaw`: from the world's to a car's. Leading axes broadcast."""
+    """Rotates `vector` by `-yaw`: from the world's frame to a car's. Leading axes broadcast."""
     return rotate(vector, -yaw)
 
 
 def safe_norm(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-    """Euclidean length whose gradient at zero is zero instead of NaN."""
+    """Computes the Euclidean length; its gradient at zero is zero instead of NaN."""
     return safe_sqrt(dot(vector, vector))
 
 
 def safe_sqrt(squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Square root whose gradient at zero is zero instead of NaN; NaN stays NaN: a distance that is not known is not short."""
+    """Computes the square root; its gradient at zero is zero instead of NaN. NaN stays NaN."""
     zero = squared <= 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:
-    """Inner product over the last axis, which is short; leading axes broadcast.
+    """Computes the inner product over the last axis, which is short; leading axes broadcast.
 
-    Written out: XLA fuses a few products into whatever comes next, but makes every reduction a kernel of its own.
+    Written out, because XLA fuses products but makes every reduction a kernel of its own.
     """
     total = a[..., 0] * b[..., 0]
     for axis in range(1, a.shape[-1]):
@@ -53,7 +53,7 @@ def dot(a: Float[Array, "*n d"], b: Float[Array, "*m d"]) -> Float[Array, "*k"]:
 
 
 def cross(a: Float[Array, "*n 2"], b: Float[Array, "*m 2"]) -> Float[Array, "*k"]:
-    """z component of the cross product of planar vectors; leading axes broadcast."""
+    """Computes the z component of the cross product of planar vectors; leading axes broadcast."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -62,17 +62,17 @@ def cover_with_circles(
     yaw: Float[Array, " A"],
     size: Float[Array, "A 2"],
     *,
-    radius_share: float,
+    radius_fraction: float,
     radius_floor_m: float,
     spacing_limit_m: float,
 ) -> tuple[Float[Array, "A 3 2"], Float[Array, " A"]]:
-    """Three circles along a car's axis that stand for its body, and their radius.
+    """Computes the centres of three circles along a car's axis that stand for its body, and their radius.
 
-    Radius max(floor, share x width), centres at +d, 0, -d with d = min(limit, max(0, length/2 - 0.8 radius)): the circles of the published
-    TTC (1.10 m and 1.12 m for the 4 x 2 m car with share 0.55 and limit half a wheelbase).
+    Radius max(floor, fraction x width), centres at +d, 0, -d with d = min(limit, max(0, length/2 - 0.8 radius)): the circles of the
+    published TTC (1.10 m and 1.12 m for the 4 x 2 m car with fraction 0.55 and limit half a wheelbase).
     """
     length, width = size[:, 0], size[:, 1]
-    radius = jnp.maximum(radius_floor_m, radius_share * width)
+    radius = jnp.maximum(radius_floor_m, radius_fraction * width)
     spacing = jnp.minimum(spacing_limit_m, jnp.maximum(0.0, 0.5 * length - 0.8 * radius))
     along = spacing[:, None] * jnp.array([1.0, 0.0, -1.0], jnp.float32)
     centres = position[:, None, :] + along[..., None] * heading_vector(yaw)[:, None, :]
@@ -82,20 +82,20 @@ def cover_with_circles(
 def distance_to_boxes(
     point: Float[Array, "*n 2"], position: Float[Array, "B 2"], yaw: Float[Array, " B"], size: Float[Array, "B 2"]
 ) -> Float[Array, "*n B"]:
-    """Distance from points to the outlines of oriented boxes; 0 inside."""
+    """Computes distances from points to the outlines of oriented boxes; 0 inside."""
     beyond = jnp.abs(to_frame(point[..., None, :] - position, yaw)) - size / 2
     return safe_norm(jnp.maximum(beyond, 0.0))
 
 
 def cumulative_length(road: Road) -> Float[Array, " P"]:
-    """Length of all valid segments up to the end of each, laid end to end in storage order."""
+    """Computes the length of all valid segments up to the end of each, in storage order."""
     return jnp.cumsum(jnp.where(road.valid, 2 * road.half_length, 0.0))
 
 
 def find_point_at_distance(
     road: Road, running: Float[Array, " P"], distance: Float[Array, "*n"]
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"], Int[Array, "*n"], Float[Array, "*n"]]:
-    """Point, yaw, polyline and arc length at a distance along all valid segments laid end to end; `running` is their `running_length`."""
+    """Computes point, yaw, polyline and arc length at a distance along all valid segments; `running` is their `cumulative_length`."""
     row = jnp.clip(jnp.searchsorted(running, distance), 0, running.shape[0] - 1)
     along = distance - running[row] + road.half_length[row]  # from the midpoint
     along = jnp.clip(along, -road.half_length[row], road.half_length[row])

@@ -1,8 +1,8 @@
-"""Frozen dataclasses that are JAX pytrees, and what one does with pytrees.
+"""Frozen dataclasses that are JAX pytrees, and operations on pytrees.
 
 `flax.struct` rebuilds a dataclass through `__init__` when a pytree is unflattened, so a shape check on the fields would see
-the tracers, `None`s and batched arrays that `vmap`, `scan` and `eval_shape` put there. Here unflattening bypasses `__init__`:
-shapes are checked where people build a value, never where JAX rebuilds one.
+the tracers, `None`s and batched arrays of `vmap`, `scan` and `eval_shape`. Here unflattening bypasses `__init__`: shapes are checked where
+code builds a value, never where JAX rebuilds one.
 """
 
 import dataclasses
@@ -20,12 +20,12 @@ T = TypeVar("T")
 
 replace = dataclasses.replace
 
-LARGEST = 1e12  # no length, speed or force of a car comes near; beyond, float32 sums of squares end at 3e38
+LARGEST = 1e12  # above any length, speed or force of a car; float32 squares overflow at 3e38
 KINDS = {"float": jnp.floating, "int": jnp.integer, "bool": jnp.bool_}
 
 
 def tree_where(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
-    """Row by row of two pytrees whose leaves all start with the axis of `condition`: agents, or worlds."""
+    """Selects rows of two pytrees whose leaves all start with the axis of `condition`: agents, or worlds."""
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - 1)), a, b)
@@ -34,27 +34,26 @@ def tree_where(condition: Bool[Array, " rows"], chosen: T, other: T) -> T:
 
 
 def is_finite(tree: Any) -> Bool[Array, " rows"]:
-    """Row by row of a pytree whose leaves all start with the same axis: whether every number is finite, and so is its square."""
+    """Mask of the rows of a pytree, whose leaves all start with the same axis, in which every number and its square are finite."""
     per_leaf = [jnp.all(jnp.abs(leaf) < LARGEST, axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
     return jnp.all(jnp.stack(per_leaf), axis=0)
 
 
 def to_jax(tree: T) -> T:
-    """Leaves as arrays of JAX, those of numpy included that a traced function closes over.
+    """Converts leaves to JAX arrays, also numpy arrays inside the tracers of `vmap`, on which `custom_jvp` fails: a copy converts them.
 
-    `vmap` hands numpy arrays on inside its tracers, where `custom_jvp` stumbles over them; a copy makes JAX arrays of them. Compiled, a
-    copy is no operation.
+    Compiled, a copy is no operation.
     """
     return jax.tree.map(lambda leaf: jnp.copy(leaf) if isinstance(leaf, Tracer) else jnp.asarray(leaf), tree)
 
 
 def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -> None:
-    """Refuse a struct with a field of another shape or kind of number than its annotation says. Only shapes and dtypes are read.
+    """Checks shape and kind of number of a struct's fields against their annotations. Only shapes and dtypes are read.
 
     Args:
-        where: what the caller calls the value, for messages.
-        sizes: axis -> size, None if it is not known yet. These axes have one size in all parts of the value, others in each part its own;
-            sizes that are found are filled in.
+        where: name of the value, for messages.
+        sizes: axis -> size, None if it is not known yet; sizes that are found are filled in. These axes have one size in all parts of the
+            value, other axes have their own in each part.
 
     Raises:
         ValueError: naming the field, what it is, and what was expected.
@@ -75,7 +74,7 @@ def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -
 def check_array(
     leaf: Any, expected: Any, *, where: str, sizes: dict[str, int | None], own: dict[str, int | None] | None = None
 ) -> None:  # fmt: skip
-    """Refuse an array of another shape or kind of number than a jaxtyping annotation; `own`: sizes of the axes that `sizes` does not name.
+    """Checks shape and kind of number of an array against a jaxtyping annotation; `own`: sizes of the axes that `sizes` does not name.
 
     Raises:
         ValueError: naming the array, what it is, and what was expected.
@@ -101,12 +100,12 @@ def _shown(shape: Iterable[Any]) -> str:
 
 
 def to_strong_type(tree: T) -> T:
-    """Cast away weak types: a carried state with one traces its function a second time."""
+    """Removes weak types, with which a carried state would make its function trace twice."""
     return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
 
 def unchecked(kind: type[T], /, **fields: Any) -> T:
-    """A struct past its `__init__`, whatever its leaves are: the annotations speak of device arrays, hosts and JAX put others there."""
+    """Builds a struct without `__init__` and its checks, for leaves of other kinds than the annotations say."""
     value = object.__new__(kind)
     for name, field in fields.items():
         object.__setattr__(value, name, field)
@@ -120,12 +119,12 @@ def static(**options: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen dataclass and a pytree; every field not declared `static()` is a child."""
+    """Makes `cls` a frozen dataclass and a pytree; every field that is not `static()` is a child."""
     return pytree(dataclasses.dataclass(frozen=True, eq=False)(cls))
 
 
 def pytree(cls: type[T]) -> type[T]:
-    """Make a frozen dataclass a pytree."""
+    """Makes a frozen dataclass a pytree."""
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     data = [f.name for f in fields if not f.metadata.get("static")]
     meta = [f.name for f in fields if f.metadata.get("static")]

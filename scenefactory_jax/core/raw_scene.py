@@ -18,6 +18,9 @@ LightState = Literal[
 LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)  # the order of WOMD's TrafficSignalLaneState.State (map.proto)
 
 
+COMPANION = "companion"  # kind of a file that is not a fault: see `Companion`
+
+
 class SceneError(ValueError):
     """A scene, or a bank of scenes, that cannot be used; the message names the file, the key, the value and what would be valid."""
 
@@ -35,6 +38,8 @@ class OtherContent(FormatMismatch):
 class Companion(SceneError):
     """The file holds no scene of its own but belongs to scenes beside it (a map, an index): neither read nor rejected, but counted."""
 
+    kind = COMPANION
+
 
 class Unpackable(SceneError):
     """A scene that packing refuses with the numbers given, and may take with others; nothing is wrong with its source."""
@@ -49,11 +54,12 @@ class Unpackable(SceneError):
 
 
 class Reject(NamedTuple):
-    """What a reader yields in place of a scene that it could not read, when it can go on with the next one of the same file."""
+    """Stands in place of a scene that cannot be read or packed."""
 
     scene: str | None  # its name, where it is known
     reason: str  # with the place in the file, such as a record's number and offset
-    kind: str | None = None  # of what packing refused: see `Unpackable`
+    kind: str | None = None  # see `Unpackable` and COMPANION
+    source: str | None = None  # file or generator, as in `RawScene`; readers leave it out
 
 
 @dataclass(frozen=True, eq=False)

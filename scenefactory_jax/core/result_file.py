@@ -1,4 +1,4 @@
-"""Results on the disk: JSON, written whole or not at all, with a digest of the settings that made it; and the records of evaluations."""
+"""Reads and writes results: JSON files, written atomically, with a digest of their settings."""
 
 import hashlib
 import json
@@ -9,37 +9,36 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.core import atomic_file
-from scenefactory_jax.evaluation import agent_metrics
 
-JUDGED = "judged.json"  # what an evaluation was asked for, beside its records
-# All that an evaluation writes to its folder
+JUDGED = "judged.json"  # settings of an evaluation, beside its records
+# Files that an evaluation writes
 WRITTEN = (JUDGED, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
 WRITTEN += ("trajectories.png", "video.gif", "video.mp4", "report.md")
 
 
 def digest(settings: Mapping[str, Any]) -> str:
-    """Tells whether a result was made with these settings; 16 hexadecimal digits."""
+    """Computes a digest of settings: 16 hexadecimal digits."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def write(path: Path, content: Mapping[str, Any], *, digits: int | None) -> None:
-    """One JSON file, complete or as it was before.
+    """Writes a JSON file atomically.
 
     Args:
-        digits: significant ones that numbers keep; None keeps all.
+        digits: significant digits of numbers; None: all.
     """
-    with atomic_file.write_atomically(path) as half:
-        half.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
+    with atomic_file.write_atomically(path) as temporary:
+        temporary.write_text(json.dumps(plain(content, digits=digits), separators=(",", ":")) + "\n")
 
 
 def plain(value: Any, *, digits: int | None) -> Any:
-    """Arrays, tuples and records as lists and dicts; what is no number (NaN, infinity) as null."""
+    """Converts arrays, tuples and records to lists and dicts, and numbers that are not finite to None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(one, digits=digits) for key, one in value.items()}
+        return {str(key): plain(item, digits=digits) for key, item in value.items()}
     if hasattr(value, "_asdict"):
         return plain(value._asdict(), digits=digits)
     if isinstance(value, (list, tuple)):
-        return [plain(one, digits=digits) for one in value]
+        return [plain(item, digits=digits) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist(), digits=digits)
     if not isinstance(value, float):
@@ -50,35 +49,25 @@ def plain(value: Any, *, digits: int | None) -> Any:
 
 
 def read(path: Path) -> Any:
-    """What `write` wrote; null in a list is NaN again."""
+    """Reads what `write` wrote; null in a list is NaN."""
     return _numbers(json.loads(path.read_text()))
 
 
 def _numbers(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _numbers(one) for key, one in value.items()}
+        return {key: _numbers(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [float("nan") if one is None else _numbers(one) for one in value]
+        return [float("nan") if item is None else _numbers(item) for item in value]
     return value
 
 
 def begin(folder: Path, judged: Mapping[str, Any]) -> None:
-    """Note what is judged, and remove what an evaluation before wrote to the folder: records of two would be read as those of one."""
+    """Writes what is evaluated, and removes the files of an earlier evaluation in the folder."""
     for file in [file for pattern in WRITTEN for file in folder.glob(pattern)]:
         file.unlink()
     write(folder / JUDGED, judged, digits=None)
 
 
 def read_evaluated(folder: Path) -> dict[str, Any]:
-    """What `begin` noted; nothing of an evaluation that did not yet."""
+    """Reads what `begin` wrote; defaults without it."""
     return read(folder / JUDGED) if (folder / JUDGED).is_file() else {"scenes": None, "overrides": []}
-
-
-def records(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Protocol -> records of the trained policy's agents, of what an evaluation wrote to a folder; empty where none did.
-
-    Raises:
-        RecordsError: a file that holds something else.
-    """
-    files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    return {name: agent_metrics.read_csv(path) for name, path in files.items() if not name.endswith("-untrained")}

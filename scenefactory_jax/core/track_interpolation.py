@@ -1,4 +1,4 @@
-"""Recorded tracks read at any time: which rows lie around it, and what a track does between them."""
+"""Interpolates logged tracks at any time."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -8,7 +8,7 @@ from scenefactory_jax.core.types import Boxes, TrafficLog
 
 
 def find_bracketing_rows(row: Float[Array, ""], valid: Bool[Array, " L"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The valid rows next to a fractional row: the last at or before it (-1: none) and the first behind it (L: none)."""
+    """Finds the valid rows next to a fractional row: the last at or before it (-1: none) and the first after it (L: none)."""
     length = valid.shape[0]
     rows = jnp.arange(length)
     here = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, length - 1)
@@ -25,9 +25,9 @@ def interpolate_track(
     *,
     dt: Float[Array, ""],
 ) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
-    """Position, velocity, yaw and yaw rate of one track at a fractional row, linear between valid rows `dt` seconds apart.
+    """Computes position, velocity, yaw and yaw rate of a track at a fractional row, linear between valid rows `dt` seconds apart.
 
-    At rest before the first valid row and from the last one on; a track without any stays at its first row, at rest.
+    At rest before the first valid row and from the last one on; a track without valid rows stays at its first row, at rest.
     """
     length = valid.shape[0]
     before, after = find_bracketing_rows(row, valid)
@@ -35,21 +35,21 @@ def interpolate_track(
     before_row, after_row = jnp.where(before >= 0, before, after), jnp.where(after < length, after, before)
     before_row, after_row = jnp.clip(before_row, 0, length - 1), jnp.clip(after_row, 0, length - 1)
     gap = (after_row - before_row).astype(jnp.float32)
-    share = jnp.where(moving & (gap > 0), (row - before_row) / jnp.maximum(gap, 1.0), 0.0)
+    fraction = jnp.where(moving & (gap > 0), (row - before_row) / jnp.maximum(gap, 1.0), 0.0)
     turn = wrap_angle(yaw[after_row] - yaw[before_row])
-    moved = position[before_row] + share * (position[after_row] - position[before_row])
-    speed = velocity[before_row] + share * (velocity[after_row] - velocity[before_row])
+    moved = position[before_row] + fraction * (position[after_row] - position[before_row])
+    speed = velocity[before_row] + fraction * (velocity[after_row] - velocity[before_row])
     yaw_rate = turn / (jnp.maximum(gap, 1.0) * dt)
-    return moved, jnp.where(moving, speed, 0.0), wrap_angle(yaw[before_row] + share * turn), jnp.where(moving, yaw_rate, 0.0)
+    return moved, jnp.where(moving, speed, 0.0), wrap_angle(yaw[before_row] + fraction * turn), jnp.where(moving, yaw_rate, 0.0)
 
 
 def make_empty_log(steps: int) -> TrafficLog:
-    """Tracks of nobody, over that many logged steps."""
+    """A log without road users, over that many steps."""
     flat, pair = jnp.zeros((0, steps), jnp.float32), jnp.zeros((0, steps, 2), jnp.float32)
     return TrafficLog(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, jnp.int32))
 
 
 def make_empty_boxes() -> Boxes:
-    """No boxes: a road with nobody on it but the cars."""
+    """No boxes."""
     none, pair = jnp.zeros(0, jnp.float32), jnp.zeros((0, 2), jnp.float32)
     return Boxes(pair, none, none, pair, none, pair, none, none.astype(bool))

@@ -1,8 +1,7 @@
-"""Which functions the config in a folder may name.
+"""Checks which functions the config in a folder names.
 
-A config entry names a function by `_target_`, which is imported and called. In the config of a run or a policy, that may be code of the
-person who made the folder. Such a config may name parts of the package; it may name other functions only with `trust`. What is typed on the
-command line, and the package's own `conf/`, is not checked.
+The function of a `_target_` is imported and called, so the config of a run or policy could run any code. Without `trust` it may name only
+modules of this package that are parts of a run. Keys of the command line and `conf/` are not checked.
 """
 
 from collections.abc import Mapping
@@ -12,44 +11,41 @@ from typing import Any
 from scenefactory_jax.core.instantiate import ConfigError
 
 PACKAGE = "scenefactory_jax"
-# Modules and packages that hold parts of a run. None of them runs programs, imports by a name that is given to it, or writes files
+# Modules with parts of a run. None of them starts programs, imports by a given name, or writes files
 PARTS = ("dynamics", "weather", "loggers", "env", "learning.networks", "learning.ppo", "evaluation.planners")
 PARTS += ("data.formats", "data.packing", "data.generators", "data.loading.samplers")
 SHOWN = 3  # targets in a message
 
 
-def check_targets(config: Mapping[str, Any], file: Path, *, trust: bool) -> None:
-    """Refuse a config of a folder that names code outside of the package; with `trust`, print what it names instead.
+def check_targets(config: Mapping[str, Any], file: Path) -> None:
+    """Checks that the config in a folder names no code outside of the package.
 
     Raises:
         ConfigError: naming the file, the key and the target.
     """
     if not (found := find_outside_targets(config)):
         return
-    if trust:
-        print(f"{file}: trusted, and runs {', '.join(f'{target} ({place})' for place, target in found.items())}", flush=True)
-        return
-    told = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
+    shown = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
     more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     raise ConfigError(
-        f"{file}: {told}{more}: outside of {PACKAGE}, so loading it would run other code;"
+        f"{file}: {shown}{more}: outside of {PACKAGE}, so loading it would run other code;"
         " read that code first, then allow it: trust=true (in Python trust=True)"
     )
 
 
 def find_outside_targets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Key -> target, for each `_target_` at any depth that is no part of the package.
+    """Finds key -> target, for each `_target_` at any depth outside of the modules in PARTS.
 
-    A name without a dot is one: `build.find` looks it up in a module of the package.
+    A name without a dot is inside: it is looked up in a module of this package.
     """
     found: dict[str, Any] = {}
     todo: list[tuple[str, Any]] = [("", config)]
-    met: set[int] = set()  # YAML may name one mapping in several places, or within itself
+    visited: set[int] = set()  # YAML may hold one mapping in several places, or within itself
     for place, node in todo:
         pairs = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, (list, tuple)) else ()
-        if id(node) in met:
+        if id(node) in visited:
             continue
-        met.add(id(node))
+        visited.add(id(node))
         for key, value in pairs:
             where = f"{place}.{_shown(key)}" if place else _shown(key)
             if key == "_target_" and not _is_part(value):
@@ -66,5 +62,5 @@ def _is_part(target: Any) -> bool:
 
 
 def _shown(key: Any) -> str:
-    """A key that cannot steer the terminal."""
+    """Returns a key that is safe to print."""
     return str(key) if str(key).isprintable() else repr(key)

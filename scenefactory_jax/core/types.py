@@ -1,7 +1,7 @@
-"""Every type that crosses a module border.
+"""Types that several modules share.
 
-Axes: `A` agent slots, `O` others on the road, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Domain code is written
-for one world and `jax.vmap` adds the world axis `W` at the edge. SI units and radians, +x forward, +y left, yaw counter-clockwise from
+Axes: `A` agent slots, `O` road users of the traffic, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Code is
+written for one world and `jax.vmap` adds the world axis `W`. SI units and radians, +x forward, +y left, yaw counter-clockwise from
 world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
 """
 
@@ -42,20 +42,20 @@ class Road:
 
 @pytree_dataclass
 class Agents:
-    """Where the cars of one episode start and what they must reach."""
+    """Starts and goals of an episode's agents."""
 
     position: Float[Array, "A 2"]
     yaw: Float[Array, " A"]
     speed: Float[Array, " A"]
     size: Float[Array, "A 2"]  # length, width
     goal: Float[Array, "A 2"]
-    route: Float[Array, " A"]  # length of the way from start to goal
+    route_length: Float[Array, " A"]  # from start to goal, m
     present: Bool[Array, " A"]
 
 
 @pytree_dataclass
 class AgentLog:
-    """What the cars did in the recording, resampled to nothing: the source's own time step."""
+    """Logged tracks of the agents, at the source's own time step."""
 
     position: Float[Array, "A L 2"]
     yaw: Float[Array, "A L"]
@@ -66,7 +66,7 @@ class AgentLog:
 
 @pytree_dataclass
 class TrafficLog:
-    """What everybody else on the road did in the recording: who was there and is no agent, at the steps of `Log`."""
+    """Logged tracks of all road users that are not agents, at the time steps of `AgentLog`."""
 
     position: Float[Array, "O L 2"]
     yaw: Float[Array, "O L"]
@@ -78,9 +78,9 @@ class TrafficLog:
 
 @pytree_dataclass
 class Patches:
-    """Places of the road with a condition of their own; where they overlap the last one counts.
+    """Regions of the road with a condition of their own; where they overlap the last one counts.
 
-    One shape stands for all: the points within `radius` of a line of vertices and, if it is `closed`, the points inside it. A circle is one
+    All have one form: the points within `radius` of a line of vertices and, if it is `closed`, the points inside it. A circle is one
     vertex repeated, a strip an open line with half its width, a polygon a closed line with radius 0.
     """
 
@@ -89,13 +89,13 @@ class Patches:
     radius: Float[Array, " N"]
     surface: Int[Array, " N"]  # index into SURFACES
     film_mm: Float[Array, " N"]
-    follows: Float[Array, " N"]  # share of the open road's film that comes on top of `film_mm`: 1 in a puddle, 0 for a film of its own
+    open_road_film_fraction: Float[Array, " N"]  # part of the open road's film added to `film_mm`: 1 in a puddle
     present: Bool[Array, " N"]
 
 
 @pytree_dataclass
 class Rain:
-    """Water film of the open road over an episode: linear between knots, constant beyond them; it stays as it is without any."""
+    """Water film of the open road over an episode: linear between knots, constant beyond them and without any."""
 
     now_s: Float[Array, ""]  # since the episode began
     time_s: Float[Array, " K"]  # of the knots, ascending
@@ -114,7 +114,7 @@ class Weather:
 
 @pytree_dataclass
 class Boxes:
-    """Oriented boxes on the road at one moment: cars, and what else they can hit."""
+    """Oriented boxes on the road at one time: cars, and what they can hit."""
 
     position: Float[Array, "B 2"]
     elevation: Float[Array, " B"]  # of the boxes' centres
@@ -122,7 +122,7 @@ class Boxes:
     velocity: Float[Array, "B 2"]
     yaw_rate: Float[Array, " B"]
     size: Float[Array, "B 2"]  # length, width
-    mass: Float[Array, " B"]  # inf: whatever hits it, it stays on its way
+    mass: Float[Array, " B"]  # inf: immovable
     present: Bool[Array, " B"]
 
 
@@ -144,10 +144,10 @@ class SpatialGrid:
 
 @pytree_dataclass
 class Scene:
-    """One world as the graph sees it: constant in an episode, except for agents and weather, which a reset may redraw, and the boxes.
+    """The data of one world: constant in an episode, except for agents and weather, which a reset may sample again, and the traffic boxes.
 
-    `lanes` (kinds DRIVABLE) and `edges` (kinds EDGES) repeat rows of `road`, so that looking for the nearest lane or edge does not walk
-    over everything else. Coordinates are metres around the scene's centre.
+    `lanes` (kinds DRIVABLE) and `edges` (kinds EDGES) repeat rows of `road`, so that a query of the nearest lane or edge reads
+    nothing else. Coordinates are metres around the scene's centre.
     """
 
     road: Road
@@ -157,13 +157,13 @@ class Scene:
     log: AgentLog
     weather: Weather
     traffic_log: TrafficLog
-    traffic: Boxes  # where the others are now; nobody is there until an environment says so
-    road_grid: SpatialGrid | None = None  # of `road`, for whoever looks up what is near; None: look through all of it
+    traffic: Boxes  # at the present time; set by the environment
+    road_grid: SpatialGrid | None = None  # of `road`, for queries within a radius; None: they read all of it
 
 
 @pytree_dataclass
 class Motion:
-    """What the rest of the system may know of a car's body, read from any dynamics backend."""
+    """The state of a car that all dynamics backends provide."""
 
     position: Float[Array, "A 3"]  # centre of the chassis box
     velocity: Float[Array, "A 3"]  # world frame
@@ -172,14 +172,14 @@ class Motion:
     upright: Float[Array, " A"]  # cosine between the car's and the world's up
     steer: Float[Array, " A"]  # mean angle of the front wheels
     contact_force: Float[Array, " A"]  # largest force of another car or box in the last control step, N
-    grip: Float[Array, " A"]  # friction coefficient, mean over the wheels
+    mu: Float[Array, " A"]  # friction coefficient, mean over the wheels
     friction_utilization: Float[Array, " A"]  # tangential force / (friction x normal force), largest over the wheels
     slip: Float[Array, " A"]  # |wheel surface speed - ground speed|, largest over the wheels, m/s
 
 
 @pytree_dataclass
 class Events:
-    """What can happen to an agent. At most one is true in one step: the order of the fields is the order of precedence."""
+    """Events of an agent. At most one is true in one step: the order of the fields is the order of precedence."""
 
     numerical_error: Bool[Array, " A"]
     goal_reached: Bool[Array, " A"]
@@ -190,7 +190,7 @@ class Events:
 
 @pytree_dataclass
 class StepMetrics:
-    """Everything true of one step, measured once. Rewards, ends, metrics and reports only read it."""
+    """Quantities computed once per control step; rewards, termination, evaluations and reports read them."""
 
     speed: Float[Array, " A"]
     goal_distance: Float[Array, " A"]
@@ -201,14 +201,14 @@ class StepMetrics:
     lane_heading: Float[Array, " A"]  # cosine between the car and the lane's own direction: negative against the traffic
     has_lane: Bool[Array, " A"]
     ttc: Float[Array, " A"]  # time to collision with the nearest other car or box, inf if none
-    gap: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
-    stopping_margin: Float[Array, " A"]  # way free straight ahead less the way to stop on the road's friction; inf with nobody ahead
+    clearance: Float[Array, " A"]  # between the bounding circles and those of the nearest other car or box; inf if none
+    stopping_margin: Float[Array, " A"]  # free distance ahead less the stopping distance; inf if free
     edge_ttc: Float[Array, " A"]
-    edge_gap: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
+    edge_clearance: Float[Array, " A"]  # between the bounding circles and the nearest road edge; negative once touched
     drac: Float[Array, " A"]  # deceleration rate to avoid a crash, m/s^2
     distance_from_start: Float[Array, " A"]  # distance from the start
     contact_force: Float[Array, " A"]
-    grip: Float[Array, " A"]
+    mu: Float[Array, " A"]
     friction_utilization: Float[Array, " A"]
     slip: Float[Array, " A"]
     off_lane: Bool[Array, " A"]
@@ -218,15 +218,15 @@ class StepMetrics:
 
 @pytree_dataclass
 class State:
-    """What changes while a world runs."""
+    """The variable state of a world."""
 
     body: Any  # the dynamics backend's own pytree
     motion: Motion
     agents: Agents  # this episode's starts and goals
     weather: Weather  # this episode's road condition
-    active: Bool[Array, " A"]  # on stage and not finished
-    past_events: Events  # events so far, in this agent's life
-    age: Int[Array, " A"]  # control steps since the agent's own start
+    active: Bool[Array, " A"]  # present and not terminated
+    past_events: Events  # since the agent's start
+    steps_since_spawn: Int[Array, " A"]  # control steps
     previous_action: Float[Array, "A 3"]
     step: Int[Array, ""]
     key: PRNGKeyArray
@@ -234,13 +234,13 @@ class State:
 
 @pytree_dataclass
 class RewardInput:
-    """All that a reward term may see."""
+    """The input of a reward term."""
 
     scene: Scene
     before: State
     action: Float[Array, "A 3"]
     after: State
-    facts: StepMetrics
+    metrics: StepMetrics
     events: Events  # new in this step and exclusive
 
 
@@ -253,25 +253,25 @@ class SetObservation:
 
 
 Observation = dict[str, Any]
-"""Group name -> Float[Array, "A F"] or Rows. Finished and absent agents read zeros and false masks."""
+"""Group name -> Float[Array, "A F"] or SetObservation. Inactive agents read zeros and false masks."""
 
 
 @pytree_dataclass
 class StepResult:
-    """What one step gave, of an action or of a control step. `observation` is None where it was not asked for."""
+    """The result of an action or of a control step. `observation` is None for a control step."""
 
     observation: Observation | None
     reward: Float[Array, " A"]
     terms: dict[str, Float[Array, " A"]]  # weighted reward terms; they sum to `reward`
     events: Events
-    done: Bool[Array, " A"]  # an event ended the agent in this step
-    truncated: Bool[Array, ""]  # the world's time is up
-    over: Bool[Array, ""]  # truncated, or no agent is left
-    facts: StepMetrics
+    terminated: Bool[Array, " A"]  # an event ended the agent in this step
+    truncated: Bool[Array, ""]  # the world reached the time limit
+    world_done: Bool[Array, ""]  # truncated, or no agent is active
+    metrics: StepMetrics
 
 
 class Dynamics(NamedTuple):
-    """A backend: cars of one world. `advance` covers one control step; bodies of inactive cars are held and touch nobody."""
+    """A backend: cars of one world. `advance` covers one control step; bodies of inactive cars are held, without contacts."""
 
     init: Callable[[PRNGKeyArray, Scene], Any]
     advance: Callable[[Scene, Any, Float[Array, "A 3"], Bool[Array, " A"]], Any]  # (scene, body, action, active) -> body
@@ -279,25 +279,25 @@ class Dynamics(NamedTuple):
 
 
 class Env(NamedTuple):
-    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all `hold` control steps that it
-    stands for, their rewards added up.
+    """One world as pure functions. `reset` and `step` are the public pair: a step is an action, with all its `action_repeat` control
+    steps, their rewards added up.
 
-    The others are their parts: `start` and `observe` divide a reset, so that a training loop can restart finished worlds before it pays
-    for the observation; `transition` is a single control step, for whoever looks closer than the agent acts. It reads every `hold`-th
-    action of an episode, the first one first, which stands until the next. `now` gives the scene as it is at a state's moment.
+    The other functions are their parts: `init_state` and `observe` divide a reset, so that training restarts finished worlds before it
+    computes the observation; `control_step` is a single control step. It reads every `action_repeat`-th action of an
+    episode, the first one first, and holds it until the next. `current_scene` gives the scene at the time of a state.
 
     All of them take arrays of numpy or JAX, also closed over, and raise ValueError when they are traced with an argument of another shape
-    or kind of number than is annotated here. Values are not refused: an agent that starts with a number that is not finite, or with a size
-    that is not above 0, is absent; one that comes to have such a number later is a fault.
+    or kind of number than is annotated here. Values are not checked: an agent that starts with a number that is not finite, or with a size
+    of 0 or less, is absent; one that gets such a number later has the event `numerical_error`.
     """
 
     reset: Callable[[PRNGKeyArray, Scene], tuple[State, Observation]]
     step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
-    start: Callable[..., State]  # (key, scene, control step at which it begins = 0)
-    transition: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
+    init_state: Callable[..., State]  # (key, scene, control step at which it begins = 0)
+    control_step: Callable[[Scene, State, Float[Array, "A 3"]], tuple[State, StepResult]]
     observe: Callable[[Scene, State], Observation]
-    now: Callable[[Scene, State], Scene]
-    hold: int = 1
+    current_scene: Callable[[Scene, State], Scene]
+    action_repeat: int = 1
 
 
 class Policy(NamedTuple):

@@ -1,1 +1,1 @@
-"""Backends that move the cars of one world: `mjx_car`, `bicycle` and `replay`, each a module with `make(...) -> Dynamics`."""
+"""Dynamics backends, which move the cars of one world: `articulated`, `bicycle`, `log_playback`; each has `make(...) -> Dynamics`."""

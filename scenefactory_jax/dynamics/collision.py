@@ -1,14 +1,13 @@
-"""Forces between cars that touch, and on cars that touch something else: upright boxes seen from above, pushed apart by spring-dampers
-with friction.
+"""Contact forces between cars, and of other objects on cars: boxes seen from above, pushed apart by spring-dampers with friction.
 
-Every unordered pair of cars is evaluated once and its force enters both with opposite sign at the same point, so linear and angular
-momentum are kept to rounding. Depth and normal come from the separating-axis theorem; the face of least depth is cut against the
+Every unordered pair of cars is evaluated once, and its force acts on both with opposite sign at the same point: linear and angular
+momentum are conserved to rounding. Depth and normal come from the separating-axis theorem. The face of least depth is clipped against the
 other box's nearest face, which leaves two contact points, each with half the stiffness.
 """
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +15,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.instantiate import ConfigError, check_numbers
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace
+from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
 
-OFF_CENTRE = 3.7  # times as much mass moves with a contact in the middle of two cars' faces as with one at their corners
+OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
 
 
 class BoxContact(NamedTuple):
-    """Where two boxes touch. The normal points from the first to the second; depths are zero or less where a point does not touch."""
+    """Contact of two boxes. The normal points from the first to the second; a depth <= 0 is a point that does not touch."""
 
     normal: Float[Array, "2"]
     points: Float[Array, "2 2"]
@@ -32,52 +32,50 @@ class BoxContact(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """The contact model bound to its numbers. Choose each car's neighbours once a control step, then ask for forces every substep."""
+    """The contact model. Neighbours are selected once per control step, forces computed once per physics step."""
 
-    neighbours: Callable[[Boxes, Boxes], Boxes]  # (cars, others) -> those that each car may touch
-    forces: Callable[[Boxes, Boxes], tuple[Array, Array, Array]]  # (cars, their neighbours) -> see `forces`
+    neighbours: Callable[[Boxes, Boxes], Boxes]  # (cars, traffic) -> neighbours [A, K, ...]
+    forces: Callable[[Boxes, Boxes], tuple[Array, Array, Array]]  # (cars, neighbours) -> see `compute_forces`
+
+
+def make_contact(entry: Mapping[str, Any], *, height: float, physics_dt: float | None = None) -> Contact:
+    """Makes the contact model of a config's `dynamics.contact`: see `make`."""
+    target = {**entry, "_target_": "make"}
+    return instantiate(target, builtins=__name__, where="dynamics.contact", height=height, physics_dt=physics_dt)()
 
 
 def make(
     *,
-    stiffness: float,
-    damping: float,
-    friction: float,
-    mass: float,
-    momentum_transfer_s: float,
-    nearest: int,
+    stiffness: Positive,
+    damping: NonNegative,
+    friction: NonNegative,
+    mass: Positive,
+    momentum_transfer_s: Positive,
+    max_neighbours: Annotated[int, Bounds(min=0)],
     height: float,
     physics_dt: float | None = None,
 ) -> Contact:
-    """`forces` and `neighbours` with their numbers.
+    """Binds `find_neighbours` and `compute_forces` to their parameters.
 
     Args:
-        nearest: of the others that a car may touch; 0: none.
-        physics_dt: s, of the steps in which the forces move cars; None: they are reported and move nobody.
+        max_neighbours: objects that a car may touch, beside other cars; 0: none.
+        physics_dt: s, if the forces move cars; None: they are only reported.
 
     Raises:
-        ConfigError: a number out of its range, or a contact too stiff for `physics_dt`, by name.
+        ConfigError: a number out of range, or a contact too stiff for `physics_dt`, by name.
     """
-    check_numbers({"stiffness": stiffness, "mass": mass, "momentum_transfer_s": momentum_transfer_s}, where="dynamics.contact", above=0.0)
-    check_numbers({"damping": damping, "friction": friction, "nearest": nearest}, where="dynamics.contact", least=0.0)
-    if physics_dt is not None:
-        _check_stable(stiffness, damping, mass / 2, physics_dt=physics_dt)
-    numbers = dict(
-        stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height
-    )
-    return Contact(functools.partial(find_neighbours, nearest=nearest), functools.partial(compute_forces, **numbers))
-
-
-def _check_stable(stiffness: float, damping: float, reduced: float, *, physics_dt: float) -> None:
-    """Refuse a contact that the integrator cannot carry, by the bound of `forces` for cars that meet off centre."""
-    load = OFF_CENTRE * (stiffness * physics_dt + 2 * damping) * physics_dt / reduced
-    if load >= 4.0:
-        message = f"{OFF_CENTRE} (k dt + 2 c) dt / m is {load:.2f} at physics_dt {physics_dt:.5f}, m half the mass; it must stay below 4"
-        raise ConfigError(f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {message}")
+    load = OFF_CENTRE * (stiffness * (physics_dt or 0.0) + 2 * damping) * (physics_dt or 0.0) / (mass / 2)
+    if load >= 4.0:  # see `compute_forces`
+        raise ConfigError(
+            f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {OFF_CENTRE} (k dt + 2 c) dt / m, m "
+            f"half the mass: expected below 4, got {load:.2f} at physics_dt {physics_dt:.5f}"
+        )
+    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height)
+    return Contact(functools.partial(find_neighbours, max_neighbours=max_neighbours), functools.partial(compute_forces, **law))
 
 
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
-    """Cars as boxes; `mass` of each, or of all."""
+    """Collects cars as boxes; `mass` per car, or one for all."""
     return Boxes(
         position=motion.position[:, :2],
         elevation=motion.position[:, 2],
@@ -90,83 +88,95 @@ def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array,
     )
 
 
-def find_neighbours(cars: Boxes, others: Boxes, *, nearest: int) -> Boxes:
-    """Each car's nearest others that are present, by the distance to the circle around a box: leaves `[A, K, ...]`, K at most `nearest`."""
-    reach = 0.5 * safe_norm(others.size)
-    gap = safe_norm(others.position[None] - cars.position[:, None]) - reach
-    gap = jnp.where(_sound(others) & jnp.isfinite(gap), gap, jnp.inf)
-    _, rows = jax.lax.top_k(-gap, min(nearest, gap.shape[1]))
-    return jax.tree.map(lambda leaf: leaf[rows], others)
+def find_neighbours(cars: Boxes, traffic: Boxes, *, max_neighbours: int) -> Boxes:
+    """Finds the boxes of `traffic` nearest to each car, by the distance to their bounding circles: leaves `[A, K, ...]`."""
+    reach = 0.5 * safe_norm(traffic.size)
+    gap = safe_norm(traffic.position[None] - cars.position[:, None]) - reach
+    gap = jnp.where(_is_valid(traffic) & jnp.isfinite(gap), gap, jnp.inf)
+    _, rows = jax.lax.top_k(-gap, min(max_neighbours, gap.shape[1]))
+    return jax.tree.map(lambda leaf: leaf[rows], traffic)
 
 
 def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
-    """Neighbours `[A, K, ...]` moved on with their present velocities."""
-    moved = lambda box: replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)  # noqa: E731
-    return jax.vmap(moved)(boxes)
+    """Moves neighbours `[A, K, ...]` with constant velocities."""
+
+    def move(box: Boxes) -> Boxes:
+        return replace(box, position=box.position + box.velocity * seconds, yaw=box.yaw + box.yaw_rate * seconds)
+
+    return jax.vmap(move)(boxes)
 
 
 def compute_forces(
-    cars: Boxes, near: Boxes, *, stiffness: float, damping: float, friction: float, mass: float, momentum_transfer_s: float, height: float
+    cars: Boxes,
+    neighbours: Boxes,
+    *,
+    stiffness: float,
+    damping: float,
+    friction: float,
+    mass: float,
+    momentum_transfer_s: float,
+    height: float,
 ) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
-    """Horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
+    """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
-    Stiffness and damping of a pair are those given times its reduced mass over the reduced mass of two cars: 1 between cars, 2 against a
-    wall, little against a pedestrian. So every pair bounces alike, with k dt^2 / m of 0.07 at 1e6 N/m and 120 Hz (m its reduced mass) and
-    `OFF_CENTRE` times that, 0.26, where cars meet off centre; semi-implicit Euler with an explicit damper is stable while that plus
-    2 c dt / m stays below 4: 0.58 and 2.1 with 3e4 N s/m.
+    Stiffness and damping of a pair scale with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
+    pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and 0.26 off centre
+    (`OFF_CENTRE`). Semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m is below 4; 2 c dt / m is 0.58 and
+    2.1 with 3e4 N s/m.
 
     Args:
-        cars: bodies that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
-            more than `height` do not meet.
-        near: what each car may touch, leaves `[A, K, ...]`: see `neighbours`. It is on its way and feels nothing. One of finite mass cannot
-            yield as it would, so its push ends where it would have taken on the car's speed within `momentum_transfer_s`.
+        cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
+            more than `height` do not touch.
+        neighbours: of each car, leaves `[A, K, ...]`: see `find_neighbours`. They follow their path and feel no force. If their mass is
+            finite, the force is limited to what gives them the car's speed within `momentum_transfer_s`.
         stiffness: of a contact along a whole face of two cars, N/m.
         damping: along the same face, N s/m. A contact never pulls.
-        friction: Coulomb coefficient of the bodies. Below the cone `damping` resists sliding, which is as stable as the normal force.
+        friction: Coulomb coefficient of the bodies. Below the limit `damping` resists sliding, which is as stable as the normal force.
         mass: of the two cars that `stiffness` and `damping` are meant for, kg.
-        momentum_transfer_s: s in which a body of finite mass takes on the speed of the car that hits it.
+        momentum_transfer_s: s.
         height: of the boxes, m.
     """
-    count, beside = near.mass.shape
-    numbers = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, height=height)
-    cars = _still(cars, mass)
-    total, torque, largest, touched = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
+    count, beside = neighbours.mass.shape
+    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, height=height)
+    cars = _sanitize(cars, mass)
+    total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if beside:
-        one = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
-        other = _still(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), near), mass)
-        pushed = tuple(leaf.reshape(count, beside, *leaf.shape[1:]) for leaf in _between(one, other, momentum_transfer_s, **numbers)[:2])
-        touched = (safe_norm(pushed[0]) > 0.0).sum(1, dtype=jnp.float32)
+        first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
+        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours), mass)
+        pair_force, pair_torque, _ = _compute_pair_forces(first, second, momentum_transfer_s, **law)
+        pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
+        contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
-        first, second = np.triu_indices(count, 1)
-        one, other = jax.tree.map(lambda leaf: leaf[first], cars), jax.tree.map(lambda leaf: leaf[second], cars)
-        force, torque_one, torque_other = _between(one, other, None, **numbers)
-        rows = _rows_of(count)  # each car's pairs, as the first of them or the second
-        touched = touched + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
-        share = _share(jnp.maximum(touched[first], touched[second]))
-        force = share[:, None] * force
+        rows_first, rows_second = np.triu_indices(count, 1)
+        first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
+        force, torque_first, torque_second = _compute_pair_forces(first, second, None, **law)
+        rows = _find_pairs(count)
+        contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
+        scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
+        force = scale[:, None] * force
         total = jnp.concatenate([-force, force])[rows].sum(1)
-        torque = jnp.concatenate([share * torque_one, share * torque_other])[rows].sum(1)
+        torque = jnp.concatenate([scale * torque_first, scale * torque_second])[rows].sum(1)
         largest = jnp.tile(safe_norm(force), 2)[rows].max(1)
     if beside:
-        share = _share(touched)[:, None]
-        force, torque_one = share[..., None] * pushed[0], share * pushed[1]
-        total, torque = total - force.sum(1), torque + torque_one.sum(1)
+        scale = _scale_of_many(contacts)[:, None]
+        force = scale[..., None] * pair_force
+        total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
         largest = jnp.maximum(largest, safe_norm(force).max(1))
     return total, torque, largest
 
 
-def _share(touched: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """What is left of a contact's strength where one of the two touches that many others.
+def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Computes the scale of a pair's force where one of the two has this many contacts.
 
-    N springs and dampers on one car add up to N times what the explicit integrator must carry: 16 cars at one place became NaN within a
-    second. Two at a time are stable as they are; where it is more, they share the strength of two. A pair shares alike: momentum stays.
+    N springs and dampers on one car add up to N times what the explicit integrator must carry: 16 cars at one position became NaN within a
+    second. Two are stable at full strength; more are scaled to the strength of two. Both cars have the same scale: momentum is kept.
     """
-    return jnp.minimum(1.0, 2.0 / jnp.maximum(touched, 1.0))
+    return jnp.minimum(1.0, 2.0 / jnp.maximum(contacts, 1.0))
 
 
-def _between(
-    one: Boxes,
-    other: Boxes,
+def _compute_pair_forces(
+    first: Boxes,
+    second: Boxes,
     momentum_transfer_s: float | None,
     *,
     stiffness: float,
@@ -175,44 +185,45 @@ def _between(
     mass: float,
     height: float,
 ) -> tuple[Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
-    """Force on the second box of each pair, which the first feels with opposite sign, and the torques on both."""
-    normal, points, depths = jax.vmap(find_box_contact)(one.position, one.yaw, one.size / 2.0, other.position, other.yaw, other.size / 2.0)
-    meet = one.present & other.present & (jnp.abs(one.elevation - other.elevation) < height)
-    depths = jnp.where(meet[:, None], depths, 0.0)
+    """Computes the force on the second box of each pair (the first has the opposite), and the torques on both."""
+    normal, points, depths = jax.vmap(find_box_contact)(
+        first.position, first.yaw, first.size / 2.0, second.position, second.yaw, second.size / 2.0
+    )
+    near = first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
+    depths = jnp.where(near[:, None], depths, 0.0)
 
-    arm_one, arm_other = points - one.position[:, None], points - other.position[:, None]
-    speed = _velocity_at(arm_other, other.velocity, other.yaw_rate) - _velocity_at(arm_one, one.velocity, one.yaw_rate)
-    tangent = _turn(normal)
+    arm_first, arm_second = points - first.position[:, None], points - second.position[:, None]
+    speed = _velocity_at(arm_second, second.velocity, second.yaw_rate) - _velocity_at(arm_first, first.velocity, first.yaw_rate)
+    tangent = _rotate_90(normal)
     closing = -dot(speed, normal[:, None])
     sliding = dot(speed, tangent[:, None])
-    scale = (2.0 / (mass / one.mass + mass / other.mass))[:, None]
+    scale = (2.0 / (mass / first.mass + mass / second.mass))[:, None]
     push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * stiffness * depths + 0.5 * damping * closing), 0.0), 0.0)
     if momentum_transfer_s is not None:
         reduced = 0.5 * mass * scale
-        most = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # one of two points
-        push = jnp.where(jnp.isfinite(other.mass)[:, None], jnp.minimum(push, most), push)
+        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # per contact point
+        push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
     drag = jnp.clip(scale * (0.5 * damping * sliding), -friction * push, friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
-    return force.sum(1), -cross(arm_one, force).sum(1), cross(arm_other, force).sum(1)
+    return force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
 
 
-def _sound(boxes: Boxes) -> Bool[Array, "*n"]:
-    """Boxes that are there, have a size, and whose state is finite."""
+def _is_valid(boxes: Boxes) -> Bool[Array, "*n"]:
+    """Selects boxes that are present and have a positive size and a finite state."""
     state = boxes.position, boxes.velocity, boxes.size, boxes.elevation, boxes.yaw, boxes.yaw_rate
     return boxes.present & is_finite(state) & (boxes.size > 0).all(-1)
 
 
-def _still(boxes: Boxes, mass: float) -> Boxes:
-    """Those that touch nobody as boxes at rest at the origin, so that their numbers spoil nothing."""
-    sound = _sound(boxes)
-    clean = lambda x: jnp.where(sound.reshape((-1,) + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x))  # noqa: E731
-    return replace(jax.tree.map(clean, boxes), mass=jnp.where(sound, boxes.mass, mass), present=sound)
+def _sanitize(boxes: Boxes, mass: float) -> Boxes:
+    """Replaces boxes that take no part by absent ones at rest at the origin, so that their NaN values do not propagate."""
+    valid = _is_valid(boxes)
+    clean = jax.tree.map(lambda x: jnp.where(valid.reshape((-1,) + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x)), boxes)
+    return replace(clean, mass=jnp.where(valid, boxes.mass, mass), present=valid)
 
 
-def _rows_of(count: int) -> Int[np.ndarray, "A partners"]:
-    """For each car the rows of its pairs, in the table of all pairs' first bodies followed by all pairs' second bodies."""
-    first, second = np.triu_indices(count, 1)
-    bodies = np.concatenate([first, second])
+def _find_pairs(count: int) -> Int[np.ndarray, "A partners"]:
+    """Finds the rows of each car's pairs in the table of all pairs' first bodies followed by all pairs' second bodies."""
+    bodies = np.concatenate(np.triu_indices(count, 1))
     return np.stack([np.flatnonzero(bodies == car) for car in range(count)])
 
 
@@ -224,19 +235,18 @@ def find_box_contact(
     other_yaw: Float[Array, ""],
     other_half: Float[Array, "2"],
 ) -> BoxContact:
-    """Contact of two oriented boxes with half sizes `half`; depths are not positive where they do not overlap."""
+    """Computes the contact of two oriented boxes with half sizes `half`; depths are not positive if they do not overlap."""
     gap = other_centre - centre
     axes, other_axes = _axes(yaw), _axes(other_yaw)
-    every = jnp.concatenate([axes, other_axes])  # 4 candidates for a separating axis
-    reach = jnp.abs(every @ axes.T) @ half + jnp.abs(every @ other_axes.T) @ other_half
-    along = every @ gap
+    candidates = jnp.concatenate([axes, other_axes])  # separating axes
+    reach = jnp.abs(candidates @ axes.T) @ half + jnp.abs(candidates @ other_axes.T) @ other_half
+    along = candidates @ gap
     overlap = reach - jnp.abs(along)
     best = jnp.argmin(overlap)
-    normal = every[best] * jnp.where(along[best] < 0.0, -1.0, 1.0)
+    normal = candidates[best] * jnp.where(along[best] < 0.0, -1.0, 1.0)
 
-    # the box that owns the axis lends the flat face ("reference"), the other one touches it with its nearest face ("incident")
-    owner = best < 2
-    pick = functools.partial(jnp.where, owner)
+    # the box of the best axis has the reference face, the other box touches it with its nearest ("incident") face
+    pick = functools.partial(jnp.where, best < 2)
     outward = pick(normal, -normal)
     reference_half = pick(half, other_half)
     front, side = reference_half[best % 2], reference_half[1 - best % 2]
@@ -247,8 +257,8 @@ def find_box_contact(
     middle = pick(gap, -gap) + towards * incident_half[face]  # of the incident face, from the reference box's centre
     along_face = incident_axes[1 - face] * incident_half[1 - face]
 
-    # cut the incident face at the reference face's sides, |w| <= side; it lies within 45 degrees across `outward`, so w_along is not 0
-    tangent = _turn(outward)
+    # clip the incident face at the reference face's sides, |w| <= side; it lies within 45 degrees across `outward`, so w_along is not 0
+    tangent = _rotate_90(outward)
     w_middle, w_along = middle @ tangent, along_face @ tangent
     w_along = jnp.where(jnp.abs(w_along) < 1e-6, 1e-6, w_along)
     low, high = (-side - w_middle) / w_along, (side - w_middle) / w_along
@@ -260,16 +270,16 @@ def find_box_contact(
 
 
 def _axes(yaw: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """Unit vectors along a box's length and width."""
+    """Computes unit vectors along a box's length and width."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
 
 
-def _turn(v: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
-    """A quarter turn counter-clockwise."""
+def _rotate_90(v: Float[Array, "*shape 2"]) -> Float[Array, "*shape 2"]:
+    """Rotates by 90 degrees counter-clockwise."""
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
 def _velocity_at(arm: Float[Array, "N 2 2"], velocity: Float[Array, "N 2"], yaw_rate: Float[Array, " N"]) -> Float[Array, "N 2 2"]:
-    """Velocity of the points `arm` away from a centre that moves and turns."""
-    return velocity[:, None] + yaw_rate[:, None, None] * _turn(arm)
+    """Computes the velocity of points at `arm` from a centre that moves and rotates."""
+    return velocity[:, None] + yaw_rate[:, None, None] * _rotate_90(arm)

@@ -1,4 +1,4 @@
-"""Cars that follow the recording. Actions are ignored; contact is reported with the other backends' model and moves nobody."""
+"""Log playback: cars follow their logged tracks. Actions are ignored; contact forces are reported and do not move the cars."""
 
 import math
 from collections.abc import Callable
@@ -9,44 +9,42 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import safe_norm
-from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.track_interpolation import interpolate_track
-from scenefactory_jax.core.types import AgentLog, Dynamics, Motion, Scene
-from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
+from scenefactory_jax.core.types import Dynamics, Motion, Scene
+from scenefactory_jax.dynamics.collision import advance_boxes, collect_boxes, make_contact
 
 
 @pytree_dataclass
 class Body:
-    """Where each car is in its recording, and what that reads; every leaf has the agent axis first."""
+    """Time step and motion of each car; every leaf has the agent axis first."""
 
     steps: Int[Array, " A"]  # control steps since the start
     motion: Motion
 
 
 def make(
-    *, start_row: int, centre_height: float, mass: float, contact: dict[str, Any], grip: Callable[..., Any], control_dt: float
+    *, start_row: int, centre_height: float, mass: float, contact: dict[str, Any], friction: Callable[..., Any], control_dt: float
 ) -> Dynamics:
-    """Cars on the tracks of `scene.log`, linear in time between valid rows, at rest before the first and after the last.
+    """Makes the backend: tracks of `scene.log`, linear in time between valid rows, at rest before the first and after the last.
 
     Args:
         start_row: row of the log at which episodes begin.
         centre_height: of the boxes' centres above the ground, m.
-        mass: kg; it decides the contact force and nothing else.
-        contact: numbers of `contact.make`.
-        grip: (weather, position, speed) -> friction coefficient, for the report.
+        mass: kg; for the contact force only.
+        contact: values of `collision.make`.
+        friction: (weather, position, speed) -> friction coefficient, for the report.
 
     Raises:
-        ConfigError: an unknown or missing number of `contact`.
+        ConfigError: an unknown or missing value of `contact`.
     """
-    entry = {**contact, "_target_": "make"}
-    meet: Contact = instantiate(entry, builtins="scenefactory_jax.dynamics.collision", where="dynamics.contact", height=math.inf)()
+    collision = make_contact(contact, height=math.inf)
 
-    def at(scene: Scene, steps: Int[Array, " A"]) -> Motion:
-        row = start_row + steps.astype(jnp.float32) * (control_dt / scene.log.dt)
-        position, velocity, yaw, yaw_rate = jax.vmap(lambda r, *track: interpolate_track(r, *track, dt=scene.log.dt))(
-            row, *_tracks(scene.log)
-        )
+    def read_log(scene: Scene, steps: Int[Array, " A"]) -> Motion:
+        log = scene.log
+        row = start_row + steps.astype(jnp.float32) * (control_dt / log.dt)
+        interpolate = jax.vmap(lambda r, *track: interpolate_track(r, *track, dt=log.dt))
+        position, velocity, yaw, yaw_rate = interpolate(row, log.position, log.yaw, log.velocity, log.valid)
         zero = jnp.zeros_like(yaw)
         return Motion(
             position=jnp.concatenate([position, jnp.full_like(zero, centre_height)[:, None]], axis=-1),
@@ -56,24 +54,21 @@ def make(
             upright=jnp.ones_like(zero),
             steer=zero,
             contact_force=zero,
-            grip=grip(scene.weather, position, safe_norm(velocity)),
+            mu=friction(scene.weather, position, safe_norm(velocity)),
             friction_utilization=zero,
             slip=zero,
         )
 
     def init(key: PRNGKeyArray, scene: Scene) -> Body:
         steps = jnp.zeros(scene.agents.yaw.shape, jnp.int32)
-        return Body(steps=steps, motion=at(scene, steps))
+        return Body(steps=steps, motion=read_log(scene, steps))
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
-        motion = at(scene, body.steps + 1)
+        motion = read_log(scene, body.steps + 1)
         cars = collect_boxes(motion, scene.agents.size, active, mass)
-        _, _, force = meet.forces(cars, advance_boxes(meet.neighbours(cars, scene.traffic), control_dt))
+        _, _, force = collision.forces(cars, advance_boxes(collision.neighbours(cars, scene.traffic), control_dt))
         moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
         return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 
     return Dynamics(init=init, advance=advance, read=lambda body: body.motion)
 
-
-def _tracks(log: AgentLog) -> tuple[Array, Array, Array, Array]:
-    return log.position, log.yaw, log.velocity, log.valid

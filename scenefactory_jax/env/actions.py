@@ -1,4 +1,4 @@
-"""What an action means: functions from an agent's numbers in [-1, 1] to throttle, steer and brake."""
+"""Actions: functions from an agent's numbers in [-1, 1] to throttle, steer and brake, the choices of `actions.command`."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,11 +10,10 @@ def separate_pedals(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
 
 
 def one_pedal(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
-    """Throttle, steer, brake, where a throttle below zero brakes, too; of the two brakes the stronger one counts.
+    """Throttle, steer, brake, where a throttle below zero brakes, too; the stronger brake counts.
 
-    A policy that explores with noise about its mean meets the brakes as soon as it lifts its foot. With `pedals` it has to press one
-    while it releases the other, and a brake whose mean lies well below zero has no slope: trained policies were seen to run into the car
-    ahead without touching it.
+    With `separate_pedals` a policy must press one pedal while it releases the other, and a brake whose mean is far below zero has no
+    gradient: such policies drove into the car ahead without braking. Here exploration noise about a small throttle reaches the brake.
     """
     throttle, steer, brake = action.T
     return jnp.stack([jnp.maximum(throttle, 0.0), steer, jnp.maximum(brake, -throttle)], axis=1)

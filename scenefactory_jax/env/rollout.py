@@ -77,8 +77,8 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
     def body(carry: tuple[State, Any, Array], key: PRNGKeyArray) -> tuple[tuple[State, Any, Array], StepRecord]:
         state, observation, over = carry
         before = replace(state, active=state.active & ~over)
-        after, outcome = env.transition(scene, before, act(parameters, observation, key))
-        return (after, env.observe(scene, after), over | outcome.over), make_step_record(env, scene, before, after, outcome)
+        after, outcome = env.control_step(scene, before, act(parameters, observation, key))
+        return (after, env.observe(scene, after), over | outcome.world_done), make_step_record(env, scene, before, after, outcome)
 
     over = ~jnp.any(state.active)
     _, shots = jax.lax.scan(body, (state, observation, over), jax.random.split(key, steps))
@@ -87,7 +87,7 @@ def _record(env: Env, act: Act, parameters: Any, scene: Scene, key: PRNGKeyArray
 
 def make_step_record(env: Env, scene: Scene, before: State, after: State, outcome: Any) -> StepRecord:
     """What one control step shows."""
-    motion, facts = after.motion, outcome.facts
+    motion, metrics = after.motion, outcome.metrics
     tyres, joints = (getattr(after.body, name, None) for name in ("tyres", "qpos"))
     return StepRecord(
         time_s=after.weather.rain.now_s,
@@ -100,15 +100,15 @@ def make_step_record(env: Env, scene: Scene, before: State, after: State, outcom
         action=after.previous_action,
         terms=outcome.terms,
         events=outcome.events,
-        ttc=facts.ttc,
-        edge_ttc=facts.edge_ttc,
-        goal_distance=facts.goal_distance,
-        grip=facts.grip,
-        friction_utilization=facts.friction_utilization,
-        slip=facts.slip,
-        contact_force=facts.contact_force,
+        ttc=metrics.ttc,
+        edge_ttc=metrics.edge_ttc,
+        goal_distance=metrics.goal_distance,
+        grip=metrics.mu,
+        friction_utilization=metrics.friction_utilization,
+        slip=metrics.slip,
+        contact_force=metrics.contact_force,
         wheels=tyres if isinstance(tyres, Tyres) else None,
         joints=joints,
-        traffic=env.now(scene, after).traffic,
+        traffic=env.current_scene(scene, after).traffic,
         film_mm=after.weather.film_mm,
     )

@@ -1,147 +1,134 @@
-"""Where an episode's cars start and what they must reach: a fresh draw at every reset, a pure function of (key, scene)."""
+"""Samples the starts and goals of an episode's agents at every reset: pure functions of (key, scene)."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import (
     CONTIGUOUS_M,
     cumulative_length,
     distance_to_boxes,
     find_point_at_distance,
-    heading_vector,
     safe_norm,
 )
-from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, check_range, check_type, instantiate
+from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace, tree_where
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, check_names
 from scenefactory_jax.core.types import Agents, Boxes, Scene
 
-Draw = Callable[[PRNGKeyArray, Scene], Agents]
+Sampler = Callable[[PRNGKeyArray, Scene], Agents]
 
 
-LEAST = {"candidates": 1, "travel_min_m": 0.0, "margin_m": 0.0, "start_gap_m": 0.0, "goal_gap_m": 0.0}
-PART = ("sampler", "share", "respawn_clearance_m")  # keys of a mixture's part, which is an entry of the config group
+@dataclasses.dataclass(frozen=True)
+class MixturePart:
+    """A part of `mixed`: an entry of the config group `spawning` with a weight."""
+
+    sampler: dict[str, Any]
+    weight: Positive
+    respawn_clearance_m: None = None  # only the whole group's counts
 
 
-def make(entry: Mapping[str, Any], *, where: str = "spawning.sampler") -> Draw:
-    """A `draw` entry with its numbers bound; those of a mixture are entries of `spawn` themselves, each with a share, or null.
+def make(entry: Mapping[str, Any], *, where: str = "spawning.sampler") -> Sampler:
+    """Binds the numbers of a `sampler` entry; the parts of a mixture are entries of `spawning` themselves, each with a weight, or null.
 
     Raises:
-        ConfigError: a key that does not fit, by name; a mixture without parts, with a share below 0 or parts that begin anew on their own.
+        ConfigError: a key that does not fit, by name; a mixture without parts.
     """
-    if not isinstance(entry, Mapping) or entry.get("_target_") != "mixed":
-        draw = instantiate(entry, builtins=__name__, where=where)
-        if "." not in entry["_target_"]:
-            _check(entry, where=where)
-        return draw
-    if unknown := [key for key in entry if key not in ("_target_", "parts")]:
-        raise ConfigError(f"{where}.{unknown[0]}: unknown key of mixed; valid: parts")
-    parts = entry.get("parts")
-    chosen = {name: part for name, part in parts.items() if part is not None} if isinstance(parts, Mapping) else {}
-    if not chosen:
-        raise ConfigError(f"{where}.parts: {parts!r}; wanted are entries of `spawn` by name, each with a share")
-    shares, draws = zip(*(_part(part, where=f"{where}.parts.{name}") for name, part in chosen.items()), strict=True)
-    return instantiate({"_target_": "mixed"}, builtins=__name__, where=where, shares=list(shares), draws=list(draws))
-
-
-def _part(part: Mapping[str, Any], *, where: str) -> tuple[float, Draw]:
-    """Share and draw of one part of a mixture."""
-    for key in ("sampler", "share"):
-        if key not in part:
-            raise ConfigError(f"{where}.{key}: missing; a part is an entry of `spawn` and its share")
-    if unknown := [key for key in part if key not in PART]:
-        raise ConfigError(f"{where}.{unknown[0]}: unknown key; valid: sampler, share")
-    check_type(part["share"], float, where=f"{where}.share")
-    check_number(part["share"], where=f"{where}.share", above=0.0)
-    if part.get("respawn_clearance_m") is not None:
-        raise ConfigError(f"{where}.respawn_clearance_m: {part['respawn_clearance_m']}; it belongs to the whole `spawn`")
-    return float(part["share"]), make(part["sampler"], where=f"{where}.sampler")
+    if entry.get("_target_") != "mixed":
+        _check(entry, where=where)
+        return instantiate(entry, builtins=__name__, where=where)
+    check_names(entry, ["_target_", "parts"], where=where, required=["parts"])
+    parts = {name: part for name, part in (entry["parts"] or {}).items() if part is not None}
+    if not parts:
+        raise ConfigError(f"{where}.parts: expected entries of the group `spawning` by name, got {entry['parts']!r}")
+    read = {name: schema.read(part, MixturePart, where=f"{where}.parts.{name}") for name, part in parts.items()}
+    samplers = [make(part.sampler, where=f"{where}.parts.{name}.sampler") for name, part in read.items()]
+    return functools.partial(mixed, weights=[float(part.weight) for part in read.values()], samplers=samplers)
 
 
 def _check(numbers: Mapping[str, Any], *, where: str) -> None:
-    """Refuse numbers of this module's draws that no start can meet."""
-    for name, least in LEAST.items():
-        if name in numbers:
-            check_number(numbers[name], where=f"{where}.{name}", least=least)
-    check_fraction(numbers.get("standing_share", 0.0), where=f"{where}.standing_share")
+    """Checks the numbers of this module's samplers that their annotations do not."""
     if len(numbers.get("car_size_m", (4.0, 2.0))) != 2:
-        raise ConfigError(f"{where}.car_size_m: {numbers['car_size_m']}; wanted is [length, width]")
+        raise ConfigError(f"{where}.car_size_m: expected [length, width], got {numbers['car_size_m']}")
     if "travel_max_m" in numbers:
         check_range([numbers["travel_min_m"], numbers["travel_max_m"]], where=f"{where}.travel_min_m, travel_max_m")
 
 
 def find_usable(agents: Agents) -> Bool[Array, " A"]:
-    """Whether each agent has finite starts, speeds, goals and routes, and a length and width above 0."""
-    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route
+    """Mask of agents with finite starts, speeds, goals and routes, and a length and width above 0."""
+    numbers = agents.position, agents.yaw, agents.speed, agents.size, agents.goal, agents.route_length
     return is_finite(numbers) & jnp.all(agents.size > 0, axis=1)
 
 
 def admit_cars(agents: Agents) -> Agents:
-    """Drawn agents without those that no car can be made of: they are absent, and their numbers zeros with a size of 1 m.
+    """Removes sampled agents with unusable numbers: they are absent, their numbers zeros with a size of 1 m.
 
-    One NaN would otherwise reach everybody near it.
+    One NaN would otherwise propagate to all agents near it.
     """
     usable = find_usable(agents)
     nothing = jax.tree.map(jnp.zeros_like, agents)
     return tree_where(usable, agents, replace(nothing, size=jnp.ones_like(agents.size)))
 
 
-def mixed(key: PRNGKeyArray, scene: Scene, *, shares: list[float], draws: list[Draw]) -> Agents:
-    """One of several draws, each as often as its share of all shares says."""
-    which_key, key = jax.random.split(key)
-    which = jax.random.choice(which_key, len(draws), p=jnp.array(shares) / sum(shares))
-    drawn = [draw(key, scene) for draw in draws]
-    return functools.reduce(
-        lambda found, one: jax.tree.map(lambda old, new: jnp.where(which == one[0], new, old), found, one[1]), enumerate(drawn), drawn[0]
-    )
+def mixed(key: PRNGKeyArray, scene: Scene, *, weights: list[float], samplers: list[Sampler]) -> Agents:
+    """One of several samplers in each episode, at random with these weights."""
+    choice_key, key = jax.random.split(key)
+    chosen = jax.random.choice(choice_key, len(samplers), p=jnp.array(weights) / sum(weights))
+    samples = [sampler(key, scene) for sampler in samplers]
+    agents = samples[0]
+    for index, sample in enumerate(samples):
+        agents = jax.tree.map(lambda old, new, index=index: jnp.where(chosen == index, new, old), agents, sample)
+    return agents
 
 
 def logged(key: PRNGKeyArray, scene: Scene) -> Agents:
-    """The starts and goals of the recording."""
+    """Logged starts, speeds and goals."""
     return scene.agents
 
 
 def logged_from_rest(key: PRNGKeyArray, scene: Scene) -> Agents:
-    """The starts and goals of the recording, from rest (the paper's preset)."""
+    """Logged starts and goals, from rest (the paper's preset)."""
     return replace(scene.agents, speed=jnp.zeros_like(scene.agents.speed))
 
 
 def along_log(
-    key: PRNGKeyArray, scene: Scene, *, travel_min_m: float, start_gap_m: float, candidates: int, standing_share: float
+    key: PRNGKeyArray, scene: Scene, *, travel_min_m: NonNegative, start_gap_m: NonNegative, candidates: Count, standing_fraction: Fraction
 ) -> Agents:
-    """Every car somewhere on its recorded way, drawn on its own: roads, goals and speeds of the recording, other encounters.
+    """Random starts along each agent's log, independent of each other: logged roads, goals and speeds, but other encounters.
 
-    Starts are rows of `scene.log` that show the car, `travel_min` or more before the goal along the way where it is that long; a shorter
-    one is driven whole. They keep `start_gap` from each other and half of it from the outlines of boxes; a car none of whose candidates
-    fits stays absent. In a share of the episodes all cars start from rest, in the others at their recorded speeds.
+    Starts are valid rows of `scene.log`, `travel_min` or more before the goal along the log; a shorter log is driven from its beginning.
+    They keep `start_gap` from each other and half of it from the outlines of boxes; an agent without a valid candidate is absent. In a
+    fraction of the episodes all agents start from rest, in the others at their logged speeds.
     """
     log, cars = scene.log, scene.agents
     place_key, rest_key = jax.random.split(key)
     both = log.valid[:, 1:] & log.valid[:, :-1]
     steps = jnp.where(both, safe_norm(log.position[:, 1:] - log.position[:, :-1]), 0.0)
     travelled = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0)))  # [A, L]
-    whole = travelled[:, -1:]
-    begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(whole - travel_min_m, 0.0)
-    row = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(travelled, begin) - 1  # the last that is no further along the way
-    row = jnp.maximum(row, jnp.argmax(log.valid, axis=1)[:, None])  # nor before the car is first seen
+    length = travelled[:, -1:]
+    begin = jax.random.uniform(place_key, (len(cars.present), candidates)) * jnp.maximum(length - travel_min_m, 0.0)
+    row = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(travelled, begin) - 1  # the last row that is no further
+    row = jnp.maximum(row, jnp.argmax(log.valid, axis=1)[:, None])  # nor before the first valid row
     read = jax.vmap(lambda track, rows: track[rows])
     start = read(log.position, row)
     usable = cars.present[:, None] & read(log.valid, row) & ~_beside(start, scene.traffic, within_m=0.5 * start_gap_m)
     goals = jnp.broadcast_to(cars.goal[:, None], start.shape)
     chosen, present = _choose(start, goals, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
     pick = functools.partial(_pick, chosen=chosen, present=present)
-    moving = ~jax.random.bernoulli(rest_key, standing_share)
+    moving = ~jax.random.bernoulli(rest_key, standing_fraction)
     return Agents(
         position=pick(start),
         yaw=pick(read(log.yaw, row)),
         speed=moving * pick(safe_norm(read(log.velocity, row))),
         size=cars.size,
         goal=jnp.where(present[:, None], cars.goal, 0.0),
-        route=pick(whole - read(travelled, row)),
+        route_length=pick(length - read(travelled, row)),
         present=present,
     )
 
@@ -150,19 +137,19 @@ def random_pairs(
     key: PRNGKeyArray,
     scene: Scene,
     *,
-    travel_min_m: float,
-    travel_max_m: float,
-    margin_m: float,
-    start_gap_m: float,
-    goal_gap_m: float,
-    candidates: int,
-    car_size_m: list[float],
+    travel_min_m: NonNegative,
+    travel_max_m: NonNegative,
+    margin_m: NonNegative,
+    start_gap_m: NonNegative,
+    goal_gap_m: NonNegative,
+    candidates: Count,
+    car_size_m: Annotated[list[float], Bounds(above=0)],
 ) -> Agents:
-    """Random start-goal pairs on the lanes, every slot filled where there is room (SceneFactory's published code).
+    """Random start-goal pairs on the lanes, in every slot where there is room (SceneFactory's published code).
 
-    Start and goal lie on one lane, `travel` apart along it, at least `margin` from its ends, drawn with probability proportional to length;
-    starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot none of
-    whose candidates fits stays absent. Speed at the start is zero.
+    Start and goal are on one lane, `travel` apart along it, at least `margin` from its ends; lanes are chosen in proportion to length.
+    Starts keep `start_gap` from other starts, half of it from the outlines of boxes, and goals `goal_gap` from other goals. A slot without
+    a valid candidate is absent. Speed at the start is zero.
     """
     slots = scene.agents.present.shape[0]
     place_key, travel_key = jax.random.split(key)
@@ -190,7 +177,7 @@ def random_pairs(
         speed=jnp.zeros(slots, jnp.float32),
         size=size,
         goal=pick(goal),
-        route=pick(travel),
+        route_length=pick(travel),
         present=present,
     )
 
@@ -198,11 +185,11 @@ def random_pairs(
 def _choose(
     start: Float[Array, "A C 2"], goal: Float[Array, "A C 2"], usable: Bool[Array, "A C"], *, start_gap_m: float, goal_gap_m: float
 ) -> tuple[Array, Bool[Array, " A"]]:
-    """Slot by slot, the first usable candidate that keeps its distance from the slots before it."""
+    """Chooses for each slot in turn the first usable candidate that keeps its distance from the slots before it."""
     slots = start.shape[0]
 
-    def place(slot, chosen_so_far):
-        starts, goals, chosen, present = chosen_so_far
+    def place(slot, carry):
+        starts, goals, chosen, present = carry
         near_start = jnp.any((safe_norm(start[slot][:, None] - starts) < start_gap_m) & present, axis=1)
         near_goal = jnp.any((safe_norm(goal[slot][:, None] - goals) < goal_gap_m) & present, axis=1)
         free = usable[slot] & ~near_start & ~near_goal
@@ -220,7 +207,7 @@ def _choose(
 
 
 def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], present: Bool[Array, " A"]) -> Float[Array, "A *d"]:
-    """Each slot's chosen candidate; zeros where it stays absent."""
+    """Gathers each slot's chosen candidate; zeros where it is absent."""
     pad = (1,) * (candidates.ndim - 2)
     found = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
     return jnp.where(present.reshape((-1, *pad)), found, 0.0).astype(jnp.float32)
@@ -229,17 +216,12 @@ def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], prese
 def is_clear(
     agents: Agents, position: Float[Array, "A 2"], active: Bool[Array, " A"], boxes: Boxes, *, clear_m: float
 ) -> Bool[Array, " A"]:
-    """Whether no active car stands within `clear_m` of each agent's start, nor the outline of a box within half of it."""
+    """Mask of agents without an active car within `clear_m` of their start, and without the outline of a box within half of it."""
     near = safe_norm(agents.position[:, None] - position[None]) < clear_m
     taken = jnp.any(near & active[None] & ~jnp.eye(len(active), dtype=bool), axis=1)
     return ~taken & ~_beside(agents.position, boxes, within_m=0.5 * clear_m)
 
 
 def _beside(point: Float[Array, "*n 2"], boxes: Boxes, *, within_m: float) -> Bool[Array, "*n"]:
-    """Whether a point is nearer than that to the outline of a box that is present."""
+    """Mask of points that are nearer than that to the outline of a box."""
     return jnp.any((distance_to_boxes(point, boxes.position, boxes.yaw, boxes.size) < within_m) & boxes.present, axis=-1)
-
-
-def forward(agents: Agents) -> Float[Array, "A 2"]:
-    """Velocity at the start."""
-    return agents.speed[:, None] * heading_vector(agents.yaw)

@@ -1,48 +1,50 @@
-"""Who else is on the road at a control step: functions (scene, step) -> Boxes, the choices of the config group `others`.
+"""Background traffic: functions (scene, control step) -> Boxes, the choices of the config group `traffic`.
 
-Others are on their recorded way whatever happens: they neither brake nor swerve for a car, and whoever is hit stays on it.
+Logged traffic follows its log whatever happens: it neither brakes nor swerves for a car, and a collision does not move it.
 """
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import track_interpolation
-from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative
 from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, TrafficLog
 
+Row = Annotated[int, Bounds(min=0)]
 VEHICLE = ROAD_USERS.index("vehicle")
-SNAP = 1e-3  # rows; a control step this near to a logged row is at it: float32 times do not meet exactly
+SNAP = 1e-3  # rows; a control step this near to a logged row is at it, since float32 times do not meet exactly
 
 
 def no_traffic(scene: Scene, step: Int[Array, ""]) -> Boxes:
-    """Nobody: the cars are alone, and nothing is computed for others."""
+    """No traffic; nothing is computed."""
     return track_interpolation.make_empty_boxes()
 
 
-def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: float, start_row: int, elevation_m: float) -> Boxes:
-    """Parked vehicles only, as boxes that nothing moves, where they stand when the episode begins.
+def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: NonNegative, start_row: Row, elevation_m: float) -> Boxes:
+    """Parked vehicles only, as immovable boxes at their logged position.
 
     Args:
-        parked_m: a vehicle whose log stays within this distance of where it is first seen is parked.
-        start_row: row of the log at which episodes begin; a vehicle that is not seen then is left out.
+        parked_m: a vehicle whose log stays within this distance of its first position is parked.
+        start_row: row of the log at which episodes begin; a vehicle that is not valid then is left out.
         elevation_m: of the boxes' centres.
     """
-    others = scene.traffic_log
-    row = min(start_row, others.valid.shape[1] - 1)
-    zero = jnp.zeros_like(others.yaw[:, row])
+    log = scene.traffic_log
+    row = min(start_row, log.valid.shape[1] - 1)
+    zero = jnp.zeros_like(log.yaw[:, row])
     return Boxes(
-        position=others.position[:, row],
+        position=log.position[:, row],
         elevation=zero + elevation_m,
-        yaw=others.yaw[:, row],
-        velocity=jnp.zeros_like(others.size),
+        yaw=log.yaw[:, row],
+        velocity=jnp.zeros_like(log.size),
         yaw_rate=zero,
-        size=others.size,
+        size=log.size,
         mass=zero + jnp.inf,
-        present=others.valid[:, row] & _parked(others, parked_m),
+        present=log.valid[:, row] & _is_parked(log, parked_m),
     )
 
 
@@ -51,52 +53,51 @@ def log_traffic(
     step: Int[Array, ""],
     *,
     kinds: list[RoadUser],
-    parked_m: float,
-    gap_s: float,
-    mass_kg: dict[str, float | None],
-    start_row: int,
+    parked_m: NonNegative,
+    gap_s: NonNegative,
+    mass_kg: dict[RoadUser, float | None],
+    start_row: Row,
     elevation_m: float,
     control_dt: float,
 ) -> Boxes:
-    """Everybody of these kinds where the recording has them, linear between its rows.
+    """Logged road users of these kinds, linear between rows of the log.
 
-    Each is there from the first row that shows it to the last; gaps up to `gap_s` are bridged, in longer ones it is away. Parked vehicles
-    stay from their first row to the end of the episode, gaps and the log's end included. Nobody ever yields: a mass decides only what a hit
-    costs the car. With null nothing moves the other: the car hits a wall that drives. With a mass the car feels the force of pushing that
-    mass, and then drives through.
+    Each is present from its first valid row to its last; gaps up to `gap_s` are bridged, in longer ones it is absent. Parked vehicles stay
+    from their first row to the end of the episode. Mass decides the force on a car that hits a road user: with null the car hits a moving
+    wall; with a mass it feels the force of pushing that mass, and then passes through.
 
     Args:
-        kinds: who takes part, names of ROAD_USERS.
-        parked_m: a vehicle whose log stays within this distance of where it is first seen is parked.
-        gap_s: the longest gap in a log that is bridged, s.
-        mass_kg: kind -> mass, or null for one that nothing moves.
-        start_row: row of the log at which episodes begin, as in `dynamics.replay`.
+        kinds: that take part.
+        parked_m: a vehicle whose log stays within this distance of its first position is parked.
+        gap_s: the longest gap in a log that is bridged.
+        mass_kg: kind -> mass, or null for an immovable road user.
+        start_row: row of the log at which episodes begin, as in `dynamics.log_playback`.
         elevation_m: of the boxes' centres.
 
     Raises:
         ConfigError: `mass_kg` does not name exactly ROAD_USERS, or a mass is not above 0.
     """
-    others, dt = scene.traffic_log, scene.log.dt
+    log, dt = scene.traffic_log, scene.log.dt
     row = start_row + step.astype(jnp.float32) * (control_dt / dt)
     row = jnp.where(jnp.abs(row - jnp.round(row)) < SNAP, jnp.round(row), row)
-    before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(others.valid)
-    known = (others.position, others.yaw, others.velocity, others.valid)
-    position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.interpolate_track(row, *track, dt=dt))(*known)
+    before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(log.valid)
+    tracks = (log.position, log.yaw, log.velocity, log.valid)
+    position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.interpolate_track(row, *track, dt=dt))(*tracks)
 
-    seen, ahead, at_row = before >= 0, after < others.valid.shape[1], before == row
+    started, ahead, at_row = before >= 0, after < log.valid.shape[1], before == row
     bridged = ahead & ((after - before) * dt <= gap_s + SNAP * dt)
-    parked = _parked(others, parked_m)
-    logged = jnp.take_along_axis(others.velocity, jnp.maximum(before, 0)[:, None, None], axis=1)[:, 0]
-    velocity = jnp.where(at_row[:, None], logged, velocity)  # also at the last row, where nothing follows
+    parked = _is_parked(log, parked_m)
+    logged = jnp.take_along_axis(log.velocity, jnp.maximum(before, 0)[:, None, None], axis=1)[:, 0]
+    velocity = jnp.where(at_row[:, None], logged, velocity)  # also at the last row
     boxes = Boxes(
         position=position,
         elevation=jnp.full_like(yaw, elevation_m),
         yaw=yaw,
         velocity=velocity,
         yaw_rate=yaw_rate,
-        size=others.size,
-        mass=_masses(mass_kg)[others.kind],
-        present=seen & (at_row | bridged | parked) & _among(others, kinds),
+        size=log.size,
+        mass=_make_masses(mass_kg)[log.kind],
+        present=started & (at_row | bridged | parked) & jnp.array([kind in kinds for kind in ROAD_USERS])[log.kind],
     )
     return replace(
         boxes,
@@ -105,23 +106,19 @@ def log_traffic(
     )
 
 
-def _parked(others: TrafficLog, within_m: float) -> Bool[Array, " O"]:
-    """Vehicles that never leave the place where they are first seen."""
-    first = jnp.argmax(others.valid, axis=1)
-    begin = jnp.take_along_axis(others.position, first[:, None, None], axis=1)
-    moved = jnp.max(jnp.where(others.valid, jnp.sum((others.position - begin) ** 2, axis=-1), 0.0), axis=1, initial=0.0)
-    return (others.kind == VEHICLE) & (moved < within_m**2)
+def _is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
+    """Mask of vehicles that never leave their first position."""
+    first = jnp.argmax(log.valid, axis=1)
+    begin = jnp.take_along_axis(log.position, first[:, None, None], axis=1)
+    moved = jnp.max(jnp.where(log.valid, jnp.sum((log.position - begin) ** 2, axis=-1), 0.0), axis=1, initial=0.0)
+    return (log.kind == VEHICLE) & (moved < within_m**2)
 
 
-def _among(others: TrafficLog, kinds: list[RoadUser]) -> Bool[Array, " O"]:
-    return jnp.array([kind in kinds for kind in ROAD_USERS])[others.kind]
-
-
-def _masses(mass_kg: Mapping[str, float | None]) -> Float[Array, " kinds"]:
-    """Masses in the order of ROAD_USERS."""
+def _make_masses(mass_kg: Mapping[RoadUser, float | None]) -> Float[Array, " kinds"]:
+    """Masses in the order of ROAD_USERS; inf for immovable ones."""
     if set(mass_kg) != set(ROAD_USERS):
-        raise ConfigError(f"traffic.mass_kg: {', '.join(mass_kg) or 'nothing'}; wanted exactly {', '.join(ROAD_USERS)}")
+        raise ConfigError(f"traffic.mass_kg: expected exactly {', '.join(ROAD_USERS)}, got {', '.join(mass_kg) or 'nothing'}")
     for kind, mass in mass_kg.items():
         if mass is not None and not mass > 0:
-            raise ConfigError(f"traffic.mass_kg.{kind}: {mass}; wanted is a mass above 0, or null for what nothing moves")
+            raise ConfigError(f"traffic.mass_kg.{kind}: expected a number > 0 or null, got {mass}")
     return jnp.array([jnp.inf if (mass := mass_kg[kind]) is None else mass for kind in ROAD_USERS], jnp.float32)

@@ -1,8 +1,7 @@
 """From per-agent records to numbers with intervals.
 
-Records are a mapping from column name to an array with one row per spawned agent and episode (`COLUMNS`; further columns are kept and may
-serve a breakdown). Agents of one scene meet each other and share a road, so they are no independent samples: intervals come from
-resampling whole scenes.
+Records are a mapping from column name to an array with one row per spawned agent and episode (`COLUMNS`; further columns are kept).
+Agents of one scene are not independent samples: intervals come from resampling whole scenes.
 """
 
 import csv
@@ -22,7 +21,8 @@ COLUMNS: dict[str, type] = {
     "goal_reached": bool, "collision": bool, "out_of_bounds": bool, "road_edge_contact": bool, "numerical_error": bool, "clean": bool,
     "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
     "max_drac": float, "min_ttc_s": float, "mean_ttc_s": float, "has_ttc": bool, "mean_speed": float, "max_contact_force_n": float,
-    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "friction_utilization": float, "stopping_margin_m": float,
+    "yaw_acceleration": float, "film_mm": float, "surface": str, "friction": float, "friction_utilization": float,
+    "stopping_margin_m": float,
 }  # fmt: skip
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
@@ -95,7 +95,8 @@ METRICS: dict[str, Metric] = {
         "Collision rate", "Agents in a car-to-car contact above the force threshold, of all spawned agents; both count.", "collision"),
     "road_edge_rate": _share("Road-edge rate", "Agents that touched a road edge, of all spawned agents.", "road_edge_contact"),
     "crash_rate": _share("Crash rate", "Agents that tipped over, fell or strayed too far, of all spawned agents.", "out_of_bounds"),
-    "fault_rate": _share("Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "numerical_error"),
+    "fault_rate": _share(
+        "Fault rate", "Agents ended because their simulated state was not finite, of all spawned agents.", "numerical_error"),
     "unfinished_rate": Metric(
         "Out of time", SHARE, "Agents with no event at all when the episode's time was up, of all spawned agents.",
         _unfinished, _spawned, rate=True),

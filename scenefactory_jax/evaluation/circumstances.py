@@ -5,11 +5,11 @@ from typing import Any
 
 STARTS = {
     "logged": "as recorded, at the recorded speed",
-    "standing": "as recorded, from rest",
-    "underway": "somewhere on the recorded way",
+    "logged_from_rest": "as recorded, from rest",
+    "along_log": "somewhere on the recorded way",
     "random_pairs": "random, start and goal along lanes",
 }
-TRAFFIC = {"ignore": "none", "static": "parked cars stand", "replay": "as recorded, it does not react"}
+TRAFFIC = {"no_traffic": "none", "parked_traffic": "parked cars stand", "log_traffic": "as recorded, it does not react"}
 
 
 def describe(config: Mapping[str, Any]) -> dict[str, str]:
@@ -43,14 +43,15 @@ def _starts(draw: Mapping[str, Any]) -> str:
     name = draw["_target_"]
     if name != "mixed":
         return STARTS.get(name, f"`{name}`")
-    return "; ".join(f"{part['share']:.0%} {_starts(part['draw'])}" for part in draw["parts"].values())
+    total = sum(part["weight"] for part in draw["parts"].values())
+    return "; ".join(f"{part['weight'] / total:.0%} {_starts(part['sampler'])}" for part in draw["parts"].values())
 
 
 def _weather(weather: Mapping[str, Any]) -> str:
     """Surfaces and films with their shares, then patches and rain."""
-    cases = weather["draw"].get("cases")
+    cases = weather["sampler"].get("cases")
     if cases is None:
-        told = f"`{weather['draw']['_target_']}`"
+        told = f"`{weather['sampler']['_target_']}`"
     else:
         whole = sum(case["weight"] for case in cases)
         shares = [f"{case['weight'] / whole:.0%} " if len(cases) > 1 else "" for case in cases]
@@ -65,4 +66,4 @@ def _dynamics(dynamics: Mapping[str, Any]) -> str:
     target = dynamics["_target_"]
     name = target.removeprefix("scenefactory_jax.dynamics.").removesuffix(".make")
     told = f"`{name}`" + (f", brakes {dynamics['brakes']}" if "brakes" in dynamics else "")
-    return told + (", every car another" if dynamics.get("fleet") else "")
+    return told + (", every car another" if dynamics.get("randomization") else "")

@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core.pytree import replace, unchecked
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.evaluation import episodes, failure_signals, failures
 from scenefactory_jax.learning.training_loop import make_policy
-from scenefactory_jax.visualization.birds_eye.drawing import Others, Trajectory
 
 Records = dict[str, np.ndarray]
 
@@ -36,34 +35,26 @@ def make_episode_runner(
     config: Mapping[str, Any],
     scenes: scene_source.Scenes,
     *,
-    protocol: str,
     settings: Mapping[str, Any],
     worlds: int | None,
-    steps: int | None,
 ) -> Callable[[Any], tuple[Records, Recording | None]]:
     """A function parameters -> (records, recording) that plays one deterministic episode for every scene and repeat, all at once.
 
     It compiles when it is first called, and not again for other parameters.
 
     Args:
-        protocol: an option of the `ends` group.
+        config: its group `termination` is the protocol.
         worlds: how many of the worlds to record; None: all.
-        steps: how many of the steps to record; None: all.
     """
-    once = {
-        "spawning": {**config["spawning"], "respawn_clearance_m": None}
-    }  # an agent is judged by one life, also of a run that starts it again
-    env, policy = (
-        environment.make_env({**config, **once, "termination": configs.load_config("task", f"termination={protocol}")["termination"]}),
-        make_policy(config),
-    )
+    spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
+    env, policy = environment.make_env({**config, "spawning": spawning}), make_policy(config)
     index = np.tile(np.arange(len(scenes)), settings["repeats"])
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
     control_hz, chunk = float(config["timing"]["control_hz"]), settings["chunk_steps"]
     limit, numbers = environment.episode_steps(config["timing"]), settings["failures"]
-    worlds, steps = len(index) if worlds is None else min(worlds, len(index)), limit if steps is None else min(steps, limit)
+    worlds = len(index) if worlds is None else min(worlds, len(index))
 
     def act(parameters, observation):
         return policy.apply(parameters, observation)[0]
@@ -80,16 +71,16 @@ def make_episode_runner(
 
     @jax.jit
     def boxes(scene, state):  # that depends on nothing but the scene and the step, so it need not be kept
-        at = lambda step: env.now(scene, replace(state, step=step)).traffic  # noqa: E731
-        return jax.lax.map(at, jnp.arange(1, steps + 1, dtype=jnp.int32))
+        at = lambda step: env.current_scene(scene, replace(state, step=step)).traffic  # noqa: E731
+        return jax.lax.map(at, jnp.arange(1, limit + 1, dtype=jnp.int32))
 
     def run(parameters):
         episode = begin(keys, batch)
         present, started, weather = jax.device_get((episode.state.agents.present, episode.tally.goal_distance, episode.state.weather))
         kept = []
-        for step in range(0, limit, chunk):
+        for _ in range(0, limit, chunk):
             episode, frames = play(parameters, batch, episode)
-            if worlds and step < steps:
+            if worlds:
                 kept.append(jax.device_get(frames))
             if bool(episode.over.all()):
                 break
@@ -98,7 +89,7 @@ def make_episode_runner(
         records |= failures.classify({**records, **_clues(tally, state, present, control_hz)}, **numbers["kinds"])
         if not kept:
             return records, None
-        frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :steps], *kept)
+        frames = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *kept)
         return records, Recording(batch, boxes, frames, state, weather, names, control_hz)
 
     return run
@@ -122,7 +113,7 @@ def _records(
         **events,
         "clean": events["goal_reached"] & ~others,
         "time_s": of(tally.steps) / control_hz,
-        "route_m": of(state.agents.route),
+        "route_m": of(state.agents.route_length),
         "start_distance_m": of(started),
         "end_distance_m": of(tally.goal_distance),
         "max_drac": of(tally.drac_max),
@@ -190,7 +181,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_describe(weather, seconds=end / control_hz),
-        traffic=Others(*(np.asarray(getattr(boxes, name))[:end] for name in Others._fields)),
+        traffic=TrafficBoxes.from_boxes(boxes).clip(0, int(end)),
     )
 
 

@@ -1,6 +1,6 @@
 """One deterministic episode a world, measured on device: what happened to every agent, and what a viewer needs to draw it.
 
-Events are counted from the facts, not from the exclusive events that rewards use: an agent that touches an edge and another car in one step
+Events are counted from step metrics, not from the exclusive events of rewards: an agent that touches an edge and another car in one step
 has done both. Nothing is counted after an agent's end or the world's.
 """
 
@@ -102,13 +102,13 @@ def run_episode_chunk(
     def body(episode: Episode, _: None) -> tuple[Episode, EpisodeFrame]:
         before = replace(episode.state, active=episode.state.active & ~episode.over)
         action = act(parameters, episode.observation)
-        state, outcome = env.transition(scene, before, action)
-        seen, boxes = episode.tally, env.now(scene, state).traffic
-        found = failure_signals.update(seen.clues, seen.past_events, scene.lanes, boxes, before, state, outcome.facts, **notes)
+        state, outcome = env.control_step(scene, before, action)
+        seen, boxes = episode.tally, env.current_scene(scene, state).traffic
+        found = failure_signals.update(seen.clues, seen.past_events, scene.lanes, boxes, before, state, outcome.metrics, **notes)
         tally = _note(seen, before, state, outcome, found, ttc_limit_s=ttc_limit_s)
         place, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = EpisodeFrame(place, state.motion.yaw, speed, before.active, state.agents.goal, outcome.events)
-        return Episode(state, env.observe(scene, state), tally, episode.over | outcome.over), frame
+        return Episode(state, env.observe(scene, state), tally, episode.over | outcome.world_done), frame
 
     return jax.lax.scan(body, episode, None, length=steps)
 
@@ -116,25 +116,25 @@ def run_episode_chunk(
 def _note(
     tally: EpisodeMetrics, before: State, after: State, outcome: StepResult, found: FailureSignals, *, ttc_limit_s: float
 ) -> EpisodeMetrics:
-    facts = outcome.facts
-    active = before.active & ~facts.events.numerical_error  # a broken car's facts are no measurements
-    seen = active & jnp.isfinite(facts.ttc)
-    past_events = jax.tree.map(lambda old, new: old | (new & before.active), tally.past_events, facts.events)
+    metrics = outcome.metrics
+    active = before.active & ~metrics.events.numerical_error  # a broken car's metrics are no measurements
+    seen = active & jnp.isfinite(metrics.ttc)
+    past_events = jax.tree.map(lambda old, new: old | (new & before.active), tally.past_events, metrics.events)
     add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
     return EpisodeMetrics(
         past_events=past_events,
-        ended=tally.ended | (outcome.done & before.active),
+        ended=tally.ended | (outcome.terminated & before.active),
         steps=tally.steps + active.astype(jnp.int32),
-        goal_distance=jnp.where(active, facts.goal_distance, tally.goal_distance),
-        drac_max=jnp.maximum(tally.drac_max, jnp.where(active, facts.drac, 0.0)),
-        ttc_min=jnp.minimum(tally.ttc_min, jnp.where(active, facts.ttc, jnp.inf)),
-        ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(facts.ttc, ttc_limit_s), 0.0),
+        goal_distance=jnp.where(active, metrics.goal_distance, tally.goal_distance),
+        drac_max=jnp.maximum(tally.drac_max, jnp.where(active, metrics.drac, 0.0)),
+        ttc_min=jnp.minimum(tally.ttc_min, jnp.where(active, metrics.ttc, jnp.inf)),
+        ttc_sum=tally.ttc_sum + jnp.where(seen, jnp.minimum(metrics.ttc, ttc_limit_s), 0.0),
         ttc_steps=tally.ttc_steps + seen.astype(jnp.int32),
-        speed_sum=add(tally.speed_sum, facts.speed),
+        speed_sum=add(tally.speed_sum, metrics.speed),
         swing_sum=add(tally.swing_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
-        grip_sum=add(tally.grip_sum, facts.grip),
-        grip_use_sum=add(tally.grip_use_sum, facts.friction_utilization),
-        margin_min=jnp.minimum(tally.margin_min, jnp.where(active, facts.stopping_margin, jnp.inf)),
-        force_max=jnp.maximum(tally.force_max, jnp.where(active, facts.contact_force, 0.0)),
+        grip_sum=add(tally.grip_sum, metrics.mu),
+        grip_use_sum=add(tally.grip_use_sum, metrics.friction_utilization),
+        margin_min=jnp.minimum(tally.margin_min, jnp.where(active, metrics.stopping_margin, jnp.inf)),
+        force_max=jnp.maximum(tally.force_max, jnp.where(active, metrics.contact_force, 0.0)),
         clues=found,
     )

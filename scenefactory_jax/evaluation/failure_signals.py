@@ -74,7 +74,7 @@ def update(
     boxes: Boxes,
     before: State,
     after: State,
-    facts: StepMetrics,
+    metrics: StepMetrics,
     *,
     moving_mps: float,
     lane_m: float,
@@ -96,20 +96,20 @@ def update(
         rest_m: radius of the circle that a car at rest does not leave.
         near_m: who has been within this distance of the goal was near it.
     """
-    active, motion = before.active & ~facts.events.numerical_error, after.motion  # a broken car's facts are no measurements
+    active, motion = before.active & ~metrics.events.numerical_error, after.motion  # a broken car's metrics are no measurements
     place = motion.position[:, :2]
     now = EventMoment(jnp.broadcast_to(after.step, active.shape), place)
     driven = safe_norm(place - before.motion.position[:, :2])
 
-    harms = jnp.stack([getattr(facts.events, name) for name in FAILURE_EVENTS])
+    harms = jnp.stack([getattr(metrics.events, name) for name in FAILURE_EVENTS])
     harmed = before.active & harms.any(0) & ~clues.harmed
-    met = active & facts.events.collision & ~past_events.collision
-    closer = active & (facts.goal_distance < clues.closest_m)
-    closest = jnp.where(closer, facts.goal_distance, clues.closest_m)
-    gone = jnp.where(active & (closest <= near_m), facts.goal_distance - closest, 0.0)
+    met = active & metrics.events.collision & ~past_events.collision
+    closer = active & (metrics.goal_distance < clues.closest_m)
+    closest = jnp.where(closer, metrics.goal_distance, clues.closest_m)
+    gone = jnp.where(active & (closest <= near_m), metrics.goal_distance - closest, 0.0)
     left = active & (safe_norm(place - clues.rest.place) > rest_m)
     against = (
-        active & (facts.speed >= moving_mps) & (heading_alignment(place, motion.velocity[:, :2], lanes, within_m=lane_m) < against_cos)
+        active & (metrics.speed >= moving_mps) & (heading_alignment(place, motion.velocity[:, :2], lanes, within_m=lane_m) < against_cos)
     )
     impact = find_collision_partners(before, after, boxes, against)
     stretch = jnp.where(against, clues.stretch_m + driven, 0.0)

@@ -25,7 +25,8 @@ class Kind(NamedTuple):
 
 
 KINDS: dict[str, Kind] = {
-    "numerical_error": Kind("fault of the simulation", "the car's state is no longer finite: a bug, no driving error.", "speed before", "m/s"),
+    "numerical_error": Kind(
+        "fault of the simulation", "the car's state is no longer finite: a bug, no driving error.", "speed before", "m/s"),
     "at_fault": Kind(
         "collision, at fault", "the first event is a collision into which the car itself drove: it moved towards the other (by "
         "`own_mps` or more, along the normal of the contact) with at least `own_share` of the closing speed. Into a parked or standing car "

@@ -25,7 +25,7 @@ MEANING = {
 
 
 def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """Step every scene for `simulate.seconds` and print what went wrong, scene by scene.
+    """Steps every scene for `simulate.seconds` and counts what went wrong, scene by scene.
 
     The default follows the log (`dynamics=log_playback`); `dynamics=bicycle spawning=from_rest` lets cars stand.
 
@@ -48,33 +48,35 @@ def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
         counts = jax.device_get(run(jax.random.split(jax.random.key(config["seed"]), size), block))
         for place, index in enumerate(range(begin, min(begin + size, len(loaded)))):
             found[loaded.names[index]] = {name: int(counts[name][place]) for name in MEANING}
-    bad = {name: row for name, row in found.items() if any(row[key] for key in list(MEANING)[1:])}
-    print(agent_metrics.grid(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()]))
-    total = {key: sum(row[key] for row in found.values()) for key in MEANING}
-    for key, meaning in MEANING.items():
-        print(f"{key}: {total[key]} {meaning}")
-    print(f"{len(found)} scenes, {steps} steps each; {len(found) - len(bad)} without any of these", flush=True)
     return found
+
+
+def describe(found: Mapping[str, Mapping[str, int]]) -> str:
+    """A table of the scenes in which something went wrong, and the sums."""
+    bad = {name: row for name, row in found.items() if any(row[key] for key in list(MEANING)[1:])}
+    lines = [agent_metrics.grid(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()])]
+    lines += [f"{key}: {sum(row[key] for row in found.values())} {meaning}" for key, meaning in MEANING.items()]
+    return "\n".join([*lines, f"{len(found)} scenes; {len(found) - len(bad)} without any of these"])
 
 
 def drive(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str, Array]:
     """One world without any control input: how many of its cars had what, see MEANING."""
-    state = env.start(key, scene)
+    state = env.init_state(key, scene)
     present = state.active
     action = jnp.zeros((len(present), 3), jnp.float32)
 
     def advance(state, _):
-        after, outcome = env.transition(scene, state, action)
-        return after, (outcome.facts, state.active)
+        after, outcome = env.control_step(scene, state, action)
+        return after, (outcome.metrics, state.active)
 
-    _, (facts, active) = jax.lax.scan(advance, state, length=steps)
-    events, ever = facts.events, lambda past_events: jnp.any(past_events & active, axis=0)  # facts of finished cars mean nothing
+    _, (metrics, active) = jax.lax.scan(advance, state, length=steps)
+    events, ever = metrics.events, lambda past_events: jnp.any(past_events & active, axis=0)  # metrics of finished cars mean nothing
     marks = {
         "cars": present,
         "faults": ever(events.numerical_error),
-        "overlapping": (facts.contact_force[0] > 0) & present,
+        "overlapping": (metrics.contact_force[0] > 0) & present,
         "on_edge": events.road_edge_contact[0] & present,
-        "off_lane": facts.off_lane[0] & present,
+        "off_lane": metrics.off_lane[0] & present,
         "collision": ever(events.collision),
         "road_edge_contact": ever(events.road_edge_contact),
     }

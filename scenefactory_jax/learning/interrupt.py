@@ -1,11 +1,12 @@
-"""Signals that ask a training to stop: the iteration that they fall into is brought to its end and kept.
+"""Defers signals that stop a training until the current iteration ended and its checkpoint is written.
 
 Ctrl-C, SIGTERM (a scheduler, `kill`) and SIGHUP (a terminal that closes) do the same; a second Ctrl-C ends at once. A second SIGTERM or
-SIGHUP does not: `timeout`, shells and schedulers send them to the process and to its group. Between donating a train state and getting the
-next one there is nothing that could be saved.
+SIGHUP does not: `timeout`, shells and schedulers send them to the process and to its group. Between donating a train state and
+getting the next one there is nothing to save.
 """
 
 import contextlib
+import logging
 import os
 import signal
 import stat
@@ -14,51 +15,53 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
-STOPPING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows has no SIGHUP
+from scenefactory_jax.core.parallel.worker import STOP_SIGNALS
+
+LOG = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
 def defer_interrupt() -> Iterator[Callable[[], int | None]]:
-    """A function that returns the signal that asked to stop, None if there was none.
+    """Gives a function that returns the signal that was received, None if there was none.
 
-    That is always None outside of the main thread, where signals do not arrive, and for signals that are ignored, as Ctrl-C is in the
-    background of a script and SIGHUP under `nohup`.
+    It always returns None outside of the main thread, and for signals that are ignored, as Ctrl-C is in the background of a script and
+    SIGHUP under `nohup`.
     """
-    asked: list[int] = []
-    before = {one: signal.getsignal(one) for one in STOPPING}
-    heard = [one for one, handler in before.items() if handler not in (None, signal.SIG_IGN)]
+    received: list[int] = []
+    before = {one: signal.getsignal(one) for one in STOP_SIGNALS}
+    handled = [one for one, handler in before.items() if handler not in (None, signal.SIG_IGN)]
     if threading.current_thread() is not threading.main_thread():
-        heard = []
+        handled = []
 
-    def ask(number: int, _) -> None:
-        if signal.SIGINT in heard:
+    def receive(number: int, _) -> None:
+        if signal.SIGINT in handled:
             signal.signal(signal.SIGINT, before[signal.SIGINT])
         if signal.Signals(number).name == "SIGHUP":
-            _let_go_of_the_terminal()
-        if not asked:
-            print("stopping after this iteration; Ctrl-C (once more) stops at once", flush=True)
-        asked.append(number)
+            _redirect_to_null()
+        if not received:
+            LOG.info("stopping after this iteration; Ctrl-C (once more) stops at once")
+        received.append(number)
 
-    for one in heard:
-        signal.signal(one, ask)
+    for one in handled:
+        signal.signal(one, receive)
     try:
-        yield lambda: asked[0] if asked else None
+        yield lambda: received[0] if received else None
     finally:
-        for one in heard:
+        for one in handled:
             signal.signal(one, before[one])
 
 
-def _let_go_of_the_terminal() -> None:
-    """Writing to a terminal that was closed, or to a pipe behind which nothing runs any more, would end the training before it is kept."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+def _redirect_to_null() -> None:
+    """Redirects output: writing to a closed terminal or pipe would end the training before its checkpoint is written."""
+    null = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         with contextlib.suppress(OSError):  # it is closed already
             if not stat.S_ISREG(os.fstat(stream).st_mode):
-                os.dup2(nowhere, stream)
-    os.close(nowhere)
+                os.dup2(null, stream)
+    os.close(null)
 
 
 def end(folder: Path, iteration: int, number: int) -> NoReturn:
-    """Say how the run goes on, and end it; the exception carries the signal's number."""
-    print(f"stopped at iteration {iteration}; goes on with the same settings and out={folder} resume=true", flush=True)
+    """Ends the run with an exception that has the signal's number; logs how to resume it."""
+    LOG.info(f"stopped at iteration {iteration}; goes on with the same settings and out={folder} resume=true")
     raise KeyboardInterrupt(number)

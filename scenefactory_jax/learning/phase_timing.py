@@ -1,6 +1,6 @@
-"""A training iteration as nested programs, each with one part more than the one before.
+"""Times the parts of a training iteration, as nested programs that each add one part to the one before.
 
-What a part costs is what the program without it saves: the parts add up to the iteration, with all that XLA fuses across them.
+A part's time is the difference of two programs: the parts add up to the iteration, with all that XLA fuses across them.
 """
 
 import statistics
@@ -17,17 +17,17 @@ from scenefactory_jax.core.types import Env, Scene, State
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.weather import rain
 
-ACTING = ("physics", "facts, rewards, ends", "restarts", "observation")  # with random actions; then come policy and update
+ACTING = ("physics", "metrics, rewards, termination", "restarts", "observation")  # with random actions; policy and update follow
 Run = Callable[[State, Scene, PRNGKeyArray], tuple[State, Array]]
 
 
 class PhaseTimes(NamedTuple):
-    """One program, timed."""
+    """Times of one program."""
 
     seconds: list[float]  # of each repeat
     compile_s: float
     memory_gib: float  # arguments, results and temporaries of the compiled program
-    left: Any  # what the last call returned
+    left: Any  # the result of the last call
 
     @property
     def median(self) -> float:
@@ -35,21 +35,26 @@ class PhaseTimes(NamedTuple):
 
 
 def control_steps(config: Mapping[str, Any]) -> int:
-    """Of a rollout."""
+    """Control steps of a rollout."""
     return config["ppo"]["horizon"] * config["actions"]["action_repeat"]
 
 
 def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:
-    """`steps` control steps of all worlds, a multiple of `env.hold`, with random actions, up to and with one of `ACTING`.
+    """Builds a function that makes `steps` control steps of all worlds with random actions, with the parts up to one of `ACTING`.
+
+    Args:
+        steps: a multiple of `env.action_repeat`.
 
     Returns:
-        A function of the worlds' state, their scenes and a key, for `jit`: the state afterwards, and a number that all went into.
+        A function of the worlds' state, their scenes and a key, for `jit`: the state after the steps, and a sum over all results, so that
+        the compiler removes none.
     """
     depth = ACTING.index(level)
 
-    def moved(scene: Scene, state: State, action: Array) -> State:
+    def move(scene: Scene, state: State, action: Array) -> State:
         state = replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt))
-        return replace(state, body=parts.dynamics.advance(env.now(scene, state), state.body, action, state.active), step=state.step + 1)
+        body = parts.dynamics.advance(env.current_scene(scene, state), state.body, action, state.active)
+        return replace(state, body=body, step=state.step + 1)
 
     def step(scenes: Scene, worlds: State, key: PRNGKeyArray) -> tuple[State, Array]:
         action_key, start_key = jax.random.split(key)
@@ -57,29 +62,30 @@ def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> R
 
         def control(worlds: State, _: None) -> tuple[State, tuple[Array, Array]]:
             if not depth:
-                return jax.vmap(moved)(scenes, worlds, action), (jnp.zeros(len(worlds.step), bool), jnp.float32(0.0))
-            after, outcome = jax.vmap(env.transition)(scenes, worlds, action)
-            return after, (outcome.over, outcome.reward.sum())
+                return jax.vmap(move)(scenes, worlds, action), (jnp.zeros(len(worlds.step), bool), jnp.float32(0.0))
+            after, outcome = jax.vmap(env.control_step)(scenes, worlds, action)
+            return after, (outcome.world_done, outcome.reward.sum())
 
-        after, (over, told) = jax.lax.scan(control, worlds, None, length=env.hold, unroll=env.hold == 1)
-        told = told.sum()
+        after, (done, total) = jax.lax.scan(control, worlds, None, length=env.action_repeat, unroll=env.action_repeat == 1)
+        total = total.sum()
         if depth > 1:
-            after = tree_where(over[-1], jax.vmap(env.start)(jax.random.split(start_key, len(worlds.step)), scenes), after)
+            after = tree_where(done[-1], jax.vmap(env.init_state)(jax.random.split(start_key, len(worlds.step)), scenes), after)
         if depth > 2:
-            seen = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # a learner would keep it: it is written out
-            told += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(seen))
-        return after, told
+            observation = jax.lax.optimization_barrier(jax.vmap(env.observe)(scenes, after))  # written to memory, as in training
+            total += sum(leaf.astype(jnp.float32).sum() for leaf in jax.tree.leaves(observation))
+        return after, total
 
     def run(worlds: State, scenes: Scene, key: PRNGKeyArray) -> tuple[State, Array]:
-        worlds, told = jax.lax.scan(lambda now, key: step(scenes, now, key), worlds, jax.random.split(key, steps // env.hold))
-        return worlds, told.sum()
+        keys = jax.random.split(key, steps // env.action_repeat)
+        worlds, totals = jax.lax.scan(lambda worlds, key: step(scenes, worlds, key), worlds, keys)
+        return worlds, totals.sum()
 
     return run
 
 
 def time_phase(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmup: int, repeats: int) -> PhaseTimes:
-    """Compile `run(state, *arguments(i))` and call it again and again, each time with the state that it returned, donated."""
-    state = jax.tree.map(jnp.copy, state)  # its own buffers: `jit` may have handed a scene's straight through, and donating would delete it
+    """Compiles `run(state, *arguments(i))` and times calls, each with the donated state that the call before returned."""
+    state = jax.tree.map(jnp.copy, state)  # `jit` may have returned a scene's buffers, which donating would delete
     begun = time.perf_counter()
     compiled = jax.jit(run, donate_argnums=0).lower(state, *arguments(0)).compile()
     compile_s, seconds, rest = time.perf_counter() - begun, [], None
@@ -92,7 +98,7 @@ def time_phase(run: Callable, state: Any, arguments: Callable[[int], tuple], *, 
 
 
 def memory_gib(compiled: Any) -> float:
-    """What a compiled program holds at once; 0 where the platform does not say."""
+    """Memory of a compiled program; 0 where the platform does not report it."""
     sizes = compiled.memory_analysis()
     if sizes is None:
         return 0.0
@@ -101,7 +107,7 @@ def memory_gib(compiled: Any) -> float:
 
 
 def time_phases(nested: Mapping[str, float]) -> dict[str, float]:
-    """Times of nested programs -> what each part adds."""
+    """Computes the time that each part adds from the times of nested programs."""
     before, found = 0.0, {}
     for name, value in nested.items():
         found[name], before = value - before, value

@@ -1,4 +1,4 @@
-"""Trained policies by where they are: a folder that `train` or `export` wrote, or the name of one that comes with the package."""
+"""Loads trained policies: from a folder that `train` or `export` wrote, or by the name of one that comes with the package."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,18 +7,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.types import Policy, Scene
 from scenefactory_jax.env import environment
-from scenefactory_jax.learning import checkpoint, initial_parameters
+from scenefactory_jax.learning import checkpoint, trainer
 from scenefactory_jax.learning.training_loop import make_policy
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
 
 class TrainedPolicy(NamedTuple):
-    """A policy with what it learnt, and the config that it was trained with."""
+    """A policy with its parameters, and the config of its training."""
 
     folder: Path
     config: dict[str, Any]
@@ -27,7 +27,7 @@ class TrainedPolicy(NamedTuple):
 
 
 def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
-    """A trained policy to act with, to judge or to train on.
+    """Loads a trained policy.
 
         trained = sf.load_policy("runs/demo-...")
         env = sf.make(trained.config)
@@ -35,7 +35,7 @@ def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
 
     Args:
         run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package.
-        trust: whether its config may name functions outside of the package, which are then imported and called; they are printed.
+        trust: whether its config may name functions outside of the package, which are then imported and called; they are logged.
 
     Raises:
         ConfigError: neither; or a config that names such functions without `trust`.
@@ -47,32 +47,32 @@ def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
 
 
 def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
-    """What a run's policy was before training, drawn anew from its config and seed as training draws it.
+    """Samples the parameters of a run's policy before training, from its config and seed.
 
     Args:
-        scene: one world, for the shapes of what is observed.
+        scene: one world, for the shapes of the observation.
     """
     key = jax.random.key(config["seed"])
-    seen = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
-    blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), seen)
-    return initial_parameters.draw_parameters(key, make_policy(config), blank)
+    shapes = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
+    blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), shapes)
+    return trainer.init_parameters(key, make_policy(config), blank)
 
 
 def find(run: str | Path) -> Path:
-    """The folder of a run, or of a policy that comes with the package, by its name.
+    """Finds the folder of a run, or of a policy that comes with the package by its name.
 
     Raises:
-        ConfigError: neither is there; the message names the policies that come with the package.
+        ConfigError: there is neither; the message names the policies that come with the package.
     """
     if (Path(run) / configs.FILE).is_file():
         return Path(run)
     shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}
     if str(run) in shipped:
         return shipped[str(run)]
-    known = f", or one of the package's own: {', '.join(shipped)}" if shipped else ""
-    raise ConfigError(f"{run} is no run: it has no {configs.FILE}; give the folder that `train` wrote{known}")
+    bundled = f", or a bundled policy: {', '.join(shipped)}" if shipped else ""
+    raise ConfigError(f"run: {configs.FILE} not found in {run}; expected a folder that `train` or `export` wrote{bundled}")
 
 
 def is_bundled(folder: Path) -> bool:
-    """Whether a policy comes with the package, whose folder is nobody's to write to."""
+    """Whether a policy comes with the package, whose folder must not be written to."""
     return folder.parent == SHIPPED

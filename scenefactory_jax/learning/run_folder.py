@@ -1,28 +1,31 @@
-"""The folder of a training: a new one or one to go on in, one command's at a time, and as it was before where nothing could begin."""
+"""Opens the folder of a training: a new one or one to resume in, for one command at a time; removed if the training cannot start."""
 
 import contextlib
 import datetime
 import itertools
+import logging
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as configs
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.instantiate import ConfigError, find_differences
+from scenefactory_jax.core.config import find_differences
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
 
+LOG = logging.getLogger(__name__)
 MOST = 80  # letters of a sweep's changes in the name of a folder
-# What may be another when a run goes on, and all below it: nothing that was learnt rests on it
+# Keys that may change when a run is resumed, with all below them
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
 FREE += ("loggers", "evaluation", "scenes.heldout")
 
 
 @contextlib.contextmanager
 def open_run_folder(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
-    """The run's folder, and whether there is a checkpoint in it to go on from. Nobody else trains there meanwhile.
+    """Opens and locks the run's folder; gives it, and whether it has a checkpoint to resume from.
 
     Raises:
         ConfigError: a folder that holds a run already, or `resume` where there is none, or one of other settings.
@@ -35,14 +38,14 @@ def open_run_folder(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
 
 
 def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:
-    """The folder of a run that begins now: `runs/NAME-TIME`, or in a sweep `runs/NAME-weather_wet-seed_1-TIME`.
+    """Makes a folder name from the present time: `runs/NAME-TIME`, or in a sweep `runs/NAME-weather_wet-seed_1-TIME`.
 
     Args:
-        changes: overrides in which the run differs from the others. Each is written as the last part of its key and its value, in letters
-            that neither a shell nor Hydra reads as anything else; what is longer than MOST letters ends in a checksum instead.
+        changes: overrides in which the run differs from the others. Each is written as the last part of its key and its value, without
+            characters that a shell or Hydra interprets; beyond MOST letters a checksum follows.
     """
-    told = [f"{key.rpartition('.')[2]}={value}" for key, _, value in (change.partition("=") for change in changes)]
-    text = "-".join(re.sub(r"[^A-Za-z0-9.-]+", "_", one).strip("_") for one in told)
+    parts = [f"{key.rpartition('.')[2]}={value}" for key, _, value in (change.partition("=") for change in changes)]
+    text = "-".join(re.sub(r"[^A-Za-z0-9.-]+", "_", part).strip("_") for part in parts)
     if len(text) > MOST:
         text = f"{text[: MOST - 9]}-{zlib.crc32(text.encode()):08x}"
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -51,14 +54,14 @@ def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:
 
 @contextlib.contextmanager
 def _made(config: Mapping[str, Any]) -> Iterator[Path]:
-    """The folder; what had to be made for it and is still empty when an error ends the run was no run's: it goes."""
+    """Makes the folder; if an error ends the run while it is empty, it is removed with its new parents."""
     named, base = config["out"] is not None, Path(config["out"] or make_folder_name(config["name"]))
     for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
         new = folder_lock.find_missing_parents(folder)
         try:
             folder.mkdir(parents=True, exist_ok=named)
             break
-        except FileExistsError:  # the jobs of a parallel sweep start in one second: making it says whose it is
+        except FileExistsError:  # jobs of a parallel sweep start in the same second
             if named:
                 raise ConfigError(f"out={folder}: is a file; give a folder") from None
     try:
@@ -69,7 +72,7 @@ def _made(config: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint is there to go on from; a run that was stopped before its first one begins anew."""
+    """Whether there is a checkpoint to resume from; a run that was stopped before its first one starts again."""
     begun, last = (folder / configs.FILE).is_file(), checkpoint.latest(folder / "checkpoints")
     if not config["resume"]:
         if begun or last is not None:
@@ -79,15 +82,15 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
         raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
     _check_same(folder, config)
     if last is None:
-        print(f"{folder} has no checkpoint to go on from: the run begins anew", flush=True)
+        LOG.info(f"{folder} has no checkpoint to go on from: the run begins anew")
     return last is not None
 
 
 def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
-    """Refuse to go on with other settings than the run's own, those of `FREE` apart."""
+    """Checks that the settings are the run's own, except for those of `FREE`."""
     shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
     found = find_differences(configs.read_values(folder), config).items()
     bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
-    if told := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
-        more = f"; and {len(told) - 8} more" if len(told) > 8 else ""
-        raise ConfigError(f"resume=true: {'; '.join(told[:8])}{more}: {folder} goes on as it began; for other settings choose another out")
+    if changed := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
+        more = f"; and {len(changed) - 8} more" if len(changed) > 8 else ""
+        raise ConfigError(f"resume=true: {'; '.join(changed[:8])}{more}: {folder} keeps its settings; for others choose another out")

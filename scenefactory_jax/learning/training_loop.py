@@ -1,6 +1,8 @@
-"""`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
+"""Trains a policy: scenes, an environment and an algorithm -> a run folder with checkpoints and metrics."""
 
 import contextlib
+import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,49 +12,50 @@ import jax
 from jax.sharding import Mesh
 
 from scenefactory_jax import loggers
-from scenefactory_jax.cli import error_messages, schema
-from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core import config as configs
+from scenefactory_jax.core import schema, sharding
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Env, Policy, Scene
 from scenefactory_jax.data.loading import scene_source, stream
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import checkpoint, interrupt, run_folder
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration as ppo
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.ppo.train_iteration import make_trainer as make_ppo_trainer
+from scenefactory_jax.learning.trainer import Trainer, TrainState, count_spawned_steps, get_policy_parameters
 from scenefactory_jax.loggers import metrics_csv
 
-OnIteration = Callable[[ppo.TrainState, Mapping[str, float | int]], None]
+LOG = logging.getLogger(__name__)
+OnIteration = Callable[[TrainState, Mapping[str, float | int]], None]
+MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | int]], None] | None]
 
 
 class Prepared(NamedTuple):
-    """What runs that differ in their seed, their scenes or their budget alone have in common: sharing it, they compile their programs once.
+    """What runs share that differ only in seed, scenes or budget, so that they compile once.
 
-    `scenes`: those to train on, before `scenes.take`; None: read anew. `examiners`: protocol -> `evaluate.make_examiner`, for evaluations
-    while training; None: the config's own.
+    `scenes`: to train on, before `scenes.take`; None: they are read again.
     """
 
     env: Env
     policy: Policy
     mesh: Mesh | None
-    trainer: ppo.Trainer
+    trainer: Trainer
     scenes: scene_source.Scenes | None = None
-    examiners: Mapping[str, Callable] | None = None
 
 
 class Run(NamedTuple):
-    """What `train` hands back in Python."""
+    """The result of `train`."""
 
     folder: Path
     config: dict[str, Any]
     env: Env
     policy: Policy
-    state: ppo.TrainState
+    state: TrainState
     metrics: list[dict[str, float]]
 
 
 def prepare(config: Mapping[str, Any]) -> Prepared:
-    """Environment, policy and trainer of a config.
+    """Builds environment, policy and trainer of a config.
 
     Raises:
         ConfigError: a key that does not fit, by name.
@@ -61,34 +64,36 @@ def prepare(config: Mapping[str, Any]) -> Prepared:
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 
 
-def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
-    """Train as a config says (`load("train", ...)`).
+def train(
+    config: dict[str, Any],
+    *,
+    on_iteration: OnIteration | None = None,
+    prepared: Prepared | None = None,
+    make_callback: MakeCallback | None = None,
+    finish: Callable[[Path], Any] | None = None,
+) -> Run:
+    """Trains as a config says (`load_config("train", ...)`).
 
     Args:
         on_iteration: called on the host with (train state, metrics row) after each iteration, for notebooks and sweeps. The state is
             donated to the next iteration: copy what is to outlive the call.
-        prepared: `prepare` of a config with the same environment, policy, learner and devices; None: this config's.
+        prepared: `prepare` of a config with the same environment, policy, algorithm and devices; None: this config's.
+        make_callback: (folder, iteration that the run resumes at or None) -> function of (parameters, metrics row) to call after each
+            iteration, or None.
+        finish: called with the folder after the last iteration, before the folder's lock is released.
 
     Raises:
         ConfigError: a key that does not fit, held-out scenes that cannot be used, a run folder that exists or is in use, nothing to resume.
         SceneError: scenes that cannot be read.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, once the iteration is whole and kept.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, after the iteration ended and its checkpoint is written.
     """
-    schema.check_train(config)
-    if config["evaluation"]["enable"]:
-        scene_source.check_heldout(config["scenes"])
     watching = loggers.make(config["loggers"])
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
     with run_folder.open_run_folder(config) as (folder, resume):
-        state = _trained(config, folder, prepared, watching, on_iteration, resume=resume)
-        if config["evaluation"]["enable"]:
-            if scene_source.has_heldout(config["scenes"]):
-                from scenefactory_jax.evaluation.protocols import after_training
-
-                after_training(config, folder)
-            else:
-                print("no report: scenes.heldout.path is null; judge the run with `evaluate run=... scenes.path=...`", flush=True)
+        state = _trained(config, folder, prepared, watching, on_iteration, make_callback, resume=resume)
+        if finish is not None:
+            finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
 
 
@@ -98,19 +103,21 @@ def _trained(
     prepared: Prepared,
     watching: Mapping[str, loggers.Logger],
     on_iteration: OnIteration | None,
+    make_callback: MakeCallback | None,
     *,
     resume: bool,
-) -> ppo.TrainState:
-    """The train state after the last iteration. The config is written once it is sure that the run can begin, or go on, with it."""
+) -> TrainState:
+    """Trains to the last iteration. The config is written after scenes and checkpoint are read, so that a failed start leaves none."""
     trainer = prepared.trainer
     with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
         state = trainer.init(jax.random.key(config["seed"]), worlds)
         if resume:
             state = checkpoint.restore(folder / "checkpoints", state)
-            print(f"resumed at iteration {int(state.iteration)}", flush=True)
+            LOG.info(f"resumed at iteration {int(state.iteration)}")
         configs.write(folder, config)
-        watch = _make_watch(config, folder, prepared.examiners, resume_at=int(state.iteration) if resume else None)
-        callbacks = [c for c in (watch, on_iteration) if c]
+        callback = make_callback and make_callback(folder, int(state.iteration) if resume else None)
+        on_parameters = callback and (lambda state, row: callback(get_policy_parameters(state), row))
+        callbacks = [c for c in (on_parameters, on_iteration) if c]
         return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
 
 
@@ -118,54 +125,36 @@ def _trained(
 def _scenes(
     config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
 ) -> Iterator[tuple[Scene, stream.SceneStream | None]]:
-    """The scenes of all worlds on their devices, and where others come from, if they do not stay."""
+    """Loads the scenes of all worlds onto their devices; the second value is the stream of further scenes, if there is one."""
     if config["stream"] is None:
         given = prepared.scenes
         loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
         worlds, chosen = scene_source.assign_scenes(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
-        print(f"run {folder}\n{loaded.account}\n{chosen}", flush=True)
+        LOG.info(f"run {folder}\n{loaded.account}\n{chosen}")
         yield worlds, None
         return
     before = checkpoint.restore_host(folder / "checkpoints") if resume else None
     with stream.open_stream(config, mesh=prepared.mesh, before=before) as flow:
         worlds = flow.scenes()
-        print(f"run {folder}", flush=True)
+        LOG.info(f"run {folder}")
         yield worlds, flow
 
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
-    """The policy of a config's `policy` entry."""
+    """Builds the policy of a config's `policy` entry."""
     return instantiate(config["policy"], builtins=late_fusion, where="policy")()
 
 
-def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> ppo.Trainer:
-    """PPO with a config's numbers; its worlds may be shared out over a mesh of devices (`across.mesh`)."""
-    entry = {"_target_": "make_trainer", **config["ppo"]}
-    make = instantiate(entry, builtins=ppo, where="ppo", episode_steps=environment.episode_steps(config["timing"]))
-    return make(env, policy, mesh=mesh)
-
-
-def _make_watch(
-    config: Mapping[str, Any], folder: Path, examiners: Mapping[str, Callable] | None, *, resume_at: int | None
-) -> OnIteration | None:
-    """Held-out evaluation every so many iterations or at those that are listed, if the config asks for it."""
-    every = config["evaluation"]["every"]
-    if not every or (examiners is None and not config["evaluation"]["enable"]):
-        return None
-    from scenefactory_jax.evaluation.protocols import make_watch
-
-    watch = make_watch(config, folder, resume_at=resume_at, examiners=examiners)
-
-    def due(iteration: int | float) -> bool:
-        return iteration in every if isinstance(every, list) else iteration % every == 0
-
-    return lambda state, row: watch(ppo.parameters_of(state), row) if due(row["iteration"]) else None
+def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:
+    """Builds PPO for a config, on one device or on a mesh (`sharding.make_mesh`)."""
+    numbers = schema.read(config["ppo"], PPOConfig, where="ppo")
+    return make_ppo_trainer(env, policy, numbers, episode_steps=environment.episode_steps(config["timing"]), mesh=mesh)
 
 
 def _loop(
     config,
     folder: Path,
-    trainer: ppo.Trainer,
+    trainer: Trainer,
     worlds,
     state,
     flow: stream.SceneStream | None,
@@ -174,16 +163,16 @@ def _loop(
     resume: bool,
     callbacks: list[OnIteration],
 ):
-    """Iterate until the iterations or the minutes are up; every row goes to metrics.csv before the next iteration starts.
+    """Iterates until `iterations` or `minutes` is reached; every row is written to metrics.csv before the next iteration starts.
 
-    The minutes count iterations (the first one compiles), not checkpoints or evaluations between them. A signal to stop ends it after
-    the iteration that it fell into, with a checkpoint.
+    `minutes` counts iterations, compilation included, not checkpoints or evaluations. A signal ends the loop after the current iteration,
+    with a checkpoint.
     """
     first, total = int(state.iteration), config["iterations"]
     file = metrics_csv.MetricsFile(folder, resume_at=first if resume else None)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
-        interrupt.defer_interrupt() as asked,
+        interrupt.defer_interrupt() as get_signal,
         loggers.open_loggers(watching, folder, config, after=first if resume else 0) as note,
         metrics_csv.progress(total, enable=config["progress"], start=first) as show,
     ):
@@ -192,15 +181,15 @@ def _loop(
             state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
             seconds = time.monotonic() - before
             spent += seconds / 60
-            row = {"iteration": iteration, "minutes": spent, "steps/total": ppo.spawned_steps(state), **row, "seconds": seconds}
+            row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
             note(row)
             show(iteration, describe(row))
-            error_messages.check_finite(row)
+            check_finite(row)
             for callback in callbacks:
                 callback(state, row)
-            late, stop = config["minutes"] is not None and spent >= config["minutes"], asked()
+            late, stop = config["minutes"] is not None and spent >= config["minutes"], get_signal()
             if late or stop or iteration == total or iteration % config["checkpoint_every"] == 0:
                 host = None if flow is None else flow.state()
                 checkpoint.save(folder / "checkpoints", state, keep=config["checkpoints_kept"], host=host)
@@ -211,23 +200,43 @@ def _loop(
     return state
 
 
+def check_finite(row: Mapping[str, float | int]) -> None:
+    """Checks that the iteration could learn: a reward term that is not finite may have made every minibatch unusable.
+
+    A car whose state is not finite ends as `numerical_error`; then single minibatches are left out (`ppo/skipped`), which is no error.
+
+    Args:
+        row: metrics of an iteration.
+
+    Raises:
+        ConfigError: naming the terms.
+    """
+    terms = [name for name, value in row.items() if name.startswith("reward/") and not math.isfinite(value)]
+    if terms and row.get("ppo/skipped", 0) > 0 and row.get("ppo/gradient_norm") == 0.0:
+        values = ", ".join(f"{name.replace('/', '.')}: {row[name]}" for name in terms)
+        raise ConfigError(
+            f"{values} in iteration {row['iteration']}, so no minibatch could be learnt from;"
+            " look for a division by zero, or a log or root below zero, or leave it out: ~" + terms[0].replace("/", ".")
+        )
+
+
 def step(
-    trainer: ppo.Trainer, state: ppo.TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
-) -> tuple[ppo.TrainState, Scene, dict[str, float | int]]:
-    """One iteration in the worlds as they are, or with the stream's next scenes in some of them, and its numbers on the host."""
+    trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
+) -> tuple[TrainState, Scene, dict[str, float | int]]:
+    """Makes one iteration, with the stream's next scenes in some worlds if there is a stream; gives its metrics on the host."""
     if flow is None:
-        state, metrics = trainer.iterate(state, worlds)
+        state, metrics = trainer.train_iteration(state, worlds)
         return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
     if not first:
-        state, worlds = flow.exchange(trainer.swap, state, worlds)
-    state, metrics = trainer.iterate(state, worlds)
-    flow.draw()  # while the devices work
-    metrics, record = jax.device_get((metrics, state.record))
+        state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
+    state, metrics = trainer.train_iteration(state, worlds)
+    flow.draw()  # while the devices compute
+    metrics, record = jax.device_get((metrics, state.scene_stats))
     return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
 
 
 def describe(row: Mapping[str, float | int]) -> str:
-    """One line on how training stands."""
+    """Describes a row of metrics in one line."""
     names = {"goal_reached": "goal", "collision": "collision", "road_edge_contact": "edge", "out_of_bounds": "crash"}
     rates = " ".join(f"{label} {100 * row[f'events/{name}']:.0f}%" for name, label in names.items() if f"events/{name}" in row)
     return f"{rates} | {row['casps']:,.0f} steps/s"

@@ -1,8 +1,7 @@
-"""Where the numbers of a training go besides metrics.csv: TensorBoard, Weights & Biases, MLflow, or a logger of one's own.
+"""Loggers of a training besides metrics.csv: TensorBoard, Weights & Biases, MLflow, or your own.
 
-`loggers=[tensorboard,wandb]` chooses options of the config group; each is an entry whose target, called with its numbers, gives a `Logger`.
-One's own is a function more: `+loggers.mine={_target_: my_loggers.make, ...}`. The target is called before anything else happens, so that a
-missing package is refused before scenes are read.
+`loggers=[tensorboard,wandb]` chooses options of the config group; the target of each entry returns a `Logger`. Your own is one more entry:
+`+loggers.mine={_target_: my_loggers.make, ...}`. Targets are called first, so a missing package is an error before scenes are read.
 """
 
 import contextlib
@@ -16,11 +15,11 @@ Row = Mapping[str, float | int]
 Add = Callable[[Row], None]
 """Takes an iteration's metrics row, with its number under `iteration`."""
 Logger = Callable[[Path, Mapping[str, Any], int], contextlib.AbstractContextManager[Add]]
-"""(run folder, config, iterations done before: 0 unless the run is resumed) -> what rows are added to until it closes."""
+"""(run folder, config, iterations before a resume, else 0) -> context manager of a function that adds rows."""
 
 
 def make(entries: Mapping[str, Any]) -> dict[str, Logger]:
-    """The loggers of a config's `loggers`, bound to their numbers; entries that are null are left out.
+    """Builds the loggers of a config; null entries are left out.
 
     Raises:
         ConfigError: an entry or key that does not fit, or a package that is not installed, by name.
@@ -31,7 +30,7 @@ def make(entries: Mapping[str, Any]) -> dict[str, Logger]:
 
 @contextlib.contextmanager
 def open_loggers(loggers: Mapping[str, Logger], folder: Path, config: Mapping[str, Any], *, after: int) -> Iterator[Add]:
-    """One `add(row)` for all of them; they close together, also when training breaks off."""
+    """Opens all loggers as one function `add(row)`; they close together, also after an error."""
     with contextlib.ExitStack() as stack:
         adds = [stack.enter_context(logger(folder, config, after)) for logger in loggers.values()]
 
@@ -43,7 +42,7 @@ def open_loggers(loggers: Mapping[str, Logger], folder: Path, config: Mapping[st
 
 
 def identity(folder: Path, name: str, fresh: Callable[[], str]) -> tuple[str, bool]:
-    """What a service calls this run, and whether it knows it already; kept in the run's folder, so that a resumed run goes on under it."""
+    """Returns the id of this run at a service, and whether it existed. It is kept in the run folder, for a resumed run."""
     file = Path(folder) / f"{name}.id"
     if file.is_file():
         return file.read_text().strip(), True

@@ -1,4 +1,4 @@
-"""A training run's numbers in metrics.csv, and a progress bar on the terminal; `loggers` take them elsewhere."""
+"""Reads and writes metrics.csv of a run, and shows a progress bar."""
 
 import contextlib
 import csv
@@ -15,14 +15,14 @@ FILE, EVALUATIONS = "metrics.csv", "evaluations.csv"
 
 
 class MetricsFile:
-    """A CSV file with one row an iteration. On resume, rows after the checkpoint are dropped, so that it tells one unbroken story."""
+    """A CSV file with one row per iteration. On resume, rows after the checkpoint are dropped."""
 
     def __init__(self, folder: Path, *, name: str = FILE, resume_at: int | None = None):
         self.path = Path(folder) / name
         rows = [row for row in read(folder, name) if resume_at is not None and row["iteration"] <= resume_at]
         self.rows = rows
         self.columns = list(rows[0]) if rows else []
-        with atomic_file.write_atomically(self.path) as half, open(half, "w", newline="") as file:
+        with atomic_file.write_atomically(self.path) as temporary, open(temporary, "w", newline="") as file:
             if rows:
                 writer = csv.DictWriter(file, self.columns)
                 writer.writeheader()
@@ -39,7 +39,7 @@ class MetricsFile:
 
 
 def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
-    """Rows of a run's metrics; none where there is no file yet. An empty cell is NaN, a last row that was cut short none at all."""
+    """Reads the rows of a run's metrics; none without a file. An empty cell is NaN; an incomplete last row is left out."""
     path = Path(folder) / name
     if not path.is_file():
         return []
@@ -48,7 +48,7 @@ def read(folder: Path, name: str = FILE) -> list[dict[str, float]]:
 
 
 class _Bar(Progress):
-    """A bar with a line of text below it: side by side they do not fit into 80 columns."""
+    """A bar with a line of text below it, to fit into 80 columns."""
 
     def get_renderables(self) -> Iterator[RenderableType]:
         yield self.make_tasks_table(self.tasks)
@@ -58,7 +58,7 @@ class _Bar(Progress):
 
 @contextlib.contextmanager
 def progress(total: int, *, enable: bool, start: int = 0, console: Console | None = None) -> Iterator:
-    """A bar `show(iteration, text)` with the time left, or one that does nothing."""
+    """Opens a progress bar as a function `show(iteration, text)`; without `enable` it does nothing."""
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
     columns += [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
     with _Bar(*columns, disable=not enable, refresh_per_second=2, console=console) as bar:

@@ -6,20 +6,20 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.loggers import Add, Logger, Row, identity
-from scenefactory_jax.visualization.report.evaluation_report import flatten
 
-PARAMETERS = 100  # that one request may carry
+PARAMETERS = 100  # limit of one request
 
 
 def make(*, experiment: str, uri: str | None) -> Logger:
-    """An MLflow run named as the run folder; every number of the config is a parameter of it.
+    """Logs to an MLflow run with the name of the run folder and the values of the config as parameters.
 
-    A resumed run goes on under its id; its parameters stay those that it began with.
+    A resumed run keeps its id and parameters.
 
     Args:
-        experiment: made where it does not exist.
+        experiment: created if missing.
         uri: of the tracking server or database, `sqlite:///mlflow.db`; None: MLFLOW_TRACKING_URI, or MLflow's default.
 
     Raises:

@@ -11,7 +11,7 @@ from scenefactory_jax.loggers import Add, Logger, Row
 
 
 def make() -> Logger:
-    """A scalar for each column of a row. Of a resumed run TensorBoard forgets what came after the checkpoint."""
+    """Logs each column of a row as a scalar. On resume, TensorBoard drops what came after the checkpoint."""
 
     @contextlib.contextmanager
     def log(folder: Path, config: Mapping[str, Any], after: int) -> Iterator[Add]:

@@ -11,13 +11,13 @@ from scenefactory_jax.loggers import Add, Logger, Row, identity
 
 
 def make(*, project: str, entity: str | None, group: str | None, mode: Literal["online", "offline", "disabled"] | None) -> Logger:
-    """A W&B run named as the run folder, with the whole config.
+    """Logs to a W&B run with the name of the run folder and the config.
 
-    A resumed run goes on under its id (offline: upload with `wandb sync --append`). Rows are drawn over `iteration`, not over W&B's own
-    step, which only ever grows: iterations that a resumed run repeats show twice.
+    A resumed run keeps its id (offline: upload with `wandb sync --append`). Rows are drawn over `iteration`, not over
+    the step of W&B, which cannot go back. Iterations that a resumed run repeats are shown twice.
 
     Args:
-        project, entity, group: where the run belongs; None: W&B's default, or its environment variables.
+        project, entity, group: of the run; None: W&B's default, or its environment variables.
         mode: None: WANDB_MODE, or online.
 
     Raises:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import EPSILON, cross, dot, heading_vector, safe_sqrt, to_frame
+from scenefactory_jax.core.geometry import SMALLEST, cross, dot, heading_vector, safe_sqrt, to_frame
 from scenefactory_jax.core.pallas import on_gpu
 from scenefactory_jax.core.types import Road, Scene, SetObservation, SpatialGrid
 from scenefactory_jax.roadgraph import road_kernels, spatial_grid
@@ -88,13 +88,13 @@ def edge_rate(
     def rate(centre: Float[Array, "A 2"]) -> Float[Array, "A P"]:
         offset = edges.midpoint - centre[:, None]
         squared = dot(offset, offset)
-        inverse = jax.lax.rsqrt(jnp.maximum(squared, EPSILON**2))
+        inverse = jax.lax.rsqrt(jnp.maximum(squared, SMALLEST**2))
         distance, closing = squared * inverse, dot(offset, velocity[:, None]) * inverse
         gap = distance - radius[:, None]
         ahead = edges.valid & (distance <= range_m) & (dot(offset, heading[:, None]) > 0)
         touches = gap <= 0
         inverse_ttc = jnp.where(touches, jnp.inf, closing / jnp.where(touches, 1.0, gap))
-        return jnp.where(ahead & (touches | (closing > EPSILON)), inverse_ttc, 0.0)
+        return jnp.where(ahead & (touches | (closing > SMALLEST)), inverse_ttc, 0.0)
 
     rates = functools.reduce(jnp.maximum, [rate(circles[:, index]) for index in range(circles.shape[1])])
     return jnp.max(rates, axis=1, initial=0.0)

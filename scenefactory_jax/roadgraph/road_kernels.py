@@ -13,7 +13,7 @@ from jax.experimental.pallas import triton as plgpu
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core import pallas
-from scenefactory_jax.core.geometry import EPSILON
+from scenefactory_jax.core.geometry import SMALLEST
 from scenefactory_jax.core.types import Road, SpatialGrid
 
 QUERY_BLOCK, GATHER_BLOCK = 128, 128  # segments of a block; the fastest of 20 settings on an H200
@@ -74,12 +74,12 @@ def _query(limits, numbers, lane, lane_valid, edge, along, half, edge_valid, row
             across = jnp.maximum(jnp.abs(ox * dy - oy * dx) - half_width, 0.0)
             squared = jnp.minimum(squared, jnp.where(mask, beyond * beyond + across * across, jnp.inf))
             offset = ox * ox + oy * oy
-            inverse = jax.lax.rsqrt(jnp.maximum(offset, EPSILON * EPSILON))
+            inverse = jax.lax.rsqrt(jnp.maximum(offset, SMALLEST * SMALLEST))
             distance, closing = offset * inverse, (ox * vx + oy * vy) * inverse
             gap = distance - radius
             touches = gap <= 0.0
             inverse_ttc = jnp.where(touches, jnp.inf, closing / jnp.where(touches, 1.0, gap))
-            ahead = mask & (distance <= range_m) & (ox * hx + oy * hy > 0.0) & (touches | (closing > EPSILON))
+            ahead = mask & (distance <= range_m) & (ox * hx + oy * hy > 0.0) & (touches | (closing > SMALLEST))
             rate = jnp.maximum(rate, jnp.where(ahead, inverse_ttc, 0.0))
         return squared, rate
 

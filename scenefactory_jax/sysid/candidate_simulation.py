@@ -13,11 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from experiments.validation import engines
-from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import pytree_dataclass, replace
 from scenefactory_jax.core.types import Dynamics, Scene
-from scenefactory_jax.dynamics import collision
+from scenefactory_jax.dynamics import collision, open_ground
 from scenefactory_jax.dynamics.articulated import articulated_car
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
@@ -100,18 +98,18 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
     """The car of a config's dynamics with the parameters of a space left open.
 
     Args:
-        dynamics: of the articulated car; its fleet is replaced.
+        dynamics: of the articulated car; its randomization is replaced.
         friction: of the surfaces, where the space leaves them alone.
     """
     car, solver = cars.read_parameters(dynamics)
     plant = articulated_car.compile_car(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
-    meet = instantiate({**dynamics["contact"], "_target_": "make"}, builtins=collision, where="dynamics.contact", height=car.height)()
+    contact = collision.make_contact(dynamics["contact"], height=car.height)
     empty = _ground(car)
 
     def bound(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Dynamics, Scene]:
         own, mu = spaces.apply(space, car, friction, row)
 
-        def grip(weather: Any, position: Float[Array, "1 4 2"], speed: Array) -> Array:
+        def friction_at(weather: Any, position: Float[Array, "1 4 2"], speed: Array) -> Array:
             del weather, speed
             strip = (position[..., 0][..., None] >= plan.edges[index]).sum(-1)
             surface = jnp.where(position[..., 1] > 0.0, plan.left[index][strip], plan.right[index][strip])
@@ -119,7 +117,7 @@ def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *
 
         crew = jax.tree.map(lambda leaf: leaf[None], own)
         scene = replace(empty, agents=replace(empty.agents, speed=plan.speed[index][None]))
-        return articulated_car.make_dynamics(plant._replace(vary=lambda key, scene: crew), meet, grip), scene
+        return articulated_car.make_dynamics(plant._replace(sample=lambda key, scene: crew), contact, friction_at), scene
 
     def driver(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]:
         backend, scene = bound(row, index, plan)
@@ -236,13 +234,13 @@ def residuals(
 def _ground(car: CarParameters) -> Scene:
     """A world that holds one car at the origin."""
     zero = np.zeros((1, 1), np.float32)
-    worlds = engines.scenes(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=(car.length, car.width))
+    worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=(car.length, car.width))
     return jax.tree.map(lambda leaf: leaf[0], worlds)
 
 
 def _seen(backend: Dynamics, plant: articulated_car.CompiledCar, body: Any) -> CandidatePath:
     """Of the only car."""
-    motion, at = backend.read(body), plant.places
+    motion, at = backend.read(body), plant.addresses
     return CandidatePath(
         position=motion.position[0, :2],
         yaw=motion.yaw[0],

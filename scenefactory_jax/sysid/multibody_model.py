@@ -122,7 +122,7 @@ def make(
         ConfigError: a time, speed or tolerance that is not above 0, or a surface without grip.
     """
     positive = dict(steering_lag_s=steering_lag_s, steering_rate_max=steering_rate_max, contact_m=contact_m, tolerance=tolerance)
-    for name, value in {**positive, "stop_speed": stop_speed, "lock_spin": lock_spin, "settle_s": settle_s, "grip": min(grip)}.items():
+    for name, value in {**positive, "stop_speed": stop_speed, "lock_spin": lock_spin, "settle_s": settle_s, "friction": min(grip)}.items():
         if value <= 0.0:
             raise ConfigError(f"sysid.teacher.{name}: {value}; must be above 0")
     return ReferenceVehicle(

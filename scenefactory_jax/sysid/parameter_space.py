@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.instantiate import ConfigError, check_range
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
-from scenefactory_jax.dynamics.articulated.randomization import with_numbers
+from scenefactory_jax.dynamics.articulated.randomization import with_values
 from scenefactory_jax.sysid.manoeuvres import SURFACES
 
 FRICTION = tuple(f"friction_{name}" for name in SURFACES)  # what the road has to give, not the car
@@ -75,4 +75,4 @@ def apply(
     road = [jnp.asarray(chosen.get(name, value), jnp.float32) for name, value in zip(FRICTION, friction, strict=True)]
     numbers = {name: [jnp.float32(x) for x in value] if isinstance(value, (list, tuple)) else jnp.asarray(value, jnp.float32)
                for name, value in numbers.items()}  # fmt: skip
-    return with_numbers(car, numbers), jnp.stack(road)
+    return with_values(car, numbers), jnp.stack(road)

@@ -142,11 +142,11 @@ def load(path: Any, *, digest: str | None) -> list[ManoeuvreRecording]:
         raise ConfigError(f"{path}: recorded with other settings ({arrays['digest']}, wanted {digest}); delete it to record anew")
     frames, strips = arrays["frames"], arrays["strips"]
     ends, grounds, edges = (np.cumsum(counts)[:-1] for counts in (frames, strips, strips - 1))
-    cut = {name: np.split(arrays[name], ends) for name in ("actions", *ManoeuvreRecording._fields[1:])}
+    cut = {name: np.split(arrays[name], ends) for name in ("controls", *ManoeuvreRecording._fields[1:])}
     cut |= {name: np.split(arrays[name], grounds) for name in ("left", "right")} | {"edges": np.split(arrays["edges"], edges)}
     found = []
     for i, name in enumerate(arrays["name"]):
-        road = [cut[field][i] for field in ("actions", "edges", "left", "right")]
+        road = [cut[field][i] for field in ("controls", "edges", "left", "right")]
         manoeuvre = Manoeuvre(str(name), str(arrays["family"][i]), float(arrays["start_speed"][i]), *road)
         found.append(ManoeuvreRecording(manoeuvre, *(cut[field][i] for field in ManoeuvreRecording._fields[1:])))
     return found

@@ -1,8 +1,7 @@
-"""Rain and road surface to tyre friction: the modified average lumped LuGre model (ALL), in closed form.
+"""Friction coefficient from road surface and water film: the modified average lumped LuGre model (ALL), in closed form.
 
-A thin water film separates the tread from the road's texture and partly lifts the tyre; what contact is left carries a LuGre bristle whose
-steady state is algebraic. The integrator of the bristle's differential equation lives in the tests, as an oracle. Constants are those
-of Zhao et al. (2024) as published with SceneFactory: `conf/weather/base.yaml` holds each of them, with its unit.
+A water film separates the tread from the road's texture and partly lifts the tyre. The remaining contact carries a LuGre bristle whose
+steady state is algebraic. Constants: Zhao et al. (2024) as published with SceneFactory; values and units in `conf/weather/base.yaml`.
 """
 
 import dataclasses
@@ -15,12 +14,12 @@ from jaxtyping import Array, Float, Int
 
 from scenefactory_jax.core.instantiate import ConfigError, check_number, check_numbers, instantiate
 from scenefactory_jax.core.types import SURFACES, Patches, Rain, Weather
-from scenefactory_jax.weather.patches import condition_at
+from scenefactory_jax.weather.patches import read_condition
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tyre:
-    """Constants of one tyre and of the water under it; SI units."""
+    """Constants of a tyre and of the water under it, SI units."""
 
     load: float  # normal load of the wheel, N
     pressure: float  # inflation pressure, Pa
@@ -42,19 +41,19 @@ class Tyre:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Surface:
-    """What a road surface adds: the ratio of its friction to asphalt concrete's, and the amplitude of its texture."""
+    """Ratio of a road surface's friction to that of asphalt concrete, and amplitude of its texture."""
 
     theta: float
     texture_mm: float
 
 
 def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"], Float[Array, "*shape"]], Float[Array, "*shape"]]:
-    """The `grip` of a weather config, bound to its numbers. It is traced once, so that what it refuses is refused here.
+    """Binds `weather.friction` of a config to its values, and traces it once to check them.
 
     Raises:
         ConfigError: naming the key that does not fit.
     """
-    bound = instantiate(entry, builtins=__name__, where="weather.grip")
+    bound = instantiate(entry, builtins=__name__, where="weather.friction")
     jax.eval_shape(bound, make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((1, 4, 2)), jnp.zeros((1, 4)))
     return bound
 
@@ -68,18 +67,18 @@ def compute_lugre_friction(
     *,
     tyre: Tyre,
 ) -> Float[Array, "*shape"]:
-    """Steady-state friction coefficient of a tyre that runs at `speed` m/s with longitudinal slip `slip` on a film of water.
+    """Computes the steady-state friction coefficient of a tyre at `speed` m/s with longitudinal slip `slip` on a water film.
 
     mu = max(theta Y_R - Y_F, 0) sigma0 s / (sigma0 s / g(s v) + K (1 + s)): the stationary point of the bristle's equation, with the
     speed cancelled from numerator and denominator (v_r = s v, w_r = (1 + s) v). Finite with finite gradients at rest and on a dry road.
-    The published bristle dampings sigma1 and sigma2 are zero and left out. It has no floor: zero means that the tyre floats.
+    The published bristle dampings sigma1 and sigma2 are zero and omitted. There is no floor: zero means that the tyre floats.
     """
     contact = jnp.maximum(
-        theta * asperity_spacing(speed, film_mm, texture_mm, tyre=tyre) - hydrodynamic_lift(speed, film_mm, tyre=tyre), 0.0
+        theta * compute_asperity_spacing(speed, film_mm, texture_mm, tyre=tyre) - compute_hydrodynamic_lift(speed, film_mm, tyre=tyre), 0.0
     )
     b1, b2, b3, b4 = tyre.stribeck_velocity
     stribeck = b1 * jnp.exp(b2 * film_mm + b3) + b4
-    # the floor keeps the gradient of x^alpha finite at rest; it moves g by less than 4e-5 and only below 1e-7 of a metre a second
+    # the floor keeps the gradient of x^alpha finite at rest; it changes g by less than 4e-5, below 1e-7 m/s only
     ratio = jnp.maximum(slip * speed / stribeck, 1e-9)
     g = tyre.coulomb + (tyre.static - tyre.coulomb) * jnp.exp(-(ratio**tyre.stribeck_exponent))
     lumping = 7.0 / (6.0 * tyre.patch_length)  # K of the average lumped model
@@ -87,24 +86,25 @@ def compute_lugre_friction(
     return contact * bristle / (bristle / g + lumping * (1.0 + slip))
 
 
-def asperity_spacing(
+def compute_asperity_spacing(
     speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], texture_mm: Float[Array, "*shape"], *, tyre: Tyre
 ) -> Float[Array, "*shape"]:
-    """Y_R: the share of the contact patch in which water is squeezed out to the minimum spacing.
+    """Computes Y_R, the fraction of the contact patch in which water is squeezed out to the minimum spacing.
 
-    The published bracket 1/(h_m^2 + 2 T h_m) - 1/(h0^2 + 2 T h0) turns negative for h0 < h_m, where the clip gives one: holding h0
-    at h_m or above says the same without a division by zero on a dry road. The difference is one fraction for float32's sake.
+    The published bracket 1/(h_m^2 + 2 T h_m) - 1/(h0^2 + 2 T h0) is negative for h0 < h_m, where the clip gives one. A lower bound of h_m
+    for h0 gives the same without a division by zero on a dry road. The difference is written as one fraction for float32.
     """
     texture = texture_mm * 1e-3
-    least, first = tyre.minimum_spacing, jnp.maximum(tyre.spacing_ratio * film_mm * 1e-3, tyre.minimum_spacing)
+    spacing, initial = tyre.minimum_spacing, jnp.maximum(tyre.spacing_ratio * film_mm * 1e-3, tyre.minimum_spacing)
     patch = tyre.patch_length * tyre.patch_width
     squeeze = 12.0 * speed * tyre.water_viscosity * tyre.tread_radius**2 / (patch * jnp.pi * tyre.pressure * tyre.patch_length)
-    bracket = (first - least) * (first + least + 2.0 * texture) / (least * (least + 2.0 * texture) * first * (first + 2.0 * texture))
+    difference = (initial - spacing) * (initial + spacing + 2.0 * texture)
+    bracket = difference / (spacing * (spacing + 2.0 * texture) * initial * (initial + 2.0 * texture))
     return jnp.clip(1.0 - squeeze * bracket, 0.0, 1.0)
 
 
-def hydrodynamic_lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre: Tyre) -> Float[Array, "*shape"]:
-    """Y_F: the share of the wheel's load that the water wedge in front of the tyre carries."""
+def compute_hydrodynamic_lift(speed: Float[Array, "*shape"], film_mm: Float[Array, "*shape"], *, tyre: Tyre) -> Float[Array, "*shape"]:
+    """Computes Y_F, the fraction of the wheel load that the water wedge in front of the tyre carries."""
     a, q = tyre.patch_length / (2.0 * tyre.radius), jnp.maximum(film_mm, 0.0) * 1e-3 / tyre.radius
     wedge = q * (2.0 * max(1.0 - a * a, 0.0) ** 0.5 - q)
     depth = wedge / (jnp.sqrt(jnp.maximum(a * a + wedge, 1e-12)) + a)  # sqrt(a^2 + wedge) - a without cancellation
@@ -124,29 +124,29 @@ def compute_mu(
     tyre: dict[str, Any],
     surfaces: dict[str, Any],
 ) -> Float[Array, "*shape"]:
-    """Friction coefficient of wheels at places of the plane.
+    """Computes the friction coefficient of wheels.
 
     Args:
-        weather: this world's road condition.
-        position: of the wheels, m: each reads the condition of the road under it.
+        weather: road condition of this world.
+        position: of the wheels, m; the road condition is read at each.
         speed: of the cars, m/s.
         mode: `static` and `dynamic` evaluate the model at `reference_speed` and `slip_static` or `slip_dynamic` (the published choice is
             `static`); `speed` evaluates it at each car's own speed and `slip_static`.
-        floor: smallest coefficient that a contact may have.
-        tyre: the numbers of `Tyre`.
-        surfaces: for every name of `types.SURFACES` the numbers of `Surface`.
+        floor: smallest coefficient of a contact.
+        tyre: values of `Tyre`.
+        surfaces: values of `Surface` for every name of `types.SURFACES`.
 
     Raises:
         ConfigError: an unknown mode, tyre constant or surface, or a number out of its range, by name.
     """
     constants = _tyre(tyre)
-    check_number(floor, where="weather.grip.floor", above=0.0)  # at 0 the solver's cone is empty, and cars fall through the road
+    check_number(floor, where="weather.friction.floor", above=0.0)  # at 0 cars fall through the road
     slips = {"reference_speed": reference_speed, "slip_static": slip_static, "slip_dynamic": slip_dynamic}
-    check_numbers(slips, where="weather.grip", least=0.0)
+    check_numbers(slips, where="weather.friction", least=0.0)
     if mode not in ("static", "dynamic", "speed"):
-        raise ConfigError(f"weather.grip.mode: {mode!r}; valid: static, dynamic, speed")
-    film_mm, surface = condition_at(weather, position)
-    speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # whole numbers would make whole numbers of the slip: 0
+        raise ConfigError(f"weather.friction.mode: {mode!r}; valid: static, dynamic, speed")
+    film_mm, surface = read_condition(weather, position)
+    speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # integers would make the slip an integer
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
     theta, texture = (table[surface] for table in _surfaces(surfaces))
@@ -154,29 +154,31 @@ def compute_mu(
 
 
 def _tyre(entry: Mapping[str, Any]) -> Tyre:
-    tyre: Tyre = instantiate({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.grip.tyre")()
+    tyre: Tyre = instantiate({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.friction.tyre")()
     numbers = dict(vars(tyre))
     stribeck = {f"stribeck_velocity[{i}]": b for i, b in enumerate(numbers.pop("stribeck_velocity"))}
     if len(stribeck) != 4:
-        raise ConfigError(f"weather.grip.tyre.stribeck_velocity: {list(stribeck.values())}; wanted are b1, b2, b3, b4")
-    check_numbers(stribeck, where="weather.grip.tyre")
-    factor, rest = "stribeck_velocity[0]", "stribeck_velocity[3]"  # above 0, so that the velocity is, under any film
-    check_numbers({**numbers, factor: stribeck[factor], rest: stribeck[rest]}, where="weather.grip.tyre", above=0.0)
+        raise ConfigError(f"weather.friction.tyre.stribeck_velocity: {list(stribeck.values())}; expected [b1, b2, b3, b4]")
+    check_numbers(stribeck, where="weather.friction.tyre")
+    first, last = "stribeck_velocity[0]", "stribeck_velocity[3]"  # b1 and b4 > 0: the Stribeck velocity is positive for any film
+    check_numbers({**numbers, first: stribeck[first], last: stribeck[last]}, where="weather.friction.tyre", above=0.0)
     return tyre
 
 
 def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-    """theta and texture in the order of `types.SURFACES`."""
+    """Reads theta and texture in the order of `types.SURFACES`."""
     if set(surfaces) != set(SURFACES):
-        raise ConfigError(f"weather.grip.surfaces: {', '.join(surfaces)}; wanted exactly {', '.join(SURFACES)}")
-    rows = [instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.grip.surfaces.{n}")() for n in SURFACES]
+        raise ConfigError(f"weather.friction.surfaces: {', '.join(surfaces)}; expected exactly {', '.join(SURFACES)}")
+    rows = [
+        instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.friction.surfaces.{n}")() for n in SURFACES
+    ]
     for name, row in zip(SURFACES, rows, strict=True):
-        check_numbers(vars(row), where=f"weather.grip.surfaces.{name}", above=0.0)
+        check_numbers(vars(row), where=f"weather.friction.surfaces.{name}", above=0.0)
     return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
 
 
 def make_uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:
-    """One condition everywhere and for ever: no patches, no rain."""
-    none, nothing = jnp.zeros(0, jnp.float32), jnp.zeros(0, bool)
-    patches = Patches(jnp.zeros((0, 1, 2), jnp.float32), nothing, none, jnp.zeros(0, jnp.int32), none, none, nothing)
-    return Weather(film_mm, surface, patches, Rain(now_s=jnp.float32(0.0), time_s=none, film_mm=none))
+    """Makes a constant road condition without patches and rain."""
+    floats, flags = jnp.zeros(0, jnp.float32), jnp.zeros(0, bool)
+    patches = Patches(jnp.zeros((0, 1, 2), jnp.float32), flags, floats, jnp.zeros(0, jnp.int32), floats, floats, flags)
+    return Weather(film_mm, surface, patches, Rain(now_s=jnp.float32(0.0), time_s=floats, film_mm=floats))

@@ -1,7 +1,7 @@
-"""The open road's water film over an episode: how it moves on, and the courses that an episode can draw.
+"""Rain: the open road's water film over an episode.
 
-A course is a function (key, weather) -> Rain, named by the entry `weather.rain`; the weather that it is given is the drawn one, so a course
-can start from its film. Films between knots are linear.
+`weather.rain` names a function (key, weather) -> Rain; it gets the sampled weather, so the film can start from there. Films are linear
+between knots.
 """
 
 import itertools
@@ -15,33 +15,33 @@ from scenefactory_jax.core.instantiate import ConfigError, check_range
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Rain, Weather
 
-SPAN = 5.0  # time constants that knots cover: 0.7 % of the change is still to come then
+SPAN = 5.0  # time constants covered by the knots: 99.3 % of the change
 
 
 def advance_rain(weather: Weather, *, dt: float | Float[Array, ""]) -> Weather:
-    """The weather `dt` seconds later; without knots its film stays as it is."""
+    """Computes the weather `dt` seconds later; without knots the film is constant."""
     rain = replace(weather.rain, now_s=weather.rain.now_s + dt)
     film_mm = jnp.interp(rain.now_s, rain.time_s, rain.film_mm) if rain.time_s.shape[0] else weather.film_mm
     return replace(weather, film_mm=film_mm, rain=rain)
 
 
 def schedule(key: PRNGKeyArray, weather: Weather, *, time_s: list[float], film_mm: list[float]) -> Rain:
-    """A given course, the same in every episode; it replaces the drawn film from the start.
+    """Makes the same film schedule in every episode, instead of the sampled film.
 
     Args:
-        time_s: knots, ascending, seconds since the episode began.
-        film_mm: the film at each of them.
+        time_s: knots, ascending, s since the start of the episode.
+        film_mm: film at the knots.
 
     Raises:
         ConfigError: lists of different lengths, times that do not ascend, or a negative film.
     """
     if not time_s or len(time_s) != len(film_mm):
-        raise ConfigError(f"film_mm: {len(film_mm)} films for {len(time_s)} times; wanted is one for each, and at least one")
+        raise ConfigError(f"film_mm: expected one film per time and at least one, got {len(film_mm)} films for {len(time_s)} times")
     if any(after <= before for before, after in itertools.pairwise(time_s)):
-        raise ConfigError(f"time_s: {time_s}; wanted are ascending times")
+        raise ConfigError(f"time_s: expected ascending times, got {time_s}")
     if min(film_mm) < 0:
-        raise ConfigError(f"film_mm: {film_mm}; wanted is nothing below 0")
-    return _course(jnp.asarray(time_s, jnp.float32), jnp.asarray(film_mm, jnp.float32))
+        raise ConfigError(f"film_mm: expected numbers >= 0, got {film_mm}")
+    return _make_rain(jnp.asarray(time_s, jnp.float32), jnp.asarray(film_mm, jnp.float32))
 
 
 def onset(
@@ -55,54 +55,54 @@ def onset(
     tau_s: list[float],
     knots: int,
 ) -> Rain:
-    """Rain sets in: the film stays as drawn until then, and from there on relaxes towards what rain and drainage balance at.
+    """Samples the start of rain: from there on the film relaxes to the balance of rain and drainage.
 
-    h' = (min(rain film_per_rain, film_max) - h) / tau. Ranges are [least, most].
+    h' = (min(rain film_per_rain, film_max) - h) / tau. Ranges are [min, max].
 
     Args:
-        start_s: range of the time at which it begins to rain.
+        start_s: range of the start.
         rain_mm_h: range of the intensity.
-        film_per_rain: film in balance with rain, mm per mm/h.
-        film_max_mm: deepest film in balance.
+        film_per_rain: balance film, mm per mm/h.
+        film_max_mm: largest balance film.
         tau_s: range of the time constant.
-        knots: of the film's course; 16 follow the exponential within 0.2 % of its change.
+        knots: of the film; 16 give the exponential within 0.2 % of its change.
 
     Raises:
         ConfigError: a number out of range, by name.
     """
     for name, number in (("film_per_rain", film_per_rain), ("film_max_mm", film_max_mm)):
         if number < 0:
-            raise ConfigError(f"{name}: {number}; wanted is at least 0")
-    begin, strength, pace = jax.random.split(key, 3)
-    balance = jnp.minimum(_uniform(strength, rain_mm_h, name="rain_mm_h") * film_per_rain, film_max_mm)
-    time_s, film_mm = _relax(weather.film_mm, balance, _uniform(pace, tau_s, name="tau_s"), knots=knots)
-    return _course(_uniform(begin, start_s, name="start_s") + time_s, film_mm)
+            raise ConfigError(f"{name}: expected a number >= 0, got {number}")
+    start_key, rain_key, tau_key = jax.random.split(key, 3)
+    balance = jnp.minimum(_uniform(rain_key, rain_mm_h, name="rain_mm_h") * film_per_rain, film_max_mm)
+    time_s, film_mm = _relax(weather.film_mm, balance, _uniform(tau_key, tau_s, name="tau_s"), knots=knots)
+    return _make_rain(_uniform(start_key, start_s, name="start_s") + time_s, film_mm)
 
 
 def drying(key: PRNGKeyArray, weather: Weather, *, tau_s: list[float], knots: int) -> Rain:
-    """The road dries: the drawn film decays exponentially from the start.
+    """Samples an exponential decay of the film from the start.
 
     Args:
-        tau_s: range of the time constant, [least, most].
-        knots: of the film's course.
+        tau_s: range of the time constant, [min, max].
+        knots: of the film.
 
     Raises:
         ConfigError: a number out of range, by name.
     """
-    return _course(*_relax(weather.film_mm, jnp.float32(0.0), _uniform(key, tau_s, name="tau_s"), knots=knots))
+    return _make_rain(*_relax(weather.film_mm, jnp.float32(0.0), _uniform(key, tau_s, name="tau_s"), knots=knots))
 
 
 def _relax(
     film_mm: Float[Array, ""], balance: Float[Array, ""], tau_s: Float[Array, ""], *, knots: int
 ) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
-    """Knots of balance + (film - balance) exp(-t / tau), equally far apart in exp(-t / 2 tau): where it bends more there are more."""
+    """Computes knots of balance + (film - balance) exp(-t / tau), equidistant in exp(-t / 2 tau)."""
     if knots < 2:
-        raise ConfigError(f"knots: {knots}; wanted are at least 2")
+        raise ConfigError(f"knots: expected an integer >= 2, got {knots}")
     half = 1.0 - jnp.linspace(0.0, 1.0, knots) * (1.0 - jnp.exp(-SPAN / 2))
     return -2.0 * tau_s * jnp.log(half), balance + (film_mm - balance) * half**2
 
 
-def _course(time_s: Float[Array, " K"], film_mm: Float[Array, " K"]) -> Rain:
+def _make_rain(time_s: Float[Array, " K"], film_mm: Float[Array, " K"]) -> Rain:
     return Rain(now_s=jnp.float32(0.0), time_s=time_s, film_mm=film_mm)
 
 

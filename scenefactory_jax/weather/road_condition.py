@@ -1,7 +1,7 @@
-"""The road condition of an episode, drawn at reset: first the open road's, then patches on it, then its course over time.
+"""Samples the road condition of an episode at reset: the open road, patches on it, and rain.
 
-Each part is an entry of the `weather` config and a pure function of its key: `draw` (key, scene) -> Weather, every entry of `patches`
-(key, scene, weather) -> Patches, and `rain` (key, weather) -> Rain.
+Each part is an entry of the `weather` config: `sampler` (key, scene) -> Weather, every entry of `patches` (key, scene, weather) -> Patches,
+and `rain` (key, weather) -> Rain.
 """
 
 import dataclasses
@@ -21,24 +21,23 @@ from scenefactory_jax.weather.rain import advance_rain
 
 
 def make(config: Mapping[str, Any]) -> Callable[[PRNGKeyArray, Scene], Weather]:
-    """A `weather` config -> the function that draws an episode's weather.
+    """Makes the function (key, scene) -> Weather of a `weather` config.
 
     Args:
-        config: `draw`; `patches`, name -> entry, of which those that are null are left out; `rain`, an entry or null. `grip` is the
-            dynamics' business.
+        config: `sampler`; `patches`, name -> entry or null; `rain`, an entry or null. `friction` belongs to the dynamics.
 
     Raises:
-        ConfigError: naming the entry and key that does not fit; numbers out of range are named by the first draw.
+        ConfigError: naming the entry and key that does not fit; numbers out of range are found by the first sample.
     """
-    keys = ("draw", "patches", "rain", "grip")
+    keys = ("sampler", "patches", "rain", "friction")
     if unknown := [key for key in config if key not in keys]:
         raise ConfigError(f"weather.{unknown[0]}: unknown key; weather has: {', '.join(keys)}")
-    if "draw" not in config:
-        raise ConfigError("weather.draw: missing; weather needs draw and grip")
+    if "sampler" not in config:
+        raise ConfigError("weather.sampler: missing; weather needs sampler and friction")
     entries, course = config.get("patches") or {}, config.get("rain")
     if not isinstance(entries, Mapping):
-        raise ConfigError(f"weather.patches: {entries!r}; wanted is name -> entry")
-    road = instantiate(config["draw"], builtins=__name__, where="weather.draw")
+        raise ConfigError(f"weather.patches: expected a mapping, got {entries!r}")
+    road = instantiate(config["sampler"], builtins=__name__, where="weather.sampler")
     builders = {
         f"weather.patches.{name}": instantiate(entry, builtins="scenefactory_jax.weather.patch_layouts", where=f"weather.patches.{name}")
         for name, entry in entries.items()
@@ -48,20 +47,20 @@ def make(config: Mapping[str, Any]) -> Callable[[PRNGKeyArray, Scene], Weather]:
     if not builders and rain is None:
         return road
 
-    def episode(key: PRNGKeyArray, scene: Scene) -> Weather:
+    def sample_weather(key: PRNGKeyArray, scene: Scene) -> Weather:
         road_key, rain_key, *keys = jax.random.split(key, 2 + len(builders))
         weather = road(road_key, scene)
-        built = [_named(where, make, key, scene, weather) for key, (where, make) in zip(keys, builders.items(), strict=True)]
-        weather = replace(weather, patches=join_patches([weather.patches, *built]))
+        sampled = [_call(where, make, key, scene, weather) for key, (where, make) in zip(keys, builders.items(), strict=True)]
+        weather = replace(weather, patches=join_patches([weather.patches, *sampled]))
         if rain is None:
             return weather
-        return advance_rain(replace(weather, rain=_named("weather.rain", rain, rain_key, weather)), dt=0.0)
+        return advance_rain(replace(weather, rain=_call("weather.rain", rain, rain_key, weather)), dt=0.0)
 
-    return episode
+    return sample_weather
 
 
-def _named(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a part that does not know what its entry is called, for its messages."""
+def _call(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a part and prefixes its error messages with its place in the config."""
     try:
         return function(*arguments)
     except ConfigError as error:
@@ -70,7 +69,7 @@ def _named(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
-    """One road condition that may be drawn, and how often relative to the others."""
+    """A road condition and its relative weight."""
 
     surface: str
     film_mm: float
@@ -78,12 +77,12 @@ class Case:
 
 
 def sample_condition(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, Any]]) -> Weather:
-    """A road condition for one episode, drawn from `cases` with probability proportional to their weights.
+    """Samples a road condition from `cases` with probability proportional to their weights.
 
     Raises:
         ConfigError: no case, an unknown surface, a film or weight below 0 or not finite, or no positive weight.
     """
-    chosen = _cases(cases)
+    chosen = _read_cases(cases)
     weights = jnp.asarray([case.weight for case in chosen], jnp.float32)
     index = jax.random.choice(key, len(chosen), p=weights / weights.sum())
     film = jnp.asarray([case.film_mm for case in chosen], jnp.float32)
@@ -91,11 +90,11 @@ def sample_condition(key: PRNGKeyArray, scene: Scene, *, cases: list[dict[str, A
     return make_uniform(film[index], surface[index])
 
 
-def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
+def _read_cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
     make: Callable[..., Case]
     chosen = []
     for i, numbers in enumerate(cases):
-        where = f"weather.draw.cases[{i}]"
+        where = f"weather.sampler.cases[{i}]"
         make = instantiate({**numbers, "_target_": "Case"}, builtins=__name__, where=where)
         case = make()
         if case.surface not in SURFACES:
@@ -103,10 +102,10 @@ def _cases(cases: Sequence[Mapping[str, Any]]) -> list[Case]:
         check_numbers({"film_mm": case.film_mm, "weight": case.weight}, where=where, least=0.0)
         chosen.append(case)
     if sum(case.weight for case in chosen) <= 0:
-        raise ConfigError("weather.draw.cases: no case with a positive weight")
+        raise ConfigError("weather.sampler.cases: no case with a positive weight")
     return chosen
 
 
 def keep_condition(key: PRNGKeyArray, scene: Scene) -> Weather:
-    """The scene's own road condition, as it was packed."""
+    """Returns the scene's road condition, as packed."""
     return scene.weather

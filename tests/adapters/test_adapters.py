@@ -30,7 +30,7 @@ def test_a_flat_observation_holds_every_group_where_its_layout_says():
     np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
 
 
-@pytest.mark.parametrize("observations", ["reference", "foresight"])  # together all groups of the package
+@pytest.mark.parametrize("observe", ["paper", "lane_preview"])  # together all groups of the package
 def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
     settings = hydra_config.load_config(
         "train", SMOKE, f"observations={observe}", "dynamics=bicycle", "termination=goal_only", "scenes.pack.agents=4"
@@ -60,7 +60,7 @@ def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
 
 
 def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
-    @observations.bound_observation(observations.SHARE, observations.ANY)
+    @observations.bound_observation(observations.FRACTION, observations.ANY)
     def mine(scene, state, *, scale: float):
         return scale * jnp.array([[0.25, 30.0, -4.0]])
 
@@ -114,7 +114,7 @@ def test_a_step_is_all_control_steps_of_an_action():
     action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
     after, moment = jax.jit(functools.partial(episodes.step_worlds, held.env))(held.scenes, episode, action)
     scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
-    step, paid = jax.jit(held.env.transition), 0.0
+    step, paid = jax.jit(held.env.control_step), 0.0
     for _ in range(3):
         driving = state.active
         state, outcome = step(scene, state, action)
@@ -130,7 +130,7 @@ def test_a_step_is_all_control_steps_of_an_action():
         ("scenes.pack.agents=4", r"scenes\.pack\.agents: 4; this environment drives one car: set scenes\.pack\.agents=1"),
         ("spawning.respawn_clearance_m=5.0", r"spawning\.respawn_clearance_m: 5\.0; here a car that ended stays so"),
         ("dynamics=hover", "Could not find 'dynamics/hover'"),
-        ("timing.control_hz=0", r"timing\.control_hz: 0"),
+        ("timing.control_hz=0", r"timing\.control_hz: expected a number > 0, got 0"),
     ],
 )
 def test_a_config_that_does_not_fit_says_what_to_set(override, message):

@@ -1,4 +1,4 @@
-"""`bench`: scopes, phases that add up, variants, suites."""
+"""`benchmark`: scopes, phases that add up, variants, suites."""
 
 import re
 from pathlib import Path
@@ -17,16 +17,16 @@ from scenefactory_jax.learning import phase_timing
 from scenefactory_jax.visualization.report import throughput_report as report
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = ("experiment=smoke", "worlds=4", "warmup=0", "repeats=1")
+SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeats=1")
 VARIANTS = {"training": {}, "environment": {"scope": "environment"}, "physics": {"scope": "physics", "worlds": 2, "phases": False}}
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Every scope once."""
-    folder = tmp_path_factory.mktemp("bench")
+    folder = tmp_path_factory.mktemp("benchmark")
     with quick_compilation():
-        return folder, command.bench({**load_config("bench", *SMALL, f"out={folder}"), "variants": VARIANTS})
+        return folder, command.benchmark({**load_config("benchmark", *SMALL, f"out={folder}"), "variants": VARIANTS})
 
 
 def test_every_scope_is_measured(made):
@@ -61,10 +61,10 @@ def test_the_report_is_made_of_the_json(made, tmp_path):
 
 def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
     folder, before = made
-    config = {**load_config("bench", *SMALL, f"out={folder}", "resume=true"), "variants": VARIANTS | {"new": {"seed": 1}}}
+    config = {**load_config("benchmark", *SMALL, f"out={folder}", "resume=true"), "variants": VARIANTS | {"new": {"seed": 1}}}
     asked, measured = [], {key: before["rows"][0][key] for key in before["rows"][0] if key not in ("name", "changes", "settings")}
     monkeypatch.setattr(command, "measure", lambda task, worlds, mesh: asked.append(task["seed"]) or measured | {"per_s": 7.0})
-    after = command.bench(config)
+    after = command.benchmark(config)
     assert asked == [1] and after["rows"][:3] == before["rows"] and after["rows"][3]["per_s"] == 7.0
     assert result_file.read(folder / "bench.json")["rows"][3]["name"] == "new"
     result_file.write(folder / "bench.json", before, digits=None)  # for whoever comes next
@@ -73,18 +73,18 @@ def test_a_stopped_bench_goes_on(made, monkeypatch, capsys):
 
 def test_the_whole_configuration_comes_first():
     """The loops in Python are compared with the first row."""
-    config = load_config("bench", "experiment=paper", "suite=throughput")
+    config = load_config("benchmark", "experiment=paper", "suite=throughput")
     name, changes = next(iter(config["variants"].items()))
     assert (name, changes) == ("256 x 16", {"phases": True})
     full = config["variants"]["bicycle environment 4096 x 16, no empty slots"]
     assert full["dynamics"]["_target_"].endswith("bicycle.make") and full["spawning"]["sampler"]["_target_"] == "random_pairs"
-    assert next(iter(load_config("bench", "suite=streaming")["variants"])) == "in memory"
+    assert next(iter(load_config("benchmark", "suite=streaming")["variants"])) == "in memory"
 
 
 def test_there_must_be_something_to_resume(tmp_path):
     for out in ("null", str(tmp_path)):
         with pytest.raises(ConfigError, match=r"resume=true: out=.*no bench\.json to go on with"):
-            command.bench(load_config("bench", *SMALL, f"out={out}", "resume=true"))
+            command.benchmark(load_config("benchmark", *SMALL, f"out={out}", "resume=true"))
 
 
 def test_the_readme_shows_what_was_measured():
@@ -140,19 +140,19 @@ def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
         return size | numbers | {"per_s_range": [1.0, 3.0], "ms_a_control_step": task["worlds"] / 2, "phases_ms": {}, "repeats": 1}
 
     monkeypatch.setattr(command, "measure", measure)
-    config = {**load_config("bench", *SMALL, f"out={tmp_path}"), "variants": {str(n): {"worlds": n} for n in (1, 2, 5, 4)}}
-    rows = command.bench(config)["rows"]
+    config = {**load_config("benchmark", *SMALL, f"out={tmp_path}"), "variants": {str(n): {"worlds": n} for n in (1, 2, 5, 4)}}
+    rows = command.benchmark(config)["rows"]
     assert [row["fits"] for row in rows] == [True, True, True, False] and rows[3]["slots"] == 4
     text = (tmp_path / "throughput.md").read_text()
     assert "| 4 | training | 4 x 4 | 1 | 8 | does not fit into the device's memory |" in text
     assert "| 5 x 4 | 2.50 | 500.0 | 2.0 | 409.6 |" in text and "4 x 4 (training) does not fit" in text
     assert (tmp_path / "scaling.png").stat().st_size > 5_000 and "4: does not fit" in capsys.readouterr().out
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
-        command.bench({**config, "out": None, "variants": {"3": {"worlds": 3}}})
+        command.benchmark({**config, "out": None, "variants": {"3": {"worlds": 3}}})
 
 
 def test_variants_change_values_and_replace_entries():
-    config = load_config("bench", "experiment=smoke")
+    config = load_config("benchmark", "experiment=smoke")
     changes = {"ppo": {"horizon": 5}, "dynamics": {"_target_": "mine", "mass": 1.0}, "worlds": 3}
     found = command.changed(config, changes, where="variants.mine")
     assert found["ppo"] == {**config["ppo"], "horizon": 5} and found["worlds"] == 3
@@ -160,15 +160,15 @@ def test_variants_change_values_and_replace_entries():
     assert config["worlds"] == 4 and config["ppo"]["horizon"] == 8  # the config itself stays
     with pytest.raises(ConfigError, match=r"variants\.mine\.ppo\.horizont: unknown; valid: horizon, "):
         command.changed(config, {"ppo": {"horizont": 5}}, where="variants.mine")
-    with pytest.raises(ConfigError, match=r"scope: 'driving' is of type str"):
-        command.bench({**config, "variants": {"mine": {"scope": "driving"}}})
+    with pytest.raises(ConfigError, match=r"scope: expected one of training, environment, physics, got 'driving'"):
+        command.benchmark({**config, "variants": {"mine": {"scope": "driving"}}})
 
 
 @pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.find_conf() / "suite").glob("*.yaml")))
 def test_every_variant_of_a_suite_is_a_config(suite):
-    config = load_config("bench", "experiment=paper", f"suite={suite}")
+    config = load_config("benchmark", "experiment=paper", f"suite={suite}")
     for name, changes in config["variants"].items():
-        schema.check(command.changed(config, changes, where=name), schema.BENCH)
+        schema.check(command.changed(config, changes, where=name), schema.Benchmark)
 
 
 def test_the_loop_stands_beside_the_first_configuration():

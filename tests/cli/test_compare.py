@@ -23,7 +23,7 @@ def run(folder, *, seed, dtype="float32", goal_reached=(0.0, 0.2, 0.4, 0.6), age
     with open(folder / "metrics.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, ["iteration", "minutes", "steps/total", "casps", *METRICS])
         writer.writeheader()
-        for i, share in enumerate(reached, start=1):
+        for i, share in enumerate(goal_reached, start=1):
             row = {"iteration": i, "minutes": 0.5 * i, "steps/total": 100 * i, "casps": 1000.0 + seed}
             writer.writerow(row | {"events/goal_reached": share, "reward": seed})
     if agents is not None:
@@ -76,9 +76,9 @@ def test_evaluations_of_all_seeds_are_pooled(tmp_path, records):
 def records():
     """Agents of an evaluation: some reached their goal, some ran out of time."""
 
-    def made(*, reached, missed):
-        count = reached + missed
-        good = np.arange(count) < reached
+    def made(*, goal_reached, missed):
+        count = goal_reached + missed
+        good = np.arange(count) < goal_reached
         columns = {name: np.zeros(count, dtype) for name, dtype in agent_metrics.COLUMNS.items()}
         columns |= {"scene": np.array([f"s{i % 2}" for i in range(count)]), "agent": np.arange(count), "goal_reached": good, "clean": good}
         return columns
@@ -90,7 +90,7 @@ def test_what_cannot_be_compared_is_named(tmp_path):
     one = run(tmp_path / "a", seed=0)
     with pytest.raises(ConfigError, match=r"nothing matches '.*none-\*'"):
         compare(settings(tmp_path / "none-*"))
-    with pytest.raises(ConfigError, match="is no run"):
+    with pytest.raises(ConfigError, match=r"config\.yaml not found in"):
         compare(settings(tmp_path))
     with pytest.raises(ConfigError, match=r"metrics\.csv has no column 'speed'; there are: iteration, minutes"):
         compare(settings(one, metrics=["speed"]))

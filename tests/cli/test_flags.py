@@ -10,6 +10,7 @@ from rich.console import Console
 from support.running import ROOT
 
 from scenefactory_jax import __main__ as command_line
+from scenefactory_jax.__main__ import COMMANDS
 from scenefactory_jax.cli import annotated_config, hydra_config
 from scenefactory_jax.learning import run_folder
 from scenefactory_jax.loggers import metrics_csv
@@ -51,13 +52,13 @@ def test_options_of_a_folder_of_ones_own_are_found(called, tmp_path):
 def test_a_reader_that_closes_its_end_stops_the_command_silently():
     call = f"{sys.executable} -m scenefactory_jax train --help | head -1"
     done = subprocess.run(["bash", "-c", f"set -o pipefail; {call}"], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.startswith("train: train a policy") and not done.stderr and done.returncode in (0, 141)
+    assert done.stdout.startswith("train: Train a policy") and not done.stderr and done.returncode in (0, 141)
 
 
-@pytest.mark.parametrize("command", hydra_config.COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_says_what_a_command_is_for(called, capsys, command):
     assert called(command, "--help") is None
-    assert re.match(rf"{command}: \S.+; \S+=", capsys.readouterr().out)
+    assert re.match(rf"{command}: [A-Z].+\. \S+=", capsys.readouterr().out)
 
 
 def test_help_is_the_config_with_its_comments():
@@ -75,8 +76,8 @@ def test_an_empty_mapping_empties_what_is_removed_first():
 
 
 def test_the_folder_of_a_sweeps_run_says_what_differs():
-    name = run_folder.make_folder_name("wet", ["weather=dry", "ppo.gamma=0.97", "scenes.path=/a b/c", "+dynamics/fleet=sizes"]).name
-    assert re.fullmatch(r"wet-weather_dry-gamma_0\.97-path_a_b_c-dynamics_fleet_sizes-\d{8}-\d{6}", name)
+    name = run_folder.make_folder_name("wet", ["weather=dry", "ppo.gamma=0.97", "scenes.path=/a b/c", "+dynamics/randomization=sizes"]).name
+    assert re.fullmatch(r"wet-weather_dry-gamma_0\.97-path_a_b_c-dynamics_randomization_sizes-\d{8}-\d{6}", name)
     long = [run_folder.make_folder_name("a", [f"scenes.path={'x' * 200}{end}"]).name for end in "12"]
     assert len(set(long)) == 2 and max(map(len, long)) <= len("a--20261125-010203") + run_folder.MOST
     assert re.fullmatch(r"a-\d{8}-\d{6}", run_folder.make_folder_name("a").name)

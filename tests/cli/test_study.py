@@ -27,7 +27,8 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 STUDIES = sorted(path.stem for path in (hydra_config.find_conf() / "study").glob("*.yaml") if path.stem != "base")
 TOY = {
-    "base": ["experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observations.ego._target_=study_parts.ego"],
+    "base": [
+        "experiment=smoke", "worlds=2", "scenes.count=2", "scenes.heldout.count=2", "observations.ego._target_=support.study_parts.ego"],
     "common": ["evaluation.every=1"],
     "examined": ["timing.episode_s=1", "spawning=logged", "weather=dry", "traffic=none", "reward=paper"],
     "trainings": {"all terms": [], "one scene": ["scenes.take.count=1"], "no TTC": ["reward.ttc=null", "ppo.learning_rate=1.0e-2"]},
@@ -376,7 +377,7 @@ def test_later_overrides_win():
 
 
 def test_fewer_scenes_of_one_seed_are_a_part_of_more():
-    load = lambda *own: scene_source.load_training_scenes(
+    load = lambda *own: scene_source.load_training_scenes(  # noqa: E731
         hydra_config.load_config("train", "experiment=smoke", "scenes.count=4", *own)["scenes"]
     )
     everything = load()

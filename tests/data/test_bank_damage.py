@@ -18,6 +18,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, bank_writer, shard_files
 from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading import scene_source
 
 PAGE = 4096
 TIMES = itertools.count(1)  # of files: a file that is changed twice within a tick of the clock would seem unchanged
@@ -121,7 +122,7 @@ def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, sc
     put(two, sizes[0])
     assert outcome(path, wanted, one) == "refused"
     with pytest.raises(SceneError, match=r"^/.*/scenes-00000\.arrow: "):
-        bank_reader.pack_scenes(bank_reader.open(path), [0], check=checker(), pack=packer(), workers=1)
+        scene_source.pack_scenes(scene_source.open_bank(bank_reader.open(path)), [0], check=checker(), pack=packer(), workers=1)
 
 
 def test_a_damaged_index_is_refused(tmp_path, scenes):
@@ -175,8 +176,8 @@ def test_an_older_bank_is_read_chosen_from_and_gone_on_with(tmp_path, scenes):
 
 
 def options(**changes):
-    numbers = {"features": None, "refine": None, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None}
-    return {"formats": {"plain": eventful.plainly}, "check": checker(), "pack": packer()} | numbers | changes
+    tools = conversion.SceneTools({"plain": eventful.plainly}, check=checker(), pack=packer())
+    return {"tools": tools, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None} | changes
 
 
 @pytest.mark.parametrize("number", [1, 2, 5])  # before the first catalogue, the first index, and the second one take their places
@@ -187,7 +188,7 @@ def test_a_bank_whose_writing_was_killed_becomes_the_undisturbed_one(tmp_path, n
         written(folder, document(name=name), f"{name}.json")
     written(folder, json.dumps(document())[:500], "b.json")
     written(folder, document(name="still", objects=[thing(0, speed=0)]), "e.json")
-    rest = {name: value for name, value in options().items() if name not in ("formats", "spread")}
+    rest = {name: value for name, value in options().items() if name != "spread"}
     process = multiprocessing.get_context("spawn").Process(target=eventful.convert_until_placed, args=(number, folder, out, rest))
     process.start()
     process.join()

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import shapely
 from support import eventful
+from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import (
     FORMATS,
     STEPS,
@@ -47,12 +48,14 @@ from scenefactory_jax.data import conversion
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader
 from scenefactory_jax.data.curation import operations
 from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, stack
+from scenefactory_jax.data.packing import summary as summary_text
 from scenefactory_jax.roadgraph import lane_topology
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
-TOPOLOGY = {key: value for key, value in hydra_config.load_config("lanes")["lanes"]["topology"].items() if key != "_target_"}
+TOPOLOGY = {key: value for key, value in hydra_config.load_config("convert")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
@@ -171,21 +174,20 @@ def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
     table = moved.metadata.to_pydict()
     assert table["letters"] == [6, 6, 5] and table["sdc"] == [7, None, 7] and table["lights"] == [0, 2, 0] and table["edges"] == [1, 1, 0]
     assert table["vehicles"] == [2, 2, 2] and table["cyclists"] == [0, 1, 0] and table["max_x"] == [40.0, 40.0, 40.0]
-    stacked, report = bank_reader.load(moved, [2, 0, 2], capacity=NONE | {"road": 79}, **TOOLS)
+    stacked, report = stacked_scenes(moved, [2, 0, 2], capacity=NONE | {"road": 79}, **TOOLS)
     wanted, _ = stack.stack([prepared(raws[i], agents=3).scene for i in (2, 0, 2)], capacity=NONE | {"road": 79})
     for name, leaf in columns.flatten(wanted).items():
         np.testing.assert_array_equal(columns.flatten(stacked)[name], leaf)
     assert sorted(cut.world for cut in report.cuts) == [0, 1, 2]
     with pytest.raises(SceneError, match="no scene 7; valid: 0 to 2"):
-        bank_reader.load(moved, [7], capacity=NONE, **TOOLS)
+        bank_reader.read_raw(moved, 7)
 
 
 def test_what_cannot_be_packed_is_refused_or_named(made):
     _, opened = made
-    tools = TOOLS | {"pack": packer(scene_size_m=2.0)}
-    with pytest.raises(SceneError, match=r"scene 0, street: tracks: no agent is left of 2: 1 .*; leave it out, or change"):
-        bank_reader.load(opened, [0], capacity=NONE, **tools)
-    found = bank_reader.pack_scenes(opened, [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
+    [found] = packed_scenes(opened, [0], **TOOLS | {"pack": packer(scene_size_m=2.0)})
+    assert (found.scene, found.kind) == ("street", "no_agent_left") and found.reason.startswith("tracks: no agent is left of 2: 1 ")
+    found = packed_scenes(opened, [1, 0], **TOOLS | {"pack": packer(scene_size_m=2.0, require_agents=False, centre="mean")})
     assert isinstance(found[0], Reject) and found[0].scene == "straße" and "no driving lane" in found[0].reason
 
 
@@ -298,8 +300,10 @@ def test_scenes_that_are_held_hold_no_file_open(made):
 
 
 def options(**changes):
-    numbers = {"features": None, "refine": None, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None}
-    return {"formats": reader_selection.make(FORMATS), "check": checker(), "pack": packer()} | numbers | changes
+    tools = {"formats": reader_selection.make(FORMATS), "check": checker(), "pack": packer()}
+    tools |= {name: changes.pop(name) for name in list(changes) if name in ("formats", "check", "pack", "refine", "features")}
+    numbers = {"settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None}
+    return {"tools": conversion.SceneTools(**tools)} | numbers | changes
 
 
 def streets(folder, *names):
@@ -327,7 +331,7 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     assert list(opened.rejects) == list(summary.rejects) and opened.settings["scene_size_m"] == 200.0
     assert opened.index.files == ("a.json", "b.json", "c.json", "deep/d.json.gz") and opened.index.complete
     assert opened.metadata["format"].to_pylist() == ["gpudrive", "gpudrive", "scenefactory"]
-    lines = conversion.describe(summary)
+    lines = summary_text.describe(summary)
     assert lines[-1] == "3 scenes with 3 agents from 4 files, 1 rejected" and any("rejected" in line and "b.json" in line for line in lines)
     assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for others"
 
@@ -343,9 +347,9 @@ def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
     assert opened.metadata["packing"].to_pylist() == ["no_agent_left"] * 3
     found = operations.statistics(opened.metadata, by=None)["all"]["texts"]
     assert found["packing"] == {"no_agent_left": 3}
-    wide = bank_reader.pack_scenes(opened, range(3), check=checker(), pack=packer(), workers=1)
+    wide = packed_scenes(opened, range(3), check=checker(), pack=packer(), workers=1)
     assert [type(one).__name__ for one in wide] == ["Packed", "Packed", "Reject"] and wide[2].kind == "no_agent_left"
-    assert bank_reader.pack_scenes(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
+    assert packed_scenes(opened, [2], check=checker(), pack=packer(require_agents=False), workers=1)[0].report.agents_kept == 0
     whole = conversion.convert(folder, tmp_path / "wide", **options())
     assert bank_reader.open(tmp_path / "wide").metadata["packing"].to_pylist() == ["packed", "packed", "no_agent_left"]
     assert whole.scenes == 3 and whole.agents_kept == 4 and whole.refused == {"no_agent_left": 1}
@@ -379,13 +383,13 @@ def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     summary = conversion.convert(folder, tmp_path / "bank", **options(formats={"eventful": eventful.read}, spread=spread))
     reasons = {(Path(reject["source"]).stem, reject["scene"]): reject["reason"] for reject in summary.rejects}
     assert reasons == {
-        ("b_killed", None): "the process at it was ended by SIGKILL, perhaps for want of memory",
+        ("b_killed", None): "its process was ended by SIGKILL, perhaps for want of memory",
         ("c_two", "second"): "record 2 at byte 77: its checksum is wrong",
         ("d_endless", None): "no result after 2 s (timeout_s)",
         ("f_broken", None): "KeyError: 'x'",
     }
     assert [Path(companion["source"]).name for companion in summary.companions] == ["e_map.json"]
-    assert "1 files belong to scenes beside them: e_map.json" in conversion.describe(summary) and summary.files == 7
+    assert "1 files belong to scenes beside them: e_map.json" in summary_text.describe(summary) and summary.files == 7
     opened = bank_reader.open(tmp_path / "bank")
     assert opened.names == ("a", "c_two", "c_two", "g") and len(opened.index.shards) == 2
     assert sorted(path.name for path in opened.path.iterdir())[0] == "bank.json"  # no hidden leftovers
@@ -395,7 +399,7 @@ def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
 def test_a_killed_conversion_goes_on_where_it_stopped(tmp_path, number, kept):
     names = [f"s{index}" for index in range(7)]
     folder, out = streets(tmp_path / "in", *names), tmp_path / "bank"
-    rest = {name: value for name, value in options().items() if name not in ("formats", "spread")}
+    rest = {name: value for name, value in options().items() if name != "spread"}
     process = multiprocessing.get_context("spawn").Process(target=eventful.convert_until, args=(number, folder, out, rest))
     process.start()
     process.join()
@@ -476,21 +480,20 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
     wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"neighbour_distance_m": [5.0, 2.0]})
     for workers in (1, 2):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
-        with pytest.raises(ConfigError, match=r"lanes\.topology\.neighbour_distance_m: \[5\.0, 2\.0\]"):
+        with pytest.raises(ConfigError, match=r"lanes\.topology\.neighbour_distance_m: expected .*, got \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
-        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: -1; wanted is a number above 0"):
-            conversion.read(
-                folder, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(scene_size_m=-1.0), workers=workers
-            )
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
+            source = scene_source.open_files(folder, reader_selection.make(FORMATS))
+            scene_source.pack_all(source, check=checker(), pack=packer(scene_size_m=-1.0), workers=workers)
     assert not (tmp_path / "bank").exists()
 
 
 @pytest.mark.parametrize("numbers", [{"workers": 0}, {"timeout_s": 0.0}, {"timeout_s": -1.0}])
 def test_numbers_with_which_nothing_would_be_done_are_refused(numbers):
     [name] = numbers
-    with pytest.raises(ConfigError, match=rf"spread\.{name}: "):
+    with pytest.raises(ConfigError, match=rf"spread\.{name}: expected "):
         list(spreads.local(dies_of_three, [1], **{"workers": 1, "timeout_s": None} | numbers))
-    with pytest.raises(ConfigError, match=r"spread\.pending: 0"):
+    with pytest.raises(ConfigError, match=r"spread\.pending: expected a number >= 1, got 0"):
         list(spreads.ray(dies_of_three, [1], address=None, pending=0, timeout_s=None))
 
 
@@ -545,7 +548,7 @@ def test_a_cluster_is_a_spread_like_any_other(tmp_path, monkeypatch):
     cluster(monkeypatch)
     assert list(ray(dies_of_three, [1, 2, 3, 4])) == [10, 20, spreads.FailedTask("Ray: RayError: the worker died"), 40]
     with monkeypatch.context() as without:
-        without.setattr(spreads, "_timed", missing)
+        without.setattr(spreads.worker, "run_task", missing)
         with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'scenefactory_jax'; "):
             list(ray(dies_of_three, [1]))
     folder = streets(tmp_path / "in", "a", "b")
@@ -558,7 +561,7 @@ def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
     (tmp_path / "here_alone.py").write_text("def read(path):\n    yield from ()\n")
     monkeypatch.syspath_prepend(tmp_path)
     work = importlib.import_module("here_alone").read
-    pack = spreads._packed
+    pack = spreads._pack
 
     def pack_and_forget(*given):
         packed = pack(*given)
@@ -566,13 +569,13 @@ def test_work_that_a_process_cannot_load_says_why(tmp_path, monkeypatch, over):
         del sys.modules["here_alone"]
         return packed
 
-    monkeypatch.setattr(spreads, "_packed", pack_and_forget)
+    monkeypatch.setattr(spreads, "_pack", pack_and_forget)
     cluster(monkeypatch)
     spread = spreads.ray if over == "cluster" else spreads.local
     numbers = {"address": None, "pending": 2} if over == "cluster" else {"workers": 2}
     with pytest.raises(SceneError, match="cannot load the work: ModuleNotFoundError: No module named 'here_alone'; every process"):
         list(spread(work, [1, 2, 3], timeout_s=9.0, **numbers))
-    monkeypatch.setattr(spreads, "_packed", pack)
+    monkeypatch.setattr(spreads, "_pack", pack)
     with pytest.raises(SceneError, match=r"cannot be sent to another process: .*; readers and parts must be functions of a module"):
         list(spreads.local(lambda item: item, [1], workers=1, timeout_s=9.0))
 
@@ -598,7 +601,7 @@ def test_real_scenes_convert_alike_in_one_process_and_in_two(tmp_path, shared_da
     for index, raw in enumerate(raws):
         exactly(bank_reader.read_raw(one, index), raw)
         exactly(bank_reader.read_raw(two, index), raw)
-    stacked, report = bank_reader.load(one, range(3), capacity=NONE, check=checker(), pack=packer(), workers=1)
+    stacked, report = stacked_scenes(one, range(3), capacity=NONE, check=checker(), pack=packer(), workers=1)
     assert not report.cuts and all(np.isfinite(leaf).all() for leaf in columns.flatten(stacked).values())
     assert np.abs(stacked.road.midpoint).max() <= 100 and np.abs(stacked.agents.goal).max() <= 100
     near = np.linalg.norm(stacked.lanes.midpoint[:, None] - stacked.agents.position[:, :, None], axis=-1)

@@ -56,7 +56,7 @@ def test_a_small_scene_by_hand(small):
     for name, value in lengths.items():
         assert found[name] == pytest.approx(value, abs=0.01), name
     assert found["curvature_rad_m"] == pytest.approx((np.pi / 2) / found["lane_m"], rel=0.02)
-    assert found["curved_share"] == pytest.approx(10 * np.pi / found["lane_m"], rel=0.02)
+    assert found["curved_fraction"] == pytest.approx(10 * np.pi / found["lane_m"], rel=0.02)
     alone = FEATURES(replace(small, sdc=None, tracks=small.tracks[1:2], roads=small.roads[1:2]))
     assert {name for name, value in alone.items() if value is None} == {name for name in alone if name.startswith("sdc_")} | {
         "mean_speed_m_s", "branches"
@@ -73,7 +73,7 @@ def test_every_column_is_described_and_none_is_another_s():
 def test_roads_are_told_apart():
     kinds = {index: FEATURES(generated(index)) for index in range(12)}
     for index in (0, 6):
-        assert kinds[index]["intersections"] == 0 and kinds[index]["curved_share"] < 0.01 < 0.2 < kinds[index + 1]["curved_share"]
+        assert kinds[index]["intersections"] == 0 and kinds[index]["curved_fraction"] < 0.01 < 0.2 < kinds[index + 1]["curved_fraction"]
     assert all(kinds[index]["intersections"] == 0 for index in (1, 5, 7, 11))  # curves and merges
     assert all(kinds[index]["intersections"] == 1 for index in (2, 3, 8, 9))  # a crossing is one, however many lanes cross
 
@@ -98,7 +98,7 @@ def test_order_and_place_change_nothing():
 
 @pytest.mark.parametrize("name", ["cell_m", "height_m", "headings", "one_in"])
 def test_a_number_of_no_place_is_refused(name):
-    with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: 0; wanted is a number above 0"):
+    with pytest.raises(ConfigError, match=rf"features\.streets\.{name}: expected a number > 0, got 0"):
         geographic_split.find_streets(generated(0), **STREETS | {name: type(STREETS[name])(0)})
 
 

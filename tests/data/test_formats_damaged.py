@@ -20,9 +20,9 @@ from support.format_documents import (
 )
 from support.scene_documents import FORMATS, document, scenefactory_document, thing
 
-from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.data import conversion
-from scenefactory_jax.data.formats import json_documents, reader_selection, tfrecord
+from scenefactory_jax.core.raw_scene import Reject, SceneError
+from scenefactory_jax.data.formats import file_content, reader_selection, tfrecord
+from scenefactory_jax.data.loading import scene_source
 
 JSON_JUNK = tuple(value for value in fuzzing.JUNK if not isinstance(value, (bytes, set, np.ndarray)))
 PEAK_BYTES = 30_000_000
@@ -57,8 +57,8 @@ def test_damaged_bytes(files, readers, name):
     path.write_bytes(content)
     assert fuzzing.attempt(readers[name], path) == "read"
     verdicts = fuzzing.attack(readers[name], path, content)
-    assert verdicts["OtherFormat"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
-    assert set(verdicts) <= {"read", "OtherFormat", "SceneError"}
+    assert verdicts["FormatMismatch"] + verdicts["SceneError"] > fuzzing.CUTS  # all that are cut short, at least
+    assert set(verdicts) <= {"read", "FormatMismatch", "SceneError"}
 
 
 @pytest.mark.parametrize("whole", [scenarionet_document(), in_spring_2023(scenarionet_document()), in_march_2023(scenarionet_document()),
@@ -133,12 +133,12 @@ def test_a_parquet_file_that_unpacks_to_more_than_the_limit_is_refused_unread(tm
 
 @pytest.mark.parametrize("document", [scenefactory_document(), {"a": 1}], ids=["the second reader's", "none's"])
 def test_a_file_is_unpacked_once_however_many_readers_try_it(tmp_path, monkeypatch, readers, document):
-    path, read, counts = tmp_path / "a.xz", json_documents._read, []
+    path, read, counts = tmp_path / "a.xz", file_content._read, []
     path.write_bytes(lzma.compress(encoded(document)))
-    monkeypatch.setattr(json_documents, "_read", lambda path, count: counts.append(count) or read(path, count))
-    found = conversion.examine(path, readers, rejects := [], [])
-    assert (len(list(found)), len(rejects)) == ((1, 0) if "road" in document else (0, 1))
-    assert sum(count > json_documents.HEAD for count in counts) == 1
+    monkeypatch.setattr(file_content, "_read", lambda path, count: counts.append(count) or read(path, count))
+    [found] = scene_source.read_file(path, readers)
+    assert isinstance(found, Reject) == ("road" not in document)
+    assert sum(count > file_content.HEAD for count in counts) == 1
 
 
 def test_a_record_of_any_length_is_not_read(tmp_path, readers):

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 import pytest
-from support.scene_banks import FEATURES, PROCEDURAL, banked, generated, moved, rounded, window
+from support.scene_banks import FEATURES, STREETS, banked, generated, moved, rounded, window
 
-from scenefactory_jax import __main__ as command_line
+from scenefactory_jax.cli import entry as command_line
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.core.instantiate import ConfigError
@@ -20,22 +20,22 @@ from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import duplicates, filter_expressions, geographic_split, operations
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading import batches
+from scenefactory_jax.data.loading import scene_source
 
 SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
-TOWN = {"metadata": {"dataset": "town", "town": "one"}}  # scenes of one frame
+TOWN = {"metadata": {"dataset": "windows", "town": "one"}}  # scenes of one frame
 NUMBERS = {"tolerance_m": 0.2, "share": 0.95, "slack": 0.02}
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
-    """Twelve scenes: six procedural ones, each alone, and six windows onto one street that overlap in two groups of three."""
+    """Twelve scenes: six generated ones, each alone, and six windows onto one street that overlap in two groups of three."""
     street = generated(0)
     points = np.concatenate([line.xyz for line in street.roads])
     centre, towards = points.mean(axis=0), np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0))[2][0]
     turn = np.array([[towards[0], towards[1], 0], [-towards[1], towards[0], 0], [0, 0, 1]])  # the street along x
     straight = replace(street, roads=tuple(replace(line, xyz=(line.xyz - centre) @ turn.T) for line in street.roads), tracks=street.tracks)
-    onto = [window(straight, x, 30.0, name=f"window-{x:+d}", **TOWN) for x in (-40, -32, -24, 24, 32, 40)]
+    onto = [window(straight, x, 30.0, name=f"window-{x:+d}", sdc=None, **TOWN) for x in (-40, -32, -24, 24, 32, 40)]
     return banked(tmp_path_factory.mktemp("banks") / "town", [*(generated(index) for index in range(6)), *onto])
 
 
@@ -226,7 +226,7 @@ def test_samples_are_seeded_and_keep_strata(town):
     one, same, other = (draw(count=5, share=None, stratify=None, seed=seed).bank.names for seed in (0, 0, 1))
     assert one == same != other and len(set(one)) == 5 and [name for name in town.names if name in one] == list(one)
     by = draw(count=None, share=0.5, stratify="dataset", seed=0).bank.metadata["dataset"].to_pylist()
-    assert sorted(by) == ["procedural"] * 3 + ["town"] * 3
+    assert sorted(by) == ["town"] * 3 + ["windows"] * 3
     assert operations._quotas(np.array([5, 3, 2]), 5).tolist() in ([3, 1, 1], [2, 2, 1])
     for wrong, message in (
         ({"count": 5, "share": 0.5}, "count 5 and share 0.5; give one"), ({"count": None, "share": None}, "give one of the two"),
@@ -246,7 +246,7 @@ def test_a_merge_has_every_scene_once(town, tmp_path):
     assert sorted(whole.bank.names) == sorted(town.names) and whole.account["banks"] == [len(bank) for bank in parts.values()]
     for index in (0, 5, 11):
         assert banks.read_raw(whole.bank, index).name == whole.bank.names[index]
-    with pytest.raises(SceneError, match=r"merge: \d scenes have the name of another: procedural-.*duplicates=first"):
+    with pytest.raises(SceneError, match=r"merge: \d scenes have the name of another: town-.*duplicates=first"):
         operations.merge([town, parts["test"]], duplicates="refuse")
     assert operations.merge([town, parts["test"]], duplicates="first").bank.names == town.names
     bare = banked(tmp_path / "bare", [generated(6)], described=False)
@@ -263,8 +263,8 @@ def test_statistics_agree_with_numpy(town):
     assert [found[key] for key in ("min", "median", "mean", "max", "sum")] == pytest.approx(
         [lane.min(), np.median(lane), lane.mean(), lane.max(), lane.sum()]
     )
-    assert every["texts"]["dataset"] == {"procedural": 6, "town": 6} and every["numbers"]["sdc_distance_m"] == {"missing": 12}
-    assert {name: part["scenes"] for name, part in parts.items()} == {"procedural": 6, "town": 6}
+    assert every["texts"]["dataset"] == {"town": 6, "windows": 6} and every["numbers"]["sdc_distance_m"]["missing"] == 6
+    assert {name: part["scenes"] for name, part in parts.items()} == {"town": 6, "windows": 6}
     assert sum(part["numbers"]["lane_m"]["sum"] for part in parts.values()) == pytest.approx(lane.sum())
     json.dumps(every)
     with pytest.raises(ConfigError, match=r"info\.by: no column 'colour'"):
@@ -283,9 +283,9 @@ def test_commands_write_views(town, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == info and info["all"]["scenes"] == 12
     command(town, "op=info", "info.by=dataset")
     printed = capsys.readouterr().out
-    assert "dataset = town: 6 scenes" in printed and "| lane_m |" in printed and "Length of all driving lanes." in printed
+    assert "dataset = windows: 6 scenes" in printed and "| lane_m |" in printed and "Length of all driving lanes." in printed
 
-    kept = command(town, "op=filter", "filter=intersections >= 1 and dataset in [\"procedural\", 'x']", f"out={tmp_path / 'filtered'}")
+    kept = command(town, "op=filter", "filter=intersections >= 1 and dataset in [\"town\", 'x']", f"out={tmp_path / 'filtered'}")
     assert len(kept) == 3 and banks.open(tmp_path / "filtered").names == kept.names and "filter: 3 of 12 scenes" in capsys.readouterr().out
     assert kept.settings["made_by"]["op"] == "filter" and not list((tmp_path / "filtered").glob("scenes*"))
     halves = ["split.shares={train: 0.5, test: 0.5}", "split.least_shared=2"]
@@ -341,7 +341,7 @@ def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
     command(bank, "op=dedupe")
     command(bank, "op=export", "export.format=gpudrive", f"out={tmp_path / 'out'}")
     with pytest.raises(SystemExit) as ended:
-        command_line._end(SceneError(f"scenes.path: no scene\n{name}"))
+        command_line.end(SceneError(f"scenes.path: no scene\n{name}"))
     told = capsys.readouterr()
     assert ended.value.code == 2 and told.err == f"error: scenes.path: no scene\n{spelled.replace(chr(92) + 'n', chr(10), 1)}\n"
     assert told.out.count(spelled) >= 5 and "\x1b" not in told.out + told.err and "\x9b" not in told.out + told.err
@@ -367,7 +367,7 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     assert "whose conversion was stopped" in capsys.readouterr().err
     assert (
         "whose conversion was stopped"
-        in batches.open(hydra_config.load_config("scenes", f"scenes.path={tmp_path / 'sample'}")["scenes"]).line
+        in scene_source.open_bank(tmp_path / "sample").description
     )
 
 
@@ -375,15 +375,15 @@ def test_banks_are_judged_and_compared(town, tmp_path):
     counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
     assert counts.keys() == hydra_config.load_config("scenes")["quality"]["rules"].keys()
     assert "12 scenes" in (tmp_path / "quality" / "quality.md").read_text()
-    others = ["compare.others=[procedural]", "compare.limit=2", f"out={tmp_path / 'compared'}"]
+    others = ["compare.others=[streets]", "compare.limit=2", f"out={tmp_path / 'compared'}"]
     text = command(town, "op=compare", *others).read_text()
-    assert f"median {town.path.name}" in text and "median procedural" in text
+    assert f"median {town.path.name}" in text and "median streets" in text
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["op=compare", "out=x"], "compare.others: none; give paths, or entries of `scenes`: procedural, town, womd"),
+        (["op=compare", "out=x"], "compare.others: none; give paths, or entries of `scenes`: streets, town, womd"),
         (["op=quality"], "out: null; give a folder for the report"),
         (["op=export", "export.format=bvh", "out=x"], "export.format: 'bvh'; valid: gpudrive, scenarionet"),
         (["op=export"], "out: null; give a folder for the files"),
@@ -392,16 +392,16 @@ def test_banks_are_judged_and_compared(town, tmp_path):
         (["op=filter", "filter='cars > 3'"], "filter: unknown column 'cars'"),
         (["op=filter", "filter='vehicles > 300'"], "none of 12 scenes meets it"),
         (["op=split"], "split.shares: null; give the parts' shares"),
-        (["op=split", "split.by=road"], "split.by: 'road'"),
-        (["op=split", "split.shares={a: 1, b: much}"], "split.shares: .* is of type dict, wanted dict"),
+        (["op=split", "split.by=road"], "split.by: expected scene or streets, got 'road'"),
+        (["op=split", "split.shares={a: 1, b: much}"], "split.shares.b: expected a number, got 'much'"),
         (["op=split", "split.shares={a: 1}"], "two parts or more"),
         (["op=sample"], "give one of the two"),
         (["op=sample", "+sample.size=3"], "sample.size: unknown key; valid: count, share, stratify"),
         (["op=sheet"], "out: null; give a folder"),
         (["op=info", "scenes.path=null"], "scenes.path: null; op=info needs a bank"),
         (["op=verify", "scenes.path=null"], "scenes.path: null; op=verify needs a bank"),
-        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: -1; wanted is a number of at least 0"),
-        (["scenes.pack.scene_size_m=0.0"], "scenes.pack.scene_size_m: 0; wanted is a number above 0"),
+        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: expected a number >= 0, got -1"),
+        (["scenes.pack.scene_size_m=0.0"], "scenes.pack.scene_size_m: expected a number > 0, got 0"),
         (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: \[4.0\]; wanted are length and width"),
         (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: \[4.0, -2.0\]; wanted are length and width"),
     ],
@@ -419,5 +419,5 @@ def test_scenes_are_simulated(capsys):
     )
     clean = [row["cars"] > 0 and row["faults"] == row["overlapping"] == row["off_lane"] == 0 for row in found.values()]
     assert clean == [True] * 3
-    assert "3 scenes, 6 steps each; 3 without any of these" in capsys.readouterr().out
-    assert PROCEDURAL["count"] > 3
+    assert "3 scenes; 3 without any of these" in capsys.readouterr().out
+    assert STREETS["count"] > 3

@@ -12,9 +12,9 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, validation
 from scenefactory_jax.roadgraph import spatial_grid
 
-PROCEDURAL = hydra_config.load_config("scenes")["scenes"]
+STREETS = hydra_config.load_config("scenes")["scenes"]
 WOMD = hydra_config.load_config("convert", "scenes=womd")["scenes"]
-GENERATE = instantiate(PROCEDURAL["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="generate")
+GENERATE = instantiate(STREETS["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="generate")
 SETTINGS = [
     {},
     {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"},
@@ -85,7 +85,7 @@ def test_generated_scenes_whole_and_damaged():
         lines, scenes = assert_same(damaged(raw, index))
         told |= {line.split(":")[0].split(" (")[0] for line in lines}
         for scene, report in scenes:
-            for reasons in (report.agents_dropped, report.others_dropped, report.segments_cut):
+            for reasons in (report.agents_dropped, report.traffic_dropped, report.segments_cut):
                 dropped |= {reason: dropped.get(reason, 0) + count for reason, count in reasons.items()}
             assert_same_grid(scene)
     assert len(told) == 6 and [reason for reason, count in dropped.items() if not count] == ["degenerate"]  # which checks removed

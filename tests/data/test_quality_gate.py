@@ -14,13 +14,14 @@ from scenefactory_jax.core.types import DRIVEWAY, EDGES
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.curation import quality_gate
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.generators.procedural import procedural_scene
+from scenefactory_jax.data.generators.town import town_scene
+from scenefactory_jax.data.packing import summary
 from scenefactory_jax.roadgraph import lane_topology
 
-QUALITY = hydra_config.load_config("quality")["quality"]
-PROCEDURAL = hydra_config.load_config("scenes")["scenes"]["generate"]
+QUALITY = hydra_config.load_config("scenes")["quality"]
+STREETS = hydra_config.load_config("scenes")["scenes"]["generate"]
 RULES = quality_gate.make(QUALITY["rules"])
-rebuild = instantiate(hydra_config.load_config("quality")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
+rebuild = instantiate(hydra_config.load_config("scenes")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
 LOG = 91
 ALONG = np.arange(0.0, 121.0)
 
@@ -137,8 +138,8 @@ def test_every_rule_has_its_defect_here():
 
 def test_a_sound_street_and_generated_scenes_have_no_findings():
     assert judge(street()).findings == ()
-    make = instantiate(PROCEDURAL, builtins=procedural_scene, where="scenes.generate")
-    for index in range(2 * len(PROCEDURAL["kinds"])):
+    make = instantiate(STREETS, builtins=town_scene, where="scenes.generate")
+    for index in range(2 * len(STREETS["kinds"])):
         assert judge(make(1, index)).findings == ()
 
 
@@ -185,8 +186,8 @@ def test_a_jitter_is_repaired_and_counted_and_a_missing_step_is_refused():
     later = lambda seconds: street(times=street().times + seconds * (np.arange(LOG) >= 40))  # noqa: E731
     passed = gate(later(0.011), reject=QUALITY["reject"])
     assert passed.metadata["quality"] == {} and passed.times[-1] == pytest.approx(9.011)  # the bank has the log as it was
-    summary = conversion.summarise([prepared(passed).report], files=1, rejects=[])
-    assert "in 1 scenes: logs of uneven steps resampled" in conversion.describe(summary)
+    found = summary.summarise_packed([prepared(passed).report], [], files=1)
+    assert "in 1 scenes: logs of uneven steps resampled" in summary.describe(found)
     with pytest.raises(SceneError, match=r"times: 1 steps of the log are not 0\.1 s long; step 39 is 0\.2 s"):
         gate(later(0.1), reject=QUALITY["reject"])
 
@@ -225,10 +226,10 @@ def crowded(raw, *, most: int):
 
 def test_the_report_counts_and_draws(tmp_path, capsys):
     scenes = hydra_config.load_config("scenes", "scenes.count=2")["scenes"]
-    settings = QUALITY | {"rules": {"length": QUALITY["rules"]["length"] | {"range_m": [5.0, 20.0]}, "times": QUALITY["rules"]["times"]}}
+    settings = QUALITY | {"rules": {"length": QUALITY["rules"]["length"] | {"range_m": [10.0, 20.0]}, "times": QUALITY["rules"]["times"]}}
     settings |= {"reject": [], "drop": ["length"]}
     counts = report_quality({"scenes": scenes, "quality": settings, "out": str(tmp_path)})
-    cars = sum(len(instantiate(PROCEDURAL, builtins=procedural_scene, where="")(0, index).tracks) for index in range(2))
+    cars = sum(len(instantiate(STREETS, builtins=town_scene, where="")(0, index).tracks) for index in range(2))
     assert counts["length"] == (cars, 2, cars) and counts["times"] == (0, 0, 0)
     text = (tmp_path / "quality.md").read_text()
     assert f"| length | {cars} | 2 | {cars} | 100 % | drops |" in text and (tmp_path / "length.png").stat().st_size > 10_000

@@ -7,20 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.probes import NUMBERS, SMALL, probe, scenes
+from support.probes import make_trainer, probe, scenes
 from support.running import smoke
+from support.scene_banks import stacked_scenes
 from support.scene_documents import document, thing, written
 from support.streets import street
 
 from experiments.benchmarks import streaming
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.parallel import task_map
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import bank_reader
-from scenefactory_jax.data.loading import batches, samplers, stream
+from scenefactory_jax.data.loading import batches, samplers, scene_source, stream
 from scenefactory_jax.learning import checkpoint
-from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.training_loop import train as run_train
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.roadgraph import spatial_grid
@@ -29,7 +29,7 @@ from scenefactory_jax.visualization.report import throughput_report
 pytestmark = pytest.mark.usefixtures("quickly")
 
 WORLDS = 8
-SHORT = ("stream.workers=0", "stream.sample=4", "stream.share=0.5")
+SHORT = ("stream.workers=0", "stream.sample=4", "stream.swap_fraction=0.5")
 CLOCK = {"seconds", "casps", "minutes", "stream/wait_s"}  # columns that no two runs share
 
 
@@ -47,9 +47,7 @@ def same(one, other):
 
 
 def trainer_of(**numbers):
-    return train_iteration.make_trainer(
-        probe(life=3, episode_steps=50), late_fusion.make(**SMALL), **{**NUMBERS, "episode_steps": 50, **numbers}
-    )
+    return make_trainer(probe(life=3, episode_steps=50), episode_steps=50, **numbers)
 
 
 @pytest.fixture(scope="module")
@@ -61,51 +59,50 @@ def trainer():
 def swapped(trainer):
     """States and scenes before and after other scenes came into worlds 6, 1 and 4, and what a restart in them alone gives."""
     stage, fresh, worlds = scenes(WORLDS), scenes(3, task=2), np.array([6, 1, 4])
-    state, _ = trainer.iterate(trainer.init(jax.random.key(0), stage), stage)
+    state, _ = trainer.train_iteration(trainer.init(jax.random.key(0), stage), stage)
     alone = trainer_of(stagger_episodes=False).restart(jax.tree.map(jnp.copy, state), fresh)
     before = bits((state, stage))
-    after, stage = trainer.swap(state, stage, worlds, fresh)
+    after, stage = trainer.replace_scenes(state, stage, worlds, fresh)
     kept = bits((after, stage))
-    following = trainer.iterate(after, stage)[0]
+    following = trainer.train_iteration(after, stage)[0]
     return SimpleNamespace(before=before, after=kept, alone=bits(alone), fresh=bits(fresh), worlds=worlds, following=following, stage=stage)
 
 
 def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
     state, stage = swapped.after
-    for name in ("worlds", "observation", "lives"):
-        same(jax.tree.map(lambda leaf: leaf[swapped.worlds], getattr(state, name)), getattr(swapped.alone, name))
+    same(jax.tree.map(lambda leaf: leaf[swapped.worlds], state.worlds), swapped.alone.worlds)
     same(jax.tree.map(lambda leaf: leaf[swapped.worlds], stage), swapped.fresh)
     same(state.key, swapped.alone.key)
-    assert not np.asarray(state.worlds.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
+    assert not np.asarray(state.worlds.state.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
 
 
 def test_a_swap_leaves_everybody_else_alone(swapped):
     others = np.setdiff1d(np.arange(WORLDS), swapped.worlds)
     rest = lambda tree: jax.tree.map(lambda leaf: leaf[others], tree)  # noqa: E731
     (before, stage_before), (after, stage_after) = swapped.before, swapped.after
-    for name in ("worlds", "observation", "lives", "record"):
+    for name in ("worlds", "scene_stats"):
         same(rest(getattr(before, name)), rest(getattr(after, name)))
     same(rest(stage_before), rest(stage_after))
-    for name in ("parameters", "optimiser", "iteration", "steps"):
+    for name in ("parameters", "optimizer", "iteration", "steps"):
         same(getattr(before, name), getattr(after, name))
 
 
 def test_records_count_from_the_swap_on(swapped):
     """Lives of three steps: five end in sixteen, of the two agents of each world; what began before the swap does not count."""
-    assert (swapped.before[0].record.episodes == 10).all() and (swapped.before[0].record.successes == 10).all()
+    assert (swapped.before[0].scene_stats.episodes == 10).all() and (swapped.before[0].scene_stats.successes == 10).all()
     wanted = np.where(np.isin(np.arange(WORLDS), swapped.worlds), 0, 10)
-    np.testing.assert_array_equal(swapped.after[0].record.episodes, wanted)
-    episodes = np.asarray(swapped.following.record.episodes)
+    np.testing.assert_array_equal(swapped.after[0].scene_stats.episodes, wanted)
+    episodes = np.asarray(swapped.following.scene_stats.episodes)
     assert (episodes[swapped.worlds] >= 10).all() and (episodes[swapped.worlds] <= 14).all()  # at most one more by time
-    assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.record.successes) <= episodes).all()
+    assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.scene_stats.successes) <= episodes).all()
 
 
 def test_nothing_compiles_twice(trainer, swapped):
     state, stage = jax.tree.map(jnp.copy, (swapped.following, swapped.stage))
     for world in range(3):
-        state, stage = trainer.swap(state, stage, np.array([world, 5, 7]), scenes(3, task=world + 1))
-        state, _ = trainer.iterate(state, stage)
-    assert trainer.swap._cache_size() == trainer.iterate._cache_size() == 1
+        state, stage = trainer.replace_scenes(state, stage, np.array([world, 5, 7]), scenes(3, task=world + 1))
+        state, _ = trainer.train_iteration(state, stage)
+    assert trainer.replace_scenes._cache_size() == trainer.train_iteration._cache_size() == 1
     np.testing.assert_array_equal(stage.weather.surface, [1, 2, 3, 5, 2, 3, 2, 3])
 
 
@@ -210,15 +207,17 @@ def flowing(found):
 
 def alone(found, index, sizes):
     """One street, stacked by itself at the stream's sizes."""
-    return batches.load(batches.open(found["scenes"]), None, [index], fit(found, sizes)).scene
+    return batches.load(loader_of(found), [index], sizes, on_overflow="cut").scene
 
 
-def fit(found, sizes, excess="cut"):
-    return batches.BoxSizes(sizes, found["scenes"]["cells"], excess)
+def loader_of(found):
+    config = found["scenes"]
+    packing = scene_source.make_packing(config)
+    return batches.BatchLoader(scene_source.open_source(config), **packing, grid=config["road_grid"], task_map=task_map.in_process)
 
 
-def measured(found, source, *, sample=8, **given):
-    return batches.measure(source, None, grid=found["scenes"]["cells"], sample=sample, headroom=1.0, given=given, seed=0)
+def measured(loader, *, sample=8, **given):
+    return batches.measure(loader, sample=sample, headroom=1.0, given=given, seed=0)
 
 
 def test_every_world_holds_the_scene_that_the_stream_says():
@@ -244,19 +243,16 @@ def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     plain = {"unusable": [], "broken": [], "deadly": [], "endless": []}
     written_bank = bank_reader.write(tmp_path / "bank", [street(0, index, **plain) for index in range(5)], settings={})
     banked = {**found, "scenes": {**found["scenes"], "path": str(tmp_path / "bank")}}
-    sources = [batches.open(one["scenes"]) for one in (found, banked)]
-    sizes = [measured(found, one, sample=5, side=60) for one in sources]
+    loaders = [loader_of(one) for one in (found, banked)]
+    sources, sizes = [one.source for one in loaders], [measured(one, sample=5, side=60) for one in loaders]
     assert [one.count for one in sources] == [None, 5] and sizes[0] == sizes[1] and sources[1].name(3) == "street 3"
-    generated, loaded = (batches.load(one, None, [4, 1, 4], fit(found, sizes[0])) for one in sources)
+    generated, loaded = (batches.load(one, [4, 1, 4], sizes[0], on_overflow="cut") for one in loaders)
     same(generated.scene, loaded.scene)
-    whole, _ = bank_reader.load(
-        written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, workers=1,
-        check=instantiate(found["scenes"]["check"], builtins="scenefactory_jax.data.packing.validation", where="check"),
-        pack=instantiate(found["scenes"]["pack"], builtins="scenefactory_jax.data.packing.pack", where="pack"),
-    )  # fmt: skip
+    packing = scene_source.make_packing(found["scenes"])
+    whole, _ = stacked_scenes(written_bank, [4, 1, 4], capacity={axis: sizes[0][axis] for axis in batches.AXES}, **packing)
     same(
         loaded.scene,
-        spatial_grid.attach_grid(whole, **found["scenes"]["cells"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
+        spatial_grid.attach_grid(whole, **found["scenes"]["road_grid"], capacity={name: sizes[0][name] for name in spatial_grid.SIZES}),
     )
 
 
@@ -265,20 +261,20 @@ def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
         written(tmp_path, document(name=name, objects=[thing(0, id=7, speed=40)]), f"{name}.json")
     (tmp_path / "broken.json").write_text("{}")
     found = hydra_config.load_config("train", "experiment=smoke", "scenes=womd", f"scenes.path={tmp_path}")
-    files = batches.open(found["scenes"])
-    assert files.count == 3 and files.name(0).endswith("broken.json")
-    sizes = measured(found, files)
-    batch = batches.load(files, None, [0, 1, 2], fit(found, sizes))
+    files = loader_of(found)
+    assert files.source.count == 3 and files.source.name(0).endswith("broken.json")
+    sizes = measured(files)
+    batch = batches.load(files, [0, 1, 2], sizes, on_overflow="cut")
     assert list(batch.indices) == [1, 1, 2] and list(batch.refused) == [str(tmp_path / "broken.json")]
     with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*no reader knows this format"):
-        batches.load(files, None, [0], fit(found, sizes))
+        batches.load(files, [0], sizes, on_overflow="cut")
 
 
 def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
     found = entry()
-    streets = batches.open(found["scenes"])
-    sizes = measured(found, streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
-    load = lambda excess, **changes: batches.load(streets, None, range(8), fit(found, sizes | changes, excess))  # noqa: E731
+    streets = loader_of(found)
+    sizes = measured(streets, road=210, lanes=70, edges=140)  # streets 0 to 2 fit
+    load = lambda how, **changes: batches.load(streets, range(8), sizes | changes, on_overflow=how)  # noqa: E731
     cut, skipped = load("cut"), load("skip")
     assert (cut.cut, list(cut.indices), cut.refused) == (5, list(range(8)), {})
     assert (skipped.cut, list(skipped.indices[:3]), len(skipped.refused)) == (0, [0, 1, 2], 5) and set(skipped.indices) == {0, 1, 2}
@@ -289,7 +285,7 @@ def test_scenes_above_the_capacity_are_cut_or_left_out_and_counted():
 
 def test_room_for_more_changes_no_look_up():
     found = entry()
-    sizes = measured(found, batches.open(found["scenes"]))
+    sizes = measured(loader_of(found))
     places = np.random.default_rng(0).uniform(-90.0, 90.0, (200, 2)).astype(np.float32)
     seen = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "longest_list": 400}):
@@ -304,12 +300,12 @@ def test_room_for_more_changes_no_look_up():
     [
         (["stream.capacity.road=8"], r"stream\.capacity\.road: 8; all 4 scenes of the sample need more: 177 to 213"),
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
-        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: True is no capacity; valid: 1 or more"),
+        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected 1 or more"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
-        (["stream.share=1.5"], r"stream\.share: 1\.5; wanted is a number from 0 to 1"),
-        (["stream.ahead=0"], r"stream\.ahead: 0; wanted is at least 1"),
-        (["stream.excess=drop"], r"stream\.excess: 'drop'"),
-        (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*samplers; valid: .*failing, .*shuffled"),
+        (["stream.swap_fraction=1.5"], r"stream\.swap_fraction: expected a number >= 0 and <= 1, got 1\.5"),
+        (["stream.prefetch=0"], r"stream\.prefetch: expected a number >= 1, got 0"),
+        (["stream.on_overflow=drop"], r"stream\.on_overflow: expected cut or skip, got 'drop'"),
+        (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*; valid: .*prioritize_failures, .*shuffled"),
         (["+stream.speed=2"], r"stream\.speed: unknown key"),
     ],
 )
@@ -336,10 +332,10 @@ def test_errors_of_the_loader_surface_by_name_and_never_hang(capsys):
 @pytest.mark.slow
 def test_processes_that_die_or_hang_end_the_run_by_name():
     context, swap = flowing(entry("stream.workers=1", deadly=[5]))
-    with pytest.raises(RuntimeError, match=r"generated scene [45]: cannot be loaded: BrokenProcessPool"), context as flow:
+    with pytest.raises(RuntimeError, match=r"generated scene 5: cannot be loaded: its process ended with code 1"), context as flow:
         flow.exchange(swap, None, flow.scenes())
     context, swap = flowing(entry("stream.workers=1", "stream.wait_s=20.0", endless=[5]))
-    with pytest.raises(RuntimeError, match=r"stream\.wait_s: no scenes after 20 s from scenes from the generator"), context as flow:
+    with pytest.raises(RuntimeError, match=r"stream\.wait_s: no scenes after 20 s from generated scenes of seed"), context as flow:
         flow.exchange(swap, None, flow.scenes())
 
 
@@ -373,7 +369,7 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(tmp_path):
     assert len(rows) == 5 and [row["stream/scenes"] for row in rows][-1] == len(told["draws"])
     for row, other in zip(rows, others, strict=True):
         assert {name: row[name] for name in row if name not in CLOCK} == {name: other[name] for name in other if name not in CLOCK}
-    np.testing.assert_array_equal(told["record"], [whole.state.record.episodes, whole.state.record.successes])
+    np.testing.assert_array_equal(told["record"], [whole.state.scene_stats.episodes, whole.state.scene_stats.successes])
 
 
 def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
@@ -386,4 +382,4 @@ def test_the_cost_of_a_stream_stands_beside_the_same_worlds_in_memory():
     assert table[0] == "| shuffled | 4 of 64 | 0.2 | 9 | 1,900 | 5.0 % of `in memory` | 12.3 | 4,096 | 3 and 1 |"
     assert "of `in memory`" not in table[1] and throughput_report.streaming_table({"rows": [row]}) == ""
     with pytest.raises(ConfigError, match=r"stream: scenes are exchanged while training; scope=physics has stream=none"):
-        streaming.measure(hydra_config.load_config("bench", "stream=shuffled", "scope=physics"), mesh=None)
+        streaming.measure(hydra_config.load_config("benchmark", "stream=shuffled", "scope=physics"), mesh=None)

@@ -12,8 +12,8 @@ from support.scene_documents import FORMATS, checker, document, packer, written
 from support.womd_records import JUMP_M, saved, scenes
 
 from scenefactory_jax.core.raw_scene import FormatMismatch, RawScene, Reject, SceneError
-from scenefactory_jax.data import conversion
 from scenefactory_jax.data.formats import reader_selection, tfrecord, womd
+from scenefactory_jax.data.loading import scene_source
 
 
 def outcome(path):
@@ -55,7 +55,7 @@ def test_a_conversion_lists_what_it_could_not_read(tmp_path, three):
     content = bytearray(records.framed(*three[0]))
     content[three[1][1] + 500] ^= 1
     path = saved(tmp_path, bytes(content))
-    packed, summary = conversion.read(path, formats=reader_selection.make(FORMATS), check=checker(), pack=packer(), workers=1)
+    packed, summary = scene_source.pack_all(scene_source.open_files(path, reader_selection.make(FORMATS)), check=checker(), pack=packer())
     assert [scene.report.metadata["record"] for scene in packed] == [0, 2] and packed[0].report.track_ids == (7,)
     reason = f"record 1 at byte {three[1][1]}: the checksum of its data does not match"
     assert list(summary.rejects) == [{"source": str(path), "scene": None, "reason": reason}]

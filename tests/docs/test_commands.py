@@ -28,7 +28,7 @@ SHORTER = {  # words of the pages, and what stands for them here
 }
 SMALL = {
     "train": ["progress=false", "iterations=1", "evaluation.video.enable=false", "evaluation.untrained=false"],
-    "bench": ["worlds=4", "warmup=0", "repeats=1"],
+    "benchmark": ["worlds=4", "warmup=0", "repeats=1"],
     "evaluate": ["bootstrap=20", "chunk_steps=30"],
     "replay": ["seconds=0.5", "film.at_s=0.2", "film.width=160", "film.height=90"],
     "study": ["study.base=[experiment=smoke,worlds=2,reward=safe_smooth]", "study.seeds=[0]", "evaluation.bootstrap=20", "progress=false"],
@@ -89,7 +89,7 @@ def test_a_command_of_the_pages_runs(desk, line):
     if any(word.startswith("hydra/launcher") for word in words):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the launcher: pip install scenefactory_jax[sweeps]")
     words = [SHORTER.get(word, word) for word in words]
-    if command in ("train", "bench") and not any(word.startswith("experiment=") for word in words):
+    if command in ("train", "benchmark") and not any(word.startswith("experiment=") for word in words):
         words.append("experiment=smoke")
     words += SMALL.get(command, [])
     done = shell(desk, command, *words, **QUICKLY)

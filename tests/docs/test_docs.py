@@ -56,13 +56,13 @@ def test_the_python_of_the_library_page_runs(quickly):
 
 def test_the_task_page_has_the_numbers_of_the_configs(quickly):
     page = (ROOT / "docs" / "task.md").read_text()
-    published, wary = (hydra_config.load_config("task", f"reward={name}")["reward"] for name in ("reference", "wary"))
+    published, wary = (hydra_config.load_config("task", f"reward={name}")["reward"] for name in ("paper", "safe_smooth"))
     for name, term in wary.items():
         shown = (f"{entry['weight']:g}" if entry else "" for entry in (published.get(name), term))
         assert f"| `{name}` | {' | '.join(shown)} |".replace("|  |", "| |") in page
     widths = []
-    for experiment in ("published", "quick", "demo"):
-        settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=procedural", "scenes.count=1", "dynamics=bicycle")
+    for experiment in ("paper", "quick", "demo"):
+        settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=streets", "scenes.count=1", "dynamics=bicycle")
         scene = sf.load_scenes(settings["scenes"])[0]
         _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
         widths.append(max(columns.stop for columns in layout(seen).values()))

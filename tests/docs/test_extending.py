@@ -14,6 +14,7 @@ from support.scene_documents import checker, packer
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.data.bank import bank_reader
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -45,16 +46,16 @@ def test_the_parts_of_the_page_drive_together(page):
         hydra_config.load_config("task", *parts, "observations=small", "~observations.road", "~observations.neighbours")
     )
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
-    state, step = env.start(jax.random.key(0), scene), jax.jit(env.step)
+    state, step = env.init_state(jax.random.key(0), scene), jax.jit(env.step)
     actions = [[0.8, 0.0, -1.0]] * 10 + [[0.0, 0.5, -1.0]] * 10 + [[-1.0, 0.0, -1.0]] * 10
     speeds, yaws = [], []
     for action in actions:
         state, outcome = step(scene, state, jnp.array([action] * 2))
-        speeds.append(float(outcome.facts.speed[0]))
+        speeds.append(float(outcome.metrics.speed[0]))
         yaws.append(float(state.motion.yaw[0]))
         assert env.observe(scene, state)["clock"].shape == (2, 2)
         assert float(outcome.terms["smoothness"][0]) <= 0.0
-    dt, held = 1 / 30, env.hold
+    dt, held = 1 / 30, env.action_repeat
     assert speeds[9] == pytest.approx(10 * held * dt * 3.0 * 0.5 * 0.8, rel=1e-4) and speeds[19] == pytest.approx(speeds[9], rel=1e-4)
     assert yaws[9] == 0.0 and yaws[19] == pytest.approx(10 * held * dt * 0.8 * 0.5, rel=1e-4) and speeds[29] < speeds[19]
     assert 0.1 < float(state.motion.position[0, 0]) < 1.0 and state.motion.position[1].tolist() == pytest.approx([-20, 0, 0.5])
@@ -71,5 +72,5 @@ def test_the_reader_of_the_page_converts_a_table(page, tmp_path):
     summary = convert(hydra_config.load_config("convert", f"source={tmp_path / 'in'}", f"out={tmp_path / 'bank'}", "progress=false", *own))
     assert (summary.files, summary.scenes) == (2, 1)
     opened = bank_reader.open(tmp_path / "bank")
-    scene, report = bank_reader.pack_scenes(opened, [0], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(opened), [0], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)

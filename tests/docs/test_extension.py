@@ -24,7 +24,7 @@ TERMS = """
     import jax.numpy as jnp
 
     def haste(step, *, unit_mps: float):
-        return step.facts.speed / unit_mps
+        return step.metrics.speed / unit_mps
 
     def jerkiness(step, *, control_dt: float):
         return jnp.abs(step.action[:, 0] - step.before.previous_action[:, 0]) / control_dt
@@ -32,15 +32,15 @@ TERMS = """
 
 GROUPS = """
     import jax.numpy as jnp
-    from scenefactory_jax.types import Rows
+    from scenefactory_jax.core.types import SetObservation
 
     def clock(scene, state, *, period_s: float, control_dt: float):
-        angle = 2 * jnp.pi * state.age * control_dt / period_s
+        angle = 2 * jnp.pi * state.steps_since_spawn * control_dt / period_s
         return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).astype(jnp.float32)
 
     def mates(scene, state, *, scale_m: float):
         offset = (state.motion.position[None, :, :2] - state.motion.position[:, None, :2]) / scale_m
-        return Rows(offset, jnp.broadcast_to(state.active[None], offset.shape[:2]))
+        return SetObservation(offset, jnp.broadcast_to(state.active[None], offset.shape[:2]))
     """
 
 CONTROLS = """
@@ -52,10 +52,10 @@ CONTROLS = """
 
 BACKEND = """
     import jax.numpy as jnp
-    from scenefactory_jax.struct import replace, struct
-    from scenefactory_jax.types import Dynamics, Motion
+    from scenefactory_jax.core.pytree import replace, pytree_dataclass
+    from scenefactory_jax.core.types import Dynamics, Motion
 
-    @struct
+    @pytree_dataclass
     class Body:
         place: jnp.ndarray
         velocity: jnp.ndarray
@@ -75,7 +75,7 @@ BACKEND = """
             nothing = jnp.zeros(len(body.place), jnp.float32)
             flat = lambda xy, z: jnp.concatenate([xy, jnp.full_like(xy[:, :1], z)], axis=1)
             names = ("yaw", "yaw_rate", "steer", "contact_force", "friction_utilization", "slip")
-            rest = dict.fromkeys(names, nothing) | {"upright": nothing + 1, "grip": nothing + 1}
+            rest = dict.fromkeys(names, nothing) | {"upright": nothing + 1, "mu": nothing + 1}
             return Motion(position=flat(body.place, height_m), velocity=flat(body.velocity, 0.0), **rest)
 
         return Dynamics(init, advance, read)
@@ -84,12 +84,12 @@ BACKEND = """
 READER = """
     import csv
     import numpy as np
-    from scenefactory_jax.scenes.raw import OtherFormat, Polyline, RawScene, Track
+    from scenefactory_jax.core.raw_scene import FormatMismatch, Polyline, RawScene, Track
 
     def read(path, *, step_s: float):
         '''Rows `lane,x,y` and `car,x,y`: one lane, and one car's way from step to step.'''
         if path.suffix != ".csv":
-            raise OtherFormat(f"{path}: no .csv")
+            raise FormatMismatch(f"{path}: no .csv")
         rows = list(csv.reader(path.open()))
         lane, car = (np.array([[float(x), float(y), 0.0] for kind, x, y in rows if kind == wanted]) for wanted in ("lane", "car"))
         steps = len(car)
@@ -158,9 +158,9 @@ def test_an_observation_group_is_one_file_and_one_entry(run):
         assert new["vector"]["layer_0"]["kernel"].shape[0] == vectors
         assert new["mates_rows"]["layer_0"]["kernel"].shape[0] == 2
         assert not np.array_equal(old["mates_rows"]["layer_0"]["kernel"], new["mates_rows"]["layer_0"]["kernel"])
-    seen = run.state.observation
+    seen = run.state.worlds.observation
     assert seen["clock"].shape == (4, 4, 2) and seen["mates"].features.shape == (4, 4, 4, 2)
-    active = np.asarray(run.state.worlds.active)
+    active = np.asarray(run.state.worlds.state.active)
     np.testing.assert_allclose(np.linalg.norm(seen["clock"], axis=-1)[active], 1.0, rtol=1e-5)
 
 
@@ -174,21 +174,21 @@ def test_a_logger_is_one_file_and_one_entry(run):
 def test_what_an_action_means_is_one_function_and_one_entry(mine):
     env = environment.make_env(hydra_config.load_config("task", "dynamics=bicycle", *CRUISE))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]])
-    state, _ = jax.jit(env.transition)(scene, env.start(jax.random.key(0), scene), jnp.array([[0.8, 0.5, 0.0], [-0.6, 0.0, 0.0]]))
+    state, _ = jax.jit(env.control_step)(scene, env.init_state(jax.random.key(0), scene), jnp.array([[0.8, 0.5, 0.0], [-0.6, 0.0, 0.0]]))
     np.testing.assert_allclose(state.previous_action, [[0.4, 0.5, 0.0], [-0.3, 0.0, 1.0]])  # and kept in bounds
 
 
 def test_a_dynamics_backend_is_one_file_and_one_entry(mine):
     env = environment.make_env(hydra_config.load_config("task", *DYNAMICS, "observations=small"))
     scene = scene_of([[0, 0], [-20, 0]], [[30, 0], [20, 0]], present=[True, False])
-    state = env.start(jax.random.key(0), scene)
-    step = jax.jit(env.transition)
+    state = env.init_state(jax.random.key(0), scene)
+    step = jax.jit(env.control_step)
     for _ in range(6):
         state, outcome = step(scene, state, jnp.array([[1.0, 0.5, 0.0]] * 2))
     dt, count = 1 / 30, 6 * 7 / 2  # velocity grows before the place does
     moved = 3.0 * dt**2 * count * np.array([1.0, 0.5])
     np.testing.assert_allclose(state.motion.position, [[*moved, 0.5], [-20, 0, 0.5]], rtol=1e-5)
-    np.testing.assert_allclose(outcome.facts.speed[0], 3.0 * dt * 6 * np.hypot(1.0, 0.5), rtol=1e-5)
+    np.testing.assert_allclose(outcome.metrics.speed[0], 3.0 * dt * 6 * np.hypot(1.0, 0.5), rtol=1e-5)
 
 
 def test_a_backend_may_be_an_option_of_the_group(mine):
@@ -210,16 +210,16 @@ def test_a_scene_format_is_one_file_and_one_entry(mine, tmp_path):
     opened = bank_reader.open(tmp_path / "bank")
     assert (summary.files, summary.scenes, opened.names) == (2, 2, ("street", "street"))  # the GPUDrive document has this name too
     index = next(i for i, source in enumerate(opened.metadata["source"].to_pylist()) if source.endswith(".csv"))
-    scene, report = bank_reader.pack_scenes(opened, [index], check=checker(), pack=packer(), workers=1)[0]
+    scene, report = scene_source.pack_scenes(scene_source.open_bank(opened), [index], check=checker(), pack=packer(), workers=1)[0]
     assert report.track_ids == (7,) and float(scene.agents.speed[0]) == pytest.approx(10.0) and float(scene.log.dt) == pytest.approx(0.2)
-    assert scene.agents.route[0] == pytest.approx(40.0) and report.segments_kept == 80
+    assert scene.agents.route_length[0] == pytest.approx(40.0) and report.segments_kept == 80
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("+reward.haste={_target_: my_terms.haste, weight: 1.0}", r"reward\.haste\.unit_mps: missing"),
-        ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"reward\.haste\.unit_mps: 'fast'.*wanted float"),
+        ("+reward.haste={_target_: my_terms.haste, weight: 1.0, unit_mps: fast}", r"haste\.unit_mps: expected a number, got 'fast'"),
         ("+reward.haste={_target_: my_terms.hurry, weight: 1.0}", r"'my_terms\.hurry' is not in my_terms; valid: haste, jerkiness"),
         ("+observations.clock={_target_: my_clocks.clock}", r"observations\.clock\._target_: cannot import 'my_clocks'"),
         (

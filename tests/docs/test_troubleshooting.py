@@ -14,16 +14,18 @@ from omegaconf import OmegaConf
 from support.running import ROOT, shell, smoke
 
 import scenefactory_jax.__main__ as command_line
-from scenefactory_jax.cli import error_messages, hydra_config, schema
+from scenefactory_jax.cli import error_messages, hydra_config
+from scenefactory_jax.cli.train import train
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
-from scenefactory_jax.learning.training_loop import train
+from scenefactory_jax.evaluation import settings
+from scenefactory_jax.learning import training_loop
 
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 SHOWN = re.findall(r"```console\n\$ (.+)\n((?:.+\n)+?)```", PAGE)
 CALL = "python -m scenefactory_jax "
-OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.facts.speed - 100.0)\n"
+OWN_REWARD = "import jax.numpy as jnp\n\n\ndef haste(step):\n    return jnp.log(step.metrics.speed - 100.0)\n"
 ELSEWHERE = re.compile(r"JAX_PLATFORMS=cuda")  # what a process decides when it starts
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -47,8 +49,8 @@ def place(tmp_path_factory):
 @pytest.fixture
 def lacking(monkeypatch):
     """A machine without the extras and with too little memory, whatever this one has."""
-    found = schema.importlib.util.find_spec
-    monkeypatch.setattr(schema.importlib.util, "find_spec", lambda name, *rest: None if name == "imageio_ffmpeg" else found(name, *rest))
+    found = settings.importlib.util.find_spec
+    monkeypatch.setattr(settings.importlib.util, "find_spec", lambda name, *rest: None if name == "imageio_ffmpeg" else found(name, *rest))
     for name in ("ray", "gymnasium"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "scenefactory_jax.adapters.gymnasium", raising=False)
@@ -57,7 +59,7 @@ def lacking(monkeypatch):
     def short_of_memory(scenes, worlds, **rest):
         return assign(scenes, worlds, **rest) if worlds < 10_000 else jnp.zeros((10**15,), jnp.uint8)
 
-    monkeypatch.setattr(scene_source, "assign", short_of_memory)
+    monkeypatch.setattr(scene_source, "assign_scenes", short_of_memory)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
 
@@ -114,9 +116,9 @@ def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkey
 def test_a_car_that_breaks_does_not_end_training():
     broken = {"iteration": 3, "reward/haste": float("nan"), "ppo/skipped": 4.0, "ppo/gradient_norm": 0.0}
     with pytest.raises(ConfigError, match=r"reward\.haste: nan in iteration 3"):
-        error_messages.check_finite(broken)
+        training_loop.check_finite(broken)
     for sound in ({"reward/haste": 1.0}, {"ppo/skipped": 0.0}, {"ppo/gradient_norm": 0.3}):  # it learnt, or no term is at fault
-        error_messages.check_finite({**broken, **sound})
+        training_loop.check_finite({**broken, **sound})
 
 
 def test_an_error_of_our_own_keeps_its_traceback():

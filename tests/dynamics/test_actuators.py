@@ -10,7 +10,8 @@ import pytest
 from test_randomization import CAR, SOLVER
 
 from scenefactory_jax.dynamics import mujoco_c
-from scenefactory_jax.dynamics.articulated import actuators, equations_of_motion, randomization, tyres
+from scenefactory_jax.dynamics.articulated import actuators, constants, equations_of_motion, tyres
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.vector import dot as vector_dot
@@ -18,8 +19,8 @@ from scenefactory_jax.dynamics.articulated.vector import dot as vector_dot
 
 @pytest.fixture(scope="module")
 def rig():
-    newton = dataclasses.replace(SOLVER, algorithm="Newton")
-    return mujoco_c.simulate_one(CAR, newton, physics_dt=1 / 120, iterations=100, line_search=50)
+    newton = dataclasses.replace(SOLVER, algorithm="newton")
+    return mujoco_c.make_one(CAR, newton, physics_dt=1 / 120, iterations=100, line_search=50)
 
 
 def slips(rig, qpos, qvel):
@@ -37,9 +38,9 @@ def slips(rig, qpos, qvel):
 
 def turning(qpos, qvel, arm):
     """`tyres.turning`, in the world's axes, as the C engine has the arms; the tyres' own arms are those."""
-    own = randomization.derive_constants(jax.tree.map(jnp.float32, CAR))
+    own = constants.derive_constants(jax.tree.map(jnp.float32, CAR))
     state = states.from_mujoco(own.car, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
-    patch = tyres.find_contact_patches(own, state)
+    patch = tyres.find_contact_patches(own.car, state)
     world = lambda vector: np.stack([vector_dot(axis, vector) for axis in (state.east, state.north, state.up)], axis=-1)  # noqa: E731
     np.testing.assert_allclose(world(patch.arm), arm, atol=1e-6)
     return world(tyres.compute_jdot_qvel(patch, equations_of_motion.compute_bias_acceleration(state)))
@@ -48,8 +49,8 @@ def turning(qpos, qvel, arm):
 @pytest.mark.parametrize("seed", range(4))
 def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
     """Against the difference of the slips a moment before and after, of a car that nothing accelerates."""
-    rng, at = np.random.default_rng(seed), cars.find_addresses(rig.model)
-    qpos, qvel = cars.find_rest_pose(rig.model, CAR), np.zeros(16)
+    rng, at = np.random.default_rng(seed), models.find_addresses(rig.model)
+    qpos, qvel = models.find_rest_pose(rig.model, CAR), np.zeros(16)
     qpos[3:7] = [np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
     qpos[at.steer_q], qvel[at.steer_v] = rng.uniform(-0.3, 0.3, 2), rng.uniform(-1.0, 1.0, 2)
     qvel[:2], qvel[5], qvel[at.spin_v] = rng.uniform(-15.0, 15.0, 2), rng.uniform(-1.0, 1.0), rng.uniform(-50.0, 50.0, 4)
@@ -67,7 +68,7 @@ def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
 
 def test_a_car_that_rolls_through_a_bend_slips_at_a_constant_rate(rig):
     """Centripetal acceleration of the hubs and the turn of their axles cancel: seen with the car, nothing about it changes."""
-    at, qpos, qvel = cars.find_addresses(rig.model), cars.find_rest_pose(rig.model, CAR), np.zeros(16)
+    at, qpos, qvel = models.find_addresses(rig.model), models.find_rest_pose(rig.model, CAR), np.zeros(16)
     rate, radius = 0.5, CAR.wheel_radius
     qvel[1], qvel[5] = 0.0, rate
     qvel[0] = 10.0
@@ -81,15 +82,15 @@ def test_a_car_that_rolls_through_a_bend_slips_at_a_constant_rate(rig):
 
 
 def test_what_the_brakes_take_of_the_engine_is_taken_off():
-    engine, friction = np.array([600.0, 300.0, 0.0, 0.0]), np.array([400.0, 500.0, 300.0, 0.0])
+    car, brake = dataclasses.replace(CAR, rolling_torque=0.0), np.array([400.0, 700.0, 300.0, 0.0])
+    command = actuators.Command(jnp.float32(0.0), jnp.float32(600.0), jnp.asarray(brake))
     for spin in (20.0, 0.0):
-        torque, left = actuators.compute_net_wheel_torque(jnp.asarray(engine), jnp.asarray(friction), jnp.full(4, spin))
+        torque, loss = actuators.compute_wheel_torques(car, command, jnp.full(4, spin))
         np.testing.assert_allclose(torque, [200.0, 0.0, 0.0, 0.0])
-        np.testing.assert_allclose(left, [cars.LATENT_FRICTION, 200.0, 300.0, cars.LATENT_FRICTION], rtol=1e-6)
-        np.testing.assert_allclose(torque - left, engine - friction, atol=2 * cars.LATENT_FRICTION)
-    torque, left = actuators.compute_net_wheel_torque(jnp.asarray(engine), jnp.asarray(friction), jnp.full(4, -20.0))
-    np.testing.assert_array_equal(torque, engine)
-    np.testing.assert_allclose(left[:3], friction[:3])
+        np.testing.assert_allclose(loss, [cars.MIN_FRICTION_LOSS, 100.0, 300.0, cars.MIN_FRICTION_LOSS], rtol=1e-6)
+    torque, loss = actuators.compute_wheel_torques(car, command, jnp.full(4, -20.0))
+    np.testing.assert_array_equal(torque, [600.0, 600.0, 0.0, 0.0])
+    np.testing.assert_allclose(loss[:3], brake[:3])
 
 
 def test_the_engine_ends_at_the_spin_limit():
@@ -107,9 +108,8 @@ def test_others_push_where_they_touch_wherever_the_mass_is():
 
     def torque(force, speed):
         state = states.from_mujoco(car, qpos, jnp.zeros(16).at[1].set(speed))
-        command = actuators.Command(jnp.float32(0.0), jnp.float32(0.0), zero, zero, jnp.array(force), jnp.float32(500.0))
-        told = actuators.make_step_input(car, state, command, zero)
-        return np.array([*told.torque])
+        push = actuators.PlanarForce(jnp.array(force), jnp.float32(500.0))
+        return np.array([*actuators.compute_applied_forces(car, state, jnp.float32(0.0), zero, push).torque])
 
     aside = 1000.0 * np.array([np.sin(turn), np.cos(turn)])  # of a push to the north, in the car's axes
     np.testing.assert_allclose(torque([0.0, 1000.0], 0.0), [-car.mass_height * aside[1], car.mass_height * aside[0], 500.0], rtol=1e-5)

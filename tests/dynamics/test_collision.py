@@ -241,10 +241,10 @@ def test_neighbours_are_the_nearest_by_their_outlines():
     cars = boxes([[0.0, 0.0], [100.0, 0.0]])
     others = boxes([[9.0, 0.0], [6.0, 0.0], [101.0, 0.0], [0.0, 5.0]], size=[[18.0, 2.5], [0.8, 0.8], [4.0, 2.0], [4.0, 2.0]],
                    present=[True, True, True, False])  # fmt: skip
-    near = collision.find_neighbours(cars, others, nearest=2)
+    near = collision.find_neighbours(cars, others, max_neighbours=2)
     np.testing.assert_array_equal(near.position[:, :, 0], [[9.0, 6.0], [101.0, 9.0]])  # the long one's front is nearer than the person
-    assert collision.find_neighbours(cars, others, nearest=9).position.shape == (2, 4, 2)
-    assert collision.find_neighbours(cars, make_empty_boxes(), nearest=4).position.shape == (2, 0, 2)
+    assert collision.find_neighbours(cars, others, max_neighbours=9).position.shape == (2, 4, 2)
+    assert collision.find_neighbours(cars, make_empty_boxes(), max_neighbours=4).position.shape == (2, 0, 2)
 
 
 def collide(masses, speed, *, offset=0.0, steps=240, dt=1 / 120, driven=False):
@@ -319,12 +319,12 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"stiffness": -1e6}, "dynamics.contact.stiffness: -1e.06; wanted is a number above 0"),
+        ({"stiffness": -1e6}, "dynamics.contact.stiffness: expected a number > 0, got -1000000.0"),
         ({"damping": -1.0}, "dynamics.contact.damping"),
         ({"friction": -0.3}, "dynamics.contact.friction"),
         ({"mass": 0.0}, "dynamics.contact.mass"),
         ({"momentum_transfer_s": 0.0}, "dynamics.contact.momentum_transfer_s"),
-        ({"nearest": -1}, "dynamics.contact.nearest: -1; wanted is a number of at least 0"),
+        ({"max_neighbours": -1}, "dynamics.contact.max_neighbours: expected an integer >= 0, got -1"),
         ({"stiffness": 1e9}, "stiffness 1e.09 and damping 30000 cannot be integrated: .* at physics_dt 0.00833"),
         ({"damping": 3e5}, "cannot be integrated"),
         ({"mass": 500.0}, "cannot be integrated"),
@@ -333,6 +333,6 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
 def test_numbers_that_cannot_be_are_refused(changes, named):
     """The last three give cars that meet more energy than they had; a contact that moves nobody may be as stiff as it likes."""
     with pytest.raises(ConfigError, match=named):
-        collision.make(**{**NUMBERS, "height": 1.0, **changes}, physics_dt=1 / 120)
-    collision.make(**{**NUMBERS, "stiffness": 1e9}, height=1.0)
-    collision.make(**NUMBERS, height=1.0, physics_dt=1 / 120)
+        collision.make_contact({**NUMBERS, **changes}, height=1.0, physics_dt=1 / 120)
+    collision.make_contact({**NUMBERS, "stiffness": 1e9}, height=1.0)
+    collision.make_contact(NUMBERS, height=1.0, physics_dt=1 / 120)

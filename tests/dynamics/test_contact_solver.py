@@ -12,8 +12,10 @@ from support.mjx_problem import newton
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.dynamics.articulated import contact_solver, mjx_backend
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
 COUNT = 48
 RATIO = 10.0
 
@@ -22,23 +24,23 @@ RATIO = 10.0
 def model():
     entry = load_config("task", "dynamics=articulated")["dynamics"]
     car = cars.CarParameters(**entry["car"])
-    exact = cars.Solver(**{**entry["solver"], "algorithm": "Newton", "iterations": 100, "line_search": 50, "tolerance": 1e-12})
-    return cars.build_standalone_model(car, exact, physics_dt=1 / 120, visual=False, brake_rows=True), car
+    exact = cars.Solver(**{**entry["solver"], "algorithm": "newton", "iterations": 100, "line_search": 50, "tolerance": 1e-12})
+    return models.build_standalone_model(car, exact, physics_dt=1 / 120, visual=False, brake_rows=True), car
 
 
 @pytest.fixture(scope="module")
 def cases(model):
     """Cars a little above, in and below their ride height, sliding and braking in all directions, some in the air."""
     model, car = model
-    at, rng = cars.find_addresses(model), np.random.default_rng(0)
-    qpos = np.tile(cars.find_rest_pose(model, car), (COUNT, 1))
+    at, rng = models.find_addresses(model), np.random.default_rng(0)
+    qpos = np.tile(models.find_rest_pose(model, car), (COUNT, 1))
     qpos[:, 2] += rng.normal(0, 0.01, COUNT)
     qpos[-4:, 2] += 0.5
     qpos[:, at.suspension_q] += rng.normal(0, 0.02, (COUNT, 4))
     qvel = rng.normal(0, 1, (COUNT, 16)) * np.array([8, 3, 0.3, 0.3, 0.3, 0.6] + [1] * 10)
     qvel[:, at.spin_v] = qvel[:, :1] / car.wheel_radius + rng.normal(0, 10, (COUNT, 4))
     mu, push = rng.uniform(0.02, 1.3, (COUNT, 4)), rng.normal(0, 1, (COUNT, 16)) * np.array([2000, 2000, 500, 300, 300, 500] + [100] * 10)
-    brake = rng.uniform(0, 1500, (COUNT, 4)) * (rng.random((COUNT, 1)) < 0.6) + cars.LATENT_FRICTION
+    brake = rng.uniform(0, 1500, (COUNT, 4)) * (rng.random((COUNT, 1)) < 0.6) + cars.MIN_FRICTION_LOSS
     return [jnp.asarray(column, jnp.float32) for column in (qpos, qvel, push, mu, brake)]
 
 
@@ -46,7 +48,7 @@ def cases(model):
 def truth(model, cases):
     """Accelerations, and the tyres' contact forces, of the C engine in double precision."""
     model, data, found, forces = model[0], mujoco.MjData(model[0]), [], []
-    at = cars.find_addresses(model)
+    at = models.find_addresses(model)
     for qpos, qvel, push, mu, brake in zip(*(np.asarray(column, float) for column in cases), strict=True):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos, qvel, push
@@ -64,8 +66,8 @@ def truth(model, cases):
 @pytest.fixture(scope="module")
 def solved(model, cases):
     """`solve.newton` on the rows that MJX makes, and its problem."""
-    stages = mjx_backend.compile_stages(model[0])
-    batched, template, at = stages.model, stages.data, stages.places
+    stages = mjx_backend.put_model(model[0])
+    batched, template, at = stages.model, stages.data, stages.addresses
 
     def one(qpos, qvel, push, mu, brake):
         fields = {"pair_friction": batched.pair_friction.at[:, :2].set(mu[:, None])}
@@ -80,14 +82,19 @@ def solved(model, cases):
     return problem, functools.partial(newton, stages=stages, friction_ratio=RATIO)
 
 
+@functools.cache
+def _converge(solver):
+    return jax.jit(jax.vmap(functools.partial(solver, iterations=20, line_search=10)))
+
+
 def converged(solved):
     problem, solver = solved
-    return jax.jit(jax.vmap(functools.partial(solver, iterations=20, line_search=10)))(*problem)
+    return _converge(solver)(*problem)
 
 
 def test_places_are_those_of_the_rows(model, solved):
     """Four brakes first, then three rows a tyre."""
-    np.testing.assert_array_equal(mjx_backend.compile_stages(model[0]).rows, 4 + np.arange(12).reshape(4, 3))
+    np.testing.assert_array_equal(mjx_backend.put_model(model[0]).rows, 4 + np.arange(12).reshape(4, 3))
     assert solved[0][2].shape == (COUNT, 16, 16)
 
 
@@ -151,4 +158,4 @@ def test_inverse_is_one():
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6))
     matrix = root @ root.T + 6 * np.eye(6)
-    np.testing.assert_allclose(contact_solver.invert_arrow_matrix(jnp.asarray(matrix, jnp.float32)) @ matrix, np.eye(6), atol=1e-5)
+    np.testing.assert_allclose(contact_solver.invert_matrix(jnp.asarray(matrix, jnp.float32)) @ matrix, np.eye(6), atol=1e-5)

@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES, Patches
 from scenefactory_jax.weather.friction import make_uniform
-from scenefactory_jax.weather.patches import condition_at
+from scenefactory_jax.weather.patches import read_condition
 
 G, CARS, CHUNK = 9.81, 8, 30
 LANES = 500.0 * np.arange(CARS)
@@ -26,8 +26,8 @@ MU = {"AC": 1.1048, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
 @functools.cache
 def backend():
     config = load_config("task")
-    grip = instantiate(config["weather"]["grip"], builtins="scenefactory_jax.weather.friction", where="weather.grip")
-    context = {"grip": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
+    grip = instantiate(config["weather"]["friction"], builtins="scenefactory_jax.weather.friction", where="weather.friction")
+    context = {"friction": grip, "physics_dt": 1 / 120, "control_dt": 1 / 30}
     dynamics = instantiate(config["dynamics"], builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
 
     @jax.jit
@@ -85,9 +85,9 @@ def braking():
 
 
 def test_wheels_on_the_two_sides_have_the_friction_of_their_side(braking):
-    np.testing.assert_allclose(braking.grip[0, :2], (MU["ICE"] + MU["AC"]) / 2, atol=2e-3)
+    np.testing.assert_allclose(braking.mu[0, :2], (MU["ICE"] + MU["AC"]) / 2, atol=2e-3)
     wanted = [MU["ICE"], MU["GRAVEL"], MU["SNOW"], 0.8595, MU["AC"]]
-    np.testing.assert_allclose(braking.grip[0, [2, 4, 5, 6, 7]], wanted, atol=2e-3)
+    np.testing.assert_allclose(braking.mu[0, [2, 4, 5, 6, 7]], wanted, atol=2e-3)
 
 
 def test_split_friction_turns_a_braking_car_to_the_side_that_grips(braking):
@@ -107,7 +107,7 @@ def test_slippery_stretches_lengthen_the_way_to_stop(braking):
     assert stop[6] == pytest.approx(dry, abs=0.1), "with 0.5 mm of water the brakes are still the limit"
     assert stop[4] == pytest.approx(dry, abs=0.1), "and on gravel"
     assert dry + 2.0 < stop[3] < stop[5] < stop[2]
-    assert braking.grip[0, 3] == pytest.approx((MU["ICE"] + MU["AC"]) / 2, abs=2e-3), "the front axle starts on the ice"
+    assert braking.mu[0, 3] == pytest.approx((MU["ICE"] + MU["AC"]) / 2, abs=2e-3), "the front axle starts on the ice"
 
 
 def test_ice_in_a_bend_pushes_a_car_wide():
@@ -140,5 +140,5 @@ def test_the_condition_is_asked_where_the_wheels_are():
     coin = ([[1.3, 1.0]], 0.2, "ICE", 0.0)
     motion = drive({0: coin, 1: ([[1.3, -1.0]], 0.2, "ICE", 0.0), 2: ([[0.0, 0.0]], 0.5, "ICE", 0.0)}, speed=0.0, seconds=1)
     one = (3 * MU["AC"] + MU["ICE"]) / 4
-    np.testing.assert_allclose(motion.grip[0, :4], [one, one, MU["AC"], MU["AC"]], atol=2e-3)
-    assert condition_at(make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)
+    np.testing.assert_allclose(motion.mu[0, :4], [one, one, MU["AC"], MU["AC"]], atol=2e-3)
+    assert read_condition(make_uniform(jnp.float32(0.0), jnp.int32(0)), jnp.zeros((2, 4, 2)))[0].shape == (2, 4)

@@ -17,18 +17,18 @@ from scenefactory_jax.dynamics.articulated import (
     actuators,
     articulated_car,
     closed_form_step,
+    constants,
     equations_of_motion,
     mjx_backend,
-    randomization,
     tyres,
 )
-from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.vector import dot
 
 COUNT, DT = 60, 1 / 120
 STEP = {"friction_ratio": SOLVER.friction_ratio, "physics_dt": DT}
-SMOOTH = ("base", "across", "own", "force_base", "force_own", "brake_reference", "brake_weight")  # whether tyres touch or not
+SMOOTH = ("base", "across", "wheel", "force_base", "force_wheel", "brake")  # whether tyres touch or not
 
 
 @pytest.fixture
@@ -41,19 +41,19 @@ def quick():
 @pytest.fixture(scope="module")
 def model():
     """Compiled with all that MJX's stages need."""
-    return cars.build_standalone_model(CAR, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
+    return models.build_standalone_model(CAR, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
 
 
 @pytest.fixture(scope="module")
 def stages(model):
-    return mjx_backend.compile_stages(model)
+    return mjx_backend.put_model(model)
 
 
 @pytest.fixture(scope="module")
 def crew():
     """As many cars, no two alike."""
     several = [jax.tree.map(jnp.float32, random_car(seed)) for seed in range(COUNT)]
-    return jax.vmap(randomization.derive_constants)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *several))
+    return jax.vmap(constants.derive_constants)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *several))
 
 
 @pytest.fixture(scope="module")
@@ -61,43 +61,42 @@ def cases(model):
     rng = np.random.default_rng(1)
     qpos, qvel = random_states(model, CAR, count=COUNT, seed=0)
     mu, friction = rng.uniform(0.02, 1.3, (COUNT, 4)), rng.uniform(0.001, 1500.0, (COUNT, 4))
-    command = actuators.Command(
-        *(rng.uniform(-0.5, 0.5, COUNT), rng.uniform(0.0, 600.0, COUNT), 0.0 * mu, mu),
-        *(rng.normal(0.0, 2000.0, (COUNT, 2)), rng.normal(0.0, 500.0, COUNT)),
-    )
-    return jax.tree.map(jnp.float32, (qpos, qvel, command, friction))
+    command = actuators.Command(rng.uniform(-0.5, 0.5, COUNT), rng.uniform(0.0, 600.0, COUNT), 0.0 * mu)
+    push = actuators.PlanarForce(rng.normal(0.0, 2000.0, (COUNT, 2)), rng.normal(0.0, 500.0, COUNT))
+    return jax.tree.map(jnp.float32, (qpos, qvel, (command, push, mu), friction))
 
 
-def told(own, qpos, qvel, command, friction):
-    """State and load of one car."""
-    state = states.from_mujoco(own.car, qpos, qvel)
-    pushed = actuators.make_step_input(own.car, state, command, actuators.compute_drive_torque(own.car, command.drive, state.spin))
-    return state, actuators.PhysicsStepInput(pushed, command.mu, friction, actuators.compute_slip_damping(own.car, state))
+def step_input(own, qpos, qvel, inputs, friction):
+    """State of one car; forces, friction loss and tyre input of a step."""
+    (command, push, mu), state = inputs, states.from_mujoco(own.car, qpos, qvel)
+    drive = actuators.compute_drive_torque(own.car, command.drive_torque, state.spin)
+    forces = actuators.compute_applied_forces(own.car, state, command.steer, drive, push)
+    return state, (forces, friction, tyres.TyreInput(mu, tyres.compute_slip_damping(own.car, state)))
 
 
-def of_arrow(own, *case):
+def of_closed_form(own, *case):
     """The problem in closed form, and the rows of which tyres count."""
-    state, load = told(own, *case)
-    patch = tyres.find_contact_patches(own, state)
-    return closed_form_step.make_contact_problem(own, state, patch, load, **STEP), patch.depth > 0.0
+    state, load = step_input(own, *case)
+    patch = tyres.find_contact_patches(own.car, state)
+    return closed_form_step.make_contact_problem(own, state, patch, *load, **STEP), patch.depth > 0.0
 
 
 def of_mjx(own, *case, stages):
     """MJX's model and data, and the reference with what `tyres.turning` adds."""
     qpos, qvel = case[:2]
-    state, load = told(own, *case)
+    state, load = step_input(own, *case)
     own_model, data = mjx_backend.compute_smooth_dynamics(
-        stages, mjx_backend.fit_model(stages.model, stages.places, own), state, load, qpos, qvel
+        stages, mjx_backend.fit_model(stages, own), state, *load, qpos, qvel
     )
-    away = tyres.compute_jdot_qvel(tyres.find_contact_patches(own, state), equations_of_motion.compute_bias_acceleration(state))
+    away = tyres.compute_jdot_qvel(tyres.find_contact_patches(own.car, state), equations_of_motion.compute_bias_acceleration(state))
     turn = jnp.stack([dot(axis, away) for axis in (state.north, -state.east)], axis=-1)
     return own_model, data, data._impl.efc_aref.at[stages.rows[:, 1:]].add(-turn), load
 
 
 def problem_of_mjx(own, *case, stages):
     _, data, reference, load = of_mjx(own, *case, stages=stages)
-    rows, rotation = data._impl, jnp.stack([jnp.stack(row) for row in states.matrix(case[0][3:7])])
-    arrays = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, load.mu, load.friction)
+    rows, rotation = data._impl, jnp.stack([jnp.stack(row) for row in states.rotation_matrix(case[0][3:7])])
+    arrays = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, load[2].mu, load[1])
     return taken_apart(*arrays, stages=stages, friction_ratio=SOLVER.friction_ratio, rotation=rotation)
 
 
@@ -113,27 +112,27 @@ def broadcast(field):
 
 def test_the_problem_is_that_of_mjx_for_cars_that_differ(quick, crew, cases, stages):
     """A force is compared with the largest of its kind: MJX's own rounding is up to 1e-5 of that, see the next test."""
-    found, pressed = jax.jit(jax.vmap(of_arrow))(crew, *cases)
+    found, pressed = jax.jit(jax.vmap(of_closed_form))(crew, *cases)
     with jax.default_matmul_precision("highest"):
         wanted = jax.jit(jax.vmap(functools.partial(problem_of_mjx, stages=stages)))(crew, *cases)
     pressed = np.asarray(pressed)[:, None]
     assert 0.1 < pressed.mean() < 0.9
     for name in found._fields:
         left, right = together(getattr(found, name)), together(getattr(wanted, name))
-        if name in ("jacobian", "reference", "weight"):  # MJX takes J out where a tyre is in the air, here it weighs nothing
+        if name == "tyre":  # MJX takes J out where a tyre is in the air, here it weighs nothing
             left, right = left * pressed, right * pressed
         tolerance = 3e-5 if "force" in name else 5e-6
         np.testing.assert_allclose(left, right, atol=tolerance * np.abs(right).max(), rtol=1e-5, err_msg=name)
-    assert not together(found.weight)[np.broadcast_to(~pressed, (COUNT, 3, 4))].any()
+    assert not together(found.tyre.weight)[np.broadcast_to(~pressed, (COUNT, 3, 4))].any()
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_inertia_and_forces_are_the_c_engines(cases, seed):
     """In double precision, of cars that were compiled one by one."""
     car = random_car(seed)
-    model = cars.build_standalone_model(car, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
-    data, full, at = mujoco.MjData(model), np.zeros((16, 16)), columns(mjx_backend.compile_stages(model))
-    own = randomization.derive_constants(jax.tree.map(jnp.float32, car))
+    model = models.build_standalone_model(car, SOLVER, physics_dt=DT, visual=False, brake_rows=True)
+    data, full, at = mujoco.MjData(model), np.zeros((16, 16)), columns(mjx_backend.put_model(model))
+    own = constants.derive_constants(jax.tree.map(jnp.float32, car))
     qpos, qvel = cases[:2]
 
     @jax.jit
@@ -150,7 +149,7 @@ def test_inertia_and_forces_are_the_c_engines(cases, seed):
         )
         smooth = jax.tree.map(lambda a, b: a - b, held, away)
         pushed = states.flatten([*smooth.force, *smooth.torque], [smooth.suspension, smooth.spin, smooth.steer], state)
-        rotation = jnp.stack([jnp.stack(row) for row in states.matrix(qpos[3:7])])
+        rotation = jnp.stack([jnp.stack(row) for row in states.rotation_matrix(qpos[3:7])])
         return base, across, joints, pushed, rotation
 
     parts = [np.asarray(part, float) for part in one(qpos, qvel)]
@@ -189,7 +188,7 @@ def test_slopes_of_the_problem_are_those_of_mjx(quick, crew, cases, stages):
 
         return jax.jit(jax.vmap(jax.grad(value, argnums=(0, 2, 3))))
 
-    found = by(lambda *case: of_arrow(*case)[0])(*few)
+    found = by(lambda *case: of_closed_form(*case)[0])(*few)
     with jax.default_matmul_precision("highest"):
         wanted = by(functools.partial(problem_of_mjx, stages=stages))(*few)
     for (path, left), right in zip(jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(wanted), strict=True):
@@ -215,39 +214,38 @@ def test_a_car_at_rest_has_a_slope_of_its_turning():
 
 def test_joints_stand_where_the_compiled_model_has_them(model, cases):
     """Numbers by joint to MuJoCo's order and axes and back."""
-    at, (qpos, qvel) = cars.find_addresses(model), cases[:2]
+    at, (qpos, qvel) = models.find_addresses(model), cases[:2]
     one = jax.tree.map(lambda leaf: leaf[0], (qpos, qvel))
     state = states.from_mujoco(CAR, *one)
     for places, number in ((at.suspension_q, state.travel), (at.steer_q, state.steer[:2])):
         np.testing.assert_array_equal(one[0][places], number)
-    for places, number in ((at.suspension_v, state.sinking), (at.steer_v, state.steering[:2]), (at.spin_v, state.spin)):
+    for places, number in ((at.suspension_v, state.travel_rate), (at.steer_v, state.steer_rate[:2]), (at.spin_v, state.spin)):
         np.testing.assert_array_equal(one[1][places], number)
     np.testing.assert_allclose(states.flatten(*states.unflatten(one[1], state), state), one[1], rtol=1e-5, atol=1e-5)
 
 
 def test_masses_and_weights_are_the_compiled_models(model):
-    own, compiled = randomization.derive_constants(jax.tree.map(jnp.float32, CAR)), articulated_car.compile_car(
+    own, compiled = constants.derive_constants(jax.tree.map(jnp.float32, CAR)), articulated_car.compile_car(
         CAR, SOLVER, brakes="friction", physics_dt=DT, control_dt=4 * DT
-    ).own  # fmt: skip
+    ).constants  # fmt: skip
     np.testing.assert_allclose(own.spin_weight, compiled.spin_weight, rtol=1e-4)
     np.testing.assert_allclose(own.wheel_weight, compiled.wheel_weight, rtol=1e-4)
     assert equations_of_motion.total_mass(CAR) == pytest.approx(model.body_mass.sum())
-    np.testing.assert_allclose(
-        equations_of_motion.compute_loads(CAR), [cars.corner_load(CAR, front=front) for front in (True, True, False, False)]
-    )
+    np.testing.assert_allclose(equations_of_motion.compute_loads(CAR).sum(), CAR.mass * 9.81)
 
 
 @pytest.fixture(scope="module")
 def moves(cases):
-    """`mjx_car.move` of the reference car by both ways, solvers converged."""
-    command = cases[2]._replace(brake=cases[3])
+    """`physics_step` of the reference car with both solvers, converged."""
+    command, push, mu = cases[2]
+    command = command._replace(brake_torque=cases[3])
     both = []
-    for algorithm in ("arrow", "Newton"):
+    for algorithm in ("closed_form", "newton"):
         solver = dataclasses.replace(SOLVER, algorithm=algorithm, iterations=20, line_search=12, tolerance=0.0)
         plant = articulated_car.compile_car(CAR, solver, brakes="friction", physics_dt=DT, control_dt=4 * DT)
         with jax.default_matmul_precision("highest"):
-            move = jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.own, {})))
-            both.append(lambda now, move=move: move(now, command))
+            move = jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.constants, {})))
+            both.append(lambda now, move=move: move(now, command, push, mu))
     return both, plant
 
 
@@ -268,7 +266,7 @@ def test_a_step_is_that_of_mjxs_newton(quick, moves, cases):
 
 def test_a_tyre_in_the_air_carries_nothing_however_its_wheel_turns(quick, moves, cases):
     both, plant = moves
-    still = np.tile(plant.still, (COUNT, 1)).astype(np.float32)
+    still = np.tile(plant.rest_pose, (COUNT, 1)).astype(np.float32)
     still[:, 2] += 2.0
     for move in both:
         _, after = move(at(jnp.asarray(still), cases[1]))
@@ -286,18 +284,20 @@ def test_the_solver_converges_where_it_is_compiled_with_its_problem():
         for more in ({}, {"iterations": 20, "line_search": 10})
     ]
     shipped, patient = (
-        jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.own, {})), compiler_options=BY_DEFAULT)
+        jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.constants, {})), compiler_options=BY_DEFAULT)
         for plant in plants
     )
     draw = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (count, *shape)), jnp.float32)  # noqa: E731
-    qpos = jnp.tile(jnp.asarray(plants[0].still, jnp.float32), (count, 1))
+    qpos = jnp.tile(jnp.asarray(plants[0].rest_pose, jnp.float32), (count, 1))
     speed = draw(0.0, 25.0)
-    qvel = draw(-0.5, 0.5, 16).at[:, 0].add(speed).at[:, plants[0].places.spin_v].add(speed[:, None] / CAR.wheel_radius)
+    qvel = draw(-0.5, 0.5, 16).at[:, 0].add(speed).at[:, plants[0].addresses.spin_v].add(speed[:, None] / CAR.wheel_radius)
     mu = jnp.broadcast_to(draw(0.05, 1.2, 1), (count, 4))
     drive, brake = CAR.drive_torque * draw(0.0, 1.0), CAR.brake_torque_front * jnp.maximum(draw(-1.0, 1.0, 1), 0.0) * jnp.ones(4)
-    command = actuators.Command(CAR.steering_limit * draw(-1.0, 1.0), drive, brake, mu, jnp.zeros((count, 2)), jnp.zeros(count))
+    command = actuators.Command(CAR.steering_limit * draw(-1.0, 1.0), drive, brake)
+    push = actuators.PlanarForce(jnp.zeros((count, 2)), jnp.zeros(count))
     now = articulated_car.CarCarry(qpos, qvel, jnp.zeros((count, 16)), jnp.ones((count, 4)))
     for _ in range(24):
-        now, _ = patient(now, command)
-    apart = np.abs(np.asarray(shipped(now, command)[0].qacc_warmstart - patient(now, command)[0].qacc_warmstart))[:, :6].max(1)
+        now, _ = patient(now, command, push, mu)
+    found, wanted = (step(now, command, push, mu)[0].qacc_warmstart for step in (shipped, patient))
+    apart = np.abs(np.asarray(found - wanted))[:, :6].max(1)
     assert np.median(apart) < 1e-5 and np.percentile(apart, 95) < 1e-3, np.sort(apart)[-24:]  # m/s^2, rad/s^2

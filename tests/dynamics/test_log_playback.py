@@ -6,8 +6,8 @@ import pytest
 from test_dynamics import LANES, drive, random_controls, scene_for
 
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import AgentLog
-from scenefactory_jax.dynamics import log_playback
 
 
 def logged(valid):
@@ -22,7 +22,7 @@ def logged(valid):
 
 def test_replay_follows_the_log_whatever_the_action():
     scene = replace(scene_for(), log=logged([True] * 11))
-    _, (_, motion) = drive("replay", scene, random_controls(0, 2, 1))
+    _, (_, motion) = drive("log_playback", scene, random_controls(0, 2, 1))
     t = np.arange(1, 61) / 30
     moving = t < 1.0 - 1e-6
     np.testing.assert_allclose(motion.position[:, 0, 0], np.minimum(10 * t, 10.0), atol=1e-4)
@@ -35,11 +35,11 @@ def test_replay_follows_the_log_whatever_the_action():
 
 def test_replay_bridges_gaps_and_stands_where_nothing_was_seen():
     log = logged([False, True, True, False, False, True, False, False])
-    at = lambda row: log_playback.sample(jnp.float32(row), log.position[0], log.yaw[0], log.velocity[0], log.valid[0], dt=log.dt)  # noqa: E731
+    at = lambda row: interpolate_track(jnp.float32(row), log.position[0], log.yaw[0], log.velocity[0], log.valid[0], dt=log.dt)  # noqa: E731
     cases = ((0.0, 1, 0), (0.5, 1, 0), (1.5, 1.5, 10), (3.0, 3, 10), (4.5, 4.5, 10), (5.0, 5, 0), (6.5, 5, 0), (99.0, 5, 0))
     for row, x, speed in cases:
         position, velocity, _, yaw_rate = at(row)
         assert float(position[0]) == pytest.approx(x, abs=1e-4), row
         assert float(velocity[0]) == pytest.approx(speed, abs=1e-4) and float(yaw_rate) == pytest.approx(0.05 * speed, abs=1e-3), row
-    nothing = log_playback.sample(jnp.float32(2.0), log.position[0], log.yaw[0], log.velocity[0], log.valid[0] & False, dt=log.dt)
+    nothing = interpolate_track(jnp.float32(2.0), log.position[0], log.yaw[0], log.velocity[0], log.valid[0] & False, dt=log.dt)
     assert all(np.isfinite(x).all() for x in nothing) and not nothing[1].any()

@@ -20,7 +20,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import pack, validation
 from scenefactory_jax.dynamics import mujoco_c
-from scenefactory_jax.dynamics.articulated import mjx_backend, randomization
+from scenefactory_jax.dynamics.articulated import constants, mjx_backend, randomization
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 CAR, SOLVER = numbers_of("articulated")
@@ -65,24 +66,24 @@ def stacked(several):
 def listed(*, physics_dt: float):
     """A fleet of one's own: `CARS`, if eight start."""
     for one in CARS:
-        cars.stable_limits(one, physics_dt=physics_dt, where="dynamics.fleet")
+        cars.check_stability(one, physics_dt=physics_dt, where="dynamics.randomization")
     return lambda key, scene: stacked(CARS)
 
 
 @functools.cache
 def several():
-    dynamics = make("articulated", fleet={"_target_": "test_fleet.listed"})
+    dynamics = make("articulated", randomization={"_target_": "test_randomization.listed"})
     return dynamics, compile_(dynamics), jax.jit(functools.partial(dynamics.init, KEY))
 
 
 def started(scene, cars_of):
     """Bodies at their start, of other cars than `CARS`: what `init` does, without its trace."""
     body = several()[2](scene)
-    crew = jax.vmap(randomization.derive_constants)(stacked(cars_of))
-    height, travel = jax.vmap(functools.partial(randomization.place_at_rest, physics_dt=1 / 120))(crew)
+    crew = jax.vmap(constants.derive_constants)(stacked(cars_of))
+    height, travel = jax.vmap(functools.partial(constants.compute_rest_pose, physics_dt=1 / 120))(crew)
     qpos = body.qpos.at[:, 2].set(height).at[:, [7, 10, 13, 15]].set(travel)
     spin = scene.agents.speed / crew.car.wheel_radius
-    return replace(body, fleet=crew, qpos=qpos, qvel=body.qvel.at[:, [8, 11, 13, 15]].set(spin[:, None]))
+    return replace(body, constants=crew, qpos=qpos, qvel=body.qvel.at[:, [8, 11, 13, 15]].set(spin[:, None]))
 
 
 def drive(scene, action, body=None):
@@ -95,30 +96,30 @@ def drive(scene, action, body=None):
 
 
 def test_columns_are_those_that_started_relies_on():
-    at = cars.find_addresses(cars.build_standalone_model(CAR, SOLVER, **COMPILED))
+    at = models.find_addresses(models.build_standalone_model(CAR, SOLVER, **COMPILED))
     assert at.suspension_q.tolist() == [7, 10, 13, 15] and at.spin_v.tolist() == [8, 11, 13, 15]
     assert at.wheel.tolist() == WHEEL_BODIES and at.chassis == CHASSIS
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_fitted_model_is_the_compiled_one(seed):
     """Every number that MJX's step reads, to 1e-4."""
     other = random_car(seed)
-    model = cars.build_standalone_model(CAR, SOLVER, **COMPILED)
-    own = randomization.derive_constants(jax.tree.map(jnp.float32, other))
+    model = models.build_standalone_model(CAR, SOLVER, **COMPILED)
+    own = constants.derive_constants(jax.tree.map(jnp.float32, other))
     put = functools.partial(mjx.put_model, impl="jax")
-    fitted = put(model).replace(**mjx_backend.fit_model(put(model), cars.find_addresses(model), own))
+    fitted = put(model).replace(**mjx_backend.fit_model(mjx_backend.put_model(model), own))
     # where a free body starts, its box, what only other solvers, engines or sensors read: no step looks at it
     unread = {"stat", "qpos0", "dof_M0", "geom_aabb", "geom_rbound"}
     partly = {"body_invweight0", "dof_invweight0", "qpos_spring", "geom_size", "body_pos"}  # below
-    wanted = put(cars.build_standalone_model(other, SOLVER, **COMPILED))
+    wanted = put(models.build_standalone_model(other, SOLVER, **COMPILED))
     compared = 0
     for (path, right), left in zip(jax.tree_util.tree_leaves_with_path(wanted), jax.tree.leaves(fitted), strict=True):
         if path[0].name not in unread | partly:
             np.testing.assert_allclose(np.asarray(left), np.asarray(right), rtol=1e-4, atol=1e-7, err_msg=jax.tree_util.keystr(path))
             compared += 1
     assert compared > 100
-    spin, spring = cars.find_addresses(model).spin_v, cars.find_addresses(model).suspension_q
+    spin, spring = models.find_addresses(model).spin_v, models.find_addresses(model).suspension_q
     np.testing.assert_allclose(fitted.dof_invweight0[spin], wanted.dof_invweight0[spin], rtol=1e-4)
     np.testing.assert_allclose(fitted.body_invweight0[WHEEL_BODIES, 0], wanted.body_invweight0[WHEEL_BODIES, 0], rtol=1e-4)
     np.testing.assert_allclose(fitted.qpos_spring[spring], wanted.qpos_spring[spring], rtol=1e-4, atol=1e-6)
@@ -126,12 +127,12 @@ def test_a_fitted_model_is_the_compiled_one(seed):
     np.testing.assert_allclose(fitted.body_pos[2:], wanted.body_pos[2:], rtol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_standing_height_is_where_the_c_engine_settles(seed):
     """Of level cars: the centre of mass amidships. A car that leans is 'level' at its axles' mean."""
     for other in (dataclasses.replace(random_car(seed), mass_forward=0.0, wheel_damping=0.5), changed(mass=2.5, suspension_stiffness=0.5)):
-        settled = cars.find_rest_pose(cars.build_standalone_model(other, SOLVER, **COMPILED), other)
-        height, travel = randomization.place_at_rest(randomization.derive_constants(jax.tree.map(jnp.float32, other)), physics_dt=1 / 120)
+        settled = models.find_rest_pose(models.build_standalone_model(other, SOLVER, **COMPILED), other)
+        height, travel = constants.compute_rest_pose(constants.derive_constants(jax.tree.map(jnp.float32, other)), physics_dt=1 / 120)
         assert float(height) == pytest.approx(settled[2], abs=2e-3)
         np.testing.assert_allclose(travel, settled[[7, 10, 13, 15]], atol=2e-3)
 
@@ -144,7 +145,7 @@ def test_each_car_drives_as_in_the_c_engine_and_nothing_is_compiled_anew():
     converged = {"physics_dt": 1 / 120, "substeps": 4, "iterations": 100, "line_search": 50}
     final = []
     for i, car in enumerate(CARS):
-        newton = dataclasses.replace(SOLVER, algorithm="Newton")
+        newton = dataclasses.replace(SOLVER, algorithm="newton")
         truth = mujoco_c.simulate(car, newton, action[:, i], np.full(4, float(MU[i])), speed=float(speed[i]), **converged)
         apart = body.qpos[:, i] - truth.qpos
         apart[:, 1] -= LANES[i]
@@ -190,7 +191,7 @@ def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
     crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in jax.tree.leaves(resized)]) for i in range(8)]
     assert crew[2].mass == pytest.approx(1800 * 3.75) and crew[2].wheelbase == pytest.approx(7.8)
     for one in crew:
-        cars.stable_limits(one, physics_dt=1 / 120, where="")
+        cars.check_stability(one, physics_dt=1 / 120, where="")
     scene = scene_for(speed=10.0)
     _, (_, away) = drive(scene, constant(throttle=1.0, seconds=3), body=started(scene, crew))
     dry = np.array([0, 4, 5, 6, 7])  # MU 0.86, 0.5, 0.7, 1.0, 1.1: engine and brakes are the limit, or nearly
@@ -227,12 +228,12 @@ def test_mass_reaches_the_contact():
 
 
 def spread(**changes):
-    return load_config("task", "dynamics/fleet=spread")["dynamics"]["fleet"] | changes
+    return load_config("task", "dynamics/randomization=spread")["dynamics"]["randomization"] | changes
 
 
 def sampler(**changes):
     numbers = {key: value for key, value in spread(**changes).items() if key != "_target_"}
-    return randomization.draw_cars(car=CAR, physics_dt=1 / 120, **numbers)
+    return randomization.car_parameter_sampler(car=CAR, physics_dt=1 / 120, **numbers)
 
 
 def test_draws_are_pure_in_the_key_and_within_their_ranges():
@@ -262,38 +263,38 @@ def test_logged_sizes_are_cut_to_the_range():
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"scale": {"colour": [0.9, 1.1]}}, "dynamics.fleet.scale.colour: unknown parameter; valid: length"),
-        ({"scale": {"mass": [1.2, 0.8]}}, "dynamics.fleet.scale.mass"),
-        ({"scale": {"mass": [0.0, 1.0]}}, "dynamics.fleet.scale.mass: 0; wanted is a number above 0"),
-        ({"scale": {"wheelbase": [0.0, 0.0]}}, "dynamics.fleet.scale.wheelbase: 0; wanted is a number above 0"),
-        ({"scale": {"tyre_impedance": [0.9, 2.0]}}, "dynamics.fleet.scale.tyre_impedance: 1; wanted is a number above 0 and below 1"),
-        ({"scale": {"tyre_impedance": [0.3, 1.0]}}, "tyre_slip_damping dt / tyre_impedance is 3.03"),
-        ({"length_m": [0.0, 5.0]}, "dynamics.fleet.length_m: 0; wanted is a number above 0"),
-        ({"length_m": [5.0]}, "dynamics.fleet.length_m"),
-        ({"size": "huge"}, "dynamics.fleet.size"),
-        ({"scale": {"suspension_damping": [1.0, 12.0]}}, "dynamics.fleet.scale: the suspension and stop cannot be integrated"),
-        ({"scale": {"steering_friction": [1.0, 4.0], "wheel_inertia": [0.5, 1.0]}}, "dynamics.fleet.scale: the steering cannot"),
-        ({"scale": {"body_stiffness": [1.0, 9.0], "mass": [0.2, 1.0]}}, "dynamics.fleet.scale: the body on the ground cannot"),
-        ({"_target_": "draws"}, "dynamics.fleet._target_"),
+        ({"scale": {"colour": [0.9, 1.1]}}, "dynamics.randomization.scale.colour: unknown parameter; valid: length"),
+        ({"scale": {"mass": [1.2, 0.8]}}, "dynamics.randomization.scale.mass"),
+        ({"scale": {"mass": [0.0, 1.0]}}, "dynamics.randomization.scale.mass: expected a.* > 0, got"),
+        ({"scale": {"wheelbase": [0.0, 0.0]}}, "dynamics.randomization.scale.wheelbase: expected a.* > 0, got"),
+        ({"scale": {"tyre_impedance": [0.9, 2.0]}}, "dynamics.randomization.scale.tyre_impedance: expected a number > 0 and < 1, got 1"),
+        ({"scale": {"tyre_impedance": [0.3, 1.0]}}, "expected below 2, got 3.03"),
+        ({"length_m": [0.0, 5.0]}, "dynamics.randomization.length_m: expected a.* > 0, got"),
+        ({"length_m": [5.0]}, "dynamics.randomization.length_m"),
+        ({"size": "huge"}, "dynamics.randomization.size"),
+        ({"scale": {"suspension_damping": [1.0, 12.0]}}, "dynamics.randomization.scale: the suspension and stop cannot be integrated"),
+        ({"scale": {"steering_friction": [1.0, 4.0], "wheel_inertia": [0.5, 1.0]}}, "dynamics.randomization.scale: the steering cannot"),
+        ({"scale": {"body_stiffness": [1.0, 9.0], "mass": [0.2, 1.0]}}, "dynamics.randomization.scale: the body on the ground cannot"),
+        ({"_target_": "draws"}, "dynamics.randomization._target_"),
     ],
 )
 def test_a_spread_that_cannot_be_is_refused_at_build(changes, named):
     with pytest.raises(ConfigError, match=named):
-        make("articulated", fleet=spread(**changes))
+        make("articulated", randomization=spread(**changes))
 
 
 def test_the_reference_numbers_leave_room_for_the_shipped_spread():
-    worst = randomization.find_worst(CAR, {name: tuple(span) for name, span in spread()["scale"].items()})
+    worst = randomization.find_stiffest(CAR, {name: tuple(span) for name, span in spread()["scale"].items()})
     assert worst.suspension_damping > CAR.suspension_damping and worst.mass < CAR.mass and worst.inertia[0] < CAR.inertia[0]
-    cars.stable_limits(worst, physics_dt=1 / 120, where="")
+    cars.check_stability(worst, physics_dt=1 / 120, where="")
 
 
 def test_a_run_can_be_amended_with_a_fleet():
     config = load_config("task")
-    assert config["dynamics"]["fleet"] is None
-    amended = apply_overrides(config, ["dynamics/fleet=sizes"])
-    assert amended["dynamics"]["fleet"]["size"] == "logged" and amended["dynamics"]["car"] == config["dynamics"]["car"]
-    assert config["dynamics"]["fleet"] is None
+    assert config["dynamics"]["randomization"] is None
+    amended = apply_overrides(config, ["dynamics/randomization=sizes"])
+    assert amended["dynamics"]["randomization"]["size"] == "logged" and amended["dynamics"]["car"] == config["dynamics"]["car"]
+    assert config["dynamics"]["randomization"] is None
 
 
 def test_sizes_of_real_scenes_build_and_step(shared_data):
@@ -306,13 +307,13 @@ def test_sizes_of_real_scenes_build_and_step(shared_data):
     )
     path = sorted((shared_data / "womd" / "train").iterdir())[0]
     scene = jax.tree.map(jnp.asarray, pack.prepare(next(iter(reader_selection.read(path, formats))), check=check, pack=packing).scene)
-    entry = load_config("task", "dynamics/fleet=sizes")["dynamics"]["fleet"]
-    dynamics = make("articulated", fleet=entry)
+    entry = load_config("task", "dynamics/randomization=sizes")["dynamics"]["randomization"]
+    dynamics = make("articulated", randomization=entry)
     present = scene.agents.present
     body = jax.jit(dynamics.init)(KEY, scene)
     size = np.asarray(scene.agents.size)[np.asarray(present)]
     assert len(np.unique(size[:, 0])) > 1  # the log's, not one for all
-    np.testing.assert_allclose(np.asarray(body.fleet.car.length)[np.asarray(present)], np.clip(size[:, 0], 2.5, 12.0), rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(body.constants.car.length)[np.asarray(present)], np.clip(size[:, 0], 2.5, 12.0), rtol=1e-6)
     advance = jax.jit(dynamics.advance)
     start = dynamics.read(body).position
     for _ in range(15):

@@ -1,4 +1,4 @@
-"""Rolling resistance, air drag, and tyres that yield to slip angle: laws of motion, on the eight cars of `test_fleet`."""
+"""Rolling resistance, air drag, and tyres that yield to slip angle: laws of motion, on the eight cars of `test_randomization`."""
 
 import dataclasses
 import functools
@@ -13,8 +13,9 @@ from test_randomization import CAR, SOLVER, drive, started
 from experiments.validation import motion_laws
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics import mujoco_c
-from scenefactory_jax.dynamics.articulated import actuators, randomization
+from scenefactory_jax.dynamics.articulated import actuators, constants, randomization, tyres
 from scenefactory_jax.dynamics.articulated import state as states
+from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 
 FREE = dataclasses.replace(  # nothing else slows it
     CAR, wheel_damping=0.0, yaw_damping=0.0, rolling_torque=0.0, air_drag=0.0, tyre_slip_damping=5.0, tyre_slip_speed=1e3
@@ -36,7 +37,7 @@ def go(several, action, speed=0.0):
 def rolling(body):
     """Radius on which the cars roll, as the trace has it (the tyres are a little pressed), and mass with the wheels' inertia."""
     radius = np.median(body.qvel[..., 0] / np.maximum(body.qvel[..., SPIN].mean(-1), 1e-3), axis=0)
-    return radius, motion_laws.mass(FREE) + 4 * FREE.wheel_inertia[0] / radius**2
+    return radius, total_mass(FREE) + 4 * FREE.wheel_inertia[0] / radius**2
 
 
 def test_rolling_resistance_slows_a_car_evenly_and_then_holds_it():
@@ -115,10 +116,10 @@ def test_a_lateral_force_needs_the_same_slip_angle_at_every_speed():
     slow, fast, middle, old_slow, old_fast = slip[grips]
     assert slow == pytest.approx(fast, rel=0.1) and middle == pytest.approx(fast, rel=0.1)
     assert old_slow > 2.5 * old_fast  # slip velocity: three times the angle at a third of the speed
-    weight = randomization.derive_constants(jax.tree.map(jnp.float32, law)).wheel_weight[2]
+    weight = constants.derive_constants(jax.tree.map(jnp.float32, law)).wheel_weight[2]
     d = law.tyre_impedance
     yields = float(weight) * (1 - d) / d / SOLVER.friction_ratio
-    assert fast == pytest.approx(motion_laws.mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
+    assert fast == pytest.approx(total_mass(law) / 4 * yields / (20.0 * 2.5 / d), rel=0.05)
 
 
 def test_below_the_slip_speed_nothing_changes():
@@ -127,7 +128,7 @@ def test_below_the_slip_speed_nothing_changes():
     law = dataclasses.replace(FREE, tyre_slip_speed=2.5, tyre_slip_damping=20.0)
 
     def damping(of, velocity):
-        return actuators.compute_slip_damping(of, states.from_mujoco(of, jnp.zeros(17).at[3].set(1.0), velocity))
+        return tyres.compute_slip_damping(of, states.from_mujoco(of, jnp.zeros(17).at[3].set(1.0), velocity))
 
     found = jax.vmap(functools.partial(damping, law))(qvel)
     np.testing.assert_allclose(found, [20.0, 20.0, 20.0, 10.0, 2.0], rtol=1e-6)
@@ -138,10 +139,10 @@ def test_gradients_are_finite_at_rest():
     law = dataclasses.replace(FREE, **ON)
 
     def load(qvel):
-        command = actuators.Command(*[jnp.zeros(())] * 2, jnp.zeros(4), jnp.ones(4), jnp.zeros(2), jnp.zeros(()))
         state = states.from_mujoco(law, jnp.zeros(17).at[3].set(1.0), qvel)
-        pushed = actuators.make_step_input(law, state, command, jnp.zeros(4))
-        return sum(jnp.sum(part) for part in jax.tree.leaves(pushed)) + actuators.compute_slip_damping(law, state)
+        push = actuators.PlanarForce(jnp.zeros(2), jnp.zeros(()))
+        pushed = actuators.compute_applied_forces(law, state, jnp.zeros(()), jnp.zeros(4), push)
+        return sum(jnp.sum(part) for part in jax.tree.leaves(pushed)) + tyres.compute_slip_damping(law, state)
 
     slope = jax.jit(jax.grad(load))
     for speed in (0.0, 3.0, 10.0):
@@ -157,7 +158,7 @@ def test_each_car_has_its_own_and_drives_as_in_the_c_engine():
         several.append(dataclasses.replace(CAR, **{name: float(number) for name, number in own.items()}))
     speed, action = np.linspace(16, 4, 8), random_controls(11, 3, 15)
     body, _ = go(several, action, speed=speed)
-    newton = dataclasses.replace(SOLVER, algorithm="Newton")
+    newton = dataclasses.replace(SOLVER, algorithm="newton")
     converged = {"physics_dt": 1 / 120, "substeps": 4, "iterations": 100, "line_search": 50}
     for i, car in enumerate(several):
         case = {"mu": np.full(4, float(MU[i])), "speed": float(speed[i]), **converged}
@@ -179,7 +180,7 @@ def test_resistance_grows_with_the_footprint():
 
 def test_brakes_distance_counts_all_that_slows():
     car, v, x, dt = dataclasses.replace(CAR, **ON), 15.0, 0.0, 1e-4
-    mass = motion_laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    mass = total_mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
     while v > 0:
         torque = 2 * (car.brake_torque_front + car.brake_torque_rear) + 4 * (car.wheel_damping * v / car.wheel_radius + car.rolling_torque)
         v, x = v - dt * (torque / car.wheel_radius + car.air_drag * v * v) / mass, x + dt * v
@@ -189,8 +190,8 @@ def test_brakes_distance_counts_all_that_slows():
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"brakes": "latched", "car": {"rolling_torque": 10.0}}, "dynamics.car.rolling_torque: 10 N m; it must be 0 with latched"),
-        ({"car": {"tyre_slip_speed": 0.0}}, "dynamics.car.tyre_slip_speed: 0; wanted is a number above 0"),
+        ({"brakes": "latched", "car": {"rolling_torque": 10.0}}, "dynamics.car.rolling_torque: expected 0 with latched brakes, got 10"),
+        ({"car": {"tyre_slip_speed": 0.0}}, "dynamics.car.tyre_slip_speed: expected a number > 0, got 0"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(changes, named):

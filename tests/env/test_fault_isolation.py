@@ -10,6 +10,7 @@ from support.hand_scenes import scene_of
 
 from experiments.validation import fault_isolation
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
@@ -42,8 +43,8 @@ def report(env):
 def test_addresses(env):
     model_config = config()["dynamics"]
     car, solver = cars.CarParameters(**model_config["car"]), cars.Solver(**model_config["solver"])
-    model = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
-    np.testing.assert_array_equal(cars.find_addresses(model).steer_q, fault_isolation.STEERING)
+    model = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    np.testing.assert_array_equal(models.find_addresses(model).steer_q, fault_isolation.STEERING)
 
 
 @pytest.mark.parametrize("name", fault_isolation.BREAKS)
@@ -98,7 +99,7 @@ def test_a_fault_that_spreads_is_seen():
     yaw = np.zeros((8, 2, 4), np.float32)
 
     def run(numerical_error=quiet, active=away, yaw=yaw):
-        traces = Traces(active, yaw, Faults(fault))
+        traces = Traces(active, yaw, Faults(numerical_error))
         return traces, traces._replace(active=quiet)
 
     def judge(hurt):

@@ -28,7 +28,7 @@ UNUSABLE = {
     "start inf": ("position", jnp.inf),
     "yaw nan": ("yaw", jnp.nan),
     "speed inf": ("speed", jnp.inf),
-    "route nan": ("route", jnp.nan),
+    "route nan": ("route_length", jnp.nan),
 }
 
 
@@ -125,8 +125,8 @@ def test_an_unknown_distance_is_not_short():
 @pytest.mark.usefixtures("unchecked_annotations")
 @pytest.mark.parametrize("mode", ["static", "speed"])
 def test_whole_numbers_are_numbers_to_friction(mode):
-    entry = load_config("task")["weather"]["grip"] | {"mode": mode}
-    grip = instantiate(entry, builtins=friction, where="weather.grip")
+    entry = load_config("task")["weather"]["friction"] | {"mode": mode}
+    grip = instantiate(entry, builtins=friction, where="weather.friction")
     road = lambda film: friction.make_uniform(film, jnp.int32(0))  # noqa: E731
     whole = grip(road(jnp.int32(0)), jnp.zeros((2, 2), int), jnp.array([10, 20]))
     np.testing.assert_array_equal(whole, grip(road(jnp.float32(0)), jnp.zeros((2, 2)), jnp.array([10.0, 20.0])))
@@ -151,7 +151,7 @@ def agents(**fields):
         (agents(goal=jnp.zeros((2, 2))), r"scene.agents.goal: expected shape \(3, 2\), got \(2, 2\)"),
         (agents(goal=jnp.zeros((3, 2), int)), "scene.agents.goal: expected float, got int32"),
         (agents(present=jnp.ones(3)), "scene.agents.present: expected bool, got float32"),
-        (agents(route=None), r"scene.agents.route: missing; expected float of shape \(A\)"),
+        (agents(route_length=None), r"scene.agents.route_length: missing; expected float of shape \(A\)"),
         (lambda scene: replace(scene, weather=None), "scene.weather: expected a Weather, got NoneType"),
         (lambda scene: jax.tree.map(lambda leaf: leaf[None], scene), r"scene.road.midpoint: .* many worlds map over them with jax.vmap"),
         (lambda scene: (scene, None), "scene: expected a Scene, got tuple"),
@@ -178,7 +178,7 @@ def test_scenes_that_do_not_fit_are_refused_by_name(env, given, change, message)
 )
 def test_actions_that_do_not_fit_are_refused_by_name(env, given, action, message):
     scene, state, _ = given
-    for name in ("step", "transition"):
+    for name in ("step", "control_step"):
         with pytest.raises(ValueError, match=f"env.{name}: {message}"):
             jax.eval_shape(getattr(env, name), scene, state, action)
     worlds = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((2, *leaf.shape), leaf.dtype), (scene, state, jnp.zeros((1, 3))))

@@ -42,7 +42,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         upright=each(upright),
         steer=each(0.0),
         contact_force=each(force),
-        grip=each(1.0),
+        mu=each(1.0),
         friction_utilization=each(0.0),
         slip=each(0.0),
     )
@@ -53,7 +53,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         weather=scene.weather,
         active=scene.agents.present,
         past_events=termination.make_empty_events(count),
-        age=jnp.full(count, age, jnp.int32),
+        steps_since_spawn=jnp.full(count, age, jnp.int32),
         previous_action=jnp.zeros((count, 3)),
         step=jnp.int32(age),
         key=jax.random.key(0),
@@ -62,9 +62,9 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
 
 def judged(parts, before, after, scene):
     """The step as the environment makes it of two moments."""
-    facts = parts.measure(scene, before, after)
-    events, _ = parts.judge(facts, before.past_events, before.active)
-    return RewardInput(scene, before, after.previous_action, after, facts, events)
+    metrics = parts.compute_metrics(scene, before, after)
+    events, _ = parts.evaluate_termination(metrics, before.past_events, before.active)
+    return RewardInput(scene, before, after.previous_action, after, metrics, events)
 
 
 def paid(parts, start, end, *, goal=FAR, present=None, **motion):
@@ -222,15 +222,15 @@ def test_an_agent_has_one_new_event_a_step_the_first_in_order(parts):
     true, past_events = rows[:, :5], rows[:, 5:]
     events = lambda table: Events(**{name: jnp.asarray(table[:, place]) for place, name in enumerate(EVENTS)})  # noqa: E731
     scene = scene_of([[0.0, 0.0]], FAR)
-    facts = judged(parts, moment(scene, [[0.0, 0.0]]), moment(scene, [[0.0, 0.0]]), scene).facts
-    facts = replace(facts, events=events(true))
-    new, done = parts.judge(facts, events(past_events), jnp.ones(len(rows), bool))
+    metrics = judged(parts, moment(scene, [[0.0, 0.0]]), moment(scene, [[0.0, 0.0]]), scene).metrics
+    metrics = replace(metrics, events=events(true))
+    new, done = parts.evaluate_termination(metrics, events(past_events), jnp.ones(len(rows), bool))
     found = np.stack([getattr(new, name) for name in EVENTS], axis=1)
     for row, (is_true, before) in enumerate(zip(true, past_events, strict=True)):
         first = next((place for place in range(5) if is_true[place] and not before[place]), None)
         assert np.flatnonzero(found[row]).tolist() == ([] if first is None else [first])
         assert done[row] == (first is not None)
-    nobody, ended = parts.judge(facts, events(past_events), jnp.zeros(len(rows), bool))
+    nobody, ended = parts.evaluate_termination(metrics, events(past_events), jnp.zeros(len(rows), bool))
     assert not any(leaf.any() for leaf in (*jax.tree.leaves(nobody), ended))
 
 

@@ -105,16 +105,16 @@ def settings():
 def played(tmp_path_factory, settings):
     """All drives at once, with the strict protocol: records, recording."""
     where = tmp_path_factory.mktemp("x")
-    config = smoke(where, "dynamics=log_playback", "traffic=parked", f"timing.episode_s={SECONDS}", "weather.patches=null")
+    config = smoke(
+        where, "dynamics=log_playback", "traffic=parked", f"timing.episode_s={SECONDS}", "weather.patches=null", "termination=strict"
+    )
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(scripted(*drive) for drive in DRIVES.values()))
     scenes = scene_source.Scenes(scene_source.attach_grids(stacked, config["scenes"]), tuple(NAMES), "")
     with quick_compilation():
         env = environment.make_env(config)
         observation = jax.jit(env.reset)(jax.random.key(0), scenes[0])[1]
         parameters = make_policy(config).init(jax.random.key(1), observation)
-        return episode_records.make_episode_runner(config, scenes, protocol="strict", settings=settings, worlds=None, steps=None)(
-            parameters
-        )
+        return episode_records.make_episode_runner(config, scenes, settings=settings, worlds=None)(parameters)
 
 
 def row_of(records, name, agent=0) -> int:
@@ -248,5 +248,5 @@ def test_settings_are_checked_at_the_door():
     del config["failures"]["notes"]["near_m"]
     with pytest.raises(ConfigError, match=r"failures\.notes\.near_m: missing"):
         schema.check_evaluate(config)
-    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: 0; wanted is at least 1"):
+    with pytest.raises(ConfigError, match=r"evaluation\.failures\.pictures\.panels: expected an integer >= 1, got 0"):
         schema.check_train(configs.load_config("train", "evaluation.failures.pictures.panels=0"))

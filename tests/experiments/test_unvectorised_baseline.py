@@ -1,4 +1,4 @@
-"""The loop in Python against the vectorised environment: the same observations, network, facts, rewards, events and, nearly, motion."""
+"""The loop in Python against the vectorised environment: the same observations, network, metrics, rewards, events and, nearly, motion."""
 
 import functools
 
@@ -24,7 +24,7 @@ MOMENTS, SECONDS = 16, 1.0
 
 @pytest.fixture(scope="module")
 def config():
-    return sf.load_config("bench", *SMALL, *NETWORK)
+    return sf.load_config("benchmark", *SMALL, *NETWORK)
 
 
 @pytest.fixture(scope="module")
@@ -39,16 +39,16 @@ def task(config):
 
 @pytest.fixture(scope="module")
 def reference(config):
-    """The device's start, observation, and facts with events and rewards, each compiled once."""
+    """The device's start, observation, and metrics with events and rewards, each compiled once."""
     parts, env = environment.make_parts(config), sf.make(config)
 
     def judged(scene, before, after):
-        facts = parts.measure(scene, before, after)
-        events, done = parts.judge(facts, before.past_events, before.active)
-        step = RewardInput(scene, before, after.previous_action, after, facts, events)
-        return facts, events, done, {name: weight * term(step) for name, (weight, term) in parts.terms.items()}
+        metrics = parts.compute_metrics(scene, before, after)
+        events, done = parts.evaluate_termination(metrics, before.past_events, before.active)
+        step = RewardInput(scene, before, after.previous_action, after, metrics, events)
+        return metrics, events, done, {name: weight * term(step) for name, (weight, term) in parts.terms.items()}
 
-    return jax.jit(env.start), jax.jit(env.observe), jax.jit(judged)
+    return jax.jit(env.init_state), jax.jit(env.observe), jax.jit(judged)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def moments(scene, reference):
             motion=motion_of(place, height, velocity, yaw, np.where(rng.random(slots) < 0.1, 0.1, 1.0), rng.choice([0.0, 100.0], slots)),
             active=jnp.asarray(rng.random(slots) < 0.9) & state.agents.present,
             past_events=Events(**{name: jnp.asarray(rng.random(slots) < 0.3) & (name != "numerical_error") for name in EVENTS}),
-            age=jnp.asarray(rng.integers(0, 60, slots), jnp.int32),
+            steps_since_spawn=jnp.asarray(rng.integers(0, 60, slots), jnp.int32),
         )
         moved = (place - velocity / 30, height, velocity, yaw, np.ones(slots), np.zeros(slots))
         found.append((replace(after, motion=motion_of(*moved)), after))
@@ -90,7 +90,7 @@ def motion_of(place, height, velocity, yaw, upright, force) -> Motion:
         upright=upright,
         contact_force=force,
     )
-    numbers |= {name: 0 * yaw for name in ("yaw_rate", "steer", "grip", "friction_utilization", "slip")}
+    numbers |= {name: 0 * yaw for name in ("yaw_rate", "steer", "mu", "friction_utilization", "slip")}
     return Motion(**{name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
 
 
@@ -102,7 +102,7 @@ def agents_of(state) -> list[one.Agent]:
             start=agents.position[slot],
             goal=agents.goal[slot],
             size=agents.size[slot],
-            route=float(agents.route[slot]),
+            route=float(agents.route_length[slot]),
             position=motion.position[slot, :2],
             elevation=float(motion.position[slot, 2]),
             velocity=motion.velocity[slot, :2],
@@ -110,7 +110,7 @@ def agents_of(state) -> list[one.Agent]:
             upright=float(motion.upright[slot]),
             contact_force=float(motion.contact_force[slot]),
             active=bool(state.active[slot]),
-            age=int(state.age[slot]),
+            age=int(state.steps_since_spawn[slot]),
             past_events={name for name in EVENTS if bool(getattr(state.past_events, name)[slot])},
         )
         for slot in range(len(state.active))
@@ -146,15 +146,15 @@ def test_rewards_and_events_are_those_of_the_device(task, scene, reference, mome
     place = one.place_of(scene, 0.0, 0)
     met = set()
     for before, after in moments:
-        facts, events, done, terms = jax.tree.map(np.asarray, reference[2](scene, before, after))
+        metrics, events, done, terms = jax.tree.map(np.asarray, reference[2](scene, before, after))
         agents = agents_of(after)
         crowd = one.gather(agents, circles=task.circles)
         for slot in np.flatnonzero(after.active):
             agent = agents[slot]
-            own = task.measure(place, agent, crowd, np.asarray(before.motion.position)[slot, :2])
+            own = task.compute_metrics(place, agent, crowd, np.asarray(before.motion.position)[slot, :2])
             for name in set(own._fields) - {"events"}:
-                np.testing.assert_allclose(getattr(own, name), getattr(facts, name)[slot], atol=1e-4, rtol=1e-4, err_msg=name)
-            new = task.judge(agent, own)
+                np.testing.assert_allclose(getattr(own, name), getattr(metrics, name)[slot], atol=1e-4, rtol=1e-4, err_msg=name)
+            new = task.evaluate_termination(agent, own)
             assert new == next((name for name in EVENTS if getattr(events, name)[slot]), None)
             assert agent.active == (not done[slot])
             paid = [weight * term(own, new) for weight, term in task.terms]
@@ -251,7 +251,7 @@ def test_measure_gives_positive_numbers(config, scene, parameters):
 )
 def test_what_only_the_device_has_is_named(override):
     with pytest.raises(ConfigError, match="baseline has"):
-        baseline_environment.make(sf.load_config("bench", override))
+        baseline_environment.make(sf.load_config("benchmark", override))
 
 
 def test_another_policy_is_named(config, scene):

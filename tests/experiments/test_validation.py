@@ -10,6 +10,7 @@ from experiments.validation import encounters, engines, equivalence, impacts, ra
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 SETTINGS = load_config("validate")["validation"]  # what `validate` runs, at toy size
@@ -145,7 +146,7 @@ def head_on(entry, impedance, *, position, speed=(10.0, 0.0), yaw=(0.0, 0.0), fr
     contact = engines.touch(entry, impedance=impedance)
     options = dict(physics_dt=1 / 1920, substeps=64, iterations=100, line_search=50)
     arrays = {"position": np.array(position, float), "speed": np.array(speed, float), "yaw": np.array(yaw, float)}
-    return mujoco_c.encounter(car, solver, np.zeros((15, 2, 3)), np.full((2, 4), friction), contact, **arrays, **options)
+    return mujoco_c.simulate_two(car, solver, np.zeros((15, 2, 3)), np.full((2, 4), friction), contact, **arrays, **options)
 
 
 @pytest.mark.parametrize("impedance", [0.95, 0.01])
@@ -162,10 +163,10 @@ def test_the_c_engines_contact_is_the_spring_damper(entry, impedance):
         peak = max(peak, force)
         rate -= force / (mass / 2) * dt
         depth += rate * dt
-    parting = story.path.qvel[-1, 1, 0] - story.path.qvel[-1, 0, 0]
+    parting = story.trajectory.qvel[-1, 1, 0] - story.trajectory.qvel[-1, 0, 0]
     assert parting == pytest.approx(-rate, rel=0.1)
     assert story.contact_force.max() == pytest.approx(peak, rel=0.05)
-    assert story.path.qvel[-1, :, 0].sum() == pytest.approx(10.0, rel=0.02)
+    assert story.trajectory.qvel[-1, :, 0].sum() == pytest.approx(10.0, rel=0.02)
 
 
 def test_near_misses_and_hits_are_told_apart(entry):
@@ -179,7 +180,7 @@ def test_mechanics_are_those_of_rigid_bodies(entry):
     car, solver = cars.read_parameters(entry)
     rig = mujoco_c.make_encounter(car, solver, engines.touch(entry, impedance=0.5), physics_dt=1 / 120, iterations=1, line_search=1)
     mujoco_c.place(rig, rig.model.qpos0[:17], np.array([[0.0, 3.0], [0.0, -2.0]]), np.zeros(2), np.array([10.0, 4.0]))
-    found = mujoco_c.mechanics(rig, rig.qpos.copy(), rig.qvel.copy())
+    found = mujoco_c.compute_mechanics(rig, rig.qpos.copy(), rig.qvel.copy())
     mass = rig.model.body_subtreemass[0] / 2
     np.testing.assert_allclose(found.momentum[:2], [14 * mass, 0], atol=1e-6)
     np.testing.assert_allclose(found.angular_momentum[2], (-3 * 10 + 2 * 4) * mass, rtol=1e-6)
@@ -190,9 +191,9 @@ def test_mechanics_are_those_of_rigid_bodies(entry):
 def test_places_of_the_wheels_rates():
     dynamics = load_config("task", "dynamics=articulated")["dynamics"]
     car, solver = cars.CarParameters(**dynamics["car"]), cars.Solver(**dynamics["solver"])
-    model = cars.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    model = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
     assert isinstance(model, mujoco.MjModel)
-    np.testing.assert_array_equal(cars.find_addresses(model).spin_v, equivalence.SPIN)
+    np.testing.assert_array_equal(models.find_addresses(model).spin_v, equivalence.SPIN)
 
 
 def test_drives_are_seeded_and_cover_their_ranges():
@@ -226,12 +227,12 @@ def test_encounters_meet_when_they_should(entry):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"speed_max": 0.5}, "speed_max: 0.5; wanted is a number above 1"),
-        ({"closing_min": 25.0}, "speed_max: 20; wanted is a number above 25"),
+        ({"speed_max": 0.5}, "speed_max: expected a number > 1, got 0.5"),
+        ({"closing_min": 25.0}, "speed_max: expected a number > 25, got 20"),
         ({"closing_min": -1.0}, "closing_min"),
-        ({"lead_max_s": 0.1}, "lead_max_s: 0.1; wanted is a number of at least 0.3"),
+        ({"lead_max_s": 0.1}, "lead_max_s: expected a number >= 0.3, got 0.1"),
         ({"friction_max": 0.01}, "friction_max"),
-        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+        ({"count": 0}, "count: expected a number >= 1, got 0"),
     ],
 )
 def test_encounters_that_cannot_be_are_refused(changes, named):
@@ -243,11 +244,11 @@ def test_encounters_that_cannot_be_are_refused(changes, named):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"hold_min_s": 0.0}, "hold_min_s: 0; wanted is a number above 0"),
-        ({"hold_min_s": 2.0}, "hold_max_s: 1; wanted is a number of at least 2"),
+        ({"hold_min_s": 0.0}, "hold_min_s: expected a number > 0, got 0"),
+        ({"hold_min_s": 2.0}, "hold_max_s: expected a number >= 2, got 1"),
         ({"friction_max": 0.01}, "friction_max"),
         ({"speed_max": -1.0}, "speed_max"),
-        ({"count": 0}, "count: 0; wanted is a number of at least 1"),
+        ({"count": 0}, "count: expected a number >= 1, got 0"),
     ],
 )
 def test_drives_that_cannot_be_are_refused(changes, named):

@@ -9,10 +9,10 @@ import pytest
 from experiments.validation import engines, friction_patches, motion_laws, random_drives, target_check
 from experiments.validation import run as command
 from experiments.validation import validation_report as report
+from experiments.validation.measurements import spread_cases
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.parallel.process_pool import make_task_map
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
 G = 9.81
@@ -57,7 +57,7 @@ def test_locked_stops_are_the_tyres_limit_and_others_the_brakes(drive, car):
 
 
 def test_the_brakes_limit_solves_its_equation(car):
-    inertia = motion_laws.mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
+    inertia = motion_laws.total_mass(car) + 4 * car.wheel_inertia[0] / car.wheel_radius**2
     speed, way, dt = 15.0, 0.0, 1e-4
     while speed > 0.0:
         way += speed * dt
@@ -65,7 +65,7 @@ def test_the_brakes_limit_solves_its_equation(car):
         force = (torque + 4 * car.rolling_torque) / car.wheel_radius + car.air_drag * speed**2
         speed -= force / inertia * dt
     assert motion_laws.brake_limit_m(car, 15.0) == pytest.approx(way, rel=1e-3)
-    assert motion_laws.mass(car) == pytest.approx(1980.03, abs=0.01)
+    assert motion_laws.total_mass(car) == pytest.approx(1980.03, abs=0.01)
 
 
 def test_braked_cars_stand(drive):
@@ -168,7 +168,7 @@ def test_pieces_do_not_matter(drive, entry):
 
 @pytest.mark.slow
 def test_ice_pushes_wide_and_splits(entry):
-    grip = load_config("task")["weather"]["grip"]
+    grip = load_config("task")["weather"]["friction"]
     options = dict(bend_speed=11.0, bend_steer=0.25, bend_seconds=3.0, ahead_m=12.0, radius_m=7.0, split_speed=8.0, split_seconds=1.0)
     found = friction_patches.patches(entry, grip, **RATES, **options)
     wide = np.array(found["bend"]["wide_m"])
@@ -237,8 +237,8 @@ def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, caps
 def test_bad_parts_and_numbers_are_refused_by_name(tmp_path):
     for override, message in {
         "parts=[lawz]": "parts: 'lawz'; valid: drives, settings, encounters, laws, extremes, faults, costs",
-        "workers=0": "workers: 0; wanted is at least 1",
-        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: 'fast' is of type str, wanted float",
+        "workers=0": "workers: expected an integer >= 1, got 0",
+        "validation.drives.draw.speed_max=fast": "validation.drives.draw.speed_max: expected a number, got 'fast'",
         "validation.drives.draw.seconds=0.4": "validation.drives.draw.seconds: 0.4; at least 0.5, validation.bound.horizon_s",
     }.items():
         with pytest.raises(ConfigError, match=message):
@@ -273,7 +273,7 @@ def square(cases):
 
 def test_cases_spread_over_processes_come_back_in_order():
     cases = motion_laws.held([0.1] * 5, np.arange(5.0), motion_laws.COAST, steps=1)
-    with make_task_map(1) as here, make_task_map(2) as there:
+    with spread_cases(1) as here, spread_cases(2) as there:
         np.testing.assert_array_equal(here(square, cases).qpos, there(square, cases).qpos)
 
 

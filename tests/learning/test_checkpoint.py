@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.probes import NUMBERS, SMALL, probe, scenes
+from support.probes import SMALL, make_trainer, probe, scenes
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration
+from scenefactory_jax.learning.trainer import get_policy_parameters
 
 STAGE = 4
 
@@ -20,9 +20,8 @@ STAGE = 4
 def fresh():
     """A trainer of its own, as in a new process."""
     env = probe(life=3, episode_steps=20)
-    numbers = {**NUMBERS, "horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 20}
-    numbers["average"] = 0.5
-    return train_iteration.make_trainer(env, late_fusion.make(**SMALL), **numbers)
+    numbers = {"horizon": 8, "epochs": 2, "minibatches": 2, "desired_kl": 0.01, "stagger_episodes": True, "parameter_ema_decay": 0.5}
+    return make_trainer(env, episode_steps=20, **numbers)
 
 
 def begin(trainer):
@@ -49,10 +48,10 @@ def saved(trainer, tmp_path_factory):
     folder, train_state, stage = tmp_path_factory.mktemp("run") / "checkpoints", begin(trainer), scenes(STAGE)
     assert checkpoint.latest(folder) is None
     for _ in range(3):
-        train_state, _ = trainer.iterate(train_state, stage)
+        train_state, _ = trainer.train_iteration(train_state, stage)
         checkpoint.save(folder, train_state, keep=2)
     third = jax.tree.map(jnp.copy, train_state)
-    return folder, third, trainer.iterate(train_state, stage)[0]
+    return folder, third, trainer.train_iteration(train_state, stage)[0]
 
 
 def test_the_newest_are_kept(saved):
@@ -67,7 +66,7 @@ def test_going_on_from_disk_is_going_on(saved):
     other = fresh()
     train_state = checkpoint.restore(folder, third, 2)
     for _ in range(2):
-        train_state, _ = other.iterate(train_state, scenes(STAGE))
+        train_state, _ = other.train_iteration(train_state, scenes(STAGE))
     assert_same(train_state, unbroken)
 
 
@@ -83,8 +82,8 @@ def test_restore_is_exact_in_every_array(saved, trainer):
 def test_parameters_alone_drive_a_policy(saved):
     folder, third, _ = saved
     parameters = checkpoint.restore_parameters(folder)
-    assert_same(parameters, third.averaged)
-    mean, _, _ = late_fusion.make(**SMALL).apply(parameters, third.observation)
+    assert_same(parameters, third.ema_parameters)
+    mean, _, _ = late_fusion.make(**SMALL).apply(parameters, third.worlds.observation)
     assert mean.shape == (STAGE, 3, 3)
 
 
@@ -92,21 +91,21 @@ def test_what_is_judged_is_the_running_mean(saved, trainer):
     folder, third, fourth = saved
     second = checkpoint.restore(folder, begin(trainer), 2)
     for before, after in ((second, third), (third, fourth)):
-        wanted = jax.tree.map(lambda old, new: 0.5 * old + 0.5 * new, before.averaged, after.parameters)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.averaged, wanted)
-        assert any((a != b).any() for a, b in zip(jax.tree.leaves(after.averaged), jax.tree.leaves(after.parameters), strict=True))
-    assert_same(train_iteration.parameters_of(fourth), fourth.averaged)
-    alone = dataclasses.replace(third, averaged=None)
-    assert_same(train_iteration.parameters_of(alone), third.parameters)
+        wanted = jax.tree.map(lambda old, new: 0.5 * old + 0.5 * new, before.ema_parameters, after.parameters)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.ema_parameters, wanted)
+        assert any((a != b).any() for a, b in zip(jax.tree.leaves(after.ema_parameters), jax.tree.leaves(after.parameters), strict=True))
+    assert_same(get_policy_parameters(fourth), fourth.ema_parameters)
+    alone = dataclasses.replace(third, ema_parameters=None)
+    assert_same(get_policy_parameters(alone), third.parameters)
 
 
 def test_a_run_without_a_mean_is_saved_and_restored(saved, tmp_path):
     folder, third, _ = saved
-    alone = dataclasses.replace(third, averaged=None)
+    alone = dataclasses.replace(third, ema_parameters=None)
     checkpoint.save(tmp_path, alone, keep=1)
     assert_same(checkpoint.restore(tmp_path, alone), alone)
     assert_same(checkpoint.restore_parameters(tmp_path), third.parameters)
-    with pytest.raises(ConfigError, match=r"has an array averaged/params/actor/.*, config wants none"):
+    with pytest.raises(ConfigError, match=r"has an array ema_parameters/params/actor/.*, config expects none"):
         checkpoint.restore(folder, alone)
 
 
@@ -122,10 +121,10 @@ def put(file, content):
 
 
 DAMAGE = {
-    "a manifest cut short": ("parameters/manifest.ocdbt", lambda file: put(file, file.read_bytes()[:20]), "is not as it was written"),
-    "metadata cut short": ("averaged/_METADATA", lambda file: put(file, file.read_bytes()[:99]), "is not as it was written"),
-    "a flipped bit": ("rest/ocdbt.process_0/d/*", lambda file: put(file, flipped(file.read_bytes())), "is not as it was written"),
-    "a lost file": ("averaged/d/*", lambda file: file.unlink(), "is missing"),
+    "a manifest cut short": ("parameters/manifest.ocdbt", lambda file: put(file, file.read_bytes()[:20]), "has changed since"),
+    "metadata cut short": ("ema_parameters/_METADATA", lambda file: put(file, file.read_bytes()[:99]), "has changed since it was written"),
+    "a flipped bit": ("rest/ocdbt.process_0/d/*", lambda file: put(file, flipped(file.read_bytes())), "has changed since it was written"),
+    "a lost file": ("ema_parameters/d/*", lambda file: file.unlink(), "is missing"),
     "the digests cut short": (checkpoint.SUMS, lambda file: put(file, file.read_bytes()[:30]), "is cut short"),
 }
 
@@ -145,19 +144,17 @@ def test_damage_is_named_and_the_one_before_goes_on(saved, tmp_path, pattern, da
     for read in (lambda: checkpoint.restore(tmp_path, third), lambda: checkpoint.restore_parameters(tmp_path)):
         with pytest.raises(ConfigError) as caught:
             read()
-        where = f"{tmp_path / '3'}: damaged: {file.relative_to(tmp_path / '3').as_posix()} {told}; checkpoint 2 before it is whole: remove"
-        assert str(caught.value).startswith(where) and "\n" not in str(caught.value)
+        where = f"{tmp_path / '3'}: damaged: {file.relative_to(tmp_path / '3').as_posix()} {told}"
+        assert str(caught.value).startswith(where) and "; checkpoint 2 before it is complete: remove" in str(caught.value)
+        assert "\n" not in str(caught.value)
     shutil.rmtree(tmp_path / "3")  # what the message says
     assert int(checkpoint.restore(tmp_path, third).iteration) == 2
 
 
-def test_a_checkpoint_without_digests_is_read_and_its_damage_is_named(saved, tmp_path):
-    folder, third, _ = saved
-    shutil.copytree(folder / "3", tmp_path / "3")
-    (tmp_path / "3" / checkpoint.SUMS).unlink()  # of an older version
-    assert_same(checkpoint.restore(tmp_path, third), third)
-    put(tmp_path / "3" / "averaged" / "_METADATA", b"{")
-    with pytest.raises(ConfigError, match=r"3: damaged: .*the folder holds no whole checkpoint before it: restore it from a copy"):
+def test_a_checkpoint_without_digests_is_damaged(saved, tmp_path):
+    shutil.copytree(saved[0] / "3", tmp_path / "3")
+    (tmp_path / "3" / checkpoint.SUMS).unlink()
+    with pytest.raises(ConfigError, match=r"3: damaged: SHA256SUMS is missing; the folder has no complete checkpoint before it"):
         checkpoint.restore_parameters(tmp_path)
 
 
@@ -166,13 +163,11 @@ def test_what_was_handed_on_has_a_digest(saved, tmp_path):
     file = checkpoint.write_parameters(tmp_path, parameters)
     assert_same(checkpoint.restore_parameters(tmp_path), parameters)
     put(file, flipped(file.read_bytes()))
-    with pytest.raises(ConfigError, match=r"policy\.npz: damaged: policy\.npz is not as it was written; restore it from a copy"):
+    with pytest.raises(ConfigError, match=r"policy\.npz: damaged: policy\.npz has changed since it was written; restore it from a copy"):
         checkpoint.restore_parameters(tmp_path)
-    (tmp_path / checkpoint.SUMS).unlink()
-    for content in (b"", file.read_bytes()[:500], file.read_bytes()):
-        put(file, content)
-        with pytest.raises(ConfigError, match=r"policy\.npz: damaged: "):
-            checkpoint.restore_parameters(tmp_path)
+    file.write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"policy\.npz: damaged: "):
+        checkpoint.restore_parameters(tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # orbax leaves its other writes unawaited
@@ -183,7 +178,7 @@ def test_a_full_disk_leaves_the_checkpoints_before_it(saved, tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1500, before[1]))
     try:
-        with pytest.raises(OSError, match="File too large; checkpoint 3 is whole: with resume=true training goes on from it") as caught:
+        with pytest.raises(OSError, match="File too large; checkpoint 3 is complete: with resume=true training goes on from it") as caught:
             checkpoint.save(tmp_path, fourth, keep=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -199,7 +194,7 @@ def test_mistakes_are_named(saved, tmp_path):
         checkpoint.restore_parameters(tmp_path)
     with pytest.raises(FileNotFoundError, match="no checkpoint of iteration 7; there are 2, 3"):
         checkpoint.restore(folder, third, 7)
-    with pytest.raises(ConfigError, match="keep: 0"):
+    with pytest.raises(ConfigError, match="keep: expected an integer >= 1, got 0"):
         checkpoint.save(folder, third, keep=0)
 
 
@@ -207,22 +202,24 @@ def test_a_checkpoint_of_another_config_is_refused_by_name(saved):
     folder, third, _ = saved
 
     def with_policy(**sizes):
-        parameters = jax.jit(late_fusion.make(**{**SMALL, **sizes}).init)(jax.random.key(0), third.observation)
-        return dataclasses.replace(third, parameters=parameters, lives=jax.tree.map(lambda x: x[:2], third.lives))
+        parameters = jax.jit(late_fusion.make(**{**SMALL, **sizes}).init)(jax.random.key(0), third.worlds.observation)
+        stats = jax.tree.map(lambda x: x[:2], third.worlds.episode_stats)
+        return dataclasses.replace(third, parameters=parameters, worlds=dataclasses.replace(third.worlds, episode_stats=stats))
 
-    wider = r"checkpoint has parameters/params/actor/vector/layer_0/kernel \(1, 16\), config wants \(1, 24\)"
+    wider = r"checkpoint has parameters/params/actor/vector/layer_0/kernel \(1, 16\), config expects \(1, 24\)"
     with pytest.raises(ConfigError, match=wider) as caught:
         checkpoint.restore(folder, with_policy(vector=[24]))
-    assert "lives" not in str(caught.value)  # a consequence, not the cause
-    with pytest.raises(ConfigError, match="has no parameters/params/actor/vector/layer_1/bias, config wants one"):
+    assert "episode_stats" not in str(caught.value)  # a consequence, not the cause
+    with pytest.raises(ConfigError, match="has no array parameters/params/actor/vector/layer_1/bias, config expects one"):
         checkpoint.restore(folder, with_policy(vector=[16, 16]))
-    with pytest.raises(ConfigError, match=r"checkpoint has lives/returns \(4, 3\), config wants \(2, 3\)"):
+    with pytest.raises(ConfigError, match=r"checkpoint has worlds/episode_stats/returns \(4, 3\), config expects \(2, 3\)"):
         checkpoint.restore(folder, with_policy())
 
 
 def test_empty_arrays_and_half_precision_survive(saved, tmp_path):
     _, third, _ = saved
-    odd = dataclasses.replace(third, observation={"none": jnp.zeros((STAGE, 3, 0)), "half": jnp.ones((STAGE, 3), jnp.bfloat16)})
+    observation = {"none": jnp.zeros((STAGE, 3, 0)), "half": jnp.ones((STAGE, 3), jnp.bfloat16)}
+    odd = dataclasses.replace(third, worlds=dataclasses.replace(third.worlds, observation=observation))
     checkpoint.save(tmp_path, odd, keep=1)
     assert_same(checkpoint.restore(tmp_path, odd), odd)
 
@@ -236,6 +233,6 @@ def test_a_stripped_checkpoint_drives_but_does_not_go_on(saved, trainer, tmp_pat
     assert sum(file.stat().st_size for file in (tmp_path / "run").rglob("*")) < 0.5 * before
     assert_same(checkpoint.restore_parameters(tmp_path / "run"), whole)
     listed = (tmp_path / "run" / "3" / checkpoint.SUMS).read_text()
-    assert "averaged/_METADATA\n" in listed and "rest/" not in listed
-    with pytest.raises(ConfigError, match="was stripped to what the policy learnt; training cannot go on"):
+    assert "ema_parameters/_METADATA\n" in listed and "rest/" not in listed
+    with pytest.raises(ConfigError, match="has parameters only; training cannot go on"):
         checkpoint.restore(tmp_path / "run", begin(trainer))

@@ -8,14 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.scipy.stats import norm
-from support.probes import NUMBERS, PRESENT, SMALL, probe, scenes
+from support.probes import NUMBERS, PRESENT, SMALL, make_trainer, ppo_config, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core import schema
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Env
+from scenefactory_jax.learning import gaussian, rollout
 from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import gae, loss, rollout, train_iteration, update
+from scenefactory_jax.learning.ppo import gae, loss, minibatches, train_iteration
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.ppo.train_iteration import PPO
+from scenefactory_jax.learning.trainer import TrainState, count_spawned_steps
 
 T, W, A = 12, 2, 3
 WORLDS = 8
@@ -51,14 +56,14 @@ def test_gaussians_agree_with_their_definitions():
     action, mean, other = jax.random.normal(jax.random.key(1), (3, 4, 3))
     log_std, log_std_old = jnp.array([-0.5, 0.0, 0.4]), jnp.array([-0.2, 0.1, 0.3])
     wanted = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
-    np.testing.assert_allclose(loss.log_probability(action, mean, log_std), wanted, rtol=1e-5)
+    np.testing.assert_allclose(gaussian.log_probability(action, mean, log_std), wanted, rtol=1e-5)
 
     draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
-    own = loss.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
-    difference = own - loss.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
-    np.testing.assert_allclose(loss.kl_divergence(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
-    np.testing.assert_allclose(loss.gaussian_entropy(log_std_old), -own.mean(), rtol=0.01)
-    assert float(jnp.abs(loss.kl_divergence(mean, log_std, mean, log_std)).max()) == 0.0
+    own = gaussian.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
+    difference = own - gaussian.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
+    np.testing.assert_allclose(gaussian.kl_divergence(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
+    np.testing.assert_allclose(gaussian.entropy(log_std_old), -own.mean(), rtol=0.01)
+    assert float(jnp.abs(gaussian.kl_divergence(mean, log_std, mean, log_std)).max()) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +79,7 @@ def batch():
         observation=observation,
         action=action,
         mean=old,
-        log_probability=loss.log_probability(action, old, log_std),
+        log_probability=gaussian.log_probability(action, old, log_std),
         value=value + 0.3 * jax.random.normal(keys[4], value.shape),
         advantage=jax.random.normal(keys[5], value.shape),
         returns=jax.random.normal(keys[6], value.shape),
@@ -85,8 +90,8 @@ def batch():
 
 def test_loss_equals_its_definition(batch):
     policy, parameters, samples, log_std_old = batch
-    numbers = dict(clip=0.2, value_clip=0.2, entropy=0.01, value=0.5)
-    total, facts = loss.compute_loss(parameters, samples, log_std_old, policy=policy, **numbers)
+    config = ppo_config(ent_coef=0.01, vf_coef=0.5)
+    total, metrics = loss.compute_loss(parameters, samples, log_std_old, policy=policy, config=config)
     mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
     surrogates, values = [], []
     for i in np.flatnonzero(np.asarray(samples.weight)):
@@ -97,7 +102,7 @@ def test_loss_equals_its_definition(batch):
         values.append(max((estimate[i] - target) ** 2, (old + np.clip(estimate[i] - old, -0.2, 0.2) - target) ** 2))
     entropy = 3 * 0.5 * np.log(2 * np.pi * np.e) + log_std.sum()
     np.testing.assert_allclose(total, -np.mean(surrogates) + 0.5 * np.mean(values) - 0.01 * entropy, rtol=1e-4)
-    assert 0.0 < float(facts["clip_fraction"]) < 1.0
+    assert 0.0 < float(metrics["clip_fraction"]) < 1.0
 
 
 def test_samples_without_weight_change_nothing(batch):
@@ -110,9 +115,7 @@ def test_samples_without_weight_change_nothing(batch):
         advantage=jnp.where(empty, jnp.nan, samples.advantage),
         returns=jnp.where(empty, 1e6, samples.returns),
     )
-    gradient = jax.jit(
-        jax.grad(lambda p, b: loss.compute_loss(p, b, log_std, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)[0])
-    )
+    gradient = jax.jit(jax.grad(lambda p, b: loss.compute_loss(p, b, log_std, policy=policy, config=ppo_config(ent_coef=0.01))[0]))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
     normal, weight = loss.normalize_advantages(garbage.advantage, samples.weight), samples.weight
     np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
@@ -126,106 +129,94 @@ def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
     observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
     samples = unchecked(  # with the axis of time before that of worlds
         rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
-        done=jnp.zeros((T, W, A), bool), truncated=truncated,
+        terminated=jnp.zeros((T, W, A), bool), truncated=truncated,
     )  # fmt: skip
-    batch = train_iteration._batch(samples, none[0], gamma=0.9, gae_lambda=0.8, normalise_advantage=True, groups=1, axis=None)
+    batch = train_iteration.compute_batch(PPO(probe(), late_fusion.make(**SMALL), ppo_config()), samples, none[0])
     np.testing.assert_array_equal(batch.weight, np.ravel(active & ~truncated))
 
 
 def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
-    whole = update.split_minibatches(jax.random.key(5), weight, minibatches=4, size=24)
+    whole = minibatches.split_minibatches(jax.random.key(5), weight, minibatches=4, size=24)
     assert sorted(whole.reshape(-1).tolist()) == list(range(96))
     assert np.ptp(np.asarray(weight[whole].sum(1))) <= 1
-    part = update.split_minibatches(jax.random.key(5), weight, minibatches=4, size=12)
+    part = minibatches.split_minibatches(jax.random.key(5), weight, minibatches=4, size=12)
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
-def test_what_is_left_out_is_counted_group_by_group(batch):
+def test_what_is_left_out_is_counted_group_by_group():
     """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
+    weight = (jnp.arange(24) < 14).astype(jnp.float32)
+    assert float(minibatches.count_left_out(weight, size=12, groups=2, axis=None)) == pytest.approx(6 / 14)
+
+
+def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
+    """Two minibatches of 12."""
     policy, parameters, samples, log_std = batch
-    adam = update.make_optimizer(learning_rate=1e-3, max_grad_norm=1.0)
-    objective = functools.partial(loss.compute_loss, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
-    numbers = dict(loss=objective, optimiser=adam, rate=update.AdaptiveRate(None, 1e-5, 1e-2, None), epochs=1, minibatches=2, size=6)
-    samples = dataclasses.replace(samples, weight=(jnp.arange(24) < 14).astype(jnp.float32))
-    given = (parameters, adam.init(parameters), samples, log_std, jax.random.key(0), jnp.int32(0))
-    *_, facts = update.update_epochs(*given, **numbers, permute_each_epoch=False, groups=2)
-    assert float(facts["left_out"]) == pytest.approx(6 / 14)
-
-
-@pytest.fixture(scope="module")
-def learn(batch):
-    """Two minibatches of 12: (samples, numbers of the rate, iteration) -> (parameters, optimiser state, facts)."""
-    policy, parameters, _, log_std = batch
-    adam = update.make_optimizer(learning_rate=1e-3, max_grad_norm=1.0)
-    objective = functools.partial(loss.compute_loss, policy=policy, clip=0.2, value_clip=0.2, entropy=0.01, value=1.0)
-    numbers = dict(loss=objective, optimiser=adam, epochs=1, minibatches=2, size=12, permute_each_epoch=False)
-
-    @jax.jit
-    def run(samples, rate, iteration):
-        return update.update_epochs(parameters, adam.init(parameters), samples, log_std, jax.random.key(6), iteration, rate=rate, **numbers)
-
-    return lambda samples, *rate, iteration=0: run(samples, update.AdaptiveRate(*rate), iteration)
-
-
-def test_what_is_not_finite_moves_nothing_and_is_counted(batch, learn):
-    _, parameters, samples, _ = batch
+    ppo = PPO(probe(), policy, ppo_config(epochs=1, minibatches=2, desired_kl=0.01, learning_rate=1e-3, permutation="once"))
+    train_state = unchecked(TrainState, parameters=parameters, optimizer=ppo.optimizer.init(parameters), iteration=jnp.int32(0))
+    learn = jax.jit(lambda samples: train_iteration.update_epochs(ppo, train_state, samples, log_std, jax.random.key(6), size=12))
     broken = dataclasses.replace(samples, returns=samples.returns.at[1].set(jnp.nan))  # in one of the two minibatches
-    after, state, facts = learn(broken, 0.01, 1e-5, 1e-2)
-    assert float(facts["skipped"]) == 1.0 and int(state[-1].count) == 1
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, facts)))
+    after, state, metrics = learn(broken)
+    assert float(metrics["skipped"]) == 1.0 and int(state[-1].count) == 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, metrics)))
     assert any((a != b).any() for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(parameters), strict=True))
 
-    after, _, facts = learn(dataclasses.replace(samples, weight=jnp.zeros(24)), 0.01, 1e-5, 1e-2)
+    after, _, metrics = learn(dataclasses.replace(samples, weight=jnp.zeros(24)))
     jax.tree.map(np.testing.assert_array_equal, after, parameters)
-    assert float(facts["skipped"]) == 0.0
+    assert float(metrics["skipped"]) == 0.0
+
+    after, state, metrics = learn(samples)
+    rate = adapted(ppo.config, 1e-3, metrics["kl"], 1e-2)
+    assert float(metrics["learning_rate"]) == float(state[-1].hyperparams["learning_rate"]) != pytest.approx(1e-3)
+    assert float(rate) == pytest.approx(1.5e-3 if metrics["kl"] < 0.005 else 1e-3 / 1.5 if metrics["kl"] > 0.02 else 1e-3)
 
 
-def test_learning_rate_follows_the_divergence(batch, learn):
-    def rate(*numbers):
-        return float(learn(batch[2], *numbers)[2]["learning_rate"])
-
-    divergence = float(learn(batch[2], 1.0, 1e-5, 1e-2)[2]["kl"])
-    np.testing.assert_allclose(rate(divergence / 9, 1e-5, 1e-2), 1e-3 / 1.5**2, rtol=1e-5)  # once in each minibatch
-    np.testing.assert_allclose(rate(divergence, 1e-5, 1e-2), 1e-3, rtol=1e-5)
-    np.testing.assert_allclose(rate(divergence * 9, 1e-5, 1e-2), 1e-3 * 1.5**2, rtol=1e-5)
-    np.testing.assert_allclose(rate(divergence / 9, 9e-4, 1e-2), 9e-4, rtol=1e-5)
+def adapted(config, rate, kl, max_rate=1e-2):
+    return float(train_iteration.adapt_learning_rate(config, jnp.float32(rate), jnp.float32(kl), jnp.float32(max_rate)))
 
 
-def test_the_largest_learning_rate_falls_as_one_over_time(batch, learn):
-    """A half after `halved` iterations, a third after twice as many, never below the least; it bounds a rate that nothing adapts, too."""
+def test_learning_rate_follows_the_divergence():
+    config = ppo_config(learning_rate=1e-3, desired_kl=0.01)
+    rates = [adapted(config, 1e-3, kl, 1.2e-3) for kl in (0.0, 0.004, 0.006, 0.019, 0.021)]
+    np.testing.assert_allclose(rates, [1e-3, 1.2e-3, 1e-3, 1e-3, 1e-3 / 1.5], rtol=1e-5)
+    assert adapted(config, 1e-3, 0.001, 1e-2) == pytest.approx(1.5e-3)
+    low = ppo_config(learning_rate=1e-3, learning_rate_min=9e-4, desired_kl=0.01)
+    assert adapted(low, 1e-3, 0.1, 1e-2) == pytest.approx(9e-4)
+    assert adapted(ppo_config(), 1e-3, 9.0, 1e-4) == pytest.approx(1e-3)  # constant without `desired_kl`
 
-    def rate(iteration, *, halved=10.0, least=1e-5, desired_kl=1e3):
-        return float(learn(batch[2], desired_kl, least, 8e-4, halved, iteration=iteration)[2]["learning_rate"])
 
-    np.testing.assert_allclose([rate(0), rate(10), rate(20), rate(70)], [8e-4, 4e-4, 8e-4 / 3, 1e-4], rtol=1e-5)
-    np.testing.assert_allclose([rate(10**6), rate(10, halved=None), rate(30, desired_kl=None)], [1e-5, 8e-4, 2e-4], rtol=1e-5)
+def test_the_largest_learning_rate_falls_as_one_over_time():
+    """A half after `learning_rate_half_life` iterations, a third after twice as many; it bounds a rate that nothing adapts, too."""
+    config = ppo_config(learning_rate=8e-4, learning_rate_max=8e-4, learning_rate_half_life=10.0)
+    rates = [float(train_iteration.max_learning_rate(config, jnp.int32(iteration))) for iteration in (0, 10, 20, 70, 10**6)]
+    np.testing.assert_allclose(rates, [8e-4, 4e-4, 8e-4 / 3, 1e-4, 1e-5], rtol=1e-5)
+    assert train_iteration.max_learning_rate(ppo_config(), jnp.int32(10)) == NUMBERS["learning_rate_max"]
+    assert adapted(config, 8e-4, 0.0, 2e-4) == pytest.approx(2e-4)
 
 
 def counted(env: Env):
     """The environment, and how often its transition was traced."""
     traces = []
 
-    def transition(scene, state, action):
+    def control_step(scene, state, action):
         traces.append(1)
-        return env.transition(scene, state, action)
+        return env.control_step(scene, state, action)
 
-    return env._replace(transition=transition), traces
+    return env._replace(control_step=control_step), traces
 
 
 @pytest.fixture(scope="module")
 def course():
     """Agents who would live 5 steps in worlds of 4: all run out of time."""
     env, traces = counted(probe(life=5, episode_steps=4))
-    return train_iteration.make_trainer(
-        env, late_fusion.make(**SMALL), **{**NUMBERS, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 4}
-    ), traces
+    return make_trainer(env, episode_steps=4, desired_kl=0.01, stagger_episodes=True), traces
 
 
 def run(trainer, stage, iterations, seed=0):
     train_state, history = trainer.init(jax.random.key(seed), stage), []
     for _ in range(iterations):
-        train_state, metrics = trainer.iterate(train_state, stage)
+        train_state, metrics = trainer.train_iteration(train_state, stage)
         history.append(metrics)
     return train_state, history
 
@@ -236,55 +227,54 @@ def test_one_trace_same_seed_same_numbers_and_scenes_survive_donation(course):
     first, history = run(trainer, stage, 3)
     second, _ = run(trainer, stage, 3)
     other = jax.tree.map(lambda x: x + jnp.ones_like(x), stage)
-    trainer.iterate(second, other)
+    trainer.train_iteration(second, other)
     assert len(traces) <= 2  # the scan traces its body once, or twice to settle the carry; never again in later iterations
     stage.agents.position.block_until_ready()
     again, _ = run(trainer, stage, 3)
     same = jax.tree.map(lambda a, b: bool((a == b).all()), (first.parameters, first.worlds), (again.parameters, again.worlds))
     assert all(jax.tree.leaves(same))
     assert all(bool(jnp.isfinite(value)) for metrics in history for value in metrics.values())
-    assert train_iteration.spawned_steps(first) == 3 * 16 * WORLDS * int(PRESENT.sum()) and int(first.iteration) == 3
+    assert count_spawned_steps(first) == 3 * 16 * WORLDS * int(PRESENT.sum()) and int(first.iteration) == 3
 
 
 def test_metrics_count_what_happened(course):
     trainer, _ = course
     _, history = run(trainer, scenes(WORLDS), 2)
     metrics = {name: float(value) for name, value in history[-1].items()}
-    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["share/active"] == 1.0
+    assert metrics["steps/spawned"] == 16 * WORLDS * 2 and metrics["active_fraction"] == 1.0
     assert metrics["reward"] == pytest.approx(metrics["reward/paid"]) and -4.0 < metrics["reward"] < 0.0
-    assert metrics["count/lives"] == 16 * WORLDS * 2 / 4 and metrics["life/steps"] == 4.0  # worlds end before the agents do
-    assert metrics["life/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
+    assert metrics["count/episodes"] == 16 * WORLDS * 2 / 4 and metrics["episode/steps"] == 4.0  # worlds end before the agents do
+    assert metrics["episode/return"] == pytest.approx(4 * metrics["reward"], abs=0.3)
     assert metrics["events/goal_reached"] == 0.0 and metrics["speed"] == 2.0 and metrics["ppo/skipped"] == 0.0
 
 
 @pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
 def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
-    env, policy, stage = probe(life=life, episode_steps=length)._replace(hold=3), late_fusion.make(**SMALL), scenes(2, 1)
-    worlds = jax.vmap(env.start)(jax.random.split(jax.random.key(0), 2), stage)
+    env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
+    worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
     seen = jax.vmap(env.observe)(stage, worlds)
     parameters = policy.init(jax.random.key(1), seen)
-    begin = (stage, worlds, seen, rollout.make_empty_episode_stats(worlds), jax.random.key(2))
-    after, _, lives, samples, tally, record = jax.jit(functools.partial(rollout.collect_rollout, env, policy, horizon=4))(
-        parameters, *begin
-    )
+    begin = rollout.Worlds(worlds, seen, rollout.make_empty_episode_stats(worlds))
+    collect = jax.jit(functools.partial(rollout.collect_rollout, env, policy, horizon=4))
+    after, samples, tally, record = collect(parameters, stage, begin, jax.random.key(2))
     lived = min(life, length)
     held = samples.active[..., :2]
     assert held.all() and not samples.active[..., 2].any()
     np.testing.assert_array_equal(samples.reward[:, 0, 0], [3, lived - 3, 3, lived - 3])
     assert float(samples.reward[..., 2].sum()) == 0.0
     ends = np.array([False, True, False, True])
-    assert (samples.done[..., 0] == (ends & (life < length))[:, None]).all() and not samples.done[..., 2].any()
+    assert (samples.terminated[..., 0] == (ends & (life < length))[:, None]).all() and not samples.terminated[..., 2].any()
     assert (samples.truncated[..., 1] == (ends & (life > length))[:, None]).all()
     assert {name: float(tally[name]) for name in ("spawned", "active", "ended", "length", "return")} == {
         "spawned": 2 * 2 * 12, "active": 2 * 2 * 2 * lived, "ended": 8, "length": 8 * lived, "return": 8 * lived}  # fmt: skip
-    assert record.episodes.tolist() == [4, 4] and not lives.steps.any() and (after.step == 0).all()
+    assert record.episodes.tolist() == [4, 4] and not after.episode_stats.steps.any() and (after.state.step == 0).all()
 
 
 def test_worlds_begin_where_an_action_is_read():
-    env = probe(life=5, episode_steps=12)._replace(hold=3)
-    trainer = train_iteration.make_trainer(env, late_fusion.make(**SMALL), **{**NUMBERS, "stagger_episodes": True, "episode_steps": 12})
-    steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.step)
+    env = probe(life=5, episode_steps=12)._replace(action_repeat=3)
+    trainer = make_trainer(env, episode_steps=12, stagger_episodes=True)
+    steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.state.step)
     assert set(steps.tolist()) == {0, 3, 6, 9}
 
 
@@ -295,35 +285,32 @@ def test_restart_keeps_what_was_learnt(course):
     learnt = jax.tree.map(np.asarray, train_state.parameters)
     train_state = trainer.restart(train_state, stage)
     jax.tree.map(np.testing.assert_array_equal, learnt, train_state.parameters)
-    assert len(set(train_state.worlds.step.tolist())) > 1 and not train_state.lives.steps.any()  # at random phases of 4 steps
+    assert (
+        len(set(train_state.worlds.state.step.tolist())) > 1 and not train_state.worlds.episode_stats.steps.any()
+    )  # at random phases of 4 steps
 
 
 def test_mistakes_are_named():
-    env, policy = probe(), late_fusion.make(**SMALL)
     with pytest.raises(ConfigError, match=r"16 x 8 worlds x 3 agents = 384 samples .* 7 minibatches"):
-        train_iteration.make_trainer(env, policy, **{**NUMBERS, "minibatches": 7}).init(jax.random.key(0), scenes(WORLDS))
-    with pytest.raises(ConfigError, match=r"ppo\.gamma: 1\.5"):
-        train_iteration.make_trainer(env, policy, **{**NUMBERS, "gamma": 1.5})
-    with pytest.raises(ConfigError, match=r"ppo\.learning_rate: 1\.0 is outside"):
-        train_iteration.make_trainer(env, policy, **{**NUMBERS, "learning_rate": 1.0})
-    wrong = {"desired_kl": -0.01, "value_clip": 0.0, "entropy": float("nan"), "value": -1.0, "max_grad_norm": 0.0}
-    for name, value in wrong.items():
-        with pytest.raises(ConfigError, match=rf"ppo\.{name}: {value:g}; wanted is a .*number"):
-            train_iteration.make_trainer(env, policy, **{**NUMBERS, name: value})
+        make_trainer(probe(), minibatches=7).init(jax.random.key(0), scenes(WORLDS))
+    with pytest.raises(ConfigError, match=r"ppo\.learning_rate: expected a number in .* = \[1e-05, 0.01\], got 1\.0"):
+        ppo_config(learning_rate=1.0)
+    wrong = {"gamma": 1.5, "desired_kl": -0.01, "value_clip": 0.0, "ent_coef": float("nan"), "vf_coef": -1.0, "max_grad_norm": 0.0}
+    for name, value in {**wrong, "sample_fraction": 1.1, "horizon": 0, "epochs": 1.5, "permutation": "never"}.items():
+        with pytest.raises(ConfigError, match=rf"ppo\.{name}: expected .*, got {value!r}"):
+            ppo_config(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["published", "demo", "steady", "smoke"])
-def test_configs_build(name):
-    entry = {"_target_": "make_trainer", **configs.load_config("train", f"ppo={name}")["ppo"]}
-    trainer = instantiate(entry, builtins=train_iteration, where="ppo", episode_steps=100)(probe(), late_fusion.make(**SMALL))
-    assert trainer.iterate
+@pytest.mark.parametrize("name", ["paper", "demo", "steady", "smoke"])
+def test_configs_are_valid(name):
+    assert schema.read(configs.load_config("train", f"ppo={name}")["ppo"], PPOConfig, where="ppo").horizon > 0
 
 
 @pytest.fixture(scope="module")
 def probes():
     """One compiled trainer for all probes: task -> (action mean and value for cues, metrics of every iteration)."""
     policy = late_fusion.make(**SMALL)
-    trainer = train_iteration.make_trainer(probe(), policy, **{**NUMBERS, "sample_fraction": 0.75})  # two of three slots are spawned
+    trainer = make_trainer(probe(), sample_fraction=0.75)  # two of three slots are spawned
     apply = jax.jit(policy.apply)
 
     def train_on(task, iterations):

@@ -25,12 +25,12 @@ def test_a_policy_is_small_and_told_about(folder):
 def test_a_policy_learnt_on_generated_scenes(folder):
     scenes = hydra_config.read(folder)["scenes"]
     assert scenes["path"] is None and scenes["heldout"]["path"] is None
-    assert scenes["generate"]["_target_"].startswith("scenefactory_jax.scenes.") and scenes["seed"] != scenes["heldout"]["seed"]
+    assert scenes["generate"]["_target_"].startswith("scenefactory_jax.data.generators.") and scenes["seed"] != scenes["heldout"]["seed"]
 
 
 def test_town_drives_where_it_has_never_been(tmp_path, quickly):
     overrides = "overrides=[spawning=logged,weather=dry,scenes.heldout.count=2,timing.episode_s=12]"
-    plainly = ["protocol.ends=[strict]", "untrained=true", "video.enable=false", "failures.pictures.enable=false"]
+    plainly = ["protocol.termination=[strict]", "untrained=true", "video.enable=false", "failures.pictures.enable=false"]
     found = sf.evaluate(sf.load_config("evaluate", "run=town", f"out={tmp_path}", overrides, *plainly)).records
     records, before = found["strict"], found["strict, untrained"]  # which came with no checkpoint
     assert len(before["goal_reached"]) == len(records["goal_reached"]) and before["clean"].mean() < records["clean"].mean()
@@ -41,6 +41,6 @@ def test_town_drives_where_it_has_never_been(tmp_path, quickly):
 
 def test_figures_of_the_readme_are_those_of_the_card():
     rows = re.findall(r"^\| 64 held-out Waymo scenes \| goal_only \| 369 \| (.+) \|$", TOWN.read_text(), re.MULTILINE)
-    success, clean, _, collision, *_ = rows[0].split(" | ")
+    success, clean, *_ = rows[0].split(" | ")
     said = " ".join((ROOT / "README.md").read_text().split())
     assert f"it reaches the goal in {success}, without any other event in {clean}, and {collided} of its cars collide" in said

@@ -9,13 +9,11 @@ import sys
 import jax
 import numpy as np
 import pytest
-from support.probes import NUMBERS, SMALL, probe, scenes
+from support.probes import make_trainer, probe, scenes
 from support.running import ROOT
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration
 
 # compiles in half the time; what runs here runs for a moment, and all that is compared is compiled alike
 PLAIN = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -58,7 +56,8 @@ def test_more_devices_learn_the_same(found, devices):
 def test_scenes_pass_through_shared_out_worlds_without_compiling_again(found):
     """In which worlds other scenes were, the record tells: it counts from the swap on."""
     for (devices, _), one in found.items():
-        assert sorted(one["compiled"]) == (["jit(_iterate)", "jit(_swap)"] if devices == 1 else ["jit(exchanged)", "jit(spread)"])
+        prefix = "" if devices == 1 else "sharded_"
+        assert sorted(one["compiled"]) == [f"jit({prefix}{name})" for name in ("replace_scenes", "train_iteration")]
         latest, before, never = (np.asarray(one["record"])[rows] for rows in ([7, 3, 4, 6], [2, 5], [0, 1]))
         assert latest.max() < before.min() and before.max() < never.min()
 
@@ -80,10 +79,9 @@ def test_other_groups_learn_something_else(found):
 
 
 def test_mistakes_are_named():
-    env, policy = probe(), late_fusion.make(**SMALL)
-    with pytest.raises(ConfigError, match=r"ppo\.shards: 0"):
-        train_iteration.make_trainer(env, policy, **{**NUMBERS, "shards": 0})
-    with pytest.raises(ConfigError, match=r"worlds: 8 do not divide into 3 shards"):
-        train_iteration.make_trainer(env, policy, **{**NUMBERS, "shards": 3}).init(jax.random.key(0), scenes(8))
+    with pytest.raises(ConfigError, match=r"ppo\.shards: expected a multiple of 1 devices, got 0"):
+        make_trainer(probe(), shards=0)
+    with pytest.raises(ConfigError, match=r"worlds: expected a multiple of 3 shards, got 8"):
+        make_trainer(probe(), shards=3).init(jax.random.key(0), scenes(8))
     with pytest.raises(ConfigError, match=r"devices: 99; there are \d+"):
         sharding.make_mesh(99)

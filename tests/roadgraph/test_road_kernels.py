@@ -40,7 +40,7 @@ def cars(scenes):
     position[:, 0] = 1e4
     yaw = rng.uniform(-3.0, 3.0, (worlds, CARS)).astype(np.float32)
     size = np.broadcast_to(np.array([4.0, 2.0], np.float32), position.shape)
-    shape = {"radius_share": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
+    shape = {"radius_fraction": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
     circles, radius = jax.vmap(lambda *at: geometry.cover_with_circles(*at, **shape))(position, yaw, size)
     velocity = rng.normal(0.0, 6.0, position.shape).astype(np.float32)
     velocity[:, 2] = 0.0

@@ -18,15 +18,15 @@ WOMD = SHARED / "womd" / "test"
 PLACES = 256
 
 
-@pytest.fixture(scope="module", params=["procedural", "womd"])
+@pytest.fixture(scope="module", params=["streets", "womd"])
 def scenes(request):
     """Stacked scenes without cells."""
-    overrides = ["scenes.count=3", "scenes.cells.radius_m=null"]
+    overrides = ["scenes.count=3", "scenes.generate.kinds=[intersection]", "scenes.road_grid.radius_m=null"]
     if request.param == "womd":
         if not WOMD.is_dir():
             pytest.skip(f"no data at {WOMD}")
         first = sorted(WOMD.iterdir())[0]
-        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.cells.radius_m=null"]
+        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.road_grid.radius_m=null"]
     return scene_source.load_training_scenes(load_config("train", *overrides)["scenes"]).scene
 
 
@@ -48,7 +48,7 @@ def look(count):
         zeros = jnp.zeros(agents, jnp.float32)
         motion = Motion(
             position=jnp.concatenate([position, zeros[:, None]], axis=1), velocity=jnp.zeros((agents, 3)), yaw=0.1 * jnp.arange(agents),
-            **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "grip", "friction_utilization", "slip"), zeros),
+            **dict.fromkeys(("yaw_rate", "upright", "steer", "contact_force", "mu", "friction_utilization", "slip"), zeros),
         )  # fmt: skip
         state = type("State", (), {"motion": motion, "active": jnp.ones(agents, bool)})()
         return observations.road.__wrapped__(scene, state, count=count, radius_m=10.0, kind_scale=20.0, kernels=True)
@@ -85,6 +85,6 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
 
 
 def test_configs_look_as_far_as_their_observation():
-    assert load_config("train", "experiment=paper")["scenes"]["cells"]["radius_m"] == 10.0
-    assert load_config("train", "observations.road.radius_m=25")["scenes"]["cells"]["radius_m"] == 25
-    assert load_config("convert")["scenes"]["cells"]["radius_m"] is None
+    assert load_config("train", "experiment=paper")["scenes"]["road_grid"]["radius_m"] == 10.0
+    assert load_config("train", "observations.road.radius_m=25")["scenes"]["road_grid"]["radius_m"] == 25
+    assert load_config("convert")["scenes"]["road_grid"]["radius_m"] is None

@@ -54,7 +54,8 @@ FORMATS = (
 )  # fmt: skip
 QUICK = (
     "experiment=quick", *SMALL[1:], f"worlds={WORLDS}", "ppo.horizon=6", "ppo.epochs=1", "ppo.minibatches=2", "policy.vector=[16]",
-    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16", "traffic=log_playback", "weather=mixed",
+    "policy.rows.road=[16]", "policy.rows.neighbours=[16]", "policy.trunk=[16]", "observations.road.count=16",
+    "traffic=log_playback", "weather=mixed",
 )  # fmt: skip
 
 
@@ -137,7 +138,7 @@ def training(*overrides: str) -> Any:
     trainer, worlds = make_trainer(config, sf.make(config), make_policy(config)), scenes().scene
     state, rows = trainer.init(jax.random.key(0), worlds), []
     for _ in range(3):
-        state, row = trainer.iterate(state, worlds)
+        state, row = trainer.train_iteration(state, worlds)
         rows.append(jax.device_get(row))
     return rows, state.parameters
 
@@ -145,7 +146,8 @@ def training(*overrides: str) -> Any:
 def evaluation() -> Any:
     """The per-agent table of an untrained policy."""
     config, settings = sf.load_config("train", *SMALL, "timing.episode_s=4"), sf.load_config("evaluate", "run=none")
-    play = make_episode_runner(config, scenes(), protocol="goal_only", settings=settings, worlds=0, steps=0)
+    config["termination"] = sf.load_config("task", "termination=goal_only")["termination"]
+    play = make_episode_runner(config, scenes(), settings=settings, worlds=0)
     env = sf.make(config)
     observation = env.reset(jax.random.key(0), scenes()[0])[1]
     return play(make_policy(config).init(jax.random.key(0), observation))[0]
@@ -192,7 +194,9 @@ def towns() -> Any:
 
 CASES: dict[str, Callable[[], Any]] = {
     **{f"environment dynamics={name}": functools.partial(environment, f"dynamics={name}", *BUSY) for name in BACKENDS},
-    "environment by mjx.step": functools.partial(environment, "dynamics=articulated", "dynamics.solver.algorithm=Newton", *BUSY),
+    "environment by mjx.step": functools.partial(
+        environment, "dynamics=mjx", "dynamics.solver.iterations=6", "dynamics.solver.line_search=6", *BUSY
+    ),
     **{f"environment traffic={name}": functools.partial(environment, f"traffic={name}") for name in TRAFFIC},
     **{f"environment weather={name}": functools.partial(environment, f"weather={name}") for name in WEATHERS},
     "training smoke": functools.partial(training, *SMALL),

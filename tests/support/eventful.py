@@ -4,13 +4,14 @@ import functools
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from scenefactory_jax.core.raw_scene import Companion, Reject
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.formats import gpudrive
 
-plainly = functools.partial(gpudrive.read, step_s=0.1, current=10, headings="layout", height_m=1.5)
+plainly = functools.partial(gpudrive.read, step_s=0.1, current=10, heading_unit="layout", height_m=1.5, file_limit_mb=32)
 
 
 def read(path):
@@ -29,6 +30,11 @@ def read(path):
         yield from plainly(path)
 
 
+def _convert(folder, out, formats, options):
+    tools = replace(options["tools"], formats=formats)
+    conversion.convert(folder, out, spread=map, **options | {"tools": tools})
+
+
 def convert_until(number, folder, out, options):
     """Convert, and die before a file."""
     seen = []
@@ -39,18 +45,18 @@ def convert_until(number, folder, out, options):
         seen.append(Path(path))
         yield from plainly(path)
 
-    conversion.convert(folder, out, formats={"dying": reader}, spread=map, **options)
+    _convert(folder, out, {"dying": reader}, options)
 
 
 def convert_until_placed(number, folder, out, options):
     """Convert, and die when so many finished files have taken their places and the next is about to: shard, catalogue, index and so on."""
     place, placed = os.replace, []
 
-    def replace(*paths):
+    def replaced(*paths):
         if len(placed) == number:
             os.kill(os.getpid(), signal.SIGKILL)
         placed.append(paths)
         place(*paths)
 
-    os.replace = replace
-    conversion.convert(folder, out, formats={"plain": plainly}, spread=map, **options)
+    os.replace = replaced
+    _convert(folder, out, {"plain": plainly}, options)

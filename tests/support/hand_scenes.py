@@ -52,7 +52,7 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
         speed=jnp.zeros(count, jnp.float32) if speeds is None else jnp.asarray(speeds, jnp.float32),
         size=jnp.tile(jnp.asarray(size, jnp.float32), (count, 1)),
         goal=jnp.asarray(goals),
-        route=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
+        route_length=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
         present=jnp.ones(count, bool) if present is None else jnp.asarray(present, bool),
     )
     log = AgentLog(

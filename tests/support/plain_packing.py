@@ -11,7 +11,7 @@ import numpy as np
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
 from scenefactory_jax.data.packing import columns
-from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, OTHER_DROPS, PackReport, _centre, overlaps
+from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _centre, overlaps
 from scenefactory_jax.data.packing.validation import DUPLICATE_M, _some
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
 
@@ -98,7 +98,7 @@ def pack(
     log_from,
     require_agents,
     traffic,
-    others_least_m,
+    min_traffic_size_m,
 ):
     origin, centred_on = _centre(raw, centre)
     half = scene_size_m / 2
@@ -108,7 +108,7 @@ def pack(
     tracks = [raw.tracks[i] for i in chosen]
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, others_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, others_least_m)
+    beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
     leaves |= beside
     report = PackReport(
         name=raw.name,
@@ -120,8 +120,8 @@ def pack(
         track_ids=tuple(track.id for track in tracks),
         agents_kept=len(tracks),
         agents_dropped=dropped,
-        others_kept=len(beside["traffic_log.kind"]),
-        others_dropped=others_dropped,
+        traffic_kept=len(beside["traffic_log.kind"]),
+        traffic_dropped=traffic_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
@@ -227,7 +227,8 @@ def corners(centre, yaw, length, width):
 
 def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
     """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
-    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")} | {name: np.zeros(slots) for name in ("yaw", "speed", "route")}
+    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")}
+    rows |= {name: np.zeros(slots) for name in ("yaw", "speed", "route_length")}
     sizes = np.array([car_size_m or track.size[:2] for track in tracks], float).reshape(-1, 2)
     absent = car_size_m or (sizes.mean(axis=0) if len(sizes) else np.ones(2))
     size = np.concatenate([sizes, np.tile(absent, (slots - len(tracks), 1))])
@@ -238,7 +239,7 @@ def _agents(tracks, raw, origin, slots, car_size_m, start_speed):
         rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-        rows["route"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
+        rows["route_length"][slot] = max(length, np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(tracks)
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 
@@ -272,7 +273,7 @@ def _choose_others(raw, agents, leaves, origin, half, limit, least):
     rows = [leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")]
     boxes = np.array([corners(place, float(yaw), *size) for place, yaw, size in zip(*rows, strict=True)]).reshape(-1, 4, 2)
     starts = rows[0] if len(rows[0]) else np.zeros((1, 2))
-    dropped, candidates = dict.fromkeys(OTHER_DROPS, 0), []
+    dropped, candidates = dict.fromkeys(TRAFFIC_DROPS, 0), []
     for index in sorted(set(range(len(raw.tracks))) - set(agents)):
         track = raw.tracks[index]
         now = track.valid[raw.current :]

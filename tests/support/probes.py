@@ -9,7 +9,12 @@ import types
 import jax
 import jax.numpy as jnp
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.types import Env, Events, Motion, Scene, State, StepMetrics, StepResult
+from scenefactory_jax.learning.networks import late_fusion
+from scenefactory_jax.learning.ppo import train_iteration
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.trainer import Trainer
 from scenefactory_jax.weather.friction import make_uniform
 
 AGENTS = 3
@@ -30,15 +35,14 @@ NUMBERS = dict(
     learning_rate_half_life=None,
     gamma=0.9,
     gae_lambda=0.95,
-    clip=0.2,
+    clip_eps=0.2,
     value_clip=0.2,
-    entropy=0.0,
-    value=1.0,
+    ent_coef=0.0,
+    vf_coef=1.0,
     max_grad_norm=1.0,
-    normalise_advantage=True,
+    normalize_advantages=True,
     stagger_episodes=False,
-    average=None,
-    episode_steps=1000,
+    parameter_ema_decay=None,
     shards=None,
 )
 
@@ -70,6 +74,16 @@ def blank(cls, **known):
     return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
 
 
+def ppo_config(**changes) -> PPOConfig:
+    """The numbers above with changes, checked."""
+    return schema.read({**NUMBERS, **changes}, PPOConfig, where="ppo")
+
+
+def make_trainer(env: Env, *, episode_steps: int = 1000, mesh=None, **changes) -> Trainer:
+    """PPO with those numbers and the small network."""
+    return train_iteration.make_trainer(env, late_fusion.make(**SMALL), ppo_config(**changes), episode_steps=episode_steps, mesh=mesh)
+
+
 def scenes(worlds: int, task: int = 5) -> Scene:
     """Scenes that hold nothing but the number of a probe."""
     scene = blank(Scene, weather=make_uniform(jnp.float32(0.0), jnp.int32(task)))
@@ -95,7 +109,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
     def see(task, cue, age):
         return jnp.select([task == 2, task == 3, task == 5], [cue, age.astype(jnp.float32), cue], 0.0)
 
-    def start(key, scene, step=0):
+    def init_state(key, scene, step=0):
         cue_key, key = jax.random.split(key)
         return State(
             body=jax.random.rademacher(cue_key, (AGENTS,), jnp.float32),
@@ -104,34 +118,38 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
             weather=scene.weather,
             active=PRESENT,
             past_events=blank(Events),
-            age=jnp.zeros(AGENTS, jnp.int32),
+            steps_since_spawn=jnp.zeros(AGENTS, jnp.int32),
             previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
             step=jnp.asarray(step, jnp.int32),
             key=key,
         )
 
-    def transition(scene, state, action):
+    def control_step(scene, state, action):
         task = scene.weather.surface
-        paid = jnp.where(state.active, pay(task, state.body, jnp.clip(action, -1.0, 1.0), state.age), POISON)
-        done = state.active & (state.age + 1 >= (life or jnp.where(task == 3, 2, 1)))
+        paid = jnp.where(state.active, pay(task, state.body, jnp.clip(action, -1.0, 1.0), state.steps_since_spawn), POISON)
+        done = state.active & (state.steps_since_spawn + 1 >= (life or jnp.where(task == 3, 2, 1)))
         after = dataclasses.replace(
-            state, active=state.active & ~done, age=state.age + 1, step=state.step + 1, previous_action=jnp.clip(action, -1.0, 1.0)
+            state,
+            active=state.active & ~done,
+            steps_since_spawn=state.steps_since_spawn + 1,
+            step=state.step + 1,
+            previous_action=jnp.clip(action, -1.0, 1.0),
         )
         truncated = after.step >= episode_steps
         over = truncated | ~jnp.any(after.active)
         events = blank(Events, goal_reached=done)
-        facts = blank(StepMetrics, speed=jnp.where(state.active, 2.0, POISON))
-        return after, StepResult(None, paid, {"paid": paid}, events, done, truncated, over, facts)
+        metrics = blank(StepMetrics, speed=jnp.where(state.active, 2.0, POISON))
+        return after, StepResult(None, paid, {"paid": paid}, events, done, truncated, over, metrics)
 
     def observe(scene, state):
-        return {"cue": jnp.where(state.active, see(scene.weather.surface, state.body, state.age), 0.0)[:, None]}
+        return {"cue": jnp.where(state.active, see(scene.weather.surface, state.body, state.steps_since_spawn), 0.0)[:, None]}
 
     def reset(key, scene):
-        state = start(key, scene)
+        state = init_state(key, scene)
         return state, observe(scene, state)
 
     def step(scene, state, action):
-        state, outcome = transition(scene, state, action)
+        state, outcome = control_step(scene, state, action)
         return state, dataclasses.replace(outcome, observation=observe(scene, state))
 
-    return Env(reset, step, start, transition, observe, lambda scene, state: scene)
+    return Env(reset, step, init_state, control_step, observe, lambda scene, state: scene)

@@ -1,4 +1,4 @@
-"""Banks of scenes that tests make up: procedural ones, and pieces and copies of them."""
+"""Banks of scenes that tests make up: generated ones, and pieces and copies of them."""
 
 import functools
 from dataclasses import replace
@@ -9,21 +9,34 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.curation import features
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing.stack import stack
 
-PROCEDURAL = hydra_config.load_config("convert", "scenes=procedural")["scenes"]
+STREETS = hydra_config.load_config("convert", "scenes=streets")["scenes"]
 FEATURES = instantiate(hydra_config.load_config("scenes")["features"], builtins=features, where="features")
 
 
 @functools.cache
 def generated(index, seed=3):
-    """A procedural scene; the kinds take turns: straight, curve, T, crossing, roundabout, merge."""
-    builtins = "scenefactory_jax.data.generators.procedural.procedural_scene"
-    return instantiate(PROCEDURAL["generate"], builtins=builtins, where="scenes.generate")(seed, index)
+    """A generated scene; the kinds take turns: straight, curve, T, crossing, roundabout, motorway."""
+    builtins = "scenefactory_jax.data.generators.town.town_scene"
+    return instantiate(STREETS["generate"], builtins=builtins, where="scenes.generate")(seed, index)
 
 
 def banked(folder, raws, *, described=True):
     """A bank of scenes."""
     return banks.write(folder, raws, settings={"made": "up"}, features=FEATURES if described else None)
+
+
+def packed_scenes(bank, indices, **packing):
+    """Scenes of a bank, packed, and a reject in place of each that cannot be."""
+    return scene_source.pack_scenes(scene_source.open_bank(bank), indices, **packing)
+
+
+def stacked_scenes(bank, indices, *, capacity, check, pack, workers=1):
+    """Scenes of a bank, packed and stacked, and the report of what a capacity cut."""
+    packed = packed_scenes(bank, indices, check=check, pack=pack, workers=workers)
+    return stack([one.scene for one in packed], capacity=capacity)
 
 
 def moved(raw, by, **changes):
@@ -39,7 +52,8 @@ def rounded(raw, metres=0.01, **changes):
     rough = lambda xyz: np.round(xyz / metres) * metres  # noqa: E731
     roads = tuple(replace(line, xyz=rough(line.xyz)) for line in reversed(raw.roads))
     tracks = tuple(replace(track, xyz=rough(track.xyz)) for track in reversed(raw.tracks))
-    return replace(raw, roads=roads, tracks=tracks, **changes)
+    sdc = None if raw.sdc is None else len(tracks) - 1 - raw.sdc
+    return replace(raw, **{"roads": roads, "tracks": tracks, "sdc": sdc} | changes)
 
 
 def window(raw, x, side, **changes):

@@ -15,19 +15,19 @@ if len(sys.argv) > 2:
 import numpy as np
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.learning.networks import late_fusion
-from scenefactory_jax.learning.ppo import train_iteration
-from support.probes import NUMBERS, SMALL, probe, scenes
+from scenefactory_jax.learning.trainer import get_policy_parameters
+from support.probes import make_trainer, probe, scenes
 
 WORLDS = 8
-OURS = ("jit(_iterate)", "jit(_swap)", "jit(spread)", "jit(exchanged)")  # the first two on one device, the others on several
+COMPILED = ("train_iteration", "replace_scenes", "sharded_train_iteration", "sharded_replace_scenes")  # on one device, on several
+OURS = tuple(f"jit({name})" for name in COMPILED)
 
 
 def learn(devices, shards):
     """Parameters and metrics after three iterations, other scenes in half of the worlds between them; and what was compiled."""
     mesh = sharding.make_mesh(devices)
-    numbers = {**NUMBERS, "desired_kl": 0.01, "stagger_episodes": True, "episode_steps": 6, "sample_fraction": 0.75, "shards": shards}
-    trainer = train_iteration.make_trainer(probe(life=5, episode_steps=6), late_fusion.make(**SMALL), **numbers, mesh=mesh)
+    numbers = {"desired_kl": 0.01, "stagger_episodes": True, "sample_fraction": 0.75, "shards": shards}
+    trainer = make_trainer(probe(life=5, episode_steps=6), episode_steps=6, mesh=mesh, **numbers)
     stage = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS)), mesh)
     fresh = sharding.place_on_devices(jax.tree.map(np.asarray, scenes(WORLDS // 2, task=2)), mesh)
     compiled, history = [], []
@@ -40,13 +40,13 @@ def learn(devices, shards):
     state = trainer.init(jax.random.key(3), stage)
     for iteration in range(3):
         if iteration:
-            state, stage = trainer.swap(state, stage, np.array([5, 1, 2, 4]) + iteration, fresh)
-        state, metrics = trainer.iterate(state, stage)
+            state, stage = trainer.replace_scenes(state, stage, np.array([5, 1, 2, 4]) + iteration, fresh)
+        state, metrics = trainer.train_iteration(state, stage)
         history.append({name: float(value) for name, value in metrics.items()})
     jax.monitoring.unregister_event_duration_listener(note)
-    found = {"record": np.asarray(state.record.episodes).tolist(), "compiled": [name for name in compiled if name in OURS]}
+    found = {"record": np.asarray(state.scene_stats.episodes).tolist(), "compiled": [name for name in compiled if name in OURS]}
     state = trainer.restart(state, stage)
-    learnt = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(train_iteration.parameters_of(state))]
+    learnt = [np.asarray(leaf).ravel().tolist() for leaf in jax.tree.leaves(get_policy_parameters(state))]
     found |= {"devices": len(jax.devices()), "processes": jax.process_count()}
     return {"parameters": [*itertools.chain(*learnt)], "metrics": history, **found}
 

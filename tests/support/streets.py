@@ -1,4 +1,4 @@
-"""A generator for tests of streams: a street whose number of cars and length tell its index, and troubles where they are asked for."""
+"""A generator for tests of streams: streets whose length and number of cars depend on the index, and scenes that fail on request."""
 
 import os
 import time
@@ -11,7 +11,7 @@ STEPS = 12
 
 
 def street(seed, index, *, unusable: list[int], broken: list[int], deadly: list[int], endless: list[int]) -> RawScene:
-    """Street number `index`: unusable scenes are refused, broken ones raise, deadly ones end the process, endless ones never come."""
+    """Makes street `index`: unusable scenes are refused, broken ones raise, deadly ones end the process, endless ones never return."""
     if index in unusable:
         raise SceneError(f"street {index}: nobody drives here")
     if index in broken:

@@ -47,7 +47,7 @@ def unseen(entries, teacher):
 
 @pytest.fixture(scope="module")
 def car():
-    return CarParameters(**conf("dynamics/mjx_car")["car"])
+    return CarParameters(**conf("dynamics/articulated")["car"])
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ def test_values_and_places_are_inverse():
         ({"mass": between(0.0, 1.0, start=0.5, scale="log")}, r"sysid.space.mass: \[0, 1\] is no range"),
         ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass: .*write {range: \[least, most\]"),
         ({"mass": [0.5, 1.0]}, r"sysid.space.mass: .*write {range: \[least, most\]"),
-        ({"mass": between(2.0, 1.0, start=1.5)}, r"sysid.space.mass: \[2.0, 1.0\]; wanted is \[least, most\]"),
+        ({"mass": between(2.0, 1.0, start=1.5)}, r"sysid.space.mass: expected \[min, max\], got \[2.0, 1.0\]"),
         ({"mass": between(0.5, 1.0, start=2.0)}, r"sysid.space.mass.start: 2.0; it must be in \[0.5, 1\]"),
     ],
 )

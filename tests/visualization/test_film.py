@@ -10,7 +10,7 @@ from support.replays import STEPS, changed, made
 from support.scene_documents import document, written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.view import replay
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mp4_writer import VideoError
@@ -182,7 +182,8 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("override", "message"), [
     ("out=a.avi", "out: a.avi; valid endings: .html, .gif, .mp4, .png, .rrd"),
-    ("film.view=side", "film.view: 'side'"), ("film.stride=0", "film.stride: 0; wanted is at least 1"),
+    ("film.view=side", "film.view: expected one of chase, bird, both, got 'side'"),
+    ("film.stride=0", "film.stride: expected an integer >= 1, got 0"),
 ])  # fmt: skip
 def test_a_wrong_setting_is_named(override, message):
     with pytest.raises(ValueError) as caught:

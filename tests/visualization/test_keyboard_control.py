@@ -166,9 +166,9 @@ def test_the_viewers_keys_become_commands(monkeypatch):
     [
         ("keys.left=f13", "keys.left: 'f13'; valid: a letter, up, down"),
         ("keys.left=right", "keys.right: 'right' is the key of left, too"),
-        ("feel.rise_s=0", "feel.rise_s: 0; wanted is at least 0.01"),
-        ("off_map_m=0", "off_map_m: 0; wanted is at least 1"),
-        ("car=-1", "car: -1; wanted is at least 0"),
+        ("feel.rise_s=0", "feel.rise_s: expected a number >= 0.01, got 0"),
+        ("off_map_m=0", "off_map_m: expected a number >= 1, got 0"),
+        ("car=-1", "car: expected an integer >= 0 or null, got -1"),
         ("overrides=[weather=wet]", "overrides: ['weather=wet'] without a run"),
     ],
 )

@@ -14,7 +14,7 @@ from support.scene_documents import document as scene_document
 from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.view import replay
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene
 from scenefactory_jax.core.types import SURFACES
 from scenefactory_jax.visualization.web import replay_data, replay_page
@@ -176,12 +176,12 @@ def test_a_scene_file_is_replayed_with_its_signs(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["run=nowhere"], "nowhere is no run: it has no config.yaml"),
+        (["run=nowhere"], "config.yaml not found in nowhere"),
         (["run=nowhere", "dynamics=bicycle"], "dynamics: decided by the run nowhere; to change it: overrides='[dynamics=...]'"),
         (["overrides=[weather=wet]"], "overrides: ['weather=wet'] without a run"),
         (["out=."], "out: . is a folder; give the page's own name, such as replay.html"),
-        (["act=wild"], "act: 'wild'"),
-        (["worlds=0"], "worlds: 0; wanted is at least 1"),
+        (["act=wild"], "act: expected one of policy, coast, random, got 'wild'"),
+        (["worlds=0"], "worlds: expected an integer >= 1, got 0"),
         (["scenes=womd"], "scenes.path: null; give a bank, a scene file or a folder"),
     ],
 )

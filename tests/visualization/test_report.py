@@ -12,6 +12,7 @@ from support.hand_scenes import road_of, scene_of
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import AgentLog, Agents, Scene
 from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization import gif_writer
@@ -49,7 +50,7 @@ def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: 
     }  # fmt: skip
 
 
-def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and curve") -> drawing.Trajectory:
+def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and curve") -> Trajectory:
     """A straight road with a quarter circle behind it; agent 0 arrives, agent 1 collides, the others drive on."""
     angle = np.linspace(0, np.pi / 2, 40)
     way = np.concatenate([np.stack([np.arange(-60.0, 0.0), np.zeros(60)], 1), 30 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)])
@@ -75,17 +76,17 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
         np.asarray, Scene(road, road, road, cars, log, make_uniform(f(0.5), jnp.int32(1)), make_empty_log(1), make_empty_boxes())
     )
     still = np.zeros((steps, agents), np.float32)
-    return drawing.Trajectory(
+    return Trajectory(
         scene, position, still, still + 8, active, events, np.asarray(size), goal, np.ones(agents, bool), 30.0, title, "SMA, 0.5 mm"
     )
 
 
 @pytest.fixture(scope="module")
-def trajectory() -> drawing.Trajectory:
+def trajectory() -> Trajectory:
     return make_trajectory()
 
 
-def beside(trajectory: drawing.Trajectory) -> drawing.Trajectory:
+def beside(trajectory: Trajectory) -> Trajectory:
     """With a parked lorry, a cyclist that rides along, and a person who leaves half way."""
     steps = len(trajectory.active)
     place = np.stack([np.tile([-30.0, 3.0], (steps, 1)), np.stack([-50 + 0.1 * np.arange(steps), np.full(steps, -2.0)], 1),
@@ -93,7 +94,7 @@ def beside(trajectory: drawing.Trajectory) -> drawing.Trajectory:
     size = np.tile([[9.0, 2.5], [1.8, 0.7], [0.8, 0.8]], (steps, 1, 1))
     present = np.ones((steps, 3), bool)
     present[steps // 2 :, 2] = False
-    return trajectory._replace(traffic=drawing.Others(place, np.zeros((steps, 3)), size, present))
+    return trajectory._replace(traffic=TrafficBoxes(place, np.zeros((steps, 3)), size, present))
 
 
 def test_others_are_drawn_where_they_are(trajectory):
@@ -199,7 +200,7 @@ def test_outcomes_are_exclusive_and_add_up():
     assert summary["clean_success_rate"].value <= summary["success_rate"].value
     names, counts = np.unique(plots.outcomes(records), return_counts=True)
     assert set(names) <= set(plots.OUTCOMES) and counts.sum() == len(records["scene"])
-    arrived = counts[np.char.startswith(names, "goal_reached")].sum()
+    arrived = counts[np.char.startswith(names, "reached")].sum()
     assert arrived == records["goal_reached"].sum()
 
 
@@ -438,14 +439,14 @@ def test_report_says_what_happened(tmp_path):
     summary = {name: agent_metrics.summarise(r, **BOOTSTRAP) for name, r in records.items()}
     (tmp_path / "a film.gif").write_bytes(b"GIF89a")
     path = evaluation_report.write(
-        tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip": 0.15}},
+        tmp_path / "report", title="Demo", summary=summary, records=records, config={"seed": 3, "ppo": {"clip_eps": 0.15}},
         versions={"GPU": "none"}, baselines={"strict": "strict, untrained"}, videos={"Four worlds": tmp_path / "a film.gif"},
         commands=["python -m scenefactory_jax evaluate run=X"], **BOOTSTRAP,
     )  # fmt: skip
     text = path.read_text()
-    assert f"**{records['strict']['reached'].sum()} of 72 cars reached their goal" in text
+    assert f"**{records['strict']['goal_reached'].sum()} of 72 cars reached their goal" in text
     assert "![Four worlds](../a%20film.gif)" in text
-    for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip` | 0.15 |", "evaluate run=X", "scene, 00"):
+    for part in ("12 scenes", "beyond what chance explains", "### By surface", "| `ppo.clip_eps` | 0.15 |", "evaluate run=X", "scene, 00"):
         assert part in text, part
     assert "nan" not in text.lower() and "None" not in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
@@ -469,9 +470,9 @@ def test_report_refuses_what_does_not_fit(tmp_path):
 
 def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
     spots = [
-        {"circle": [-20, 0], "radius": 3.0, "surface": None, "film_mm": 0.3, "follows": 1.0},
-        {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "follows": 0.0},
-        {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "follows": 0.0},
+        {"circle": [-20, 0], "radius": 3.0, "surface": None, "film_mm": 0.3, "open_road_film_fraction": 1.0},
+        {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "open_road_film_fraction": 0.0},
+        {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "open_road_film_fraction": 0.0},
     ]
     road = jax.tree.map(jnp.asarray, trajectory.scene.weather)
     laid = patch_layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=spots)

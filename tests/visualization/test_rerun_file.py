@@ -6,7 +6,7 @@ import pytest
 from support.replays import NAMES, STEPS, made
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.view import replay
+from scenefactory_jax.cli.replay import replay
 from scenefactory_jax.visualization import rerun_file
 from scenefactory_jax.visualization.rerun_file import RerunError
 from scenefactory_jax.visualization.web import replay_data

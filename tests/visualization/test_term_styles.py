@@ -27,7 +27,7 @@ def lab(colour, seen=NORMAL):
 
 
 def test_the_terms_of_every_reward_are_told_apart():
-    for reward in ("reference", "careful", "wary"):
+    for reward in ("paper", "safe", "safe_smooth"):
         names = list(hydra_config.load_config("task", f"reward={reward}")["reward"])
         assert TERMS.keys() >= set(names) and len(set(term_looks(names).values())) == len(names)
     assert len(names) == 14

@@ -20,8 +20,8 @@ from scenefactory_jax.weather.friction import make_uniform
 
 CONF = ROOT / "conf" / "weather"
 BASE = yaml.safe_load((CONF / "base.yaml").read_text())
-TYRE = friction.Tyre(**BASE["grip"]["tyre"])
-SURFACE = BASE["grip"]["surfaces"]
+TYRE = friction.Tyre(**BASE["friction"]["tyre"])
+SURFACE = BASE["friction"]["surfaces"]
 FILMS = (0.0, 0.3, 0.5, 1.0, 2.0)
 PUBLISHED = {"AC": (1.105, 0.959, 0.859, 0, 0), "SMA": (1.204, 1.046, 0.937, 0, 0), "OGFC": (1.337, 1.162, 1.041, 0, 0)}
 
@@ -32,7 +32,7 @@ def mu_of(speed, film, theta, texture, slip):
 
 
 def grip_of(**numbers):
-    return instantiate({**BASE["grip"], **numbers}, builtins=friction, where="weather.grip")
+    return instantiate({**BASE["friction"], **numbers}, builtins=friction, where="weather.friction")
 
 
 @pytest.mark.parametrize(("column", "slip"), [("mu_static_ss", 0.15), ("mu_dynamic_ss", 0.80)])
@@ -61,8 +61,8 @@ def test_closed_form_is_where_the_bristle_comes_to_rest(film, slip):
     speed, dt, z = 13.89, 1e-4, 0.0
     theta, texture = SURFACE["SMA"]["theta"], SURFACE["SMA"]["texture_mm"]
     args = (jnp.float32(speed), jnp.float32(film))
-    y_r = float(friction.asperity_spacing(*args, jnp.float32(texture), tyre=TYRE))
-    contact = theta * y_r - float(friction.hydrodynamic_lift(*args, tyre=TYRE))
+    y_r = float(friction.compute_asperity_spacing(*args, jnp.float32(texture), tyre=TYRE))
+    contact = theta * y_r - float(friction.compute_hydrodynamic_lift(*args, tyre=TYRE))
     b1, b2, b3, b4 = TYRE.stribeck_velocity
     stribeck = b1 * np.exp(b2 * film + b3) + b4
     g = TYRE.coulomb + (TYRE.static - TYRE.coulomb) * np.exp(-np.sqrt(slip * speed / stribeck))
@@ -126,24 +126,24 @@ def test_draw_follows_the_weights_and_keep_keeps():
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"mode": "wet"}, "weather.grip.mode"),
-        ({"tyre": {**BASE["grip"]["tyre"], "wdith": 1.0}}, "tyre.wdith"),
-        ({"tyre": {k: v for k, v in BASE["grip"]["tyre"].items() if k != "load"}}, "tyre.load"),
+        ({"mode": "wet"}, "weather.friction.mode"),
+        ({"tyre": {**BASE["friction"]["tyre"], "wdith": 1.0}}, "tyre.wdith"),
+        ({"tyre": {k: v for k, v in BASE["friction"]["tyre"].items() if k != "load"}}, "tyre.load"),
         ({"surfaces": {"AC": SURFACE["AC"]}}, "SMA"),
         ({"surfaces": {**SURFACE, "AC": {"theta": 1.0}}}, "surfaces.AC.texture_mm"),
-        ({"floor": 0.0}, "weather.grip.floor: 0; wanted is a number above 0"),
-        ({"slip_static": -0.15}, "weather.grip.slip_static: -0.15; wanted is a number of at least 0"),
-        ({"reference_speed": -1.0}, "weather.grip.reference_speed"),
-        ({"tyre": {**BASE["grip"]["tyre"], "load": -3469.0}}, "weather.grip.tyre.load"),
-        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"weather.grip.tyre.stribeck_velocity\[3\]"),
-        ({"tyre": {**BASE["grip"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, "stribeck_velocity: .*; wanted are b1, b2, b3, b4"),
-        ({"surfaces": {**SURFACE, "ICE": {"theta": 0.1, "texture_mm": 0.0}}}, "weather.grip.surfaces.ICE.texture_mm"),
+        ({"floor": 0.0}, "weather.friction.floor: expected a number > 0, got 0"),
+        ({"slip_static": -0.15}, "weather.friction.slip_static: expected a number >= 0, got -0.15"),
+        ({"reference_speed": -1.0}, "weather.friction.reference_speed"),
+        ({"tyre": {**BASE["friction"]["tyre"], "load": -3469.0}}, "weather.friction.tyre.load"),
+        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"friction.tyre.stribeck_velocity\[3\]"),
+        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, "stribeck_velocity: .*; expected .b1, b2, b3, b4"),
+        ({"surfaces": {**SURFACE, "ICE": {"theta": 0.1, "texture_mm": 0.0}}}, "weather.friction.surfaces.ICE.texture_mm"),
     ],
 )
 def test_grip_refuses_by_name(change, named):
     """When it is made, as an environment does, not when it is first asked."""
     with pytest.raises(ConfigError, match=named):
-        friction.make({**BASE["grip"], **change})
+        friction.make({**BASE["friction"], **change})
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_grip_refuses_by_name(change, named):
         ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
         ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
         ({"surface": "AC", "weight": 1.0}, "film_mm"),
-        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: nan; wanted is a finite number of at least 0"),
+        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: expected a finite number >= 0, got nan"),
     ],
 )
 def test_draw_refuses_by_name(case, named):
@@ -164,7 +164,7 @@ def test_draw_refuses_by_name(case, named):
 @pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
 def test_every_shipped_weather_draws_a_drivable_road(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    draw = instantiate({**BASE["draw"], **config["draw"]}, builtins=road_condition, where="weather.draw")
+    draw = instantiate({**BASE["sampler"], **config["sampler"]}, builtins=road_condition, where="weather.sampler")
     scene = scene_of([[0, 0]], [[1, 0]])
     drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
     mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
@@ -174,7 +174,7 @@ def test_every_shipped_weather_draws_a_drivable_road(name):
 @pytest.mark.parametrize(("name", "least"), [("mixed", "0.80"), ("winter", "0.1")])
 def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
     text = (CONF / f"{name}.yaml").read_text()
-    cases = yaml.safe_load(text)["draw"]["cases"]
+    cases = yaml.safe_load(text)["sampler"]["cases"]
     roads = [make_uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
     mu = [float(grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0]) for road in roads]
     assert (min(mu), max(mu)) == pytest.approx((float(least), 1.10), abs=0.006)
@@ -183,20 +183,20 @@ def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
 
 
 def test_the_command_tells_what_the_model_says(tmp_path):
-    found = command.weather(load_config("weather", f"out={tmp_path}", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
+    found = command.physics(load_config("physics", f"out={tmp_path}", "comparison=null", "films_mm=[0.0,0.3,1.0]", "weather=wet"))
     for name, row in PUBLISHED.items():
         wanted = [mu for film, mu in zip(FILMS, row, strict=True) if film in (0.0, 0.3, 1.0)]
         np.testing.assert_allclose(found["table"][name]["static"], wanted, atol=1e-3)
     assert found == result_file.read(tmp_path / "weather.json") and (tmp_path / "weather.png").is_file()
     text = (tmp_path / "weather.md").read_text()
     assert "| AC | 1.105 (1.144) | 0.959 (0.830) | 0.000 (0.000) |" in text and "| SMA | 1.204 / 1.204 | 1.046 / 1.046 |" in text
-    with pytest.raises(ConfigError, match=r"slips: \[0.5, 0.1\]; wanted is \[least, most\]"):
-        command.weather(load_config("weather", f"out={tmp_path}", "slips=[0.5,0.1]"))
+    with pytest.raises(ConfigError, match=r"slips: expected \[min, max\], got \[0.5, 0.1\]"):
+        command.physics(load_config("physics", f"out={tmp_path}", "slips=[0.5,0.1]"))
 
 
 def test_what_is_committed_is_what_the_model_says(tmp_path):
     committed = result_file.read(ROOT / "experiments" / "weather" / "weather.json")
-    found = command.weather(load_config("weather", f"out={tmp_path}"))
+    found = command.physics(load_config("physics", f"out={tmp_path}", "comparison=null"))
     for name, row in committed["table"].items():
         for kind in row:
             np.testing.assert_allclose(found["table"][name][kind], row[kind], atol=1e-4)

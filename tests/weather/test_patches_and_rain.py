@@ -29,7 +29,7 @@ OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml"
 DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
 inside = jax.jit(patches.contains_points)
-COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "follows": 0.5}
+COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "open_road_film_fraction": 0.5}
 LAYOUTS = {
     "circles": {"count": 40, "radius_m": [0.5, 3.0], "scatter_m": 1.5, **COVER},
     "polygons": {"count": 40, "corners": 7, "radius_m": [1.0, 4.0], "scatter_m": 1.5, **COVER},
@@ -106,7 +106,7 @@ def test_repeated_vertices_and_absent_patches_change_nothing():
     np.testing.assert_array_equal(inside(patches.join_patches(doubled), points), alone)
     hidden = patch([[0.0, 0.0]], radius=50.0, surface=SNOW, film=9.0, present=False)
     for with_hidden in (on(*shapes, hidden), on(hidden, *shapes)):
-        for got, wanted in zip(patches.condition_at(with_hidden, points), patches.condition_at(on(*shapes), points), strict=True):
+        for got, wanted in zip(patches.read_condition(with_hidden, points), patches.read_condition(on(*shapes), points), strict=True):
             np.testing.assert_array_equal(got, wanted)
 
 
@@ -114,16 +114,16 @@ def test_the_last_patch_counts_and_films_follow_the_open_road():
     low = patch([[0, 0]], radius=2.0, surface=ICE, film=0.1)
     high = patch([[2, 0]], radius=2.0, surface=SNOW, film=0.2, follows=0.5)
     points = jnp.array([[-1.0, 0.0], [1.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
-    film, surface = patches.condition_at(on(low, high, film=0.4, surface=1), points)
+    film, surface = patches.read_condition(on(low, high, film=0.4, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.4, 0.4, 0.4], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, SNOW, SNOW, 1])
-    film, surface = patches.condition_at(on(high, low, film=0.8, surface=1), points)
+    film, surface = patches.read_condition(on(high, low, film=0.8, surface=1), points)
     np.testing.assert_allclose(film, [0.1, 0.1, 0.6, 0.8], rtol=1e-6)
     np.testing.assert_array_equal(surface, [ICE, ICE, SNOW, 1])
 
 
 def test_no_patches_cost_nothing():
-    operations = jax.make_jaxpr(functools.partial(patches.condition_at, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
+    operations = jax.make_jaxpr(functools.partial(patches.read_condition, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
     assert {operation.primitive.name for operation in operations} <= {"broadcast_in_dim", "jit", "pjit"}
     assert patches.join_patches([DRY.patches, patch([[0, 0]])]).vertices.shape == (1, 1, 2)
 
@@ -142,7 +142,8 @@ def test_drawn_areas_are_the_patches():
 
 
 def test_dry_surfaces_have_their_textbook_friction():
-    grip = instantiate.instantiate(scenefactory_jax.load_config("task")["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    entry = scenefactory_jax.load_config("task")["weather"]["friction"]
+    grip = instantiate.instantiate(entry, builtins=friction_model, where="weather.friction")
     wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
     spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
@@ -150,11 +151,11 @@ def test_dry_surfaces_have_their_textbook_friction():
 
 
 def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
-    entry = scenefactory_jax.load_config("task")["weather"]["grip"]
+    entry = scenefactory_jax.load_config("task")["weather"]["friction"]
     condition = on(patch([[0, 5]], radius=5.0, surface=0, film=0.5), film=0.3)
     wheels = jnp.array([[[1.3, 1.0], [1.3, -1.0], [-1.3, 1.0], [-1.3, -1.0]]])
     for mode, wet, damp in (("static", 0.8595, 0.9594), ("dynamic", 0.6770, 0.8302), ("speed", 0.8595, 0.9594)):
-        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.grip")
+        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.friction")
         np.testing.assert_allclose(grip(condition, wheels, jnp.full((1, 4), 13.89)), [[wet, damp, wet, damp]], atol=1e-4)
 
 
@@ -232,7 +233,7 @@ def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     middle, half = np.asarray(scene.lanes.midpoint)[rows], (scene.lanes.half_length[:, None] * scene.lanes.direction)[rows]
     lanes = shapely.MultiLineString([[m - h, m + h] for m, h in zip(middle, np.asarray(half), strict=True)])
     apart = lambda points: shapely.distance(lanes, shapely.points(points))  # noqa: E731
-    assert laid.present.all() and (laid.surface == ICE).all() and (laid.follows == 0.5).all()
+    assert laid.present.all() and (laid.surface == ICE).all() and (laid.open_road_film_fraction == 0.5).all()
     assert 0.1 <= laid.film_mm.min() < 0.15 and 0.35 < laid.film_mm.max() <= 0.4
     vertices = np.asarray(laid.vertices, float)
     if name == "circles":
@@ -271,9 +272,9 @@ def test_chance_and_the_open_roads_surface():
 
 
 SHAPES = [
-    {"circle": [1.0, 2.0], "radius": 3, "surface": "ICE", "film_mm": 0.0, "follows": 0.0},
-    {"polygon": [[0, 0], [4, 0], [0, 4]], "surface": None, "film_mm": 0.5, "follows": 1.0},
-    {"strip": [[20, 0], [30, 0]], "width": 2.0, "surface": "SNOW", "film_mm": 0.0, "follows": 0.0},
+    {"circle": [1.0, 2.0], "radius": 3, "surface": "ICE", "film_mm": 0.0, "open_road_film_fraction": 0.0},
+    {"polygon": [[0, 0], [4, 0], [0, 4]], "surface": None, "film_mm": 0.5, "open_road_film_fraction": 1.0},
+    {"strip": [[20, 0], [30, 0]], "width": 2.0, "surface": "SNOW", "film_mm": 0.0, "open_road_film_fraction": 0.0},
 ]
 
 
@@ -310,7 +311,7 @@ def test_every_option_resets_steps_and_traces_once(option):
     for _ in range(3):
         states, outcome = step(scenes, states, jnp.zeros((6, 2, 3)))
     assert len(traces) == 1 and seen["weather"].shape == (6, 2, 4)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.facts.grip, outcome.observation, states.weather)))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.metrics.mu, outcome.observation, states.weather)))
     np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
     later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(states.weather)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
@@ -323,7 +324,10 @@ def test_every_option_resets_steps_and_traces_once(option):
         np.testing.assert_array_equal(getattr(states.weather.patches, name), leaf)
 
 
-PUDDLE = "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, follows: 1.0}]}"
+PUDDLE = (
+    "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, "
+    "open_road_film_fraction: 1.0}]}"
+)
 COURSE = "weather.rain={_target_: schedule, time_s: [0.0, 1.0], film_mm: [0.1, 0.4]}"
 
 
@@ -336,7 +340,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     for _ in range(30):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
         tokens.append(outcome.observation["weather"])
-        friction.append(outcome.facts.grip)
+        friction.append(outcome.metrics.mu)
     tokens, film, friction = np.array(tokens), 0.1 + 0.3 * np.arange(1, 31) / 30, np.array(friction)
     wet = np.array([4.0 * step / 30 for step in range(1, 31)]) < 1.9  # the bearings' drag takes little of 4 m/s
     np.testing.assert_allclose(tokens[:, 1, 0], film, atol=1e-5)
@@ -345,7 +349,7 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     assert tokens[-1, 0, 0] == pytest.approx(0.4, abs=1e-5)
     assert (np.diff(friction[:, 1]) < 0).all() and friction[0, 0] != friction[0, 1] and friction[-1, 0] == pytest.approx(friction[-1, 1])
     # the weather moves on before the dynamics read it: the step to 1 s drives on the film of 1 s
-    grip = instantiate.instantiate(config_of()["weather"]["grip"], builtins=friction_model, where="weather.grip")
+    grip = instantiate.instantiate(config_of()["weather"]["friction"], builtins=friction_model, where="weather.friction")
     assert friction[-1, 1] == pytest.approx(float(grip(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
 
 
@@ -359,10 +363,11 @@ def test_the_token_lists_the_surfaces_that_it_is_told():
 
 
 def test_an_entry_of_null_is_left_out_and_others_may_be_added():
-    added = config_of("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")["weather"]
+    overrides = ("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")
+    added = scenefactory_jax.load_config("train", *overrides)["weather"]
     laid = road_condition.make(added)(KEY, lanes_scene())
     assert laid.patches.present.shape == (6,) and (laid.patches.surface == ICE).all()
-    old = {name: entry for name, entry in config_of()["weather"].items() if name in ("draw", "grip")}  # of a run before there were patches
+    old = {name: config_of()["weather"][name] for name in ("sampler", "friction")}  # without patches and rain
     assert road_condition.make(old)(KEY, lanes_scene()).patches.present.shape == (0,)
 
 
@@ -379,24 +384,24 @@ def test_the_report_says_how_the_film_changed():
     ("override", "message"),
     [
         ("+weather.patches.mud={_target_: swamp}", r"weather\.patches\.mud\._target_: 'swamp' is not in .*valid: circles, fixed, polygons"),
-        ("+weather.patches.ice.cuont=3", r"weather\.patches\.ice\.cuont: unknown key of polygons; valid: chance, corners, count"),
-        ("~weather.patches.ice.chance", r"weather\.patches\.ice\.chance: missing; polygons needs"),
+        ("+weather.patches.ice.cuont=3", r"weather\.patches\.ice\.cuont: unknown key; valid: chance, corners, count"),
+        ("~weather.patches.ice.chance", r"weather\.patches\.ice\.chance: missing; weather\.patches\.ice needs"),
         ("weather.patches.ice.surface=MUD", r"weather\.patches\.ice\.surface: 'MUD'; valid: AC, SMA, OGFC, GRAVEL, SNOW, ICE"),
-        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: 1\.5; wanted is a number from 0 to 1"),
-        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: \[3\.0, 1\.0\]; wanted is \[least, most\]"),
-        ("weather.patches.ice.film_mm=[-1.0,1.0]", r"weather\.patches\.ice\.film_mm: .*nothing below 0"),
-        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: 2; wanted is at least 3"),
-        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: -1\.0; wanted is at least 0"),
-        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: 'many' is of type str, wanted int"),
-        ("weather.patches=wet", r"weather\.patches: 'wet'"),
-        ("+weather.rian=3", r"weather\.rian: unknown key; valid: draw, grip, patches, rain"),
-        ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: drying, onset, pass_time, schedule"),
-        ("weather.rain={_target_: drying, tau_s: [-1.0, 2.0], knots: 8}", r"weather\.rain\.tau_s: .*nothing below 0"),
-        ("weather.rain={_target_: drying, tau_s: [1.0, 2.0], knots: 1}", r"weather\.rain\.knots: 1; wanted are at least 2"),
+        ("weather.patches.ice.chance=1.5", r"weather\.patches\.ice\.chance: expected a number >= 0 and <= 1, got 1\.5"),
+        ("weather.patches.ice.radius_m=[3.0,1.0]", r"weather\.patches\.ice\.radius_m: expected \[min, max\], got \[3\.0, 1\.0\]"),
+        ("weather.patches.ice.film_mm=[-1.0,1.0]", r"weather\.patches\.ice\.film_mm: expected .*>= 0"),
+        ("weather.patches.ice.corners=2", r"weather\.patches\.ice\.corners: expected a number >= 3, got 2"),
+        ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: expected a number >= 0, got -1\.0"),
+        ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: expected an integer, got 'many'"),
+        ("weather.patches=wet", r"weather\.patches: expected a mapping, got 'wet'"),
+        ("+weather.rian=3", r"weather\.rian: unknown key; weather has: sampler, patches, rain, friction"),
+        ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: advance_rain, drying, onset, schedule"),
+        ("weather.rain={_target_: drying, tau_s: [-1.0, 2.0], knots: 8}", r"weather\.rain\.tau_s: expected .*>= 0"),
+        ("weather.rain={_target_: drying, tau_s: [1.0, 2.0], knots: 1}", r"weather\.rain\.knots: expected an integer >= 2, got 1"),
         ("weather.rain={_target_: schedule, time_s: [1.0, 1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.time_s: .*ascending"),
-        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.film_mm: 2 films for 1 times"),
-        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [-0.1]}", r"weather\.rain\.film_mm: .*nothing below 0"),
-        ("observations.weather.surfaces=[AC,MUD]", r"observations\.weather\.surfaces: 'MUD'; valid: AC, SMA"),
+        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.film_mm: expected one film per time"),
+        ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [-0.1]}", r"weather\.rain\.film_mm: expected .*>= 0"),
+        ("observations.weather.surfaces=[AC,MUD]", r"observations\.weather\.surfaces: expected names of AC, SMA"),
     ],
 )
 def test_refuses_by_name(override, message):
@@ -411,15 +416,15 @@ def test_refuses_by_name(override, message):
         ({**SHAPES[0], "strip": [[0, 0], [1, 0]]}, r"shapes\[0\]: .*one of circle"),
         ({**SHAPES[0], "width": 1.0}, r"shapes\[0\]\.width: unknown; a circle has circle, radius, surface"),
         ({k: v for k, v in SHAPES[0].items() if k != "radius"}, r"shapes\[0\]\.radius: missing; a circle has"),
-        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: -1\.0; wanted is at least 0"),
-        ({**SHAPES[0], "circle": [[0, 0]]}, r"shapes\[0\]\.circle: .*wanted tuple\[float, float\]"),
-        ({**SHAPES[1], "polygon": [[0, 0], [1, 0]]}, r"shapes\[0\]\.polygon: 2 points; wanted are at least 3"),
+        ({**SHAPES[0], "radius": -1.0}, r"shapes\[0\]\.radius: expected a number >= 0, got -1\.0"),
+        ({**SHAPES[0], "circle": [[0, 0]]}, r"shapes\[0\]\.circle: expected \[a number, a number\]"),
+        ({**SHAPES[1], "polygon": [[0, 0], [1, 0]]}, r"shapes\[0\]\.polygon: expected at least 3 points, got 2"),
         ({**SHAPES[1], "surface": "MUD"}, r"shapes\[0\]\.surface: 'MUD'; valid: AC"),
-        ({**SHAPES[2], "film_mm": "deep"}, r"shapes\[0\]\.film_mm: 'deep' is of type str"),
+        ({**SHAPES[2], "film_mm": "deep"}, r"shapes\[0\]\.film_mm: expected a number, got 'deep'"),
     ],
 )
 def test_given_shapes_are_refused_by_name(shape, message):
-    entry = {"draw": {"_target_": "keep_condition"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
+    entry = {"sampler": {"_target_": "keep_condition"}, "patches": {"mine": {"_target_": "fixed", "shapes": [shape]}}}
     with pytest.raises(ConfigError, match=r"weather\.patches\.mine\." + message):
         road_condition.make(entry)(KEY, lanes_scene())
 

@@ -1,201 +1,84 @@
-"""Work spread over processes or machines, whose results come in order, and which a death does not end.
+"""Tasks spread over processes of this machine or over a Ray cluster.
 
-A spread is a function `(work, items) -> results`, bound to its numbers; `map` is one. A process that dies or takes too long loses its item
-and nothing else: a `Lost` comes in place of the result. Work that a process cannot load, for want of a module, ends everything with the
-reason. Entries of `conf/spread/` name the functions here.
+A task map is a function `(work, items) -> results`, in the order of the items. The death of a process, a time limit or an error costs one
+item: a `FailedTask` stands in place of its result. `ConfigError` is raised, as is work that a process cannot import.
+Entries of `conf/spread/` name the functions `local` and `ray`.
 """
 
-import functools
+import contextlib
 import importlib
-import multiprocessing
 import pickle
 import signal
-import subprocess
-import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.connection import wait
+from typing import Any
 
 from scenefactory_jax.core.instantiate import ConfigError, check_number
+from scenefactory_jax.core.parallel import worker
+from scenefactory_jax.core.parallel.worker import FailedTask, Unloadable, Worker
 from scenefactory_jax.core.raw_scene import SceneError
 
-HERE = "spread=local scenes.workers=1 spread.timeout_s=null does without other processes"
-SERVE = (  # what a process runs, given a pipe and the path on which modules are found
-    "import sys; from multiprocessing.connection import Connection; sys.path[:] = sys.argv[2:];"
-    " from scenefactory_jax.core.parallel import task_map; task_map.serve(Connection(int(sys.argv[1])))"
-)
+IN_PROCESS = "spread=local scenes.workers=1 spread.timeout_s=null works without other processes"
+NO_ACCELERATOR = {"JAX_PLATFORMS": "cpu"}
 Work = Callable[[Any], Any]
-Task = tuple[int, Any]  # an item, and its place among the items
-Busy = dict[Connection, tuple[subprocess.Popen[bytes], Task | None]]  # processes and what they work on; None while one starts
-Spread = Callable[[Work, Sequence[Any]], Iterable[Any]]
+TaskMap = Callable[[Work, Sequence[Any]], Iterable[Any]]
 
 
-class FailedTask(NamedTuple):
-    """What comes in place of a result."""
+@contextlib.contextmanager
+def open_pool(
+    workers: int, *, timeout_s: float | None = None, environments: Sequence[Mapping[str, str]] | None = None, stops: bool = False
+) -> Iterator[TaskMap]:
+    """A task map over processes that stay between its calls; they end with the context, at once after an error.
 
-    reason: str
+    Args:
+        workers: processes; 0: this process, whose death is the command's own.
+        timeout_s: limit of one item.
+        environments: variables of each process; item i of a call goes to process i first. None: the accelerator is left to this process.
+        stops: the processes obey signals to stop, and are asked to stop (SIGTERM) rather than killed.
+    """
+    if not workers:
+        yield in_process
+        return
+    pool = _Pool(environments or [NO_ACCELERATOR] * workers, timeout_s, stops)
+    try:
+        yield pool.run
+    except BaseException as error:
+        pool.close(None if isinstance(error, KeyboardInterrupt) and stops else signal.SIGTERM if stops else signal.SIGKILL)
+        raise
+    pool.close(None if stops else signal.SIGKILL)
 
 
-class Unloadable(NamedTuple):
-    """What comes in place of every result where the work itself cannot be loaded."""
-
-    reason: str
+def in_process(work: Work, items: Sequence[Any]) -> Iterator[Any]:
+    """Maps in this process."""
+    return (_checked(worker.run_work(work, item)) for item in items)
 
 
 def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | None) -> Iterator[Any]:
-    """Over processes of this machine, started fresh: forking a process in which JAX runs may hang it.
+    """Maps over processes of this machine.
 
     Args:
-        work: a function of a module, bound to what can be sent to another process.
-        items: each goes to a process that is free.
-        workers: processes; 1 without a limit of time works in this process, and dies with it.
-        timeout_s: an item that takes longer is lost; null: no limit.
+        work: a function of a module, bound to values that can be sent to another process.
+        items: each goes to a free process.
+        workers: processes; 1 without a time limit works in this process.
+        timeout_s: limit of one item; null: none.
 
     Raises:
         SceneError: a process cannot be started, or cannot load the work.
-        ConfigError: numbers with which nothing would be done, or what an item's work says of the config.
+        ConfigError: numbers out of range, or a `ConfigError` of an item's work.
     """
     check_number(workers, where="spread.workers", least=1)
-    if timeout_s is not None:
-        check_number(timeout_s, where="spread.timeout_s", above=0)
-    if workers == 1 and timeout_s is None:
-        yield from map(work, items)
-        return
-    packed = _packed(work, pickle.dumps)
-    waiting, done = deque(enumerate(items)), {}
-    busy: Busy = {}
-    try:
-        busy.update(_start() for _ in range(min(workers, len(items))))
-        for number in range(len(items)):
-            while number not in done:
-                for connection in wait(list(busy)):
-                    _answer(connection, busy, waiting, done, packed, timeout_s)  # pyright: ignore[reportArgumentType]
-            yield _passed(done.pop(number))
-    finally:
-        for connection, (process, _) in busy.items():
-            connection.close()
-            process.terminate()
-            process.wait()
-
-
-def _packed(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
-    """The work as bytes, which a process loads where it can say what goes wrong."""
-    try:
-        return dumps(work)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises all three for what it cannot send
-        wanted = "readers and parts must be functions of a module"
-        raise SceneError(f"spread: the work cannot be sent to another process: {error}; {wanted}; {HERE}") from error
-
-
-def _answer(
-    connection: Connection, busy: Busy, waiting: deque[Task], done: dict[int, Any], packed: bytes, timeout_s: float | None
-) -> None:
-    """Take a result, or the news of a death, and give the process or its successor the next item."""
-    process, given = busy.pop(connection)
-    try:
-        answer = connection.recv()
-    except (EOFError, OSError):
-        process.wait()
-        if given is None:
-            raise SceneError(f"a process cannot be started, {_death(process, timeout_s)}; {HERE}") from None
-        done[given[0]] = FailedTask(_death(process, timeout_s))
-        if waiting:
-            busy.update([_start()])
-        return
-    if given is not None:
-        done[given[0]] = answer
-    if not waiting:
-        connection.close()  # the process ends
-        process.wait()
-        return
-    following = waiting.popleft()
-    try:
-        if given is None:
-            connection.send((packed, timeout_s))
-        connection.send(following[1])
-        busy[connection] = process, following
-    except OSError:  # it died without work: the item is not to blame
-        process.wait()
-        waiting.appendleft(following)
-        busy.update([_start()])
-
-
-def _start() -> tuple[Connection, tuple[subprocess.Popen[bytes], None]]:
-    """A process that finds the modules of this one, and does not run this one's script again, as those of multiprocessing do."""
-    ours, its = multiprocessing.Pipe()
-    command = [sys.executable, "-P", "-c", SERVE, str(its.fileno()), *map(str, sys.path)]
-    process = subprocess.Popen(command, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL)
-    its.close()  # only the process has it now: the pipe breaks when the process dies
-    return ours, (process, None)
-
-
-def serve(connection: Connection) -> None:
-    """A process's life: it says that it is there, then answers until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the one that started this one ends it
-    try:
-        connection.send(None)
-        packed, timeout_s = connection.recv()
-        while True:
-            connection.send(_timed(packed, timeout_s, connection.recv()))
-    except (EOFError, OSError):
-        return
-
-
-def _timed(packed: bytes, timeout_s: float | None, item: Any) -> Any:
-    """The result, or why there is none; of a mistake in the config the error itself.
-
-    Past its time the kernel's alarm ends the process, whatever code it hangs in.
-    """
-    if isinstance(work := _loaded(packed), Unloadable):
-        return work
-    if timeout_s is not None:
-        signal.setitimer(signal.ITIMER_REAL, timeout_s)
-    try:
-        return work(item)
-    except ConfigError as error:
-        return error
-    except Exception as error:
-        return FailedTask(f"{type(error).__name__}: {error}")
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-
-
-@functools.cache
-def _loaded(packed: bytes) -> Work | Unloadable:
-    """The work, loaded once in a process; or why it cannot be: loading imports modules, and whatever these raise is the reason."""
-    try:
-        return pickle.loads(packed)
-    except Exception as error:
-        return Unloadable(f"{type(error).__name__}: {error}")
-
-
-def _passed(result: Any) -> Any:
-    """The result; a mistake in the config, and work that cannot be loaded, are no item's own, and end the work."""
-    if isinstance(result, ConfigError):
-        raise result
-    if isinstance(result, Unloadable):
-        where = "every process, on every machine of a cluster, must be able to import readers and parts"
-        raise SceneError(f"spread: a process cannot load the work: {result.reason}; {where}; {HERE}")
-    return result
-
-
-def _death(process: subprocess.Popen[bytes], timeout_s: float | None) -> str:
-    code = process.returncode
-    if code == -signal.SIGALRM:
-        return f"no result after {timeout_s:g} s (timeout_s)"
-    if code < 0:
-        name = signal.Signals(-code).name
-        return f"the process at it was ended by {name}" + (", perhaps for want of memory" if name == "SIGKILL" else "")
-    return f"the process at it ended with code {code}"
+    _check_timeout(timeout_s)
+    with open_pool(0 if workers == 1 and timeout_s is None else workers, timeout_s=timeout_s) as task_map:
+        yield from task_map(work, items)
 
 
 def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, timeout_s: float | None) -> Iterator[Any]:
-    """Over a Ray cluster (`pip install "scenefactory_jax[ray]"`). Files, and the bank to be, must lie where all machines see them.
+    """Maps over a Ray cluster (`pip install "scenefactory_jax[ray]"`). All machines must see the files and the bank under the same paths.
 
     Args:
-        address: of the cluster, as for `ray.init`; null: one on this machine, or the one that is running.
-        pending: items that are handed over at a time; those beyond wait.
+        address: of the cluster, as for `ray.init`; null: the running one, or one on this machine.
+        pending: items that are submitted at a time.
         timeout_s: as for `local`.
 
     Raises:
@@ -203,22 +86,130 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
         ConfigError: as for `local`.
     """
     check_number(pending, where="spread.pending", least=1)
-    if timeout_s is not None:
-        check_number(timeout_s, where="spread.timeout_s", above=0)
+    _check_timeout(timeout_s)
     try:
         cluster = importlib.import_module("ray")
     except ImportError as error:
         raise SceneError('spread=ray: Ray is not installed; `pip install "scenefactory_jax[ray]"`, or spread=local') from error
     cluster.init(address=address, ignore_reinit_error=True)
-    task = cluster.remote(num_cpus=1, max_retries=0)(_timed)
-    shared, waiting, ahead = cluster.put(_packed(work, cluster.cloudpickle.dumps)), deque(items), deque()
-    while waiting or ahead:
-        while waiting and len(ahead) < pending:
-            ahead.append(task.remote(shared, timeout_s, waiting.popleft()))
+    task = cluster.remote(num_cpus=1, max_retries=0)(worker.run_task)
+    packed, waiting, submitted = cluster.put(_pack(work, cluster.cloudpickle.dumps)), deque(items), deque()
+    while waiting or submitted:
+        while waiting and len(submitted) < pending:
+            submitted.append(task.remote(packed, timeout_s, waiting.popleft()))
         try:
-            result = cluster.get(ahead.popleft())
-        except cluster.exceptions.RayTaskError as error:  # `_timed` raises nothing: it could not be loaded, and the last line says why
+            result = cluster.get(submitted.popleft())
+        except cluster.exceptions.RayTaskError as error:  # `run_task` raises nothing: it was not loaded, and the last line says why
             result = Unloadable(str(error).strip().splitlines()[-1])
         except cluster.exceptions.RayError as error:
             result = FailedTask(f"Ray: {type(error).__name__}: {str(error).strip().splitlines()[0]}")
-        yield _passed(result)
+        yield _checked(result)
+
+
+def require_results(results: Iterable[Any]) -> Iterator[Any]:
+    """The results of a task map where no task may fail.
+
+    Raises:
+        RuntimeError: with the reason of the first failure.
+    """
+    for result in results:
+        if isinstance(result, FailedTask):
+            raise RuntimeError(result.reason) from result.error
+        yield result
+
+
+class _Pool:
+    def __init__(self, environments: Sequence[Mapping[str, str]], timeout_s: float | None, stops: bool):
+        self._environments, self._timeout_s, self._stops = environments, timeout_s, stops
+        self._workers: list[Worker] = []
+        self._closed = False  # perhaps by another thread than that of `run`
+
+    def run(self, work: Work, items: Sequence[Any]) -> Iterator[Any]:
+        packed, waiting, done = _pack(work, pickle.dumps), deque(enumerate(items)), {}
+        try:
+            self._assign(packed, waiting)
+            for number in range(len(items)):
+                while number not in done:
+                    self._collect(done)
+                    self._assign(packed, waiting)
+                yield _checked(done.pop(number))
+        finally:
+            for busy in [one for one in self._workers if one.task is not None and not self._stops]:
+                self._workers.remove(busy)
+                busy.end(signal.SIGKILL)
+
+    def close(self, number: int | None) -> None:
+        """Ends the processes by a signal, or, without one, after their tasks."""
+        self._closed = True
+        for one in self._workers:  # all get the signal before the first is waited for
+            if number is not None:
+                one.process.send_signal(number)
+        for one in list(self._workers):
+            one.end(number)
+
+    def _assign(self, packed: bytes, waiting: deque[tuple[int, Any]]) -> None:
+        """Sends the next items to idle processes, and to new ones up to their number."""
+        while waiting:
+            if self._closed:
+                raise RuntimeError("the pool of processes is closed")
+            idle = next((one for one in self._workers if one.task is None), None)
+            if idle is None:
+                if len(self._workers) == len(self._environments):
+                    return
+                idle = Worker(self._environments[len(self._workers)], stops=self._stops)
+                self._workers.append(idle)
+            number, item = waiting[0]
+            try:
+                idle.connection.send((packed, self._timeout_s, item))
+            except OSError:  # it died without work
+                self._workers.remove(idle)
+                idle.process.wait()
+                if not idle.started:
+                    raise self._not_started(idle) from None
+            else:
+                idle.task = number
+                waiting.popleft()
+
+    def _collect(self, done: dict[int, Any]) -> None:
+        """Waits for results, or for the death of a process."""
+        by_connection = {one.connection: one for one in self._workers if one.task is not None}
+        for connection in wait(list(by_connection)):
+            one = by_connection[connection]  # pyright: ignore[reportArgumentType]
+            assert one.task is not None
+            try:
+                answer = one.connection.recv()
+            except (EOFError, OSError):
+                self._workers.remove(one)
+                if not one.started:
+                    raise self._not_started(one) from None
+                done[one.task] = FailedTask(one.describe_end(self._timeout_s))
+                continue
+            if one.started:
+                done[one.task], one.task = answer, None
+            one.started = True
+
+    def _not_started(self, one: Worker) -> SceneError:
+        return SceneError(f"a process cannot be started: {one.describe_end(self._timeout_s)}; {IN_PROCESS}")
+
+
+def _pack(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
+    """The work as bytes, which a process loads where it can say what goes wrong."""
+    try:
+        return dumps(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises all three for values that it cannot send
+        hint = "readers and parts must be functions of a module"
+        raise SceneError(f"spread: the work cannot be sent to another process: {error}; {hint}; {IN_PROCESS}") from error
+
+
+def _checked(result: Any) -> Any:
+    if isinstance(result, ConfigError):
+        raise result
+    if isinstance(result, Unloadable):
+        hint = "every process, on every machine of a cluster, must be able to import readers and parts"
+        raise SceneError(f"spread: a process cannot load the work: {result.reason}; {hint}; {IN_PROCESS}")
+    return result
+
+
+def _check_timeout(timeout_s: float | None) -> None:
+    if timeout_s is not None:
+        check_number(timeout_s, where="spread.timeout_s", above=0)

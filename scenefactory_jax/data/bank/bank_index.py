@@ -5,7 +5,6 @@ Its last line is the SHA-256 of what stands before it.
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core.instantiate import find_differences
+from scenefactory_jax.core.atomic_file import write_atomically
+from scenefactory_jax.core.config import find_differences
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats.reader_selection import BANK_INDEX as INDEX
 
@@ -138,13 +138,9 @@ def write(folder: Path, index: Index) -> None:
     entries = {"format": FORMAT, "schema": SCHEMA} | {entry.name: getattr(index, entry.name) for entry in fields(Index)}
     entries |= {name: [asdict(shard) for shard in entries[name]] for name in ("shards", "metadata")}
     lines = [f'"{name}": {json.dumps(value, default=_plain)}' for name, value in entries.items()]  # a line each: json's indent is slow
-    fresh = folder / f".{INDEX}"
-    with fresh.open("w") as file:
-        body = "{\n" + ",\n".join(lines) + ",\n"
-        file.write(f'{body}"{DIGEST}": "{hashlib.sha256(body.encode()).hexdigest()}"\n}}\n')
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(fresh, folder / INDEX)
+    body = "{\n" + ",\n".join(lines) + ",\n"
+    with write_atomically(folder / INDEX) as part:
+        part.write_text(f'{body}"{DIGEST}": "{hashlib.sha256(body.encode()).hexdigest()}"\n}}\n')
 
 
 def describe(folder: Path, file: str, scenes: int) -> Shard:

@@ -5,10 +5,9 @@ A bank is a folder with `bank.json` (`bank_index`), shards of scenes (`arrow`: A
 none. Shards are mapped when they are first read, and hold no file open; a scene that is not what was written is refused (`shard_files`).
 """
 
-import functools
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,19 +16,13 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from scenefactory_jax.core.parallel import task_map
-from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
-from scenefactory_jax.core.types import Scene
+from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_writer, catalogue, shard_files
 from scenefactory_jax.data.bank.bank_index import Index, Shard
 from scenefactory_jax.data.bank.catalogue import Features
-from scenefactory_jax.data.packing import columns
-from scenefactory_jax.data.packing.pack import Packed, prepare
-from scenefactory_jax.data.packing.stack import CutReport, stack
 
 INDEX = bank_index.INDEX
 is_bank = bank_index.is_bank
-PIECE = 16  # scenes that a process packs at a time
 SHARD = 256  # scenes of a shard, where a bank is written at once
 Readers = dict[int, shard_files.Reader]
 
@@ -207,81 +200,6 @@ def write(
         )
         bank_writer.fill(folder, shards, settings=settings, compression=compression)
     return open(path)
-
-
-def pack_scenes(
-    bank: Bank, indices: Sequence[int] | np.ndarray, *, check: Callable[..., Any], pack: Callable[..., Any], workers: int
-) -> list[Packed | Reject]:
-    """Scenes checked and packed, in the order of the indices; a scene that cannot be is a `Reject` in its place.
-
-    Args:
-        check: `checks.check` bound to its numbers.
-        pack: `pack.pack` bound to its numbers.
-        workers: processes; 1 works in this one.
-
-    Raises:
-        SceneError: no such scene, a shard that has changed, or a process that died.
-    """
-    places = bank.places[_rows(bank, indices)]
-    pieces = [places[start : start + PIECE] for start in range(0, len(places), PIECE)]
-    work = functools.partial(_packed, shards=bank.shards, check=check, pack=pack)
-    found: list[Packed | Reject] = []
-    for piece in task_map.local(work, pieces, workers=workers if len(pieces) > 1 else 1, timeout_s=None):
-        if isinstance(piece, task_map.FailedTask):
-            raise SceneError(f"{bank.path}: scenes could not be packed: {piece.reason}; try fewer workers")
-        if isinstance(piece, SceneError):
-            raise piece
-        found.extend(piece)
-    return found
-
-
-def load(
-    bank: Bank,
-    indices: Sequence[int] | np.ndarray,
-    *,
-    check: Callable[..., Any],
-    pack: Callable[..., Any],
-    capacity: Mapping[str, int | None],
-    workers: int,
-) -> tuple[Scene, CutReport]:
-    """Worlds of the given scenes, checked, packed, stacked and padded; an index may occur many times. See `packed` and `stack`.
-
-    Raises:
-        SceneError: a scene that does not exist or cannot be packed, no indices, or a capacity that is none.
-    """
-    rows = _rows(bank, indices)
-    distinct, world = np.unique(rows, return_inverse=True)
-    scenes = []
-    for row, one in zip(distinct, pack_scenes(bank, distinct, check=check, pack=pack, workers=workers), strict=True):
-        if isinstance(one, Reject):
-            raise SceneError(f"{bank.path}: scene {row}, {one.scene}: {one.reason}; leave it out, or change scenes.check or scenes.pack")
-        scenes.append(one.scene)
-    stacked, report = stack(scenes, capacity=capacity)
-    if np.array_equal(distinct, rows):
-        return stacked, report
-    leaves = {name: leaf[world] for name, leaf in columns.flatten(stacked).items()}
-    cuts = tuple(replace(cut, world=int(place)) for cut in report.cuts for place in np.flatnonzero(world == cut.world))
-    return columns.assemble_columns(Scene, leaves), CutReport(len(rows), report.capacity, cuts)
-
-
-def _packed(
-    places: Int[np.ndarray, "N 5"], *, shards: Sequence[Shard], check: Callable[..., Any], pack: Callable[..., Any]
-) -> list[Packed | Reject] | SceneError:
-    """Some scenes of a bank; of a damaged file the error, which another process is to raise."""
-    found: list[Packed | Reject] = []
-    try:
-        for scene in _scenes(shards, places, {}):
-            found.append(_prepared(scene, check, pack))
-    except SceneError as error:
-        return error
-    return found
-
-
-def _prepared(scene: RawScene, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed | Reject:
-    try:
-        return prepare(scene, check=check, pack=pack)
-    except SceneError as error:
-        return Reject(scene.name, str(error).removeprefix(f"{scene.source}: "), error.kind)
 
 
 def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:

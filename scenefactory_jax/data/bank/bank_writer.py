@@ -18,13 +18,14 @@ import pyarrow as pa
 from jaxtyping import Int
 
 from scenefactory_jax.core import folder_lock
+from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.bank import arrow_codec, bank_index, catalogue, shard_files
 from scenefactory_jax.data.bank.bank_index import Index, Shard
 
 Compression = Literal["zstd", "lz4"] | None
 # what a conversion leaves that was killed before its first shard
-OWN = re.compile(rf"\.?(part|scenes|metadata)-\d+(-\w+)?\.arrow|\.bank\.json|{re.escape(folder_lock.LOCK)}")
+OWN = re.compile(rf"\.?(part|scenes|metadata)-\d+(-\w+)?\.arrow(\.part)?|\.bank\.json\.part|{re.escape(folder_lock.LOCK)}")
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def write_part(folder: Path, number: int, batches: Iterable[pa.RecordBatch]) -> 
 
 def remove_parts(folder: Path) -> None:
     """What was being written when a conversion was stopped."""
-    for path in folder.glob(".*.arrow"):
+    for path in [*folder.glob(".*.arrow"), *folder.glob(".*.part")]:
         path.unlink()
 
 
@@ -204,22 +205,12 @@ def check_free_space(path: Path) -> None:
         bank_index.check_replaceable(path)
 
 
-@contextlib.contextmanager
-def _finishing(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path`; what lies there takes its place at the end, once it is on the disk."""
-    fresh = path.with_name(f".{path.name}")
-    yield fresh
-    with fresh.open("rb") as file:
-        os.fsync(file.fileno())
-    os.replace(fresh, path)
-
-
 def _writer(path: Path, schema: pa.Schema, compression: Compression) -> pa.ipc.RecordBatchFileWriter:
     return pa.ipc.new_file(str(path), schema, options=pa.ipc.IpcWriteOptions(compression=compression))
 
 
 def _write_scenes(path: Path, batches: Iterable[pa.RecordBatch], compression: Compression) -> None:
-    with _finishing(path) as fresh, _writer(fresh, arrow_codec.SCHEMA, compression) as writer:
+    with write_atomically(path) as fresh, _writer(fresh, arrow_codec.SCHEMA, compression) as writer:
         for batch in batches:
             writer.write_batch(batch)
 
@@ -232,6 +223,6 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
 def _write_catalogue(folder: Path, name: str, table: pa.Table, places: Int[np.ndarray, "N 5"]) -> Shard:
     for column, values in zip(shard_files.PLACE, places.T, strict=True):
         table = table.append_column(column, pa.array(np.ascontiguousarray(values), pa.int64()))
-    with _finishing(folder / name) as fresh, _writer(fresh, table.schema, None) as writer:
+    with write_atomically(folder / name) as fresh, _writer(fresh, table.schema, None) as writer:
         writer.write_table(table)
     return bank_index.describe(folder, name, table.num_rows)

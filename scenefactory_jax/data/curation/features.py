@@ -74,7 +74,7 @@ COLUMNS: dict[str, str] = {
     "extent_y_m": "Its depth, south to north.",
     "relief_m": "Height between the lowest and the highest point of a driving lane.",
     "curvature_rad_m": "Mean curvature of the driving lanes, over their length, whichever way they bend.",
-    "curved_share": "Share of the driving lanes' length that bends more tightly than `curve_radius_m`.",
+    "curved_fraction": "Share of the driving lanes' length that bends more tightly than `curve_radius_m`.",
     "intersections": "Places where driving lanes cross at more than `crossing_deg`; those within `junction_m` of each other are one.",
     "branches": "Driving lanes with more than one exit; none if the source says nothing of exits.",
     "speed_bumps": "Speed bumps.",
@@ -198,12 +198,12 @@ def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> 
     bends = (samples.line[2:] == line) & (samples.line[:-2] == line) & (step > chord_m / 4)  # shorter lanes are shorter than a chord
     turn, line, step = turn[bends], line[bends], step[bends]
     if not len(turn):
-        return {"curvature_rad_m": 0.0, "curved_share": 0.0}
+        return {"curvature_rad_m": 0.0, "curved_fraction": 0.0}
     steps = np.bincount(line)[line]
     length = step * (steps + 2) / steps
     return {
         "curvature_rad_m": float((turn / step * length).sum() / length.sum()),
-        "curved_share": float(length[turn / step > 1 / curve_radius_m].sum() / length.sum()),
+        "curved_fraction": float(length[turn / step > 1 / curve_radius_m].sum() / length.sum()),
     }
 
 

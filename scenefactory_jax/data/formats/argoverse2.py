@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet
 from scipy.spatial import KDTree
 
-from scenefactory_jax.core.raw_scene import Companion, FormatMismatch, OtherContent, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.raw_scene import Companion, FormatMismatch, OtherContent, RawScene, SceneError, Track
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.formats import argoverse2_map, file_content, scene_parts, values
 

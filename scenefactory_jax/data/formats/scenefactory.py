@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import OtherContent, Polyline, RawScene, Sc
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.formats import file_content, scene_parts, values
 
-MAX_STEPS = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.steps_most` less the first step
+MAX_STEPS = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.max_steps` less the first step
 TYPES: dict[int, RoadUser] = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
 Pose = Float[np.ndarray, "4"]  # x, y, z, yaw
 

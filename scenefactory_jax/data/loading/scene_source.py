@@ -1,35 +1,229 @@
-"""Where a command's scenes come from: a bank, files in any known format, or the generator."""
+"""Scenes of a bank, of files in any known format or of a generator, behind one interface: `SceneSource`; and `Scenes`, loaded from one."""
 
+import functools
 import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.cli import schema
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
-from scenefactory_jax.core.raw_scene import RawScene, Reject
+from scenefactory_jax.core.parallel import task_map
+from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data import conversion
-from scenefactory_jax.data.bank import bank_reader
+from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
 from scenefactory_jax.data.formats import reader_selection
+from scenefactory_jax.data.loading.scenes_config import check_config
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
+from scenefactory_jax.data.packing.summary import Summary, summarise_packed
+from scenefactory_jax.data.packing.summary import describe as describe_summary
 from scenefactory_jax.roadgraph import spatial_grid
 
 CACHE = "SCENEFACTORY_CACHE"  # environment variable: folder of compiled programs; empty switches the cache off
+Read = Callable[[], Iterable[RawScene | Reject]]  # reads an entry; can be sent to another process
+Check = Callable[[RawScene], tuple[RawScene, list[str]]]
+Pack = Callable[[RawScene], tuple[Any, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSource:
+    """Scenes in entries, which are read in any order: the scenes of a bank, files, or the indices of a generator."""
+
+    kind: Literal["bank", "files", "generator"]
+    description: str  # for messages
+    count: int | None  # entries; None: endless
+    name: Callable[[int], str]  # of an entry, printable
+    reader: Callable[[int], Read]  # of an entry: one scene or reject, of a file also several
+    files: int  # that the scenes came from
+    rejects: tuple[dict[str, Any], ...] = ()  # of the conversion that made the bank
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a resumed run compares."""
+        return {"kind": self.kind, "entries": self.count}
+
+    def read(self, *, limit: int | None = None) -> Iterator[RawScene | Reject]:
+        """All scenes one after another, before checks and packing, and a reject in place of each that cannot be read.
+
+        Raises:
+            SceneError: a bank that is damaged.
+        """
+        entries = itertools.count() if self.count is None else range(self.count)
+        return itertools.islice(itertools.chain.from_iterable(self.reader(index)() for index in entries), limit)
+
+    def read_one(self, index: int) -> Callable[[], RawScene]:
+        """A function, which can be sent to another process, that reads the only scene of an entry or raises `SceneError`."""
+        return functools.partial(_read_one, self.name(index), self.reader(index))
+
+
+def _read_one(name: str, read: Read) -> RawScene:
+    scenes = list(read())
+    if len(scenes) != 1:
+        raise SceneError(f"{name}: {len(scenes)} scenes in one file; `convert source={name} out=BANK`, and stream the bank")
+    if isinstance(scenes[0], Reject):
+        raise SceneError(f"{scenes[0].source}: {scenes[0].reason}")
+    return scenes[0]
+
+
+def open_source(config: Mapping[str, Any]) -> SceneSource:
+    """The source that a `scenes` config names: `path`, or the generator with `seed`.
+
+    Raises:
+        ConfigError: neither path nor generator, or an entry that cannot be built.
+        SceneError: no scenes at the path.
+    """
+    path = config["path"]
+    if path is None:
+        return open_generator(make_generator(config), seed=config["seed"])
+    return open_bank(path) if bank_index.is_bank(path) else open_files(path, reader_selection.make(config["formats"]))
+
+
+def open_bank(bank: bank_reader.Bank | Path | str) -> SceneSource:
+    """The source of a bank's scenes."""
+    bank = bank if isinstance(bank, bank_reader.Bank) else bank_reader.open(bank)
+    names, files = bank.names, len(set(bank.metadata["source"].to_pylist()))
+
+    def reader(index: int) -> Read:
+        shard, *place = bank.places[index].tolist()
+        return functools.partial(_read_banked, bank.shards[shard], tuple(place))
+
+    what = f"{len(bank)} scenes of the bank {bank.path}{bank.unfinished}"
+    return SceneSource("bank", what, len(bank), lambda index: escape_for_terminal(str(names[index])), reader, files, bank.rejects)
+
+
+def open_files(path: Path | str, formats: Mapping[str, reader_selection.Reader]) -> SceneSource:
+    """The source of a file's scenes, or of all files below a folder."""
+    files = reader_selection.find(path)
+    reader = lambda index: functools.partial(read_file, files[index], dict(formats))  # noqa: E731
+    name = lambda index: escape_for_terminal(str(files[index]))  # noqa: E731
+    return SceneSource("files", f"{len(files)} files of {path}", len(files), name, reader, len(files))
+
+
+def open_generator(generate: Callable[[int, int], RawScene], *, seed: int) -> SceneSource:
+    """The endless source of a generator's scenes."""
+    reader = lambda index: functools.partial(_generate, generate, seed, index)  # noqa: E731
+    return SceneSource("generator", f"generated scenes of seed {seed}", None, lambda index: f"generated scene {index}", reader, 0)
+
+
+def _read_banked(shard: bank_index.Shard, place: tuple[int, ...]) -> list[RawScene]:
+    return [shard_files.Reader(shard).scene(place)]
+
+
+def _generate(generate: Callable[[int, int], RawScene], seed: int, index: int) -> list[RawScene]:
+    return [generate(seed, index)]
+
+
+def read_file(path: Path, formats: Mapping[str, reader_selection.Reader]) -> Iterator[RawScene | Reject]:
+    """Reads the scenes of a file; whatever a reader raises is a reject, but for `ConfigError`."""
+    scenes = reader_selection.read(path, formats)
+    while True:
+        try:
+            found = next(scenes, None)
+        except ConfigError:
+            raise
+        except Exception as error:  # after which a reader yields no more
+            yield explain(error, str(path))
+            return
+        if found is None:
+            return
+        yield found._replace(source=str(path)) if isinstance(found, Reject) else replace(found, source=str(path))
+
+
+def explain(error: Exception, source: str, scene: str | None = None) -> Reject:
+    """The reject of an error, which is named by its type if it is not a SceneError; the reason does not repeat the source."""
+    reason = str(error).removeprefix(f"{source}: ")
+    known = isinstance(error, SceneError)
+    return Reject(scene, reason if known else f"{type(error).__name__}: {reason}", error.kind if known else None, source)
+
+
+def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
+    """The generator of a `scenes` config, bound to its numbers: (seed, index) -> scene.
+
+    Raises:
+        ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
+    """
+    if "_target_" not in (config["generate"] or {}):  # an experiment may set numbers of a generator that `scenes=womd` does not have
+        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=streets")
+    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="scenes.generate")
+
+
+def make_packing(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The functions `check` and `pack` of a `scenes` config, bound to their numbers."""
+    return {
+        "check": instantiate(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check"),
+        "pack": instantiate(config["pack"], builtins="scenefactory_jax.data.packing.pack", where="scenes.pack"),
+    }
+
+
+# ---- packing
+
+
+def pack_scenes(source: SceneSource, indices: Iterable[int], *, check: Check, pack: Pack, workers: int = 1) -> list[Packed | Reject]:
+    """The scenes of entries checked and packed, in the order of the indices, and a reject in place of each that cannot be.
+
+    Raises:
+        ConfigError: a number that packing refuses.
+        SceneError: a bank that is damaged, or a process that died while it read one.
+    """
+    readers = [source.reader(index) for index in indices]
+    work = functools.partial(_pack_entry, check=check, pack=pack)
+    found: list[Packed | Reject] = []
+    results = task_map.local(work, readers, workers=workers if len(readers) > 1 else 1, timeout_s=None)
+    for index, result in zip(indices, results, strict=True):
+        if isinstance(result, SceneError):
+            raise result
+        if isinstance(result, task_map.FailedTask):
+            if source.kind != "files":
+                raise SceneError(f"{source.description}: scenes could not be packed: {result.reason}; try fewer workers")
+            result = [Reject(None, result.reason, None, source.name(index))]
+        found.extend(result)
+    return found
+
+
+def _pack_entry(read: Read, *, check: Check, pack: Pack) -> list[Packed | Reject] | SceneError:
+    """The packed scenes of an entry; of a damaged bank the error, for the process that asked to raise."""
+    found: list[Packed | Reject] = []
+    try:
+        for raw in read():
+            found.append(raw if isinstance(raw, Reject) else _pack_scene(raw, check, pack))
+    except SceneError as error:
+        return error
+    return found
+
+
+def _pack_scene(raw: RawScene, check: Check, pack: Pack) -> Packed | Reject:
+    try:
+        return prepare(raw, check=check, pack=pack)
+    except ConfigError:
+        raise
+    except Exception as error:
+        return explain(error, raw.source, raw.name)
+
+
+def pack_all(
+    source: SceneSource, *, check: Check, pack: Pack, workers: int = 1, count: int | None = None
+) -> tuple[list[Packed], Summary]:
+    """All scenes that can be packed, of an endless source the first `count`, and the summary. Raises as `pack_scenes`."""
+    indices = range(source.count if source.count is not None else count or 0)
+    found = pack_scenes(source, indices, check=check, pack=pack, workers=workers)
+    packed, rejects = [one for one in found if isinstance(one, Packed)], [one for one in found if isinstance(one, Reject)]
+    return packed, summarise_packed([one.report for one in packed], rejects, files=source.files, earlier=source.rejects)
+
+
+# ---- loading
 
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """Scenes stacked along the first axis, their names as they can be printed, and what was kept and dropped on the way."""
+    """Scenes stacked along the first axis, their names as they can be printed, and an account of what was kept and dropped."""
 
     scene: Scene
     names: tuple[str, ...]
@@ -43,150 +237,89 @@ class Scenes:
 
 
 def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
-    """The scenes to train on: `scenes.path`, or the generator's; of these, what `scenes.take` leaves.
+    """Loads the scenes of a `scenes` config: all of `path`, or `count` of the generator's; of these the sample `take`.
 
     Raises:
-        ConfigError: neither is given.
-        SceneError: nothing usable at the path, with the reasons.
+        ConfigError: neither path nor generator, or not one usable scene, with the reasons.
+        SceneError: no scenes at the path.
     """
-    schema.check_scenes(config)
+    check_config(config)
     return take_scenes(load_all_scenes(config), config)
 
 
 def load_all_scenes(config: Mapping[str, Any]) -> Scenes:
-    """The scenes that `scenes.take` takes from."""
-    if config["path"] is not None:
-        return from_path(config, config["path"])
-    return generate_scenes(config, seed=config["seed"], count=config["count"])
+    """Loads the scenes that `scenes.take` samples from."""
+    source = open_source(config)
+    packed, summary = pack_all(source, **make_packing(config), workers=config["workers"], count=config["count"])
+    lines = [source.description, *describe_summary(summary)]
+    if not packed:
+        raise ConfigError(f"scenes.path={config['path']}: no usable scene\n" + "\n".join(lines[1:]))
+    scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
+    names = tuple(escape_for_terminal(one.report.name) for one in packed)
+    return Scenes(attach_grids(scene, config), names, "\n".join([*lines, *describe(cuts)]))
 
 
 def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
-    """`scenes.take.count` scenes at random, in the order in which they lie: of one seed, fewer are always a part of more.
+    """Samples `scenes.take.count` scenes, in the order in which they lie: of one seed, fewer are always a part of more.
 
     Raises:
         ConfigError: more than there are.
     """
-    schema.check_scenes(config)
-    take: Mapping[str, Any] = config.get("take") or {"count": None}  # runs from before there was a choice have none
-    count = take["count"]
+    check_config(config)
+    count, seed = config["take"]["count"], config["take"]["seed"]
     if count is None or count == len(scenes):
         return scenes
     if count > len(scenes):
         raise ConfigError(f"scenes.take.count: {count}, but there are {len(scenes)} scenes")
-    chosen = np.sort(np.random.default_rng(take["seed"]).permutation(len(scenes))[:count])
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(scenes))[:count])
     scene = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)
-    account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {take['seed']}"
+    account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {seed}"
     return Scenes(scene, tuple(scenes.names[index] for index in chosen), account)
 
 
 def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scenes:
-    """Scenes that training never saw: those at `path`, or what the config's `scenes.heldout` names.
+    """Loads scenes that training does not use: those at `path`, or those that `scenes.heldout` names.
 
     Raises:
-        ConfigError: the config names none.
-        SceneError: nothing usable at the path, with the reasons.
+        ConfigError: the config names none, or not one usable scene.
+        SceneError: no scenes at the path.
     """
-    schema.check_scenes(config)
-    path = path if path is not None else config["heldout"]["path"]
-    if path is not None:
-        return from_path(config, path)
-    if config["path"] is not None or not _has_generator(config):
-        raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
-    check_heldout(config)
-    return generate_scenes(config, seed=config["heldout"]["seed"], count=config["heldout"]["count"])
+    check_config(config)
+    heldout = config["heldout"]
+    path = path if path is not None else heldout["path"]
+    if path is None:
+        if not has_heldout(config):
+            raise ConfigError("scenes.heldout.path: null; give held-out scenes here, or scenes.path=... to `evaluate`")
+        check_heldout(config)
+    return load_all_scenes({**config, "path": path, "seed": heldout["seed"], "count": heldout["count"]})
 
 
 def check_heldout(config: Mapping[str, Any]) -> None:
-    """Refuse held-out scenes that are not there or not held out, without reading them: at the door, not after a training.
+    """Checks that held-out scenes exist and are not those of training, without reading them.
 
     Raises:
         ConfigError: naming the key.
     """
-    schema.check_scenes(config)
-    path, own = config["heldout"]["path"], config["path"]
+    check_config(config)
+    path, trained = config["heldout"]["path"], config["path"]
     if path is not None and not Path(path).exists():
         raise ConfigError(f"scenes.heldout.path: {path}: no such file or folder; give held-out scenes, or null for none")
-    if path is not None and own is not None and Path(path).resolve() == Path(own).resolve():
+    if path is not None and trained is not None and Path(path).resolve() == Path(trained).resolve():
         raise ConfigError(f"scenes.heldout.path: {path} is what is trained on; the scenes would not be held out")
-    if path is None and own is None and config["heldout"]["seed"] == config["seed"]:
+    if path is None and trained is None and config["heldout"]["seed"] == config["seed"]:
         raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
 
 
 def has_heldout(config: Mapping[str, Any]) -> bool:
     """Whether a config names held-out scenes."""
-    return config["heldout"]["path"] is not None or (config["path"] is None and _has_generator(config))
-
-
-def _has_generator(config: Mapping[str, Any]) -> bool:
-    """An experiment may set numbers of a generator that `scenes=womd` does not have."""
-    return "_target_" in (config["generate"] or {})
-
-
-def from_path(config: Mapping[str, Any], path: str | Path) -> Scenes:
-    """Scenes of a bank or of files, checked and packed now; what cannot be is listed in the account.
-
-    Raises:
-        ConfigError: not one can be used, with the reasons.
-    """
-    what, packed, summary = _from_bank(config, path) if bank_reader.is_bank(path) else _from_files(config, path)
-    lines = [what, *conversion.describe(summary)]
-    if not packed:
-        raise ConfigError(f"scenes.path={path}: no usable scene\n" + "\n".join(lines[1:]))
-    return _stacked(packed, config, lines)
-
-
-def _from_bank(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[Packed], conversion.Summary]:
-    """Everything of a bank that can be packed, and the account of that."""
-    opened = bank_reader.open(path)
-    parts = {name: part for name, part in make_readers(config).items() if name != "formats"}
-    found = bank_reader.pack_scenes(opened, range(len(opened)), **parts, workers=config["workers"])
-    sources = opened.metadata["source"].to_pylist()
-    refused = [one._asdict() | {"source": place} for one, place in zip(found, sources, strict=True) if isinstance(one, Reject)]
-    packed = [one for one in found if isinstance(one, Packed)]
-    summary = conversion.summarise([one.report for one in packed], files=len(set(sources)), rejects=[*opened.rejects, *refused])
-    return f"bank {path}{opened.unfinished}", packed, summary
-
-
-def _from_files(config: Mapping[str, Any], path: str | Path) -> tuple[str, list[Packed], conversion.Summary]:
-    """Everything in a file or folder that can be packed, and the account of that."""
-    packed, summary = conversion.read(path, **make_readers(config), workers=config["workers"])
-    return f"scenes {path}", packed, summary
-
-
-def generate_scenes(config: Mapping[str, Any], *, seed: int, count: int) -> Scenes:
-    """Scenes from the generator, checked and packed like any others."""
-    generate = make_generator(config)
-    parts = make_readers(config)
-    packed = [prepare(generate(seed, index), check=parts["check"], pack=parts["pack"]) for index in range(count)]
-    agents = sum(scene.report.agents_kept for scene in packed)
-    return _stacked(packed, config, [f"{count} generated scenes with {agents} agents, seed {seed}"])
-
-
-def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
-    """The generator of a scenes config, bound to its numbers: (seed, index) -> scene.
-
-    Raises:
-        ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
-    """
-    if not _has_generator(config):
-        raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=procedural")
-    return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.procedural.procedural_scene", where="scenes.generate")
-
-
-def make_readers(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Formats, check and pack of a scenes config, bound to their numbers."""
-    return {
-        "formats": reader_selection.make(config["formats"]),
-        "check": instantiate(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check"),
-        "pack": instantiate(config["pack"], builtins="scenefactory_jax.data.packing.pack", where="scenes.pack"),
-    }
+    return config["heldout"]["path"] is not None or (config["path"] is None and "_target_" in (config["generate"] or {}))
 
 
 def assign_scenes(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
-    """One scene for each world: the whole list shuffled, again and again (SceneFactory's); on the device, or shared out on several.
+    """Gives each world a scene: the list shuffled, again and again (SceneFactory's), placed on the device or sharded over a mesh.
 
     Returns:
-        Scenes along the first axis, and a line that says how often each is used.
+        Scenes along the first axis, and a line with the number of worlds per scene.
 
     Raises:
         ConfigError: worlds that do not divide among the devices.
@@ -204,21 +337,14 @@ def assign_scenes(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None =
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs between processes, in the user's cache folder or where SCENEFACTORY_CACHE says."""
-    place = os.environ.get(CACHE, str(Path.home() / ".cache" / "scenefactory_jax"))
-    if place and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        jax.config.update("jax_compilation_cache_dir", place)
+    """Keeps compiled programs between processes, in the user's cache folder or in SCENEFACTORY_CACHE."""
+    folder = os.environ.get(CACHE, str(Path.home() / ".cache" / "scenefactory_jax"))
+    if folder and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
 
 
-def _stacked(packed: Sequence[Packed], config: Mapping[str, Any], lines: list[str]) -> Scenes:
-    scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
-    return Scenes(
-        attach_grids(scene, config), tuple(escape_for_terminal(one.report.name) for one in packed), "\n".join([*lines, *describe(cuts)])
-    )
-
-
 def attach_grids(scene: Scene, config: Mapping[str, Any]) -> Scene:
-    """Stacked scenes with cells for the radius of the road observation, if a config has one."""
-    numbers = config["cells"]
-    return scene if numbers["radius_m"] is None else spatial_grid.attach_grid(scene, **numbers)
+    """Stacked scenes with road grids for the radius of the road observation, if a config has one."""
+    grid = config["road_grid"]
+    return scene if grid["radius_m"] is None else spatial_grid.attach_grid(scene, **grid)

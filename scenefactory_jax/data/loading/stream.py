@@ -4,17 +4,17 @@
         scenes = flow.scenes()                                # for all worlds, on their devices
         for iteration in range(iterations):
             if iteration:
-                state, scenes = flow.exchange(trainer.swap, state, scenes)
-            state, metrics = trainer.iterate(state, scenes)
+                state, scenes = flow.exchange(trainer.replace_scenes, state, scenes)
+            state, metrics = trainer.train_iteration(state, scenes)
             flow.draw()                                       # while the devices work
-            flow.note(*jax.device_get((state.record.episodes, state.record.successes)))
+            flow.note(*jax.device_get((state.scene_stats.episodes, state.scene_stats.successes)))
 
 What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
 state, it makes a resumed run the unbroken one, bit for bit.
 """
 
 import contextlib
-import functools
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -28,12 +28,15 @@ from jax.sharding import Mesh
 
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, instantiate
-from scenefactory_jax.core.parallel import process_pool
+from scenefactory_jax.core.parallel.task_map import open_pool
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
-from scenefactory_jax.data.loading.batches import Batch
+from scenefactory_jax.data.loading.batches import Batch, BatchLoader
+from scenefactory_jax.data.loading.scene_source import SceneSource, make_packing, open_source
+from scenefactory_jax.data.loading.scenes_config import check_config
 
+LOG = logging.getLogger(__name__)
 SHOWN = 10  # scenes left out that are told by name
 
 
@@ -42,11 +45,11 @@ class StreamSettings(NamedTuple):
 
     sampler: samplers.Sampler
     swapped: int  # worlds, before every iteration
-    ahead: int
-    processes: int
+    prefetch: int
+    workers: int
     wait_s: float
     memory: float
-    excess: batches.Excess
+    on_overflow: batches.OnOverflow
     sample: int
     headroom: float
     memory_gib: float
@@ -56,12 +59,12 @@ class StreamSettings(NamedTuple):
 def make_settings(
     *,
     sampler: dict,
-    share: float,
-    ahead: int,
+    swap_fraction: float,
+    prefetch: int,
     workers: int,
     wait_s: float,
     memory: float,
-    excess: Literal["cut", "skip"],
+    on_overflow: Literal["cut", "skip"],
     sample: int,
     headroom: float,
     memory_gib: float,
@@ -70,24 +73,22 @@ def make_settings(
     worlds: int,
     devices: int,
 ) -> StreamSettings:
-    """Check a `stream` entry.
+    """Checks a `stream` entry.
 
     Raises:
         ConfigError: a number out of range, or worlds that do not divide among the devices, by name.
     """
-    least = {"ahead": (ahead, 1), "workers": (workers, 0), "sample": (sample, 1), "headroom": (headroom, 1)}
-    for name, (value, bound) in least.items():
-        if value < bound:
-            raise ConfigError(f"stream.{name}: {value}; wanted is at least {bound}")
-    for name, value in {"share": share, "memory": memory}.items():
-        check_fraction(value, where=f"stream.{name}")
-    for name, value in {"wait_s": wait_s, "memory_gib": memory_gib}.items():
-        check_number(value, where=f"stream.{name}", above=0)
+    for name, value, least in (("prefetch", prefetch, 1), ("workers", workers, 0), ("sample", sample, 1), ("headroom", headroom, 1)):
+        check_number(value, where=f"stream.{name}", least=least)
+    check_fraction(swap_fraction, where="stream.swap_fraction")
+    check_fraction(memory, where="stream.memory")
+    check_number(wait_s, where="stream.wait_s", above=0)
+    check_number(memory_gib, where="stream.memory_gib", above=0)
     if worlds % devices:
         raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
-    swapped = min(worlds, int(np.ceil(share * worlds / devices)) * devices)  # every device takes an equal part of the rows
-    draw = instantiate(sampler, builtins=samplers, where="stream.sampler", seed=seed)
-    return StreamSettings(draw, swapped, ahead, workers, wait_s, memory, excess, sample, headroom, memory_gib, capacity)
+    swapped = min(worlds, int(np.ceil(swap_fraction * worlds / devices)) * devices)  # every device takes an equal part of the rows
+    bound = instantiate(sampler, builtins=samplers, where="stream.sampler", seed=seed)
+    return StreamSettings(bound, swapped, prefetch, workers, wait_s, memory, on_overflow, sample, headroom, memory_gib, capacity)
 
 
 class PlacedScenes(NamedTuple):
@@ -100,7 +101,7 @@ class PlacedScenes(NamedTuple):
 class SceneStream:
     """Scenes on their way into worlds, and what is known of them. Made by `flowing`."""
 
-    def __init__(self, source: batches.Source, entry: StreamSettings, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
+    def __init__(self, source: SceneSource, entry: StreamSettings, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
         """`held` is what `state` told, or `_new`."""
         self._source, self._entry, self._load = source, entry, load
         self._table = samplers.SceneOutcomes(
@@ -143,7 +144,7 @@ class SceneStream:
 
     def draw(self) -> None:
         """Draw what is to be on its way, and begin to load it."""
-        while self._entry.swapped and len(self._waiting) < self._entry.ahead:
+        while self._entry.swapped and len(self._waiting) < self._entry.prefetch:
             drawn = self._drawn(self._entry.swapped)
             self._waiting.append((drawn, self._load(drawn)))
 
@@ -157,7 +158,7 @@ class SceneStream:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON values."""
         return {
-            "source": self._source.count,
+            "source": self._source.identity,
             "sizes": self._sizes,
             "exchanges": self._exchanges,
             "placed": self._placed.tolist(),
@@ -185,22 +186,22 @@ class SceneStream:
             taken: PlacedScenes = future.result(timeout=self._entry.wait_s)
         except Late:
             wait = f"stream.wait_s: no scenes after {self._entry.wait_s:g} s"
-            raise RuntimeError(f"{wait} from {self._source.line}; raise it, or stream.workers") from None
+            raise RuntimeError(f"{wait} from {self._source.description}; raise it, or stream.workers") from None
         self._waited_s += time.monotonic() - begun
         self._counts["cut"] += taken.batch.cut
         self._counts["refused"] += len(taken.batch.refused)
         for name, reason in taken.batch.refused.items():
             if name not in self._told and len(self._told) < SHOWN:
                 self._told.add(name)
-                print(escape_for_terminal(f"left out {name}: {reason}"), flush=True)
+                LOG.info(escape_for_terminal(f"left out {name}: {reason}"))
         return taken
 
 
-def _new(source: batches.Source, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
+def _new(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
     """The state of a stream that has not begun."""
     table = samplers.empty(source.count)
     return {
-        "source": source.count,
+        "source": source.identity,
         "sizes": dict(sizes),
         "exchanges": 0,
         "placed": np.zeros(worlds, int),
@@ -219,31 +220,35 @@ def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping
         ConfigError: a key that does not fit, sizes that make no sense, or a state that belongs to other scenes.
         SceneError: scenes that cannot be read, with reasons.
     """
-    source = batches.open(config["scenes"])
-    devices = 1 if mesh is None else mesh.size
-    context = {"seed": config["seed"], "worlds": config["worlds"], "devices": devices}
+    check_config(config["scenes"])
+    if (count := config["scenes"]["take"]["count"]) is not None:
+        raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=sample` makes a smaller bank")
+    source = open_source(config["scenes"])
+    context = {"seed": config["seed"], "worlds": config["worlds"], "devices": 1 if mesh is None else mesh.size}
     entry: StreamSettings = instantiate({"_target_": "make_settings", **config["stream"]}, builtins=__name__, where="stream", **context)()
-    if before is not None and before["source"] != source.count:
-        raise ConfigError(f"resume=true: the run streamed {before['source']} scenes; there are {source.line} now")
-    grid = config["scenes"]["cells"]
+    if before is not None and before["source"] != source.identity:
+        raise ConfigError(f"resume=true: the run streamed {_count(before['source'])}; now there are {_count(source.identity)}")
     with contextlib.ExitStack() as stack:
         thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
         stack.callback(thread.shutdown, wait=True, cancel_futures=True)
-        pool = stack.enter_context(process_pool.open_pool(entry.processes)) if entry.processes else None
+        task_map = stack.enter_context(open_pool(entry.workers))
+        loader = BatchLoader(source, **make_packing(config["scenes"]), grid=config["scenes"]["road_grid"], task_map=task_map)
         if before is None:
-            asked = {"sample": entry.sample, "headroom": entry.headroom, "given": entry.capacity, "seed": config["seed"]}
-            sizes = batches.measure(source, pool, grid=grid, **asked)
+            sizes = batches.measure(loader, sample=entry.sample, headroom=entry.headroom, given=entry.capacity, seed=config["seed"])
         else:
             sizes = before["sizes"]
-        batches.require_memory(sizes, config["worlds"] + entry.ahead * entry.swapped, gib=entry.memory_gib)
-        read = functools.partial(batches.load, source, pool, fit=batches.BoxSizes(sizes, grid, entry.excess))
+        batches.require_memory(sizes, config["worlds"] + entry.prefetch * entry.swapped, gib=entry.memory_gib)
 
-        def placed(indices: np.ndarray) -> PlacedScenes:
-            batch = read(indices)
+        def load(indices: np.ndarray) -> PlacedScenes:
+            batch = batches.load(loader, indices, sizes, on_overflow=entry.on_overflow)
             return PlacedScenes(batch, jax.block_until_ready(sharding.place_on_devices(batch.scene, mesh)))
 
         held = _new(source, sizes, config["worlds"]) if before is None else before
-        flow = SceneStream(source, entry, lambda indices: thread.submit(placed, indices), held)
         what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
-        print(f"stream of {source.line}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}", flush=True)
-        yield flow
+        LOG.info(f"stream of {source.description}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}")
+        yield SceneStream(source, entry, lambda indices: thread.submit(load, indices), held)
+
+
+def _count(identity: Mapping[str, Any]) -> str:
+    kind, entries = identity["kind"], identity["entries"]
+    return "scenes of a generator" if kind == "generator" else f"{entries} {'files' if kind == 'files' else 'scenes of a bank'}"

@@ -21,7 +21,7 @@ DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
     "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
 )  # fmt: skip
-OTHER_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
+TRAFFIC_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
 REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
 CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
@@ -39,8 +39,8 @@ class PackReport:
     track_ids: tuple[int, ...]  # of the agents, slot by slot
     agents_kept: int
     agents_dropped: dict[str, int]  # reason -> count, every reason of DROPS
-    others_kept: int  # everybody who is no agent is counted here or in the next
-    others_dropped: dict[str, int]  # reason -> count, every reason of OTHER_DROPS
+    traffic_kept: int  # everybody who is no agent is counted here or in the next
+    traffic_dropped: dict[str, int]  # reason -> count, every reason of TRAFFIC_DROPS
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count, every reason of CUTS
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -79,8 +79,8 @@ def pack(
     log_from: Literal["start", "current"],
     require_agents: bool,
     traffic: int,
-    others_least_m: float,
-    outline_m: float = 2.0,
+    min_traffic_size_m: float,
+    outline_m: float,
 ) -> tuple[Scene, PackReport]:
     """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
 
@@ -95,8 +95,8 @@ def pack(
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
         traffic: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
-        others_least_m: shortest and narrowest that they may be.
-        outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway); the configs of older runs do not say it.
+        min_traffic_size_m: shortest and narrowest that they may be.
+        outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -113,7 +113,7 @@ def pack(
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _log(chosen, logs, raw, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, others_dropped = _others(raw, logs, chosen, leaves, half, first, traffic, others_least_m)
+    beside, traffic_dropped = _others(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -124,8 +124,8 @@ def pack(
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=len(chosen),
         agents_dropped=dropped,
-        others_kept=len(beside["traffic_log.kind"]),
-        others_dropped=others_dropped,
+        traffic_kept=len(beside["traffic_log.kind"]),
+        traffic_dropped=traffic_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
@@ -299,7 +299,8 @@ def _agents(
     chosen: list[int], logs: Logs, current: int, slots: int, car_size_m: list[float] | None, start_speed: str
 ) -> dict[str, np.ndarray]:
     """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
-    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")} | {name: np.zeros(slots) for name in ("yaw", "speed", "route")}
+    rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")}
+    rows |= {name: np.zeros(slots) for name in ("yaw", "speed", "route_length")}
     sizes = np.tile(car_size_m, (len(chosen), 1)) if car_size_m else logs.size[chosen, :2]
     absent = car_size_m or (sizes.mean(axis=0) if len(sizes) else np.ones(2))
     size = np.concatenate([sizes.reshape(-1, 2), np.tile(absent, (slots - len(chosen), 1))])
@@ -309,7 +310,7 @@ def _agents(
         along = float(logs.velocity[index, current] @ np.array([np.cos(yaw), np.sin(yaw)]))
         rows["position"][slot], rows["goal"][slot], rows["yaw"][slot] = path[0], path[-1], wrap_angles(yaw)
         rows["speed"][slot] = max(along, 0.0) if start_speed == "logged" else 0.0
-        rows["route"][slot] = max(segment_lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
+        rows["route_length"][slot] = max(segment_lengths(np.diff(path, axis=0)).sum(), np.linalg.norm(path[-1] - path[0]))
     present = np.arange(slots) < len(chosen)
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 

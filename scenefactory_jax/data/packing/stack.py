@@ -12,7 +12,7 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.packing import columns
 
 AXES = (*columns.ROADS, "agents", "steps", "traffic")
-ROW_MULTIPLE = 256  # road capacities are rounded up to this, so that similar selections share a compiled program
+ROW_MULTIPLE = 256
 Leaves = dict[str, np.ndarray]
 
 
@@ -103,11 +103,16 @@ def _resolve(worlds: Sequence[Leaves], capacity: Mapping[str, int | None]) -> di
         rows, least = capacity.get(axis), 0 if axis == "traffic" else 1
         if rows is None:
             rows = max(least, *(_count(world, axis) for world in worlds))
-            rows = -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE if axis in columns.ROADS else rows
+            rows = round_rows(axis, rows)
         elif isinstance(rows, bool) or not isinstance(rows, int) or rows < least:
             raise SceneError(f"capacity.{axis}: {rows!r} is no capacity; valid: {least} or more, or null for what the largest scene needs")
         sizes[axis] = rows
     return sizes
+
+
+def round_rows(axis: str, rows: int) -> int:
+    """Rows of an axis as a capacity: those of segments are rounded up, so that similar selections share a compiled program."""
+    return -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE if axis in columns.ROADS else rows
 
 
 def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCounts]) -> Leaves:

@@ -1,6 +1,5 @@
-"""What a scene must be before it is packed: refused by name where nothing can be done, repaired and counted where something can."""
+"""Checks on scenes before they are packed: a scene is repaired where that is possible, and refused by name where it is not."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -20,45 +19,45 @@ def check(
     *,
     track_speed_limit_m_s: float,
     car_size_m: list[float],
-    most_m: float = 1e7,
-    segment_most_m: float = math.inf,
-    lanes_most_m: float = math.inf,
-    size_most_m: float = math.inf,
-    speed_most_m_s: float = math.inf,
-    steps_most: float | int = math.inf,
-    step_s: Sequence[float] = (0.0, math.inf),
-    uneven_share: Sequence[float] = (math.inf, math.inf),
+    max_coordinate_m: float,
+    max_segment_m: float,
+    max_lanes_m: float,
+    max_size_m: float,
+    max_speed_m_s: float,
+    max_steps: int,
+    step_s: Sequence[float],
+    uneven_fraction: Sequence[float],
 ) -> tuple[RawScene, list[str]]:
-    """A scene that can be packed, and one line for each kind of repair or finding.
+    """Checks and repairs a scene, and returns it with one line for each kind of repair or finding.
 
-    The bounds keep the work on a scene in proportion to its file: one damaged number must not ask for 10^7 points along a lane. The configs
-    of older runs name `most_m` at most; they have no other bound.
+    The bounds keep the work on a scene in proportion to its file: one damaged number must not ask for 10^7 points along a lane.
 
     Args:
         raw: as a reader or a generator gave it.
         track_speed_limit_m_s: a track whose positions imply more than that in a step is reported as jumping.
         car_size_m: length, width, height given to objects whose logged size is not positive.
-        most_m: largest coordinate, and largest yaw in radians.
-        segment_most_m: largest distance between neighbouring points of a polyline.
-        lanes_most_m: largest length of all driving lanes together.
-        size_most_m: largest length, width and height of an object.
-        speed_most_m_s: largest velocity along x or y.
-        steps_most: most steps of a log.
+        max_coordinate_m: largest coordinate, and largest yaw in radians.
+        max_segment_m: largest distance between neighbouring points of a polyline.
+        max_lanes_m: largest length of all driving lanes together.
+        max_size_m: largest length, width and height of an object.
+        max_speed_m_s: largest velocity along x or y.
+        max_steps: most steps of a log.
         step_s: shortest and longest step of a log.
-        uneven_share: logs whose steps differ from the median step by more than the first share of it, and by no more than the second, are
-            resampled to even steps; logs that are more uneven stay as they are.
+        uneven_fraction: logs whose steps differ from the median step by more than the first fraction of it and
+            by no more than the second are resampled to even steps; logs that are more uneven stay as they are.
 
     Raises:
         SceneError: steps that disagree, no driving lane, or a number that is not finite or beyond a bound, naming the file and the element.
     """
-    _require_steps(raw, steps_most, step_s)
+    _require_steps(raw, max_steps, step_s)
     points, logs = join_lines(raw.roads), stack_tracks(raw.tracks, len(raw.times))
-    _require_map(raw, points, most_m)
-    _require_lengths(raw, points, segment_most_m, lanes_most_m)
-    _require_tracks(raw, logs, {"xyz": (most_m, "most_m"), "yaw": (most_m, "most_m"), "velocity": (speed_most_m_s, "speed_most_m_s")})
-    _require_sizes(raw, logs, size_most_m)
+    _require_map(raw, points, max_coordinate_m)
+    _require_lengths(raw, points, max_segment_m, max_lanes_m)
+    coordinate = (max_coordinate_m, "max_coordinate_m")
+    _require_tracks(raw, logs, {"xyz": coordinate, "yaw": coordinate, "velocity": (max_speed_m_s, "max_speed_m_s")})
+    _require_sizes(raw, logs, max_size_m)
     lines: list[str] = []
-    raw, logs = _even_steps(raw, logs, uneven_share, lines)
+    raw, logs = _even_steps(raw, logs, uneven_fraction, lines)
     whole = _repair_roads(raw.roads, points, lines)
     roads = _known(whole, lines)
     if not any(line.kind in DRIVABLE for line in roads):
@@ -73,7 +72,7 @@ def _require_steps(raw: RawScene, most: float | int, step_s: Sequence[float]) ->
     """Times rise by steps that a log can have, the current step is one of them, and every track and light has all of them."""
     steps = len(raw.times)
     if steps > most:
-        raise SceneError(f"{raw.source}: times: {steps} steps; valid: up to {most:g} (scenes.check.steps_most)")
+        raise SceneError(f"{raw.source}: times: {steps} steps; valid: up to {most:g} (scenes.check.max_steps)")
     span = np.diff(raw.times)
     if not np.all(np.isfinite(raw.times)) or np.any(span <= 0):
         raise SceneError(f"{raw.source}: times: they must be finite and rise from step to step")
@@ -98,7 +97,7 @@ def _require_map(raw: RawScene, points: Points, most: float) -> None:
     if bad.any():
         row, axis = np.argwhere(bad)[0]
         place, number = _polyline(raw, points, int(row))
-        raise SceneError(f"{raw.source}: {place}: xyz[{number}][{axis}]: {_fault(float(points.xyz[row, axis]), most, 'most_m')}")
+        raise SceneError(f"{raw.source}: {place}: xyz[{number}][{axis}]: {_fault(float(points.xyz[row, axis]), most, 'max_coordinate_m')}")
 
 
 def _require_lengths(raw: RawScene, points: Points, segment_most: float, lanes_most: float) -> None:
@@ -107,11 +106,11 @@ def _require_lengths(raw: RawScene, points: Points, segment_most: float, lanes_m
     length = np.linalg.norm(np.diff(points.xyz, axis=0), axis=1) * (owner[1:] == owner[:-1])
     if (bad := np.flatnonzero(length > segment_most)).size:
         place, number = _polyline(raw, points, int(bad[0]))
-        fault = f"{length[bad[0]]:g} m long; valid: up to {segment_most:g} (scenes.check.segment_most_m)"
+        fault = f"{length[bad[0]]:g} m long; valid: up to {segment_most:g} (scenes.check.max_segment_m)"
         raise SceneError(f"{raw.source}: {place}: the segment from xyz[{number}] is {fault}")
     drivable = np.array([line.kind in DRIVABLE for line in raw.roads], bool)
     if (total := float(length[drivable[owner[1:]]].sum())) > lanes_most:
-        raise SceneError(f"{raw.source}: roads: {total:g} m of driving lanes; valid: up to {lanes_most:g} (scenes.check.lanes_most_m)")
+        raise SceneError(f"{raw.source}: roads: {total:g} m of driving lanes; valid: up to {lanes_most:g} (scenes.check.max_lanes_m)")
 
 
 def _polyline(raw: RawScene, points: Points, row: int) -> tuple[str, int]:
@@ -143,7 +142,7 @@ def _require_sizes(raw: RawScene, logs: Logs, most: float) -> None:
     huge = np.argwhere(np.isfinite(logs.size) & (logs.size > most))
     if len(huge):
         index, axis = huge[0]
-        fault = _fault(float(logs.size[index, axis]), most, "size_most_m")
+        fault = _fault(float(logs.size[index, axis]), most, "max_size_m")
         raise SceneError(f"{raw.source}: tracks[{index}] (id {raw.tracks[index].id}): size[{axis}]: {fault}")
 
 

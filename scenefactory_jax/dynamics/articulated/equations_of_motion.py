@@ -1,8 +1,8 @@
 """A car's equations of motion in closed form: M(q) a + bias(q, v) = forces, for a free chassis with four sprung, steered, spinning wheels.
 
-Everything is seen in the car's own axes, the linear acceleration of the chassis too. MuJoCo's free joint has that one in the world's axes;
-a rotation of unknowns changes nothing about the motion, and without it M depends on suspension and steering alone and is mostly zeros.
-A wheel is round: its inertia is `across` 1 + (`about` - `across`) axle axle^T, whatever its spin angle, which is why none appears here.
+All quantities are in the car's axes, the linear acceleration of the chassis too (MuJoCo's free joint has it in the world's axes). In these
+axes M depends on suspension and steering alone and is mostly zeros. A wheel is a body of revolution: its inertia is
+`across` 1 + (`about` - `across`) axle axle^T at any spin angle.
 
 M comes from the kinetic energy, bias from the accelerations of all bodies while no joint accelerates (Featherstone, Rigid Body Dynamics
 Algorithms, chapters 2 and 5; MuJoCo documentation, "Computation", general framework). Gravity is an upward acceleration of everything.
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, GRAVITY, CarParameters
 from scenefactory_jax.dynamics.articulated.state import CarState
-from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, over_wheels, wheels
+from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, sum_vectors, sum_wheels
 
 FRONT = 0.5 * (1.0 + AHEAD)  # 1 for the wheels that steer
 Matrix = list[list[Number]]
@@ -28,15 +28,15 @@ class Forces(NamedTuple):
     steer: Number  # zero for the rear wheels
 
 
-class Drift(NamedTuple):
+class WheelAcceleration(NamedTuple):
     """Accelerations of the wheels while no joint accelerates."""
 
     hub: Vector  # m/s^2
-    turn: Vector  # rad/s^2
+    angular: Vector  # rad/s^2
 
 
 class Unsprung(NamedTuple):
-    """Masses of the wheels with all that moves with them."""
+    """Masses of the wheels with carriers and knuckles."""
 
     mass: Number  # [4] kg
     about: Number  # inertia about the axle, kg m^2
@@ -44,50 +44,50 @@ class Unsprung(NamedTuple):
 
 
 def compute_unsprung(car: CarParameters) -> Unsprung:
-    """Sums of the parts."""
+    """Computes the masses and inertias of the wheels, carriers and knuckles."""
     about, across = car.wheel_inertia
     mass = car.wheel_mass + car.carrier_mass + FRONT * car.knuckle_mass
     return Unsprung(mass, about, across + car.carrier_inertia + FRONT * car.knuckle_inertia)
 
 
 def total_mass(car: CarParameters) -> Number:
-    """Of the whole car, kg; the cars may have an axis."""
+    """Computes the mass of the whole car, kg; the parameters may have a car axis."""
     return car.mass + 4 * (car.wheel_mass + car.carrier_mass) + 2 * car.knuckle_mass
 
 
 def centre_of_mass(car: CarParameters) -> Vector:
-    """Of the chassis' mass, from the box's centre, m."""
+    """Computes the centre of mass of the chassis, from the box's centre, m."""
     return Vector(car.mass_forward, 0.0, car.mass_height)
 
 
 def compute_loads(car: CarParameters) -> Number:
-    """Weight of the chassis on each wheel at rest, N."""
+    """Computes the weight of the chassis on each wheel at rest, N: the axle nearer to the centre of mass carries more."""
     return 0.5 * car.mass * GRAVITY * (0.5 + AHEAD * (car.mass_forward / car.wheelbase))
 
 
-def compute_bias_acceleration(state: CarState) -> Drift:
-    """Centripetal, Coriolis and gyroscopic accelerations."""
+def compute_bias_acceleration(state: CarState) -> WheelAcceleration:
+    """Computes centripetal, Coriolis and gyroscopic accelerations."""
     rate, up = state.rate, Vector(0.0, 0.0, 1.0)
-    steered = up * state.steering
-    hub = cross(rate, cross(rate, state.hub) + up * (2.0 * state.sinking))
-    return Drift(hub, cross(rate, steered) + cross(rate + steered, state.axle * state.spin))
+    steered = up * state.steer_rate
+    hub = cross(rate, cross(rate, state.hub) + up * (2.0 * state.travel_rate))
+    return WheelAcceleration(hub, cross(rate, steered) + cross(rate + steered, state.axle * state.spin))
 
 
 def compute_mass_matrix(car: CarParameters, state: CarState) -> tuple[Matrix, Matrix, Matrix]:
-    """M: of the chassis (6 x 6, linear before angular), between chassis and wheels (6 x 3), of the wheels' own joints (3 x 3).
+    """Computes M in blocks: chassis (6 x 6, linear before angular), chassis-wheel coupling (6 x 3), wheel joints (3 x 3).
 
-    The own joints are suspension, spin and steering. They do not meet: the axle is across the other two, and the hub lies on all three.
-    A rear wheel, which has no steering, gets a row of zeros with a unit diagonal.
+    The wheel joints are suspension, spin and steering. They are decoupled: the axle is across the other two, and the hub lies on all three.
+    A rear wheel has no steering: its row is zero with a unit diagonal.
     """
     wheel, axle, hub = compute_unsprung(car), state.axle, state.hub
     oval, total = wheel.about - wheel.across, total_mass(car)
-    x, y, z = centre_of_mass(car) * car.mass + wheels(hub * wheel.mass)
-    shift = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # linear momentum of a turn
+    x, y, z = centre_of_mass(car) * car.mass + sum_vectors(hub * wheel.mass)
+    shift = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # linear momentum of a rotation
 
     def second_moment(i: int, j: int) -> Number:
         chassis, hubs = _second_moment(i, j, car.mass, centre_of_mass(car)), _second_moment(i, j, wheel.mass, hub)
-        own = chassis + over_wheels(hubs + oval * axle[i] * axle[j])
-        return own + car.inertia[i] + over_wheels(wheel.across) if i == j else own
+        moment = chassis + sum_wheels(hubs + oval * axle[i] * axle[j])
+        return moment + car.inertia[i] + sum_wheels(wheel.across) if i == j else moment
 
     lower = [[second_moment(i, j) for j in range(i + 1)] for i in range(3)]
     linear = [[*(total if i == j else 0.0 for j in range(3)), *shift[i]] for i in range(3)]
@@ -104,19 +104,19 @@ def compute_mass_matrix(car: CarParameters, state: CarState) -> tuple[Matrix, Ma
     return [*linear, *angular], across, [[wheel.mass, 0.0, 0.0], [0.0, wheel.about, 0.0], [0.0, 0.0, pivot]]
 
 
-def compute_bias_force(car: CarParameters, state: CarState, drift: Drift) -> Forces:
-    """What keeps every joint from accelerating: the bodies' masses times `drift`, and their weight."""
-    wheel, rate, axle, weightless = compute_unsprung(car), state.rate, state.axle, state.up * GRAVITY
-    chassis = (cross(rate, cross(rate, centre_of_mass(car))) + weightless) * car.mass
-    push = (drift.hub + weightless) * wheel.mass
-    whole = rate + Vector(0.0, 0.0, state.steering) + axle * state.spin
+def compute_bias_force(car: CarParameters, state: CarState, drift: WheelAcceleration) -> Forces:
+    """Computes the bias force: the bodies' masses times `drift`, and their weight."""
+    wheel, rate, axle, gravity = compute_unsprung(car), state.rate, state.axle, state.up * GRAVITY
+    chassis = (cross(rate, cross(rate, centre_of_mass(car))) + gravity) * car.mass
+    push = (drift.hub + gravity) * wheel.mass
+    total = rate + Vector(0.0, 0.0, state.steer_rate) + axle * state.spin
     oval = wheel.about - wheel.across
-    torque = drift.turn * wheel.across + axle * (oval * dot(axle, drift.turn)) + cross(whole, axle) * (oval * dot(axle, whole))
+    torque = drift.angular * wheel.across + axle * (oval * dot(axle, drift.angular)) + cross(total, axle) * (oval * dot(axle, total))
     roll, pitch, yaw = car.inertia
-    still = cross(centre_of_mass(car), chassis) + cross(rate, Vector(roll * rate.x, pitch * rate.y, yaw * rate.z))
+    bias = cross(centre_of_mass(car), chassis) + cross(rate, Vector(roll * rate.x, pitch * rate.y, yaw * rate.z))
     return Forces(
-        force=chassis + wheels(push),
-        torque=still + wheels(cross(state.hub, push) + torque),
+        force=chassis + sum_vectors(push),
+        torque=bias + sum_vectors(cross(state.hub, push) + torque),
         suspension=push.z,
         spin=dot(axle, torque),
         steer=FRONT * torque.z,
@@ -124,5 +124,5 @@ def compute_bias_force(car: CarParameters, state: CarState, drift: Drift) -> For
 
 
 def _second_moment(i: int, j: int, mass: Number, arm: Vector) -> Number:
-    """Element of the inertia of a point mass about the origin."""
+    """Computes an element of the inertia of a point mass about the origin."""
     return mass * ((dot(arm, arm) if i == j else 0.0) - arm[i] * arm[j])

@@ -1,4 +1,4 @@
-"""Where a car is and how it moves, in its own axes: read from MuJoCo's arrays, written back, and moved on in time."""
+"""Position and velocity of a car in its own axes: conversion from and to MuJoCo's arrays, and integration in time."""
 
 from typing import NamedTuple
 
@@ -15,33 +15,36 @@ class CarState(NamedTuple):
     """A car's position and velocity, in its own axes."""
 
     height: Array  # of the box's centre above the road, m
-    east: Vector  # the world's x, y and z axes
+    east: Vector  # the x, y and z axes of the world
     north: Vector
     up: Vector
     velocity: Vector  # of the box's centre, m/s
     rate: Vector  # angular velocity, rad/s
     travel: Float[Array, "4"]  # of each suspension, m
-    sinking: Float[Array, "4"]  # its rate, m/s
+    travel_rate: Float[Array, "4"]  # m/s
     steer: Float[Array, "4"]  # rad; 0 for the rear wheels
-    steering: Float[Array, "4"]  # its rate, rad/s
+    steer_rate: Float[Array, "4"]  # rad/s
     spin: Float[Array, "4"]  # rate, rad/s
-    hub: Vector  # place of each wheel's centre, m
-    axle: Vector  # its axis of spin
+    hub: Vector  # position of each wheel centre, m
+    axle: Vector  # spin axis of each wheel
 
 
 def from_mujoco(car: CarParameters, qpos: Float[Array, "17"], qvel: Float[Array, "16"]) -> CarState:
-    """MuJoCo's arrays as a state."""
-    east, north, up = (Vector(*row) for row in matrix(qpos[3:7]))
+    """Computes the state from MuJoCo's arrays."""
+    east, north, up = (Vector(*row) for row in rotation_matrix(qpos[3:7]))
     velocity = east * qvel[0] + north * qvel[1] + up * qvel[2]
-    travel, steer, _ = _apart(qpos[7:])
-    sinking, steering, spin = _apart(qvel[6:])
+    travel, steer, _ = _split_joints(qpos[7:])
+    travel_rate, steer_rate, spin = _split_joints(qvel[6:])
     hub = Vector(AHEAD * (car.wheelbase / 2), LEFT * (car.track / 2), car.wheel_height + travel)
     axle = Vector(-jnp.sin(steer), jnp.cos(steer), 0.0)
-    return CarState(qpos[2], east, north, up, velocity, Vector(*qvel[3:6]), travel, sinking, steer, steering, spin, hub, axle)
+    return CarState(qpos[2], east, north, up, velocity, Vector(*qvel[3:6]), travel, travel_rate, steer, steer_rate, spin, hub, axle)
 
 
-def matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
-    """Rotation matrix of a unit quaternion (w, x, y, z): its columns are the body's axes in the world, its rows the world's in the body."""
+def rotation_matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
+    """Computes the rotation matrix of a unit quaternion (w, x, y, z).
+
+    Its columns are the body's axes in the world, its rows the world's axes in the body.
+    """
     w, x, y, z = quaternion
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -50,29 +53,29 @@ def matrix(quaternion: Float[Array, "4 *cars"]) -> list[list[Array]]:
     ]
 
 
-def flatten(base: list[Number], own: list[Number], state: CarState) -> Float[Array, "16"]:
-    """Velocities, accelerations or forces by joint, in MuJoCo's order and axes.
+def flatten(base: list[Number], wheel: list[Number], state: CarState) -> Float[Array, "16"]:
+    """Arranges velocities, accelerations or forces by joint, in MuJoCo's order and axes.
 
     Args:
-        base: 3 linear and 3 angular ones of the chassis, in the car's axes.
-        own: of the wheels: suspension, spin, steering.
+        base: 3 linear and 3 angular components of the chassis, in the car's axes.
+        wheel: suspension, spin and steering of the wheels.
     """
     linear = Vector(*base[:3])
     world = [dot(axis, linear) for axis in (state.east, state.north, state.up)]
-    suspension, spin, steer = own
+    suspension, spin, steer = wheel
     joints = [number[wheel] for wheel in range(4) for number in ((suspension, steer, spin) if wheel < 2 else (suspension, spin))]
     return jnp.stack([*world, *base[3:], *joints])
 
 
 def unflatten(joints: Float[Array, "16"], state: CarState) -> tuple[list[Number], list[Number]]:
-    """The inverse of `flat`."""
+    """Computes the inverse of `flatten`."""
     linear = state.east * joints[0] + state.north * joints[1] + state.up * joints[2]
-    suspension, steer, spin = _apart(joints[6:])
+    suspension, steer, spin = _split_joints(joints[6:])
     return [*linear, *joints[3:6]], [suspension, spin, steer]
 
 
-def _apart(joints: Float[Array, "10"]) -> tuple[Float[Array, "4"], Float[Array, "4"], Float[Array, "4"]]:
-    """Suspension, steering and spin of each wheel: in MuJoCo's arrays wheel by wheel, the rear ones without steering."""
+def _split_joints(joints: Float[Array, "10"]) -> tuple[Float[Array, "4"], Float[Array, "4"], Float[Array, "4"]]:
+    """Splits joints, which MuJoCo stores wheel by wheel (rear wheels without steering), into suspension, steering and spin [4]."""
     front, rear = joints[:6].reshape(2, 3), joints[6:].reshape(2, 2)
     suspension, spin = jnp.concatenate([front[:, 0], rear[:, 0]]), jnp.concatenate([front[:, 2], rear[:, 1]])
     return suspension, jnp.concatenate([front[:, 1], jnp.zeros(2)]), spin
@@ -81,15 +84,15 @@ def _apart(joints: Float[Array, "10"]) -> tuple[Float[Array, "4"], Float[Array, 
 def integrate(
     qpos: Float[Array, "17"], qvel: Float[Array, "16"], acceleration: Float[Array, "16"], *, physics_dt: float
 ) -> tuple[Float[Array, "17"], Float[Array, "16"]]:
-    """Semi-implicit Euler: the new velocities move the car. The chassis turns about its angular velocity, which is in its own axes."""
+    """Integrates by semi-implicit Euler: the new velocities move the car. Angular velocity is in the car's axes."""
     qvel = qvel + physics_dt * acceleration
     x, y, z = qvel[3:6]
     rate = length(x, y, z)
-    turns, half = rate > TINY, 0.5 * physics_dt
-    share = jnp.where(turns, jnp.sin(half * rate) / jnp.where(turns, rate, 1.0), half)
-    a, b, c, d = jnp.cos(half * rate), share * x, share * y, share * z
+    rotates, half = rate > TINY, 0.5 * physics_dt
+    scale = jnp.where(rotates, jnp.sin(half * rate) / jnp.where(rotates, rate, 1.0), half)
+    a, b, c, d = jnp.cos(half * rate), scale * x, scale * y, scale * z
     w, i, j, k = qpos[3:7]
-    turned = [w * a - i * b - j * c - k * d, w * b + i * a + j * d - k * c, w * c - i * d + j * a + k * b, w * d + i * c - j * b + k * a]
-    unit = length(*turned)
+    rotated = [w * a - i * b - j * c - k * d, w * b + i * a + j * d - k * c, w * c - i * d + j * a + k * b, w * d + i * c - j * b + k * a]
+    unit = length(*rotated)
     joints = qpos[7:] + physics_dt * qvel[6:]
-    return jnp.concatenate([qpos[:3] + physics_dt * qvel[:3], jnp.stack([part / unit for part in turned]), joints]), qvel
+    return jnp.concatenate([qpos[:3] + physics_dt * qvel[:3], jnp.stack([part / unit for part in rotated]), joints]), qvel

@@ -1,7 +1,7 @@
-"""Vectors whose components are single numbers: what a car's mechanics is written in.
+"""Vectors with scalar components, for the car's mechanics.
 
-An array with an axis of three would cut XLA's loops at every stack and slice; arithmetic on numbers fuses. A component may have an axis of
-wheels, and broadcasts: `cross(rate, hub)` is of one angular velocity and four places.
+XLA cannot fuse across the stacks and slices of arrays with an axis of three; arithmetic on scalars fuses. A component may have an axis of
+wheels and broadcasts: `cross(rate, hub)` combines one angular velocity with four positions.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from scenefactory_jax.core.geometry import safe_sqrt
 from scenefactory_jax.core.pytree import pytree_dataclass
 
-Number = Any  # an array, [] of a car or [4] of its wheels; plain where it comes from the reference car alone
+Number = Any  # an array, [] per car or [4] per wheel; a float if it comes from the reference car
 
 
 @pytree_dataclass
@@ -53,17 +53,17 @@ def cross(a: Vector, b: Vector) -> Vector:
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
-def wheels(vector: Vector) -> Vector:
-    """Sum over the four wheels. Slices that are added fuse; a reduction is a kernel of its own."""
-    return Vector(*(over_wheels(part) for part in vector))
+def sum_vectors(vector: Vector) -> Vector:
+    """Computes the sum of the four wheels' vectors."""
+    return Vector(*(sum_wheels(part) for part in vector))
 
 
-def over_wheels(number: Number) -> Number:
-    """Sum over the four wheels of a number that each of them has."""
+def sum_wheels(number: Number) -> Number:
+    """Computes the sum over the four wheels. Added slices fuse; a reduction is a kernel of its own."""
     number = jnp.asarray(number)
     return number[0] + number[1] + number[2] + number[3]
 
 
 def length(*parts: Number) -> Array:
-    """Euclidean length of components; its gradient at zero is zero instead of NaN."""
+    """Computes the Euclidean length; the gradient at zero is zero instead of NaN."""
     return safe_sqrt(jnp.asarray(sum(part * part for part in parts)))

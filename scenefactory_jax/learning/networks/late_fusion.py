@@ -1,13 +1,12 @@
-"""Late-fusion policy: every observation group has its own encoder, what they say is joined, a trunk decides (paper, section 4).
+"""Late-fusion policy: an encoder for each observation group, whose outputs are joined and go through a trunk (paper, section 4).
 
-Actor and critic are two towers without shared weights. Vector groups are concatenated in the order of their names and go through one
-encoder; each set of rows goes through its own row encoder and is max-pooled over the rows that its mask shows. An observation group that
-a config adds is picked up by its kind: a vector joins the vector encoder, rows get an encoder of `rows_default` widths.
+Actor and critic are two towers without shared weights. Vector groups are concatenated in the order of their names and share one encoder;
+each set of rows has its own row encoder and is max-pooled over the rows of its mask. A group that a config adds is encoded by its kind: a
+vector joins the vector encoder, a set gets an encoder of `rows_default` widths.
 
-Rows are pooled before the last activation, which is the same since activations increase. A pooled channel depends on one row alone, its
-winner, so that the gradient recomputes the winners and keeps no activation of the others: exact, in a fraction of time and memory. On
-NVIDIA GPUs encoders of two layers run as one kernel (`set_kernel`); the plain JAX here is what that is tested against, and what runs
-elsewhere.
+Rows are pooled before the last activation, which gives the same since activations increase. A pooled channel depends on one row, its
+winner, so that the gradient recomputes the winners and stores no activation of other rows: exact, in less time and memory. On NVIDIA GPUs
+encoders of two layers run as one kernel (`set_kernel`), which is tested against the plain JAX here.
 
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
@@ -45,32 +44,31 @@ def make(
     dtype: Literal["float32", "bfloat16"],
     kernels: bool,
 ) -> Policy:
-    """Two late-fusion towers and a state-independent log standard deviation.
+    """Builds two late-fusion towers and a state-independent log standard deviation.
 
     Args:
-        vector: widths of the encoder of all vector groups together.
-        rows: widths of the row encoder of each named group of rows; None: as if it were not named, for observations without that group.
-        rows_default: widths for groups of rows that `rows` does not name.
+        vector: widths of the encoder of all vector groups.
+        rows: widths of the row encoder of each named set; None: as if it were not named, for observations without that group.
+        rows_default: widths for sets that `rows` does not name.
         trunk: widths of the layers between fusion and head.
-        mean_init: what the actor's last bias starts at: throttle, steer, brake. Around zero, a brake that is stronger than the drive keeps
-            every car at rest whatever the noise; a negative brake lets untrained cars roll.
+        mean_init: first bias of the actor's last layer: throttle, steer, brake. With a brake around zero, stronger than the drive, cars
+            stay at rest whatever the noise; a negative one lets untrained cars roll.
         log_std_init: logarithm of the first standard deviation of every action.
-        actor_head_scale: gain of the orthogonal kernel of the actor's last layer; small, so that the first actions are near zero whatever
-            is seen (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's
-            default there.
-        dtype: of what is multiplied behind the first layer of an encoder; features, sums, parameters, means and values stay float32.
-        kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX everywhere.
+        actor_head_scale: gain of the orthogonal kernel of the actor's last layer; small, so that the first actions are near `mean_init`
+            (Andrychowicz et al. 2021, "What matters in on-policy reinforcement learning?"). The published code has PyTorch's default.
+        dtype: of products behind the first layer of an encoder; features, sums, parameters, means and values stay float32.
+        kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
 
     Raises:
-        ConfigError: a width below one; at `init`, an observation without groups, or widths for a group of rows that it does not have.
+        ConfigError: a width below one; at `init`, an observation without groups, or widths for a set that it does not have.
     """
     chosen = {group: widths for group, widths in rows.items() if widths is not None}
     named = {"vector": vector, "rows_default": rows_default, "trunk": trunk}
     for name, widths in {**named, **{f"rows.{group}": widths for group, widths in chosen.items()}}.items():
         if not widths or min(widths) < 1:
-            raise ConfigError(f"policy.{name}: {list(widths)} are no layer widths; wanted is a list of positive numbers")
+            raise ConfigError(f"policy.{name}: expected a list of integers >= 1, got {list(widths)}")
     if len(mean_init) != ACTIONS:
-        raise ConfigError(f"policy.mean_init: {list(mean_init)} holds {len(mean_init)} numbers, wanted {ACTIONS}: throttle, steer, brake")
+        raise ConfigError(f"policy.mean_init: expected {ACTIONS} numbers, throttle, steer and brake, got {list(mean_init)}")
     network = ActorCritic(
         vector=tuple(vector),
         rows=tuple((name, tuple(widths)) for name, widths in sorted(chosen.items())),
@@ -87,9 +85,9 @@ def make(
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(chosen) - set(groups)):
-            raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such group of rows; valid: {', '.join(groups) or 'none'}")
+            raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
         if not observation:
-            raise ConfigError("policy: the observation has no group at all; add one to `observe`")
+            raise ConfigError("policy: the observation has no group; add one to `observations`")
         return network.init(key, observation)
 
     return Policy(init, network.apply)  # pyright: ignore[reportArgumentType]
@@ -152,7 +150,7 @@ class Tower(nn.Module):
 
 
 class Layers(nn.Module):
-    """Dense layers with activations between them and none after the last; with a mask, max-pooled over the rows of a set."""
+    """Dense layers with activations between them and none after the last; with a mask, max-pooled over the rows."""
 
     widths: tuple[int, ...]
     activation: str
@@ -183,7 +181,7 @@ class Affine(nn.Module):
 
 
 def affine(activation: str, dtype: str, weights: list, x: Float[Array, "*batch F"]) -> Float[Array, "*batch G"]:
-    """x through dense layers with activations between them. The first layer multiplies what it is given, the others numbers of `dtype`."""
+    """Applies dense layers with activations between them; layers after the first multiply in `dtype`."""
     for index, (kernel, bias) in enumerate(weights):
         x = ACTIVATIONS[activation](x).astype(dtype) if index else x
         x = jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.float32) + bias
@@ -194,21 +192,21 @@ def affine(activation: str, dtype: str, weights: list, x: Float[Array, "*batch F
 def encode_set(
     activation: str, dtype: str, kernels: bool, weights: list, x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]
 ) -> Float[Array, "*batch G"]:
-    """Rows through `affine`, then the largest value of each channel over the rows that the mask shows; zeros for an empty set.
+    """Applies `affine` to rows and computes each channel's maximum over the rows of the mask; zeros for an empty set.
 
-    Of equal rows the first one takes the gradient. Forward-mode differentiation is not defined.
+    Of equal rows the first gets the gradient. Forward-mode differentiation is not defined.
     """
     return _winners(activation, dtype, kernels, weights, x, mask)[0]
 
 
 def pool(x: Float[Array, "*batch K F"], mask: Bool[Array, "*batch K"]) -> Float[Array, "*batch F"]:
-    """Largest value of each channel over the rows that the mask shows; zeros for an empty set."""
+    """Computes each channel's maximum over the rows of the mask; zeros for an empty set."""
     largest = jnp.max(jnp.where(mask[..., None], x, -jnp.inf), axis=-2, initial=-jnp.inf)
     return jnp.where(jnp.any(mask, axis=-1)[..., None], largest, 0.0)
 
 
 def _winners(activation: str, dtype: str, kernels: bool, weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
-    """The pooled channels and the row that each came from."""
+    """Computes the pooled channels and the row that each is from."""
 
     def plain(weights: list, x: Array, mask: Array) -> tuple[Array, Array]:
         rows = affine(activation, dtype, weights, x)
@@ -233,7 +231,7 @@ def _encode_backward(activation: str, dtype: str, kernels: bool, kept: tuple, co
     cotangent = jnp.where(shown, cotangent, 0.0)
 
     def at_winners(weights: list, x: Array) -> Array:
-        rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the row that each channel took
+        rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the winner of each channel
         kernel, bias = weights[-1]
         if len(weights) > 1:
             rows = ACTIVATIONS[activation](affine(activation, dtype, weights[:-1], rows)).astype(dtype)
@@ -244,7 +242,7 @@ def _encode_backward(activation: str, dtype: str, kernels: bool, kept: tuple, co
 
     quick = functools.partial(set_kernel.gradient, activation, dtype)
     of_weights = _on(kernels and set_kernel.fits(weights), quick, plain, weights, x, winner, cotangent)
-    [of_rows] = jax.vjp(lambda x: at_winners(weights, x), x)[1](cotangent)  # the compiler leaves it out where nobody asks for it
+    [of_rows] = jax.vjp(lambda x: at_winners(weights, x), x)[1](cotangent)  # removed by the compiler where it is not used
     return of_weights, of_rows, None
 
 

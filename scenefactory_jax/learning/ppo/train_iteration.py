@@ -1,405 +1,200 @@
-"""Multi-agent PPO: one jitted iteration = rollout, advantages, epochs of minibatches. All agents share one policy.
+"""Multi-agent PPO (Schulman et al. 2017). All agents of all worlds share one policy; each is a sample.
 
-    trainer = make(env, policy, horizon=128, ...)
-    train_state = trainer.init(key, scenes)                         # scenes: worlds stacked along the first axis
-    train_state, metrics = trainer.iterate(train_state, scenes)     # `train_state` is donated: use the returned one
-    train_state, scenes = trainer.swap(train_state, scenes, worlds, fresh)    # other scenes in some worlds; both are donated
-
-Scenes are an argument of the compiled functions, never a constant in them. On several devices each acts in its own worlds and learns from
-its own samples; sums over samples, and with them gradients, are added up over the devices.
+Read from the top: `train_iteration` collects a rollout, computes advantages (`compute_batch`), passes over the samples in minibatches
+(`update_epochs`, `update_minibatch`) and returns the next train state and its metrics. On a mesh it runs on every device, with the device's
+own worlds and samples; sums over samples, and with them gradients, are sums over the devices.
 """
 
+import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number
-from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
-from scenefactory_jax.core.types import Env, Observation, Policy, Scene, State
-from scenefactory_jax.learning import initial_parameters
-from scenefactory_jax.learning.ppo import gae, loss, rollout, update
-
-Metrics = dict[str, Float[Array, ""]]
-MILLION = 1_000_000
-
-
-@pytree_dataclass
-class TrainState:
-    """All that training carries from one iteration to the next: saving it and going on is the same as going on."""
-
-    parameters: Any
-    averaged: Any  # mean of the parameters of the last iterations, which is what is judged; None: nobody asked for one
-    optimiser: optax.OptState
-    worlds: State  # with the axis W in front
-    observation: Observation  # of `worlds`
-    lives: rollout.EpisodeStats
-    record: rollout.SceneStats  # of all worlds, wherever they lie
-    key: PRNGKeyArray
-    iteration: Int[Array, ""]
-    steps: Int[Array, " 2"]  # steps of spawned slots so far: whole millions and the rest, since int32 ends at 2.1 billion
+from scenefactory_jax.core.pytree import replace, to_strong_type
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import Env, Policy, Scene
+from scenefactory_jax.learning import rollout, trainer
+from scenefactory_jax.learning.ppo import gae, loss
+from scenefactory_jax.learning.ppo.config import PPOConfig
+from scenefactory_jax.learning.ppo.minibatches import count_left_out, flatten, minibatch_size, split_minibatches
+from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
 
-class Trainer(NamedTuple):
-    """Training as functions of a train state.
+@dataclasses.dataclass(frozen=True)
+class PPO:
+    """What stays the same in all iterations."""
 
-    `restart` puts all worlds at their start in other scenes and keeps what was learnt. `swap` does so with some worlds and leaves the
-    others as they are: (train state, scenes, distinct numbers of worlds, as many scenes of the same sizes) -> (train state, scenes).
-    """
+    env: Env
+    policy: Policy
+    config: PPOConfig
+    axis: str | None = None  # mesh axis of the devices, inside `shard_map`; None: one device
+    groups: int = 1  # of this device's worlds, see `PPOConfig.shards`
 
-    init: Callable[[PRNGKeyArray, Scene], TrainState]
-    iterate: Callable[[TrainState, Scene], tuple[TrainState, Metrics]]
-    restart: Callable[[TrainState, Scene], TrainState]
-    swap: Callable[[TrainState, Scene, Int[Array, " N"], Scene], tuple[TrainState, Scene]]
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam, with the gradient's norm bounded; the learning rate is part of its state."""
+        adam = optax.inject_hyperparams(optax.adam)(learning_rate=self.config.learning_rate)
+        return optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), adam)
 
 
-def make_trainer(
-    env: Env,
-    policy: Policy,
-    *,
-    horizon: int,
-    epochs: int,
-    minibatches: int,
-    sample_fraction: float,
-    permutation: Literal["once", "each_epoch"],
-    learning_rate: float,
-    desired_kl: float | None,
-    learning_rate_min: float,
-    learning_rate_max: float,
-    learning_rate_half_life: float | None,
-    gamma: float,
-    gae_lambda: float,
-    clip: float,
-    value_clip: float | None,
-    entropy: float,
-    value: float,
-    max_grad_norm: float,
-    normalise_advantage: bool,
-    stagger_episodes: bool,
-    average: float | None,
-    episode_steps: int,
-    shards: int | None,
-    mesh: Mesh | None = None,
-) -> Trainer:
-    """A trainer for one environment and one policy; every agent of every world is a sample of the same policy.
-
-    Args:
-        horizon, epochs, minibatches: actions of a rollout (`env.hold` control steps each), passes over it, gradient steps in each.
-        sample_fraction: share of a rollout's samples that an epoch visits, active agents first. Those without an active agent carry no weight:
-            a larger share than the active one costs only time, a smaller one leaves out random active samples.
-        permutation: of samples to minibatches, drawn `once` a rollout (as RSL-RL does) or at `each_epoch`.
-        learning_rate, desired_kl: of Adam, and the nats that it follows between learning_rate_min and learning_rate_max; None holds it.
-        learning_rate_half_life: iterations after which learning_rate_max has halved, and a third is left after twice that; None: it stays.
-        gamma, gae_lambda: discount of an action, and the advantage's mix of horizons.
-        clip, value_clip, entropy, value: bounds of the probability ratio and of the value loss (None: none), weights of entropy and value.
-        normalise_advantage: over the active samples of the whole rollout.
-        stagger_episodes: worlds start at random times of their episodes, so that they do not run out of time together.
-        average: share of the parameters' running mean that stays at every iteration; the mean is what is judged. None: there is no mean.
-        episode_steps: control steps of an episode.
-        shards: groups of worlds whose samples are shuffled on their own; each gives every minibatch an equal part. None: one a device.
-            With the same number of groups any number of devices learns the same, up to rounding.
-        mesh: of devices with the one axis `across.AXIS`, whose scenes lie on them by their first axis; None: one device.
-
-    Raises:
-        ConfigError: a number out of range; at `init`, samples that the minibatches do not divide.
-    """
-    _check(locals())
-    axis, own, everybody = _groups(shards, mesh)
-    adam = update.make_optimizer(learning_rate=learning_rate, max_grad_norm=max_grad_norm)
-    objective = functools.partial(
-        loss.compute_loss, policy=policy, clip=clip, value_clip=value_clip, entropy=entropy, value=value, axis=axis
+def train_iteration(ppo: PPO, train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
+    """Computes one iteration: rollout, advantages, epochs of minibatches, metrics."""
+    config, axis, parameters = ppo.config, ppo.axis, train_state.parameters
+    rollout_key, update_key, key = jax.random.split(train_state.key, 3)
+    worlds, samples, counts, scene_stats = rollout.collect_rollout(
+        ppo.env, ppo.policy, parameters, scenes, train_state.worlds, rollout_key, horizon=config.horizon, axis=axis
     )
-    rate = update.AdaptiveRate(desired_kl, learning_rate_min, learning_rate_max, learning_rate_half_life)
-    passes = {"epochs": epochs, "minibatches": minibatches, "permute_each_epoch": permutation == "each_epoch"}
-    learn = functools.partial(update.update_epochs, loss=objective, optimiser=adam, rate=rate, **passes, groups=own, axis=axis)
-    start = functools.partial(_start, env=env, phases=episode_steps // env.hold if stagger_episodes else 1)
-    act = functools.partial(rollout.collect_rollout, env, policy, horizon=horizon, axis=axis)
-    prepare = functools.partial(_batch, gamma=gamma, gae_lambda=gae_lambda, normalise_advantage=normalise_advantage, groups=own, axis=axis)
-    size = functools.partial(minibatch_size, horizon=horizon, minibatches=minibatches, sample_fraction=sample_fraction)
-    whole, size = functools.partial(size, groups=everybody), functools.partial(size, groups=own)
-    init = functools.partial(_init, policy=policy, optimiser=adam, start=start, size=whole, average=average is not None)
-    iterate = functools.partial(_iterate, policy=policy, act=act, prepare=prepare, learn=learn, size=size, axis=axis, average=average)
-    restart, swap = functools.partial(_restart, start=start), functools.partial(_swap, env=env, axis=axis)
-    return _compiled(init, iterate, restart, swap, mesh)
+    _, log_std, last_value = ppo.policy.apply(parameters, worlds.observation)
+    batch = compute_batch(ppo, samples, last_value)
+    size = minibatch_size(config, worlds.state.active.shape, groups=ppo.groups)
+    parameters, optimizer, metrics = update_epochs(ppo, train_state, batch, log_std, update_key, size=size)
 
-
-def _groups(shards: int | None, mesh: Mesh | None) -> tuple[str | None, int, int]:
-    """The axis of the devices, how many groups of worlds each of them has, and how many there are in all."""
-    axis, devices = (None, 1) if mesh is None else (sharding.AXIS, mesh.size)
-    shards = devices if shards is None else shards
-    if shards < 1 or shards % devices:
-        raise ConfigError(f"ppo.shards: {shards}; wanted is a multiple of the {devices} devices")
-    return axis, shards // devices, shards
-
-
-def _compiled(init: Callable, iterate: Callable, restart: Callable, swap: Callable, mesh: Mesh | None) -> Trainer:
-    """Under `jit`; on a mesh, every device runs `iterate` in its own worlds, and takes its own out of the rows of a `swap`."""
-    if mesh is None:
-        swap = jax.jit(swap, donate_argnums=(0, 1))
-        return Trainer(jax.jit(init), jax.jit(iterate, donate_argnums=0), jax.jit(restart, donate_argnums=0), swap)
-
-    def placed(train_state: TrainState) -> TrainState:
-        shardings = jax.tree.map(functools.partial(NamedSharding, mesh), _places(train_state))
-        return jax.lax.with_sharding_constraint(train_state, shardings)
-
-    def spread(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
-        arguments = [(train_state, _places(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
-        return sharding.map_over_devices(
-            iterate, arguments, lambda found: (_places(found[0]), sharding.make_replicated_specs(found[1])), mesh
-        )
-
-    def exchanged(train_state: TrainState, scenes: Scene, worlds: Array, fresh: Scene) -> tuple[TrainState, Scene]:
-        arguments = [(train_state, _places(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
-        arguments += [(part, sharding.make_replicated_specs(part)) for part in (worlds, fresh)]
-        return sharding.map_over_devices(swap, arguments, lambda found: (_places(found[0]), sharding.make_sharded_specs(found[1])), mesh)
-
-    return Trainer(
-        init=jax.jit(lambda key, scenes: placed(init(key, scenes))),
-        iterate=jax.jit(spread, donate_argnums=0),
-        restart=jax.jit(lambda train_state, scenes: placed(restart(train_state, scenes)), donate_argnums=0),
-        swap=jax.jit(exchanged, donate_argnums=(0, 1)),
-    )
-
-
-def _places(train_state: TrainState) -> Any:
-    """Where the leaves of a train state lie: worlds apart, what is learnt on every device."""
-    apart = ("worlds", "observation", "lives")
-    return jax.tree_util.tree_map_with_path(
-        lambda path, _: PartitionSpec(sharding.AXIS) if path[0].name in apart else PartitionSpec(), train_state
-    )
-
-
-def parameters_of(train_state: TrainState) -> Any:
-    """What the policy has learnt, on one device: the running mean, if there is one."""
-    learnt = train_state.parameters if train_state.averaged is None else train_state.averaged
-    return jax.tree.map(lambda leaf: leaf.addressable_data(0), learnt)
-
-
-def _start(key: PRNGKeyArray, scenes: Scene, *, env: Env, phases: int) -> tuple[State, Observation]:
-    """All worlds at their start, each at one of the first `phases` actions of its episode."""
-
-    def one(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
-        phase_key, start_key = jax.random.split(key)
-        world = env.start(start_key, scene, env.hold * jax.random.randint(phase_key, (), 0, phases))
-        return world, env.observe(scene, world)
-
-    return jax.vmap(one)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
-
-
-def _init(
-    key: PRNGKeyArray,
-    scenes: Scene,
-    *,
-    policy: Policy,
-    optimiser: optax.GradientTransformation,
-    start: Callable,
-    size: Callable,
-    average: bool,
-) -> TrainState:
-    _, start_key, later_key = initial_parameters.split_key(key)
-    worlds, observation = start(start_key, scenes)
-    size(worlds)
-    parameters = initial_parameters.draw_parameters(key, policy, observation)
+    metrics["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
+    counts = sharding.sum_over_devices(counts, axis)
     train_state = TrainState(
         parameters=parameters,
-        averaged=parameters if average else None,
-        optimiser=optimiser.init(parameters),
+        ema_parameters=trainer.advance_ema(train_state, parameters, config.parameter_ema_decay),
+        optimizer=optimizer,
         worlds=worlds,
-        observation=observation,
-        lives=rollout.make_empty_episode_stats(worlds),
-        record=rollout.make_empty_scene_stats(worlds),
-        key=later_key,
-        iteration=jnp.int32(0),
-        steps=jnp.zeros(2, jnp.int32),
-    )
-    return _own(train_state)
-
-
-def _restart(train_state: TrainState, scenes: Scene, *, start: Callable) -> TrainState:
-    start_key, key = jax.random.split(train_state.key)
-    worlds, observation = start(start_key, scenes)
-    empty = {"lives": rollout.make_empty_episode_stats(worlds), "record": rollout.make_empty_scene_stats(worlds)}
-    return _own(replace(train_state, worlds=worlds, observation=observation, key=key, **empty))
-
-
-def _swap(
-    train_state: TrainState, scenes: Scene, worlds: Int[Array, " N"], fresh: Scene, *, env: Env, axis: str | None
-) -> tuple[TrainState, Scene]:
-    """Every device starts all fresh scenes, and keeps those of its own worlds.
-
-    At the beginning of their episodes, whatever `stagger_episodes` says: a life that its world's clock cuts short would count as a failure.
-    """
-    start_key, key = jax.random.split(train_state.key)
-    begun, seen = _start(start_key, fresh, env=env, phases=1)
-    rows = sharding.to_local_index(worlds, len(train_state.worlds.step), axis)
-
-    def put(held: Any, new: Any) -> Any:
-        return jax.tree.map(lambda leaf, row: leaf.at[rows].set(row, mode="drop"), held, new)
-
-    held = (train_state.worlds, train_state.observation, train_state.lives, scenes)
-    now, observation, lives, scenes = put(held, (begun, seen, rollout.make_empty_episode_stats(begun), fresh))
-    record = jax.tree.map(lambda count: count.at[worlds].set(0), train_state.record)
-    return to_strong_type(replace(train_state, worlds=now, observation=observation, lives=lives, record=record, key=key)), scenes
-
-
-def _iterate(
-    train_state: TrainState,
-    scenes: Scene,
-    *,
-    policy: Policy,
-    act: Callable,
-    prepare: Callable,
-    learn: Callable,
-    size: Callable,
-    average: float | None,
-    axis: str | None,
-) -> tuple[TrainState, Metrics]:
-    """Rollout, advantages, updates."""
-    act_key, learn_key, key = jax.random.split(train_state.key, 3)
-    acted = act(train_state.parameters, scenes, train_state.worlds, train_state.observation, train_state.lives, act_key)
-    worlds, observation, lives, samples, tally, lately = acted
-    _, log_std, bootstrap = policy.apply(train_state.parameters, observation)
-    batch = prepare(samples, bootstrap)
-    learnt = (train_state.parameters, train_state.optimiser)
-    parameters, optimiser, facts = learn(*learnt, batch, log_std, learn_key, train_state.iteration, size=size(worlds))
-    facts["explained_variance"] = loss.explained_variance(batch.value, batch.returns, batch.weight, axis=axis)
-    tally = sharding.sum_over_devices(tally, axis)
-    following = TrainState(
-        parameters=parameters,
-        averaged=None if average is None else _mean(train_state.averaged, parameters, train_state.iteration, average),
-        optimiser=optimiser,
-        worlds=worlds,
-        observation=observation,
-        lives=lives,
-        record=jax.tree.map(jnp.add, train_state.record, sharding.gather_over_devices(lately, axis)),
+        scene_stats=jax.tree.map(jnp.add, train_state.scene_stats, sharding.gather_over_devices(scene_stats, axis)),
         key=key,
         iteration=train_state.iteration + 1,
-        steps=_add(train_state.steps, tally["spawned"]),
+        steps=trainer.add_steps(train_state.steps, counts["spawned"]),
     )
-    return to_strong_type(following), measure(tally, facts)
+    metrics = {f"ppo/{name}": value for name, value in metrics.items()}
+    return to_strong_type(train_state), rollout.compute_rollout_metrics(counts) | metrics
 
 
-def _mean(before: Any, now: Any, iteration: Int[Array, ""], stays: float) -> Any:
-    """Running mean of parameters (Polyak and Juditsky 1992): of all so far, then of the last 1 / (1 - stays) iterations or so."""
-    share = jnp.minimum(stays, iteration / (iteration + 1.0))
-    return jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, before, now)
+def compute_batch(ppo: PPO, samples: rollout.Sample, last_value: Float[Array, "W A"]) -> loss.Batch:
+    """Computes advantages and returns of samples [T, W, A], as one flat batch; groups of worlds follow one another.
 
-
-def minibatch_size(worlds: State, *, horizon: int, minibatches: int, sample_fraction: float, groups: int = 1) -> int:
-    """Samples in a minibatch.
-
-    Raises:
-        ConfigError: the whole rollout (`sample_fraction` 1) does not divide into the minibatches, or a minibatch would be empty.
+    Samples of inactive agents and of agents that the time limit stopped carry no weight.
     """
-    count, agents = worlds.active.shape
-    samples = horizon * count * agents
-    if count % groups:
-        raise ConfigError(f"worlds: {count} do not divide into {groups} shards")
-    size = int(samples // groups * sample_fraction) // minibatches * groups
-    if size < 1 or (sample_fraction == 1.0 and samples % (minibatches * groups)):
-        counted = f"horizon {horizon} x {count} worlds x {agents} agents = {samples} samples"
-        parts = f"{minibatches} minibatches" + (f" of {groups} shards" if groups > 1 else "")
-        raise ConfigError(f"ppo.minibatches: {counted} (share {sample_fraction}) do not divide into {parts}")
-    return size
-
-
-def spawned_steps(train_state: TrainState) -> int:
-    """Steps of spawned slots since the start of training, on the host."""
-    millions, rest = (int(x) for x in train_state.steps)
-    return millions * MILLION + rest
-
-
-def measure(tally: rollout.Tally, facts: dict[str, Array]) -> Metrics:
-    """Scalars of one iteration.
-
-    `reward` and `reward/...`: mean of a step of an active agent. `events/...`: new events for each agent's life that ended, by event or by
-    time; `count/...`: the same as a number. `life/...`: undiscounted return and steps of those lives. `share/active`: of the steps of
-    spawned slots; `steps/...`: of this iteration. `speed`: m/s. `ppo/...`: means over the minibatches; `ppo/skipped`: minibatches that were
-    not finite and therefore moved nothing; `ppo/left_out`: active samples that `sample_fraction` left out, as a share.
-    """
-    steps, ends = jnp.maximum(tally["active"], 1.0), jnp.maximum(tally["ended"], 1.0)
-    spawned = tally["spawned"].astype(jnp.float32)
-    metrics = {name: tally[name] / steps for name in tally if name == "reward" or name.startswith("reward/")}
-    for name in (name.removeprefix("events/") for name in tally if name.startswith("events/")):
-        metrics[f"events/{name}"] = tally[f"events/{name}"] / ends
-        metrics[f"count/{name}"] = tally[f"events/{name}"]
-    return {
-        **metrics,
-        "life/return": tally["return"] / ends,
-        "life/steps": tally["length"] / ends,
-        "count/lives": tally["ended"],
-        "share/active": tally["active"] / jnp.maximum(spawned, 1.0),
-        "steps/spawned": spawned,
-        "steps/active": tally["active"],
-        "speed": tally["speed"] / steps,
-        **{f"ppo/{name}": fact for name, fact in facts.items()},
-    }
-
-
-def _batch(
-    samples: rollout.Sample,
-    bootstrap: Array,
-    *,
-    gamma: float,
-    gae_lambda: float,
-    normalise_advantage: bool,
-    groups: int,
-    axis: str | None,
-) -> loss.Batch:
-    """Samples [T, W, A] with their advantages, as one flat batch, one group of worlds after the other.
-
-    Only active agents whose time did not run out carry weight.
-    """
-    flat = functools.partial(_flat, groups=groups)
     advantage, returns = gae.compute_gae(
-        samples.reward, samples.value, bootstrap, samples.active, samples.done, samples.truncated, gamma=gamma, gae_lambda=gae_lambda
+        samples.reward,
+        samples.value,
+        last_value,
+        samples.active,
+        samples.terminated,
+        samples.truncated,
+        gamma=ppo.config.gamma,
+        gae_lambda=ppo.config.gae_lambda,
     )
     weight = (samples.active & ~samples.truncated).astype(jnp.float32)
-    batch = loss.Batch(
-        observation=jax.tree.map(flat, samples.observation),
-        action=flat(samples.action),
-        mean=flat(samples.mean),
-        log_probability=flat(samples.log_probability),
-        value=flat(samples.value),
-        advantage=flat(advantage),
-        returns=flat(returns),
-        weight=flat(weight),
-    )
-    return replace(batch, advantage=loss.normalize_advantages(batch.advantage, batch.weight, axis=axis)) if normalise_advantage else batch
+    columns = samples.observation, samples.action, samples.mean, samples.log_probability, samples.value, advantage, returns, weight
+    batch = loss.Batch(*jax.tree.map(functools.partial(flatten, groups=ppo.groups), columns))
+    if not ppo.config.normalize_advantages:
+        return batch
+    return replace(batch, advantage=loss.normalize_advantages(batch.advantage, batch.weight, axis=ppo.axis))
 
 
-def _flat(x: Array, *, groups: int) -> Array:
-    time, worlds, *rest = x.shape
-    return x.reshape(time, groups, worlds // groups, *rest).swapaxes(0, 1).reshape(-1, *rest[1:])
+def update_epochs(
+    ppo: PPO, train_state: TrainState, batch: loss.Batch, log_std_old: Float[Array, " 3"], key: PRNGKeyArray, *, size: int
+) -> tuple[Any, optax.OptState, Metrics]:
+    """Passes over the batch `epochs` times, in minibatches of `size` samples.
+
+    Returns:
+        Parameters, optimizer state, and metrics: means of the loss's metrics over the minibatches that changed the parameters; `skipped`:
+        minibatches whose loss or gradient was not finite; `left_out`: fraction of the samples with weight that no minibatch holds.
+    """
+    config = ppo.config
+    update = functools.partial(update_minibatch, ppo, batch, log_std_old, max_learning_rate(config, train_state.iteration))
+    groups = {"groups": ppo.groups, "axis": ppo.axis}
+    split = functools.partial(split_minibatches, weight=batch.weight, size=size, minibatches=config.minibatches, **groups)
+
+    def epoch(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, dict[str, Array]]:
+        return jax.lax.scan(update, carry, split(key))
+
+    each = config.permutation == "each_epoch"
+    keys = jax.random.split(key, config.epochs) if each else jnp.broadcast_to(key, (config.epochs,))
+    (parameters, optimizer), metrics = jax.lax.scan(epoch, (train_state.parameters, train_state.optimizer), keys)
+    changed, skipped = metrics.pop("changed"), metrics.pop("skipped")
+    metrics = {name: jnp.sum(jnp.where(changed, x, 0.0)) / jnp.maximum(jnp.sum(changed), 1) for name, x in metrics.items()}
+    metrics |= {
+        "skipped": jnp.sum(skipped, dtype=jnp.float32),
+        "learning_rate": _hyperparams(optimizer)["learning_rate"],
+        "left_out": count_left_out(batch.weight, size=size * config.minibatches, **groups),
+    }
+    return parameters, optimizer, metrics
 
 
-def _add(steps: Array, more: Array) -> Array:
-    rest = steps[1] + more
-    return jnp.stack([steps[0] + rest // MILLION, rest % MILLION])
+def update_minibatch(
+    ppo: PPO,
+    batch: loss.Batch,
+    log_std_old: Float[Array, " 3"],
+    max_rate: float | Float[Array, ""],
+    carry: tuple[Any, optax.OptState],
+    index: Int[Array, " size"],
+) -> tuple[tuple[Any, optax.OptState], dict[str, Array]]:
+    """Makes one gradient step; nothing changes where it is not finite, or where no sample has weight."""
+    parameters, optimizer = carry
+    minibatch = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", unique_indices=True), batch)
+    objective = functools.partial(loss.compute_loss, policy=ppo.policy, config=ppo.config, axis=ppo.axis)
+    result = jax.value_and_grad(objective, has_aux=True)(parameters, minibatch, log_std_old)
+    (total, metrics), gradient = sharding.sum_over_devices(result, ppo.axis)
+    norm = optax.global_norm(gradient)
+    adapted = jax.tree.map(lambda x: x, optimizer)  # a new dict of hyperparameters
+    rate = _hyperparams(adapted)["learning_rate"]
+    _hyperparams(adapted)["learning_rate"] = adapt_learning_rate(ppo.config, rate, metrics["kl"], max_rate)
+    updates, adapted = ppo.optimizer.update(gradient, adapted, parameters)
+    updated = optax.apply_updates(parameters, updates)
+
+    finite = jnp.isfinite(total) & jnp.isfinite(norm)
+    changed = finite & (sharding.sum_over_devices(jnp.sum(minibatch.weight), ppo.axis) > 0.0)
+    carry = jax.tree.map(lambda new, old: jnp.where(changed, new, old), (updated, adapted), (parameters, optimizer))
+    return carry, {**metrics, "gradient_norm": norm, "skipped": ~finite, "changed": changed}
 
 
-def _own(tree: Any) -> Any:
-    """Buffers of its own: `jit` may hand an argument (a scene's spawn points) straight through, and donating it would delete the scene."""
-    return jax.tree.map(jnp.copy, to_strong_type(tree))
+def max_learning_rate(config: PPOConfig, iteration: Int[Array, ""]) -> float | Float[Array, ""]:
+    """Computes the upper bound of the learning rate; with a half-life it falls as 1 / t, with which noisy gradients converge (Robbins and
+    Monro 1951)."""
+    if config.learning_rate_half_life is None:
+        return config.learning_rate_max
+    return jnp.maximum(config.learning_rate_max / (1.0 + iteration / config.learning_rate_half_life), config.learning_rate_min)
 
 
-def _check(numbers: dict[str, Any]) -> None:
-    given = {name: value for name, value in numbers.items() if value is not None}
-    for name in ("horizon", "epochs", "minibatches", "episode_steps"):
-        check_number(given[name], where=f"ppo.{name}", least=1)
-    positive = ("learning_rate", "max_grad_norm", "clip", "sample_fraction", "learning_rate_half_life", "desired_kl", "value_clip")
-    for name in filter(given.__contains__, positive):
-        check_number(given[name], where=f"ppo.{name}", above=0)
-    for name in ("entropy", "value"):
-        check_number(given[name], where=f"ppo.{name}", least=0)
-    for name in filter(given.__contains__, ("gamma", "gae_lambda", "sample_fraction", "average")):
-        check_fraction(given[name], where=f"ppo.{name}")
-    if not 0 < numbers["learning_rate_min"] <= numbers["learning_rate"] <= numbers["learning_rate_max"]:
-        bounds = f"[{numbers['learning_rate_min']}, {numbers['learning_rate_max']}]"
-        raise ConfigError(f"ppo.learning_rate: {numbers['learning_rate']} is outside [learning_rate_min, learning_rate_max] = {bounds}")
+def adapt_learning_rate(
+    config: PPOConfig, rate: Float[Array, ""], kl: Float[Array, ""], max_rate: float | Float[Array, ""]
+) -> Float[Array, ""]:
+    """Computes the next learning rate, as RSL-RL: divided by 1.5 above twice `desired_kl`, times 1.5 below half of it, in bounds."""
+    if config.desired_kl is not None:
+        rate = jnp.where(kl > config.desired_kl * 2.0, jnp.maximum(config.learning_rate_min, rate / 1.5), rate)
+        rate = jnp.where((kl < config.desired_kl / 2.0) & (kl > 0.0), jnp.minimum(max_rate, rate * 1.5), rate)
+    return rate if config.learning_rate_half_life is None else jnp.minimum(rate, max_rate)
+
+
+def _hyperparams(optimizer: optax.OptState) -> dict[str, Any]:
+    return optimizer[-1].hyperparams  # pyright: ignore
+
+
+def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: int, mesh: Mesh | None = None) -> Trainer:
+    """Builds a trainer for one environment and one policy.
+
+    Args:
+        episode_steps: control steps of an episode.
+        mesh: of devices with the axis `sharding.AXIS`, that share the worlds; None: one device. With the same `shards` any number of
+            devices learns the same, up to rounding.
+
+    Raises:
+        ConfigError: `shards` is not a multiple of the devices; at `init`, samples that the minibatches do not divide.
+    """
+    axis, devices = (None, 1) if mesh is None else (sharding.AXIS, mesh.size)
+    shards = devices if config.shards is None else config.shards
+    if shards < 1 or shards % devices:
+        raise ConfigError(f"ppo.shards: expected a multiple of {devices} devices, got {shards}")
+    ppo = PPO(env, policy, config, axis, shards // devices)
+    starts = episode_steps // env.action_repeat if config.stagger_episodes else 1
+
+    def init(key: PRNGKeyArray, scenes: Scene) -> TrainState:
+        ema = config.parameter_ema_decay is not None
+        train_state = trainer.init_train_state(key, scenes, env, policy, ppo.optimizer, starts=starts, ema=ema)
+        minibatch_size(config, train_state.worlds.state.active.shape, groups=shards)
+        return train_state
+
+    return trainer.compile_trainer(init, functools.partial(train_iteration, ppo), env, starts=starts, mesh=mesh)

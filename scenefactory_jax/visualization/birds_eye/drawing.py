@@ -1,12 +1,12 @@
 """What pictures and videos share: a trajectory, a window on the plane, road strokes, car shapes and colours."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road, Scene
+from scenefactory_jax.core.trajectory import Trajectory
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road
 
 Colour = tuple[int, int, int]
 
@@ -47,38 +47,6 @@ MARKS: dict[str, Mark] = {
     "out_of_bounds": Mark("crash", (0, 0, 0), "D"),
     "numerical_error": Mark("numerical_error", (198, 0, 190), "s"),
 }
-
-
-class Trajectory(NamedTuple):
-    """One recorded world: what a picture or a video of an episode needs, as numpy arrays.
-
-    `scene` holds the episode's own weather, whose patches are drawn with the films of its start. `goal` is `[A, 2]`, or `[T, A, 2]` where
-    agents are respawned with new goals. `events` maps a name of `MARKS` to the steps at which it is new. `weather` is text:
-    "SMA, 0.5 mm", or "AC, 0.0 to 0.4 mm" where it rains.
-    """
-
-    scene: Scene
-    position: Float[np.ndarray, "T A 2"]
-    yaw: Float[np.ndarray, "T A"]
-    speed: Float[np.ndarray, "T A"]
-    active: Bool[np.ndarray, "T A"]
-    events: Mapping[str, Bool[np.ndarray, "T A"]]
-    size: Float[np.ndarray, "A 2"]
-    goal: Float[np.ndarray, "*T A 2"]
-    present: Bool[np.ndarray, " A"]
-    control_hz: float
-    title: str
-    weather: str
-    traffic: "Others | None" = None  # None: nobody but the agents
-
-
-class Others(NamedTuple):
-    """Boxes on the road over the steps of an episode: everybody who is no agent."""
-
-    position: Float[np.ndarray, "T O 2"]
-    yaw: Float[np.ndarray, "T O"]
-    size: Float[np.ndarray, "T O 2"]
-    present: Bool[np.ndarray, "T O"]
 
 
 class TrajectoryError(ValueError):

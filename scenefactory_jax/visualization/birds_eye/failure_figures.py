@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation.failures import FLAGS, KINDS, Failure
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import INK, QUIET, Colour, Trajectory, View
+from scenefactory_jax.visualization.birds_eye.drawing import INK, QUIET, Colour, View
 from scenefactory_jax.visualization.birds_eye.video import road_image
 from scenefactory_jax.visualization.report.plots import STYLE
 

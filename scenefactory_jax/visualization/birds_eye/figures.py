@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
+from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, GROUND, INK, MARKS, Colour, Trajectory
+from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, GROUND, INK, MARKS, Colour
 from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING as OTHERS
 from scenefactory_jax.visualization.report.plots import STYLE
@@ -40,7 +41,7 @@ def scene_figure(scene: Scene, *, title: str = "", whole: bool = False) -> Figur
     with matplotlib.rc_context(STYLE):
         figure, axes, scale = _stage(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
         recorded, still = traffic_shapes.shapes_at_start(scene)
-        _draw_others(axes, recorded, 0, still)
+        _draw_traffic(axes, recorded, 0, still)
         for agent in present.tolist():
             look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
             axes.plot(*np.stack([start[agent], goal[agent]]).T, color=_rgb(drawing.colour_of(agent)), **look)
@@ -63,7 +64,7 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
         title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
         figure, axes, scale = _stage(trajectory.scene, view, title=title)
         if trajectory.traffic is not None:
-            _draw_others(axes, trajectory.traffic, 0, traffic_shapes.shapes_at_rest(trajectory.traffic))
+            _draw_traffic(axes, trajectory.traffic, 0, traffic_shapes.shapes_at_rest(trajectory.traffic))
         for agent in np.flatnonzero(trajectory.present).tolist():
             steps = np.flatnonzero(driven[:, agent])
             way = trajectory.position[:, agent]
@@ -123,7 +124,7 @@ def _draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, ag
     axes.add_patch(Polygon(arrow, facecolor=_rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
 
 
-def _draw_others(axes: Axes, boxes: drawing.Others, step: int, still: np.ndarray) -> None:
+def _draw_traffic(axes: Axes, boxes: TrafficBoxes, step: int, still: np.ndarray) -> None:
     """Everybody who is no agent at one step."""
     for shape in traffic_shapes.shapes(boxes, step, still):
         look = {"facecolor": _rgb(shape.fill), "edgecolor": _rgb(shape.outline), "linewidth": 0.6, "zorder": 2.5}

@@ -32,7 +32,7 @@ def areas(weather: Weather) -> list[Area]:
     """The present patches of one world's weather, bottom first, with the films of this moment."""
     patches, found = weather.patches, []
     for row in np.flatnonzero(np.asarray(patches.present)):
-        film = float(patches.film_mm[row] + patches.follows[row] * weather.film_mm)
+        film = float(patches.film_mm[row] + patches.open_road_film_fraction[row] * weather.film_mm)
         colour, label = colour_area(SURFACES[int(patches.surface[row])], film)
         pieces = outline(np.asarray(patches.vertices[row], float), float(patches.radius[row]), closed=bool(patches.closed[row]))
         found.append(Area(pieces, colour, blend(INK, colour, 0.3), label))

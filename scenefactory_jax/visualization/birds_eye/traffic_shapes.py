@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.visualization.birds_eye.drawing import WHITE, Colour, Others, blend
+from scenefactory_jax.visualization.birds_eye.drawing import WHITE, Colour, blend
 
 MOVING: Colour = (105, 109, 115)
 PARKED: Colour = (214, 216, 219)
@@ -24,7 +25,7 @@ class Shape(NamedTuple):
     outline: Colour
 
 
-def shapes_at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
+def shapes_at_start(scene: Scene) -> tuple[TrafficBoxes, Bool[np.ndarray, " O"]]:
     """The recorded others of a packed scene at the logged step at which its agents start, as one step; and who never moves in the log."""
     log, present = scene.log, np.asarray(scene.agents.present)
     apart = np.linalg.norm(np.asarray(log.position) - np.asarray(scene.agents.position)[:, None], axis=-1)
@@ -33,22 +34,22 @@ def shapes_at_start(scene: Scene) -> tuple[Others, Bool[np.ndarray, " O"]]:
     position, yaw, valid = (
         np.asarray(leaf).swapaxes(0, 1) for leaf in (scene.traffic_log.position, scene.traffic_log.yaw, scene.traffic_log.valid)
     )
-    whole = Others(position, yaw, np.broadcast_to(np.asarray(scene.traffic_log.size), position.shape), valid)
-    return Others(*(leaf[row : row + 1] for leaf in whole)), shapes_at_rest(whole)
+    whole = TrafficBoxes(position, yaw, np.broadcast_to(np.asarray(scene.traffic_log.size), position.shape), valid)
+    return TrafficBoxes(*(leaf[row : row + 1] for leaf in whole)), shapes_at_rest(whole)
 
 
-def shapes_at_rest(others: Others) -> Bool[np.ndarray, " O"]:
+def shapes_at_rest(traffic: TrafficBoxes) -> Bool[np.ndarray, " O"]:
     """Who, as far as it is there, never leaves its place."""
-    first = np.argmax(others.present, axis=0)
-    begin = others.position[first, np.arange(others.present.shape[1])]
-    moved = np.where(others.present, np.linalg.norm(others.position - begin, axis=-1), 0.0)
+    first = np.argmax(traffic.present, axis=0)
+    begin = traffic.position[first, np.arange(traffic.present.shape[1])]
+    moved = np.where(traffic.present, np.linalg.norm(traffic.position - begin, axis=-1), 0.0)
     return moved.max(axis=0, initial=0.0) < STILL_M
 
 
-def shapes(others: Others, step: int, still: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
+def shapes(traffic: TrafficBoxes, step: int, still: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
     """What to draw at a step, bottom first; `still` as `parked` tells it."""
-    for row in np.flatnonzero(others.present[step]):
-        size = others.size[step, row]
+    for row in np.flatnonzero(traffic.present[step]):
+        size = traffic.size[step, row]
         angle = np.linspace(0.0, 2 * np.pi, 17)[:-1]
         round_ = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * 0.5
         if size[0] < PERSON_M:
@@ -57,7 +58,7 @@ def shapes(others: Others, step: int, still: Bool[np.ndarray, " O"]) -> Iterator
             local = np.array([[0.5, 0.0], [0.1, 0.5], [-0.1, 0.5], [-0.5, 0.0], [-0.1, -0.5], [0.1, -0.5]]) * size
         else:  # a nose tells front from back
             local = np.array([[0.42, 0.5], [0.5, 0.25], [0.5, -0.25], [0.42, -0.5], [-0.5, -0.5], [-0.5, 0.5]]) * size
-        cos, sin = np.cos(others.yaw[step, row]), np.sin(others.yaw[step, row])
-        points = local @ np.array([[cos, sin], [-sin, cos]]) + others.position[step, row]
+        cos, sin = np.cos(traffic.yaw[step, row]), np.sin(traffic.yaw[step, row])
+        points = local @ np.array([[cos, sin], [-sin, cos]]) + traffic.position[step, row]
         vehicle_at_rest = still[row] and size[0] >= PERSON_M
         yield Shape(points, blend(PARKED, WHITE, 0.5) if vehicle_at_rest else MOVING, OUTLINE)

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.visualization import gif_writer, mp4_writer
 from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
-from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, Colour, Stroke, Trajectory, View
+from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, Colour, Stroke, View
 from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
 from scenefactory_jax.visualization.mp4_writer import VideoError
 
@@ -311,7 +312,7 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, panel: int, stage: _St
     counts = {name: int(stage.counts[name][now]) for name in MARKS if name in stage.counts}
     total, once = int(stage.trajectory.present.sum()), not drawing.find_respawns(stage.trajectory)
     entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "numerical_error"}
-    entries |= {"goal_reached": f"{entries['reached']} of {total}"} if once and "goal_reached" in entries else {}
+    entries |= {"goal_reached": f"{entries['goal_reached']} of {total}"} if once and "goal_reached" in entries else {}
     while sum(font.getlength(entry) + 12 for entry in entries.values()) > panel - font.getlength(clock) and len(entries) > 1:
         others = [name for name in reversed(entries) if name != "goal_reached"]
         del entries[next((name for name in others if not counts[name]), others[0])]

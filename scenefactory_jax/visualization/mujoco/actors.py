@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
@@ -32,7 +33,7 @@ class ActorTrajectories(NamedTuple):
     active: Bool[np.ndarray, "T A"]
     opacity: Float[np.ndarray, "T A"]
     goal: Float[np.ndarray, "T A 2"]
-    others: drawing.Others
+    traffic: TrafficBoxes
     hz: float
 
 
@@ -57,10 +58,9 @@ def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTr
         joints = scene_model.set_posture(car, shots.position, shots.yaw, shots.steer, spin)
     else:
         joints = np.asarray(shots.joints, float)
-    others = drawing.Others(*(np.asarray(getattr(shots.traffic, name)) for name in drawing.Others._fields))
     opacity = np.where(last < 0, 0.0, np.clip(1.0 - (steps - last) / (FADE_S * hz), 0.0, 1.0))
     yaw, goal = shots.yaw[held, agents], shots.goal[held, agents]
-    return ActorTrajectories(scene, joints[held, agents], yaw, active, opacity, goal, others, hz)
+    return ActorTrajectories(scene, joints[held, agents], yaw, active, opacity, goal, TrafficBoxes.from_boxes(shots.traffic), hz)
 
 
 def add(
@@ -75,14 +75,14 @@ def add(
     scene.ngeom += 1
 
 
-def add_others(scene: mujoco.MjvScene, others: drawing.Others, step: int) -> None:
+def add_traffic(scene: mujoco.MjvScene, traffic: TrafficBoxes, step: int) -> None:
     """Everybody who is no agent, as boxes as large as they are; who is narrower than a metre stands upright."""
-    for row in np.flatnonzero(others.present[step]):
-        (x, y), (length, width) = others.position[step, row].tolist(), others.size[step, row].tolist()
+    for row in np.flatnonzero(traffic.present[step]):
+        (x, y), (length, width) = traffic.position[step, row].tolist(), traffic.size[step, row].tolist()
         person = min(length, width) < 1.0
         height = PERSON_M if person else OTHER_M
         size, place = (length / 2, width / 2, height / 2), (x, y, height / 2)
-        add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, float(others.yaw[step, row]), SKIN if person else GREY)
+        add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, float(traffic.yaw[step, row]), SKIN if person else GREY)
 
 
 def add_goals(

@@ -101,7 +101,7 @@ def frames(
             def decorate(scene: mujoco.MjvScene, step: int = step) -> None:
                 actors.add_goals(scene, whole.goal[step], whole.opacity[step], radius_m=look.goal_radius_m)
                 actors.add_trails(scene, whole, step, trail_s=look.trail_s)
-                actors.add_others(scene, whole.traffic, step)
+                actors.add_traffic(scene, whole.traffic, step)
 
             shown = []
             for camera in (behind if view == "chase" else above for view in views):

@@ -98,7 +98,7 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
     """One world in which the car in slot `car` does what it is told and the others what `act` says."""
 
     def begin(scene: Scene, key: PRNGKeyArray) -> tuple[State, Observation]:
-        state = env.start(key, scene)
+        state = env.init_state(key, scene)
         goal = state.agents.goal.at[car].set(FAR_M)
         state = replace(state, agents=replace(state.agents, goal=goal))
         return state, env.observe(scene, state)
@@ -107,7 +107,7 @@ def world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, dt: fl
         scene: Scene, parameters: Any, state: State, observation: Observation, key: PRNGKeyArray, action: Float[Array, "3"]
     ) -> tuple[State, Observation, StepRecord, Float[Array, ""]]:
         actions = act(parameters, observation, key).at[car].set(action)
-        after, outcome = env.transition(scene, state, actions)
+        after, outcome = env.control_step(scene, state, actions)
         squared = queries.squared_segment_distance(after.motion.position[car, None, :2], scene.road, half_width_m=0.0)
         away = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
         return after, env.observe(scene, after), make_step_record(env, scene, state, after, outcome), away

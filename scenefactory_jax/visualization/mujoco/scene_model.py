@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import ground_meshes
@@ -129,6 +129,6 @@ def _mesh(model: mujoco.MjSpec, surface: Surface) -> None:
 
 def _painted(car: CarParameters, slot: int) -> mujoco.MjSpec:
     """A car in its slot's colour."""
-    spec = cars.build_mjspec(car, visual=True, brake_rows=False)
+    spec = models.build_mjspec(car, visual=True, brake_rows=False)
     spec.geom("hull").rgba = [*(channel / 255 for channel in drawing.colour_of(slot)), 1.0]
     return spec

@@ -1,85 +1,103 @@
-"""Figures, video and report.md of an evaluation."""
+"""The folder of an evaluation: tables of agents, figures, video, pictures of failures and report.md."""
 
-import json
-import re
-import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.evaluation import agent_metrics, circumstances, failures
+from scenefactory_jax.core import result_file
+from scenefactory_jax.core.trajectory import Trajectory
+from scenefactory_jax.evaluation import agent_metrics, circumstances, episode_records, failures
+from scenefactory_jax.evaluation.agent_metrics import Estimate
+from scenefactory_jax.evaluation.protocols import Evaluated
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
-from scenefactory_jax.visualization.birds_eye.drawing import Trajectory
 from scenefactory_jax.visualization.report import evaluation_report, failure_pictures, plots
+
+
+class Result(NamedTuple):
+    """An evaluation as `evaluate` returns it: protocol -> records, protocol -> metric -> estimate, and the path of the report."""
+
+    folder: Path
+    records: dict[str, dict[str, np.ndarray]]
+    summary: dict[str, dict[str, Estimate]]
+    report: Path
 
 
 def write(
     out: Path,
+    evaluated: Iterable[Evaluated],
     *,
     config: Mapping[str, Any],
     run: Path,
     asked: Mapping[str, Any],
     settings: Mapping[str, Any],
-    records: Mapping[str, dict[str, np.ndarray]],
-    summary: Mapping[str, Mapping[str, agent_metrics.Estimate]],
-    trajectories: list[Trajectory],
-    failed: Mapping[str, Mapping[str, Path]],
-) -> Path:
-    """Write everything that a reader of the evaluation wants to see to `out`, and return the report's path.
+    versions: Mapping[str, str],
+    commands: Sequence[str],
+) -> Result:
+    """Writes records, figures, video, pictures of failures and report.md of an evaluation to `out`, while its episodes run.
 
-    `asked` is as `evaluate.judge` has it, with the protocols; `failed` has the pictures of failures: name of records -> kind -> picture.
+    Files of an earlier evaluation are removed once the first episodes have run.
+
+    Args:
+        evaluated: see `protocols.evaluate_protocols`.
+        config: of the evaluated environment, resolved.
+        run: folder of the run, for its learning curves.
+        asked: run, scenes (None: the run's own held-out ones), overrides, protocol, protocols and trust, as they were named.
+        settings: of the evaluation, with `video`, `failures`, `bootstrap` and `seed`.
     """
+    out.mkdir(parents=True, exist_ok=True)
+    records, trajectories, pictures = {}, [], {}
+    for one in evaluated:
+        if not records:
+            noted = {**asked, "episodes": circumstances.describe(config)}
+            result_file.begin(out, {**noted, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
+        records[one.label] = one.records
+        agent_metrics.write_csv(out / _agents_file(one.label), one.records)
+        if one.recording is None or one.policy != "trained":
+            continue
+        if settings["video"]["enable"] and not trajectories:
+            trajectories = _filmed_worlds(config, one.recording, settings["video"])
+        if settings["failures"]["pictures"]["enable"]:
+            pictures[one.label] = failure_pictures.draw(out, one.label, one.records, one.recording, settings)
+    resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
+    summary = {label: agent_metrics.summarise(rows, **resampling) for label, rows in records.items()}
     metrics = metrics_csv.read(run)
     baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
-    figures = _figures(out, metrics, records, summary, baselines, trajectories)
-    videos = _videos(out, trajectories, settings["video"])
-    files = {f"Agents, {name}": out / f"agents-{name.replace(', ', '-')}.csv" for name in records}
-    files["Failures, ranked"] = failure_pictures.write(out, records, failed)
+    files = {f"Agents, {name}": out / _agents_file(name) for name in records}
+    files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
     if metrics:
         files["Metrics of the training"] = run / metrics_csv.FILE
-    return evaluation_report.write(
+    report = evaluation_report.write(
         out,
         title=title(config["name"], asked),
         summary=summary,
         records=records,
         config=config,
-        versions=configs.versions(),
-        bootstrap=settings["bootstrap"],
-        seed=settings["seed"],
+        versions=versions,
+        **resampling,
         baselines=baselines,
-        figures=figures,
-        videos=videos,
-        failed=failed,
+        figures=_figures(out, metrics, records, summary, baselines, trajectories),
+        videos=_videos(out, trajectories, settings["video"]),
+        failed=pictures,
         kinds=failures.list_thresholds(settings["failures"]),
         files=files,
-        commands=[format_rerun_command(asked, settings)],
+        commands=commands,
         episodes={"Protocol": f"`{asked['protocol']}`", **circumstances.describe(config)},
     )
+    return Result(out, records, summary, report)
 
 
-def format_rerun_command(asked: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """The command that makes an evaluation's numbers anew, with every setting that is not its default."""
-    default = configs.load_config("evaluate", "run=null", f"protocol={asked['protocol']}")
-    protocol = {**settings.get("protocol", default["protocol"]), "termination": asked["protocols"]}
-    own = {name: asked[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": asked["scenes"]}}
-    own |= {"out": None, "protocol": protocol}
-    wanted, usual = (
-        evaluation_report.flatten({name: {**settings, **own}[name] for name in ("run", *default)}),
-        evaluation_report.flatten(default),
-    )
-    words = [f"{key}={_word(value)}" for key, value in wanted.items() if value != usual.get(key)]
-    named = [] if asked["protocol"] == "trained" else [f"protocol={asked['protocol']}"]
-    return f"python -m scenefactory_jax evaluate {shlex.join([*words[:1], *named, *words[1:]])}"
+def _agents_file(label: str) -> str:
+    return f"agents-{label.replace(', ', '-')}.csv"
 
 
-def _word(value: Any) -> str:
-    """A value in Hydra's grammar."""
-    bare = isinstance(value, str) and re.fullmatch(r"[A-Za-z/._][\w/.+-]*", value)
-    return value if bare else json.dumps(value, ensure_ascii=False, separators=(",", ":"), default=str)
+def _filmed_worlds(config: Mapping[str, Any], recording: episode_records.Recording, settings: Mapping[str, Any]) -> list[Trajectory]:
+    """The first worlds, as long as the video is."""
+    steps = round(settings["seconds"] * float(config["timing"]["control_hz"]))
+    worlds = min(settings["worlds"], len(recording.names))
+    return [episode_records.trajectory(recording, index, steps=steps) for index in range(worlds)]
 
 
 def title(name: str, asked: Mapping[str, Any]) -> str:

@@ -19,9 +19,9 @@ PROTOCOLS = {
     "goal_only": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
 }
 KEY_NUMBERS = (
-    "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.draw", "weather.patches",
-    "weather.rain", "weather.grip.mode", "spawning.sampler", "step_metrics.goal_radius_m", "step_metrics.collision_force_n", "termination.ending", "ppo",
-    "policy._target_", "scenes",
+    "seed", "worlds", "iterations", "minutes", "timing", "dynamics._target_", "dynamics.solver", "weather.sampler", "weather.patches",
+    "weather.rain", "weather.friction.mode", "spawning.sampler", "step_metrics.goal_radius_m", "step_metrics.collision_force_n",
+    "termination.ending", "ppo", "policy._target_", "scenes",
 )  # fmt: skip
 _GROUPS, _FAILURES = 20, 40  # the longest tables that a reader still reads; the CSV holds everything
 

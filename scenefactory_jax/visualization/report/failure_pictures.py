@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.evaluation import episode_records, failures
 from scenefactory_jax.evaluation.failures import KINDS, Failure
-from scenefactory_jax.visualization.birds_eye import drawing, video
+from scenefactory_jax.visualization.birds_eye import video
 from scenefactory_jax.visualization.birds_eye.failure_figures import Case, failures_figure
 from scenefactory_jax.visualization.report import plots
 
@@ -22,7 +21,7 @@ def draw(
 ) -> dict[str, Path]:
     """Draw the worst of every kind that occurred; returns kind -> picture, and "film" -> film if the settings want one."""
     numbers, found, stem = settings["failures"]["pictures"], failures.rank_failures(records), label.replace(", ", "-")
-    worlds: dict[int, drawing.Trajectory] = {}
+    worlds: dict[int, Trajectory] = {}
 
     def case(failure: Failure) -> Case:
         if failure.world not in worlds:
@@ -42,23 +41,13 @@ def draw(
     return paths
 
 
-def _film(case: Case, *, before_s: float) -> drawing.Trajectory:
+def _film(case: Case, *, before_s: float) -> Trajectory:
     """The seconds around a failure."""
     failure, whole = case.failure, case.trajectory
     middle, hz = failure.moment_s * whole.control_hz, whole.control_hz
     first, last = max(round(middle - before_s * hz), 0), round(middle + _AFTER_S * hz)
-    cut = lambda leaf: leaf[first:last]  # noqa: E731
-    beside = None if whole.traffic is None else drawing.Others(*map(cut, whole.traffic))
-    return whole._replace(
-        position=cut(whole.position),
-        yaw=cut(whole.yaw),
-        speed=cut(whole.speed),
-        active=cut(whole.active),
-        goal=cut(whole.goal) if np.ndim(whole.goal) == 3 else whole.goal,
-        events={name: cut(past_events) for name, past_events in whole.events.items()},
-        traffic=beside,
-        title=f"{KINDS[failure.kind].label}: car {failure.agent}, {whole.title}",
-    )
+    title = f"{KINDS[failure.kind].label}: car {failure.agent}, {whole.title}"
+    return whole.clip(first, last)._replace(title=title)
 
 
 def write(out: Path, records: Mapping[str, episode_records.Records], pictures: Mapping[str, Mapping[str, Path]]) -> Path:

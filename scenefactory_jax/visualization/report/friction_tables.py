@@ -1,14 +1,20 @@
-"""weather.md and its figure: the friction of tyres on wet roads, from the JSON of `weather` alone."""
+"""Friction coefficients of the model by surface, water film, speed and slip: weather.md and its figure."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import matplotlib
+import numpy as np
 from matplotlib.figure import Figure
 
+from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.weather import friction as model
+
+POINTS = 200  # of a curve
 
 # SceneFactory, Table 5: static friction at 13.89 m/s by film, mm; where it prints "at most 0.001" the tyre floats
 PUBLISHED = {
@@ -18,20 +24,56 @@ PUBLISHED = {
 }
 
 
+def compute_tables(
+    friction: Mapping[str, Any], *, films_mm: list[float], speeds_mps: list[float], slips: list[float], max_film_mm: float
+) -> dict[str, Any]:
+    """Computes friction coefficients at the reference speed by surface and film, and curves over film, speed and slip.
+
+    Args:
+        friction: `weather.friction` of a config.
+        films_mm: of the table.
+        speeds_mps, slips: [min, max] of the curves.
+        max_film_mm: end of the curve over the film.
+
+    Raises:
+        ConfigError: a range that is not ascending.
+    """
+    speeds, slip = (np.linspace(*check_range(span, where=name), POINTS) for name, span in (("speeds_mps", speeds_mps), ("slips", slips)))
+    tyre = instantiate({**friction["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.friction.tyre")()
+    kinds, speed = {"static": friction["slip_static"], "dynamic": friction["slip_dynamic"]}, friction["reference_speed"]
+    films, first = np.linspace(0.0, max_film_mm, POINTS), next(iter(friction["surfaces"]))
+
+    def mu(surface: str, speed: Any, film_mm: Any, slip: Any) -> np.ndarray:
+        entry = friction["surfaces"][surface]
+        inputs = (jnp.asarray(x, jnp.float32) for x in (speed, film_mm, entry["theta"], entry["texture_mm"], slip))
+        return np.asarray(model.compute_lugre_friction(*jnp.broadcast_arrays(*inputs), tyre=tyre))
+
+    def by_surface(film_mm: Any) -> dict[str, dict[str, np.ndarray]]:
+        return {name: {kind: mu(name, speed, film_mm, value) for kind, value in kinds.items()} for name in friction["surfaces"]}
+
+    return {
+        "reference": {"speed_mps": speed, "slips": kinds, "films_mm": films_mm, "surface": first},
+        "table": by_surface(films_mm),
+        "over_film": {"film_mm": films, **by_surface(films)},
+        "over_speed": {"speed_mps": speeds, **{f"{film:g}": mu(first, speeds, film, kinds["static"]) for film in films_mm}},
+        "over_slip": {"slip": slip, **{f"{film:g}": mu(first, speed, film, slip) for film in films_mm}},
+    }
+
+
 def write(folder: Path, found: Mapping[str, Any]) -> Path:
-    """Write `folder`/weather.md and its figure, and return the path of the text."""
+    """Writes `folder`/weather.md and its figure; returns the path of the text."""
     picture = plots.save(figure(found), folder / "weather.png")
     reference = found["reference"]
     words = (
         f"Friction coefficient of a tyre at {reference['speed_mps']:g} m/s, before a contact's own floor: at slip "
-        f"{reference['slips']['static']:g} (static, which the simulation uses unless `weather.grip.mode` says otherwise) and, in brackets, "
+        f"{reference['slips']['static']:g} (static, the default of `weather.friction.mode`) and, in brackets, "
         f"{reference['slips']['dynamic']:g} (dynamic). Water films across, in mm. Zero: the tyre floats."
     )
     lines = ["# Friction on wet roads", f"`{found['command']}`", words, table(found)]
     if compared := compare_with_published(found):
         lines += ["## Beside the published table", compared]
     cliff = (
-        "The film at which grip is lost is where the water can no longer be squeezed out to the minimum spacing: 0.8 mm for every surface "
+        "Friction is lost at the film depth from which water is no longer squeezed out to the minimum spacing: 0.8 mm for every surface "
         "(`minimum_spacing` / `spacing_ratio`). Below it a film only thins the friction through the Stribeck speed; above it contact ends "
         "within hundredths of a millimetre. The model has no gradual aquaplaning, and its surfaces differ by their ratio theta alone."
     )
@@ -42,7 +84,7 @@ def write(folder: Path, found: Mapping[str, Any]) -> Path:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Static and dynamic friction of every surface by film."""
+    """Formats static and dynamic friction of every surface by film."""
     films = found["reference"]["films_mm"]
     cells = {name: zip(row["static"], row["dynamic"], strict=True) for name, row in found["table"].items()}
     rows = [[name, *(f"{static:.3f} ({dynamic:.3f})" for static, dynamic in pairs)] for name, pairs in cells.items()]
@@ -50,7 +92,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 
 def compare_with_published(found: Mapping[str, Any]) -> str:
-    """Static friction beside Table 5 of the paper, for the surfaces and films that both have; empty without any."""
+    """Formats static friction beside Table 5 of the paper, for surfaces and films in both; empty if there are none."""
     films = found["reference"]["films_mm"]
     shown = [(at, film) for at, film in enumerate(films) if all(film in row for row in PUBLISHED.values())]
     rows = [
@@ -61,7 +103,7 @@ def compare_with_published(found: Mapping[str, Any]) -> str:
 
 
 def figure(found: Mapping[str, Any]) -> Figure:
-    """Friction over the film of every surface, and over speed and slip of the first one for every film of the table."""
+    """Draws friction over the film for every surface, and over speed and slip for the first surface and every film of the table."""
     reference = found["reference"]
     with matplotlib.rc_context(plots.STYLE):
         whole = Figure(figsize=(12.0, 3.6), layout="constrained")

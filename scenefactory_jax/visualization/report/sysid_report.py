@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.validation.target_check import Verdict, table
 from scenefactory_jax.evaluation import agent_metrics
 from scenefactory_jax.visualization.report import plots
 from scenefactory_jax.visualization.report import sysid_figures as figures
+from scenefactory_jax.visualization.report.verdicts import Verdict, table
 
 Result = Mapping[str, Any]
 PUBLISHED = {  # SceneFactory, arXiv:2605.08528, Table 8: candidates and best loss of each stage

@@ -9,6 +9,7 @@ import shapely
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, RawScene
+from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import (
     CROSSWALK,
     DRIVABLE,
@@ -23,7 +24,7 @@ from scenefactory_jax.core.types import (
     Scene,
 )
 from scenefactory_jax.env.rollout import Recording, StepRecord
-from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.birds_eye import patch_overlay, traffic_shapes
 from scenefactory_jax.visualization.web.array_packing import Packer
 
 # how a kind of segment looks (`map.js`); kinds as in `types`
@@ -148,7 +149,8 @@ def _add_cars(packer: Packer, shots: StepRecord, active: Bool[np.ndarray, "T A"]
     columns = {
         "x": shots.position[..., 0], "y": shots.position[..., 1], "yaw": shots.yaw, "speed": shots.speed, "steer": shots.steer,
         "throttle": shots.action[..., 0], "turn": shots.action[..., 1], "brake": shots.action[..., 2], "ttc": _near(np.asarray(shots.ttc)),
-        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip, "friction_utilization": shots.friction_utilization,
+        "edge_ttc": _near(np.asarray(shots.edge_ttc)), "goal_distance": shots.goal_distance, "grip": shots.grip,
+        "friction_utilization": shots.friction_utilization,
         "slip": shots.slip, "contact_force": shots.contact_force,
     }  # fmt: skip
     finely = {name: (values, RESOLUTION[name]) for name, values in columns.items()}
@@ -196,7 +198,7 @@ def _events(shots: StepRecord, active: Bool[np.ndarray, "T A"], held: Int[np.nda
 
 def _add_others(packer: Packer, scene: Scene, shots: StepRecord) -> list[dict[str, Any]]:
     """Everybody else who is ever there: size, kind, spans, and whether it only stands."""
-    whole = drawing.Others(*(np.asarray(getattr(shots.traffic, name)) for name in drawing.Others._fields))
+    whole = TrafficBoxes.from_boxes(shots.traffic)
     seen = np.flatnonzero(whole.present.any(axis=0))
     still, held = traffic_shapes.shapes_at_rest(whole), _held(whole.present)
     kinds = np.asarray(scene.traffic_log.kind) if len(scene.traffic_log.kind) == whole.present.shape[1] else None

@@ -10,18 +10,18 @@ from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
 from scenefactory_jax.data.packing.pack import box_corners
 
 
-def times(raw: RawScene, *, share: float) -> list[Finding]:
-    """Steps whose length differs from the median step by more than a share of it."""
+def times(raw: RawScene, *, tolerance_fraction: float) -> list[Finding]:
+    """Steps whose length differs from the median step by more than a fraction of it."""
     step = np.diff(raw.times)
     if not len(step):
         return []
     usual = float(np.median(step))
     off = np.abs(step - usual) / usual if usual > 0 else np.full(len(step), np.inf)
     worst = int(np.argmax(off))
-    if off[worst] <= share:
+    if off[worst] <= tolerance_fraction:
         return []
-    message = f"{int((off > share).sum())} steps of the log are not {usual:.3g} s long; step {worst} is {step[worst]:.3g} s"
-    return [Finding(message, float(off[worst]), share, step=worst)]
+    message = f"{int((off > tolerance_fraction).sum())} steps of the log are not {usual:.3g} s long; step {worst} is {step[worst]:.3g} s"
+    return [Finding(message, float(off[worst]), tolerance_fraction, step=worst)]
 
 
 def sdc(raw: RawScene, *, without: list[str]) -> list[Finding]:
@@ -51,8 +51,8 @@ def track_ids(raw: RawScene) -> list[Finding]:
     ]
 
 
-def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
-    """Vehicles whose boxes lie in each other at the current step, by a share of the smaller box."""
+def overlapping_starts(raw: RawScene, *, min_overlap_fraction: float) -> list[Finding]:
+    """Vehicles whose boxes lie in each other at the current step, by a fraction of the smaller box."""
     tracks = [track for track in raw.tracks if track.kind == "vehicle" and track.valid[raw.current]]
     now = raw.current
     boxes = np.array([shapely.Polygon(box_corners(t.xyz[now, :2], float(t.yaw[now]), *t.size[:2])) for t in tracks], dtype=object)
@@ -64,11 +64,11 @@ def overlapping_starts(raw: RawScene, *, share: float) -> list[Finding]:
     common = shapely.area(shapely.intersection(boxes[one], boxes[other])) / np.minimum(area[one], area[other])
     found = []
     for first, second, part in zip(one, other, common, strict=True):
-        if part > share and _same_level(tracks[first], tracks[second], now):
+        if part > min_overlap_fraction and _same_level(tracks[first], tracks[second], now):
             ids = (tracks[first].id, tracks[second].id)
             place = (tracks[first].xyz[now] + tracks[second].xyz[now]) / 2
             message = f"vehicles {ids[0]} and {ids[1]} share {100 * part:.0f} % of the smaller box at the current step"
-            found.append(Finding(message, float(part), share, describe_point(place), now, ids))
+            found.append(Finding(message, float(part), min_overlap_fraction, describe_point(place), now, ids))
     return found
 
 

@@ -46,29 +46,29 @@ def _height(xyz: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "2"]) -> flo
     return float(np.interp(shapely.line_locate_point(shapely.LineString(xyz[:, :2]), shapely.Point(place)), arc, xyz[:, 2]))
 
 
-def short_lanes(raw: RawScene, *, least_m: float) -> list[Finding]:
+def short_lanes(raw: RawScene, *, min_length_m: float) -> list[Finding]:
     """Lanes for cars that are hardly any length, down to single points."""
     found = []
     for line in raw.roads:
         if line.kind in DRIVABLE:
             length = float(np.linalg.norm(np.diff(line.xyz[:, :2], axis=0), axis=1).sum())
-            if length < least_m:
+            if length < min_length_m:
                 place = describe_point(line.xyz[0]) if len(line.xyz) else None
-                found.append(Finding(f"lane {line.id} is {length:.2f} m long", length, least_m, place, roads=(line.id,)))
+                found.append(Finding(f"lane {line.id} is {length:.2f} m long", length, min_length_m, place, roads=(line.id,)))
     return found
 
 
-def kinks(raw: RawScene, *, turn_deg: float, least_step_m: float) -> list[Finding]:
+def kinks(raw: RawScene, *, turn_deg: float, min_step_m: float) -> list[Finding]:
     """Lanes whose direction changes by more at a single point.
 
     Args:
         turn_deg: allowed.
-        least_step_m: between points; nearer ones have no direction that means anything.
+        min_step_m: between points; nearer ones have no direction that means anything.
     """
     found = []
     for line in _long(raw):
         step = np.diff(line.xyz[:, :2], axis=0)
-        long = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) >= least_step_m)
+        long = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) >= min_step_m)
         turn = np.rad2deg(_turns(step[long]))
         if len(turn) and (value := float(turn.max())) > turn_deg:
             place = describe_point(line.xyz[long[int(np.argmax(turn)) + 1]])

@@ -24,15 +24,15 @@ class Crossing(NamedTuple):
 
 
 def unreachable(
-    raw: RawScene, *, least_travel_m: float, topology: Mapping[str, Any], network: Mapping[str, Any], search: Mapping[str, Any]
+    raw: RawScene, *, min_travel_m: float, topology: Mapping[str, Any], network: Mapping[str, Any], search: Mapping[str, Any]
 ) -> list[Finding]:
     """Vehicles whose last logged place no route over lanes reaches from where they are at the current step.
 
     Args:
-        least_travel_m: vehicles that get less far are not looked at: most are parked, beside any lane.
+        min_travel_m: vehicles that get less far are not looked at: most are parked, beside any lane.
         topology, network, search: entries of `lanes` in the config.
     """
-    movers = [(track, last) for track, last in _movers(raw, least_travel_m) if track.valid[raw.current]]
+    movers = [(track, last) for track, last in _movers(raw, min_travel_m) if track.valid[raw.current]]
     if not movers:
         return []
     linked = instantiate(topology, builtins="scenefactory_jax.roadgraph.lane_topology", where="quality.rules.unreachable.topology")(raw)
@@ -45,20 +45,20 @@ def unreachable(
             continue
         distance = float(np.linalg.norm(goal[:2] - start[:2]))
         message = f"vehicle {track.id}: no route over lanes to its goal {distance:.0f} m away"
-        found.append(Finding(message, distance, least_travel_m, describe_point(goal), last, (track.id,)))
+        found.append(Finding(message, distance, min_travel_m, describe_point(goal), last, (track.id,)))
     return found
 
 
-def crossed_edges(raw: RawScene, *, least_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
+def crossed_edges(raw: RawScene, *, min_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
     """Vehicles whose logged centre crosses a road edge away from any driveway, so that its own path is no way to drive.
 
     Args:
-        least_travel_m: vehicles that get less far are not looked at.
+        min_travel_m: vehicles that get less far are not looked at.
         rise_m: an edge at another height belongs to another level.
         driveway_m: crossings nearer to a driveway speak against the edge (`edges_across_driveways`).
     """
     found = {}
-    for crossing in _crossings(raw, least_travel_m, rise_m):
+    for crossing in _crossings(raw, min_travel_m, rise_m):
         if crossing.driveway_m > driveway_m:
             track, edge = crossing.track.id, crossing.edge.id
             message = f"vehicle {track} crosses road edge {edge} at step {crossing.step}"
@@ -66,15 +66,15 @@ def crossed_edges(raw: RawScene, *, least_travel_m: float, rise_m: float, drivew
     return list(found.values())
 
 
-def edges_across_driveways(raw: RawScene, *, least_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
+def edges_across_driveways(raw: RawScene, *, min_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
     """Road edges that run on across a driveway where logged vehicles cross them: the label is wrong, not the driver.
 
     Args:
-        least_travel_m, rise_m: see `crossed_edges`.
+        min_travel_m, rise_m: see `crossed_edges`.
         driveway_m: from the crossing to the driveway.
     """
     by_edge: dict[int, list[Crossing]] = {}
-    for crossing in _crossings(raw, least_travel_m, rise_m):
+    for crossing in _crossings(raw, min_travel_m, rise_m):
         if crossing.driveway_m <= driveway_m:
             by_edge.setdefault(crossing.edge.id, []).append(crossing)
     found = []
@@ -85,19 +85,19 @@ def edges_across_driveways(raw: RawScene, *, least_travel_m: float, rise_m: floa
     return found
 
 
-def _movers(raw: RawScene, least_travel_m: float) -> Iterator[tuple[Track, int]]:
+def _movers(raw: RawScene, min_travel_m: float) -> Iterator[tuple[Track, int]]:
     """Vehicles that end far enough from where the current step or, later, their log begins; and the last step of each."""
     for track in raw.tracks:
         steps = np.flatnonzero(track.valid[raw.current :]) + raw.current
         if track.kind == "vehicle" and len(steps) > 1:
             way = track.xyz[steps[-1], :2] - track.xyz[steps[0], :2]
-            if np.hypot(way[0], way[1]) > least_travel_m:
+            if np.hypot(way[0], way[1]) > min_travel_m:
                 yield track, int(steps[-1])
 
 
-def _crossings(raw: RawScene, least_travel_m: float, rise_m: float) -> Iterator[Crossing]:
+def _crossings(raw: RawScene, min_travel_m: float, rise_m: float) -> Iterator[Crossing]:
     """Every place at which a mover's path crosses a road edge of its own level, track by track."""
-    tracks = [track for track, _ in _movers(raw, least_travel_m)]
+    tracks = [track for track, _ in _movers(raw, min_travel_m)]
     edges = [line for line in raw.roads if line.kind in EDGES and len(line.xyz) > 1]
     if not tracks or not edges:
         return

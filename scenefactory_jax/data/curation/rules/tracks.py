@@ -12,7 +12,7 @@ from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
 Excess = tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"]]  # steps, and what was measured there
 
 
-def speed(raw: RawScene, *, most_m_s: float) -> list[Finding]:
+def speed(raw: RawScene, *, max_speed_m_s: float) -> list[Finding]:
     """Positions of neighbouring steps that imply a higher speed."""
 
     def measure(track: Track) -> Excess:
@@ -20,10 +20,10 @@ def speed(raw: RawScene, *, most_m_s: float) -> list[Finding]:
         way = np.linalg.norm(track.xyz[steps + 1, :2] - track.xyz[steps, :2], axis=1)
         return steps + 1, way / np.diff(raw.times)[steps]
 
-    return _worst(raw, measure, most_m_s, "moves at {:.1f} m/s")
+    return _worst(raw, measure, max_speed_m_s, "moves at {:.1f} m/s")
 
 
-def acceleration(raw: RawScene, *, most_m_s2: float, over_s: float) -> list[Finding]:
+def acceleration(raw: RawScene, *, max_acceleration_m_s2: float, over_s: float) -> list[Finding]:
     """Logged speeds that change faster than a car can, over a time long enough for the noise of single steps to fade."""
     stride = max(1, round(over_s / _step_s(raw)))
 
@@ -32,10 +32,10 @@ def acceleration(raw: RawScene, *, most_m_s2: float, over_s: float) -> list[Find
         value = np.linalg.norm(track.velocity, axis=1)
         return there + stride, np.abs(value[there + stride] - value[there]) / (raw.times[there + stride] - raw.times[there])
 
-    return _worst(raw, measure, most_m_s2, "changes its speed by {:.1f} m/s²")
+    return _worst(raw, measure, max_acceleration_m_s2, "changes its speed by {:.1f} m/s²")
 
 
-def yaw_rate(raw: RawScene, *, most_rad_s: float) -> list[Finding]:
+def yaw_rate(raw: RawScene, *, max_yaw_rate_rad_s: float) -> list[Finding]:
     """Headings of neighbouring steps that imply a faster turn, such as a box that is turned round."""
 
     def measure(track: Track) -> Excess:
@@ -43,7 +43,7 @@ def yaw_rate(raw: RawScene, *, most_rad_s: float) -> list[Finding]:
         turn = np.abs(wrap_angles(track.yaw[steps + 1] - track.yaw[steps]))
         return steps + 1, turn / np.diff(raw.times)[steps]
 
-    return _worst(raw, measure, most_rad_s, "turns at {:.1f} rad/s")
+    return _worst(raw, measure, max_yaw_rate_rad_s, "turns at {:.1f} rad/s")
 
 
 def jumps(raw: RawScene, *, off_m: float, drift_m_s: float) -> list[Finding]:

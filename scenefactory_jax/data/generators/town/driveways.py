@@ -1,15 +1,16 @@
-"""Private driveways: aprons outside the kerb, some with a car on them."""
+"""Draws private driveways outside of the kerbs, each with a parking space."""
 
 import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from scenefactory_jax.data.generators.curves import Points, arc_length
-from scenefactory_jax.data.generators.procedural.road_layout import check_range, draw
-from scenefactory_jax.data.generators.town.lane_paths import change_to_right
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, Spot
+from scenefactory_jax.data.generators.curves import Points, arc_length, interpolate, right_normals
+from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count
+from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, ParkingSpace
 
-CAR_M = 5.0  # depth of an apron's pavement crossing and half a car: where the middle of a parked car is
+CAR_M = 5.0  # from the kerb to the middle of a parked car
+MIN_SPACING_M = 8.0  # between the middles of two parked cars
+CLEARANCE_M = 4.0  # between the middle of a parked car and the paved surface
 
 
 def draw_driveways(
@@ -22,41 +23,42 @@ def draw_driveways(
     width_m: list[float],
     depth_m: list[float],
     junction_m: float,
-) -> tuple[list[Points], list[Spot]]:
-    """Outlines outside random places of the kerbs, and where a car may stand on each. Fewer where there is no room.
+) -> tuple[list[Points], list[ParkingSpace]]:
+    """Draws outlines at random places of the kerbs and their parking spaces, fewer where there is no room.
 
     Args:
-        count: fewest and most.
-        width_m: along the kerb.
-        depth_m: away from it.
-        junction_m: between an apron and the lanes of a junction.
+        count: range of the number of places that are drawn.
+        width_m: range of the size along the kerb.
+        depth_m: range of the size away from it.
+        junction_m: minimum distance of a driveway from the lanes of a junction.
     """
-    check_range(count, "aprons.count", low=0.0)
+    check_range(count, "driveways.count")
     outlines: list[Points] = []
-    spots: list[Spot] = []
+    spots: list[ParkingSpace] = []
     if not kerbs:
         return outlines, spots
     turns = [lane.points[::4] for lane in network.lanes if lane.rank != ON_ROAD]
     turns = KDTree(np.concatenate(turns)) if turns else None
-    places, rights = [arc_length(kerb) for kerb in kerbs], [change_to_right(kerb) for kerb in kerbs]
+    places, normals = [arc_length(kerb) for kerb in kerbs], [right_normals(kerb) for kerb in kerbs]
     lengths = np.array([place[-1] for place in places])
-    for _ in range(int(rng.integers(count[0], count[1] + 1))):
+    for _ in range(draw_count(rng, count)):
         chosen = int(rng.choice(len(kerbs), p=lengths / lengths.sum()))
-        kerb, place, right = kerbs[chosen], places[chosen], rights[chosen]
-        width, depth, at = draw(rng, width_m, "aprons.width_m"), draw(rng, depth_m, "aprons.depth_m"), rng.uniform(0.0, place[-1])
-        sample = lambda s, table, place=place: np.array([np.interp(s, place, table[:, i]) for i in (0, 1)])  # noqa: E731
+        kerb, place = kerbs[chosen], places[chosen]
+        width, depth, at = draw(rng, width_m, "driveways.width_m"), draw(rng, depth_m, "driveways.depth_m"), rng.uniform(0.0, place[-1])
         if width > min(at, place[-1] - at):
             continue
-        out = sample(at, right)
+        out = interpolate(at, place, normals[chosen])
         out = out / np.linalg.norm(out)
-        near = np.stack([sample(at - width / 2, kerb), sample(at + width / 2, kerb)])
+        near = interpolate([at - width / 2, at + width / 2], place, kerb)
         outline = np.concatenate([near, near[::-1] + depth * out])
-        middle = sample(at, kerb) + CAR_M * out
-        if turns is not None and turns.query(sample(at, kerb))[0] < junction_m:
+        entry = interpolate(at, place, kerb)
+        middle = entry + CAR_M * out
+        if turns is not None and turns.query(entry)[0] < junction_m:
             continue
-        taken = any(np.linalg.norm(middle - spot.place) < 8.0 for spot in spots)
-        if taken or shapely.Polygon(outline + 0.2 * out).intersects(surface) or shapely.Point(middle).buffer(4.0).intersects(surface):
+        taken = any(np.linalg.norm(middle - spot.place) < MIN_SPACING_M for spot in spots)
+        ground = shapely.Polygon(outline + 0.2 * out), shapely.Point(middle).buffer(CLEARANCE_M)
+        if taken or any(area.intersects(surface) for area in ground):
             continue
         outlines.append(np.concatenate([outline, outline[:1]]))
-        spots.append(Spot(middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
+        spots.append(ParkingSpace(middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
     return outlines, spots

@@ -1,81 +1,89 @@
-"""A motorway through the town's middle: two carriageways, each with a ramp that joins and one that leaves."""
+"""Builds a motorway through the middle of a town: two carriageways, each with up to two ramps."""
 
 import itertools
 
 import numpy as np
 import shapely
 
+from scenefactory_jax.core.schema import Fraction, Positive
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, integrate
-from scenefactory_jax.data.generators.procedural.road_layout import DOUBLE_YELLOW, draw
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Block, Joint, Lane, Network, Port, Street, assemble
-from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, lay_road, shift_line, stack_lines
+from scenefactory_jax.data.generators.ranges import draw, draw_count
+from scenefactory_jax.data.generators.town.road_network import DOUBLE_YELLOW, ON_ROAD, Block, Joint, Lane, Network, Port, Street, assemble
+from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, build_carriageway, combine, shift_line
+
+RANK = 3  # of the motorway as a street
+RAMP_LEAD_M, RAMP_EASING_M = 5.0, 30.0  # of the bend of a ramp
 
 
 def motorway(
     rng: np.random.Generator,
-    reach: float,
     *,
+    length_m: Positive,
     lanes: list[int],
     lane_width_m: float,
     median_m: list[float],
     speed_limit_mps: list[float],
-    bend_radius_m: float,
+    bend_radius_m: Positive,
     offset_m: float,
     join_m: list[float],
     leave_m: list[float],
     auxiliary_m: list[float],
     taper_m: float,
-    ramp_share: float,
+    ramp_fraction: Fraction,
     ramp_turn_deg: list[float],
     ramp_radius_m: float,
     ramp_limit_mps: float,
     shoulder_m: float,
 ) -> Network:
-    """Two carriageways side by side; a joining ramp adds a lane that drops further on, a leaving one takes a lane that was added.
+    """Draws two carriageways side by side; a joining ramp adds a lane that drops later, a leaving ramp takes an added lane.
 
     Args:
-        lanes: fewest and most of a carriageway.
-        bend_radius_m: the sharpest.
-        offset_m: how far the motorway may pass from the town's middle.
-        join_m, leave_m: place of the ramps' noses along a carriageway, from the town's middle.
-        auxiliary_m: length of an added lane.
-        ramp_share: how many of the possible ramps are there.
-        ramp_turn_deg: how far a ramp turns away.
+        length_m: of both carriageways.
+        lanes: range of the lanes of a carriageway.
+        bend_radius_m: minimum radius.
+        offset_m: maximum distance from the middle of the town, along each axis.
+        join_m, leave_m: ranges of the places of the ramps along a carriageway, from the middle of the town.
+        auxiliary_m: range of the length of an added lane.
+        ramp_fraction: of the possible ramps that exist.
+        ramp_turn_deg: range of the angle by which a ramp turns away.
     """
-    count = int(rng.integers(lanes[0], lanes[1] + 1))
+    count = draw_count(rng, lanes)
     limit = draw(rng, speed_limit_mps, "motorway.speed_limit_mps", low=5.0)
-    street = Street(count, count, lane_width_m, draw(rng, median_m, "motorway.median_m"), limit, 3, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)
-    half = 3.0 * reach  # cars are fast: those that reach the town within a log start far out
-    steps = round(half / FINE_M)
+    median = draw(rng, median_m, "motorway.median_m")
+    street = Street(count, lane_width_m, median, limit, RANK, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)
+    half = length_m / 2
     yaw, bend = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(-1, 1)) / bend_radius_m
     middle = rng.uniform(-offset_m, offset_m, 2)
-    forward, back = (integrate(middle, yaw + turn, np.full(steps, sign * bend), FINE_M) for turn, sign in ((0.0, 1.0), (np.pi, -1.0)))
+    bends = np.full(round(half / FINE_M), bend)
+    forward, back = integrate(middle, yaw, bends, FINE_M), integrate(middle, yaw + np.pi, -bends, FINE_M)
     curve = np.concatenate([back[0][:0:-1], forward[0]]), np.concatenate([back[1][:0:-1] - np.pi, forward[1]])
     blocks: list[Block] = []
     joints: list[Joint] = []
-    for carriageway in (curve, (curve[0][::-1], curve[1][::-1] + np.pi)):
+    for direction in (curve, (curve[0][::-1], curve[1][::-1] + np.pi)):
         places = [draw(rng, span, f"motorway.{name}", low=-half) for span, name in ((join_m, "join_m"), (leave_m, "leave_m"))]
         added, taken = (draw(rng, auxiliary_m, "motorway.auxiliary_m") for _ in places)
-        rows = [round((half + place) / FINE_M) if rng.random() < ramp_share else None for place in places]
-        numbers = RoadDimensions(bay=taken, hold=added, taper=taper_m, solid=0.0, shoulder=shoulder_m, spot=1.0, spot_margin=0.0)
-        main = _carriageway(carriageway, street, numbers, rows[0], rows[1])
+        rows = [round((half + place) / FINE_M) if rng.random() < ramp_fraction else None for place in places]
+        numbers = RoadDimensions(
+            bay_m=taken, hold_m=added, taper_m=taper_m, solid_m=0.0, shoulder_m=shoulder_m, spot_m=1.0, spot_margin_m=0.0
+        )
+        main = _carriageway(direction, street, numbers, rows[0], rows[1])
         ramps = [
             _ramp(port, np.radians(draw(rng, ramp_turn_deg, "motorway.ramp_turn_deg")), ramp_radius_m, ramp_limit_mps, shoulder_m, half)
             for port in main.ports
         ]
         joints += [((len(blocks), port), (len(blocks) + 1 + port, 0)) for port in range(len(ramps))]
         blocks += [main, *ramps]
-    if street.median > 2 * shoulder_m + 1.0:
-        island = shapely.LineString(curve[0]).simplify(0.02).buffer(street.median / 2 - shoulder_m, cap_style="flat")
+    if median > 2 * shoulder_m + 1.0:
+        island = shapely.LineString(curve[0]).simplify(0.02).buffer(median / 2 - shoulder_m, cap_style="flat")
         blocks[0] = blocks[0]._replace(islands=[island])
     return assemble(blocks, joints)
 
 
 def _carriageway(curve: Curve, street: Street, numbers: RoadDimensions, join: int | None, leave: int | None) -> Block:
-    """One direction, its lanes on the right of the curve, with a port for each ramp at the given points of the curve."""
-    count, last = street.forward, len(curve[0]) - 1
-    stretches = []  # from point, to point, lanes at its start, lanes at its end
+    """Builds one direction with its lanes on the right of the curve, and a port for each ramp at the given points of the curve."""
+    count, last = street.lanes, len(curve[0]) - 1
+    stretches = []  # first point, last point, lanes at the start, lanes at the end
     at = 0
     if join is not None:
         stretches.append((0, join, count, count))
@@ -86,17 +94,17 @@ def _carriageway(curve: Curve, street: Street, numbers: RoadDimensions, join: in
     if not stretches:
         stretches = [(0, last, count, count)]
     ways = [
-        lay_road((curve[0][a : b + 1], curve[1][a : b + 1]), first, then, street, numbers, side="right", controlled=False)
-        for a, b, first, then in stretches
+        build_carriageway((curve[0][a : b + 1], curve[1][a : b + 1]), before, behind, street, numbers, side="right", controlled=False)
+        for a, b, before, behind in stretches
     ]
-    block = stack_lines("motorway", ways)
-    base = np.concatenate([[0], np.cumsum([len(way.lanes) for way in ways])]).tolist()
+    block = combine("motorway", ways)
+    base = list(itertools.accumulate((len(way.lanes) for way in ways), initial=0))
     follows, ports = list(block.follows), []
     for i, (way, following) in enumerate(itertools.pairwise(ways)):
         follows += [(a + base[i], b + base[i + 1]) for a, b in zip(way.end, following.start, strict=False)]
     beside = street.median / 2 + (count + 0.5) * street.width
-    for i, (a, b, first, then) in enumerate(stretches):
-        for row, wide, joins in ((a, first, True), (b, then, False)):
+    for i, (a, b, before, behind) in enumerate(stretches):
+        for row, wide, joins in ((a, before, True), (b, behind, False)):
             if wide > count:
                 place = shift_line((curve[0][row : row + 1], curve[1][row : row + 1]), beside)[0]
                 slot = ((ways[i].start[-1] if joins else ways[i].end[-1]) + base[i],)
@@ -106,12 +114,12 @@ def _carriageway(curve: Curve, street: Street, numbers: RoadDimensions, join: in
 
 
 def _ramp(port: Port, turn: float, radius: float, limit: float, shoulder: float, length: float) -> Block:
-    """The road that leads to a carriageway's port, or away from it: both bend to the carriageway's right."""
+    """Builds the road that leads to a port of a carriageway, or away from it; both bend to the right of the carriageway."""
     joins = not port.leaving
-    bends, step = easing_bend(length, turn if joins else -turn, radius, 30.0, lead=5.0)
+    bends, step = easing_bend(length, turn if joins else -turn, radius, RAMP_EASING_M, lead=RAMP_LEAD_M)
     points, _ = integrate(port.place, port.yaw, bends, step)
     points = points[::-1] if joins else points
     lane = Lane(points, port.street.width, limit, ON_ROAD, LANE_FREEWAY)
     area = shapely.LineString(points).simplify(0.02).buffer(port.street.width / 2 + shoulder, cap_style="flat")
-    own = Port(port.place, port.yaw + np.pi, port.street, ((0,),) if joins else (), () if joins else ((0,),))
-    return Block("merge" if joins else "ramp", [lane], areas=[area], ports=[own])
+    end = Port(port.place, port.yaw + np.pi, port.street, ((0,),) if joins else (), () if joins else ((0,),))
+    return Block("merge" if joins else "ramp", [lane], areas=[area], ports=[end])

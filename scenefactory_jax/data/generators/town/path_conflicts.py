@@ -1,5 +1,6 @@
-"""Where the ways of road users meet: for every two of them, which places of one lie on the other."""
+"""Finds where the paths of road users meet: for every pair, which places of one lie on the other."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,78 +9,70 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path
 
-STRIDE = 2  # points of a path from one row of the table to the next
+STRIDE = 2  # points of a path per row of the table
 ROW_M = STRIDE * STEP_M
-SIDE_M = 0.35  # between two who pass one another
-ALONG = 0.7  # cosine between two ways that run together
+SIDE_M = 0.35  # minimum gap between two road users that pass each other
+ALONG_COS = 0.7  # minimum cosine between two paths that run together
 
 
 class PathProjections(NamedTuple):
-    """The projection of every way on every other."""
+    """Projections of all paths onto each other."""
 
-    place: Float[np.ndarray, "N N S"]  # [i, j, row]: place on j's way of a row of i's; NaN where j's way is not near
-    rows: Int[np.ndarray, " N"]  # of each way
+    place: Float[np.ndarray, "N N S"]  # [i, j, row]: place on path j of a row of path i; NaN where path j is not near
+    rows: Int[np.ndarray, " N"]  # of each path
 
 
 class Zones(NamedTuple):
-    """Stretches of one's way that lie on another's, seen by `own`."""
+    """Stretches of the path `first` that lie on the path `second`; every zone occurs twice, once for each."""
 
-    own: Int[np.ndarray, " Z"]
-    other: Int[np.ndarray, " Z"]
-    start: Float[np.ndarray, " Z"]  # on own's way, m
+    first: Int[np.ndarray, " Z"]
+    second: Int[np.ndarray, " Z"]
+    start: Float[np.ndarray, " Z"]  # on the first path, m
     end: Float[np.ndarray, " Z"]
-    other_start: Float[np.ndarray, " Z"]  # on other's way
-    other_end: Float[np.ndarray, " Z"]
-    along: Bool[np.ndarray, " Z"]  # the two run together rather than cross
-    rank: Float[np.ndarray, " Z"]  # own's right of way less the other's
+    second_start: Float[np.ndarray, " Z"]  # on the second path, m
+    second_end: Float[np.ndarray, " Z"]
+    along: Bool[np.ndarray, " Z"]  # the paths run together rather than cross
+    rank: Float[np.ndarray, " Z"]  # right of way of the first less that of the second
 
 
 def find_conflicts(paths: list[Path], width: Float[np.ndarray, " N"]) -> tuple[PathProjections, Zones]:
-    """Project all ways on one another; two ways meet where the boxes that drive them would touch.
-
-    Args:
-        width: of the road users.
-    """
+    """Projects all paths onto each other; two paths meet where road users of the given widths would touch."""
     count = len(paths)
     thinned = [path.points[::STRIDE] for path in paths]
     rows = np.array([len(points) for points in thinned])
-    owner = np.repeat(np.arange(count), rows)
+    path_of = np.repeat(np.arange(count), rows)
     row = np.concatenate([np.arange(n) for n in rows])
     points = np.concatenate(thinned)
     pairs = KDTree(points).query_pairs(float(width.max()) + SIDE_M, output_type="ndarray")
-    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
-    limit = (width[owner[pairs[:, 0]]] + width[owner[pairs[:, 1]]]) / 2 + SIDE_M
+    pairs = pairs[path_of[pairs[:, 0]] != path_of[pairs[:, 1]]]
+    limit = (width[path_of[pairs[:, 0]]] + width[path_of[pairs[:, 1]]]) / 2 + SIDE_M
     pairs = pairs[((points[pairs[:, 0]] - points[pairs[:, 1]]) ** 2).sum(axis=1) < limit**2]
     both = np.concatenate([pairs, pairs[:, ::-1]])
-    most = int(rows.max())
-    key = (owner[both[:, 0]] * count + owner[both[:, 1]]) * most + row[both[:, 0]]
-    size = count * count * most
+    max_rows = int(rows.max())
+    key = (path_of[both[:, 0]] * count + path_of[both[:, 1]]) * max_rows + row[both[:, 0]]
+    size = count * count * max_rows
     hits = np.bincount(key, minlength=size)
-    # the mean over all near points is the projection: they lie around it
-    with np.errstate(invalid="ignore"):
-        place = (ROW_M * np.bincount(key, weights=row[both[:, 1]], minlength=size) / hits).reshape(count, count, most)
-    return PathProjections(place, rows), _zones(paths, place)
+    with np.errstate(invalid="ignore"):  # the projection is the mean of the near points, which lie around it
+        place = (ROW_M * np.bincount(key, weights=row[both[:, 1]], minlength=size) / hits).reshape(count, count, max_rows)
+    return PathProjections(place, rows), _find_zones(paths, place)
 
 
-def _zones(paths: list[Path], place: Float[np.ndarray, "N N S"]) -> Zones:
-    """Runs of rows that have a projection."""
-    near = np.isfinite(place)
-    padded = np.pad(near, ((0, 0), (0, 0), (1, 1)))
-    own, other, first = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, :-2])
-    _, _, last = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, 2:])
-    a, b = place[own, other, first], place[own, other, last]
-    rank, yaw, most = _columns(paths)
-    at = lambda table, who, metres: table[who, np.clip((metres / STEP_M).astype(int), 0, most - 1)]  # noqa: E731
-    middle = (first + last) // 2
-    turn = at(yaw, own, middle * ROW_M) - at(yaw, other, place[own, other, middle])
-    lead = 1.0  # m into the zone: where the lanes are those that meet
-    difference = at(rank, own, first * ROW_M + lead) - at(rank, other, np.minimum(a, b) + lead)
-    return Zones(own, other, first * ROW_M, last * ROW_M, np.minimum(a, b), np.maximum(a, b), np.cos(turn) > ALONG, difference)
+def _find_zones(paths: list[Path], place: Float[np.ndarray, "N N S"]) -> Zones:
+    """Finds runs of rows that have a projection."""
+    padded = np.pad(np.isfinite(place), ((0, 0), (0, 0), (1, 1)))
+    first, second, begin = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, :-2])
+    end = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, 2:])[2]
+    a, b = place[first, second, begin], place[first, second, end]
+    rank, yaw = (stack_columns(columns) for columns in ([path.rank for path in paths], [path.yaw for path in paths]))
+    at = lambda table, path, metres: table[path, np.clip((metres / STEP_M).astype(int), 0, table.shape[1] - 1)]  # noqa: E731
+    middle = (begin + end) // 2
+    turn = at(yaw, first, middle * ROW_M) - at(yaw, second, place[first, second, middle])
+    lead = 1.0  # m into the zone, where the lanes are those that meet
+    difference = at(rank, first, begin * ROW_M + lead) - at(rank, second, np.minimum(a, b) + lead)
+    return Zones(first, second, begin * ROW_M, end * ROW_M, np.minimum(a, b), np.maximum(a, b), np.cos(turn) > ALONG_COS, difference)
 
 
-def _columns(paths: list[Path]) -> tuple[Float[np.ndarray, "N P"], Float[np.ndarray, "N P"], int]:
-    """Right of way and yaw of all ways as tables, the last value repeated."""
-    most = max(len(path.points) for path in paths)
-    rank, yaw = (np.stack([np.pad(column, (0, most - len(column)), mode="edge") for column in columns])
-                 for columns in ([path.rank for path in paths], [path.yaw for path in paths]))  # fmt: skip
-    return rank, yaw, most
+def stack_columns(columns: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "N P"]:
+    """Stacks arrays of different lengths as a table, with the last value repeated."""
+    length = max(len(column) for column in columns)
+    return np.stack([np.pad(column, (0, length - len(column)), mode="edge") for column in columns])

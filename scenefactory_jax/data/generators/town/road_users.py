@@ -1,74 +1,81 @@
-"""Who is on the road, and which way each goes: cars, cyclists, people on foot, parked cars."""
+"""Draws the road users of a town and their paths: cars, cyclists, pedestrians."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
+from scenefactory_jax.core.schema import Fraction
 from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET, RoadUser
-from scenefactory_jax.data.generators.curves import Points, arc_length
-from scenefactory_jax.data.generators.procedural.road_layout import draw
-from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, change_to_right, draw_path, make_path, offset_path, walk
+from scenefactory_jax.data.generators.curves import FINE_M, Points, arc_length, interpolate, right_normals
+from scenefactory_jax.data.generators.ranges import draw, draw_count
+from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, draw_path, make_path, offset_path, walk
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network
 
-LOT_MPS = 5.0  # lanes with lower limits are those of parking lots and driveways
-MIDDLE_SHARE = 0.35  # of the town's half side: where the first car starts, for one near the middle records the log
-LATEST = 0.7  # share of the log after which nobody sets out to cross a road
+PARKING_LOT_MPS = 5.0  # maximum speed limit of lanes in parking lots and driveways
+MIN_PATH_M = 15.0
+BIKE_LANE_FRACTION = 0.7  # of the cyclists, where there are bicycle lanes
+KERB_GAP_M = 0.6  # between a cyclist on a street and the side of the lane
+LAST_CROSSING = 0.7  # fraction of the log after which no pedestrian starts to cross
 
 
 class SimulatedUser(NamedTuple):
-    """A road user before he sets off."""
+    """A road user at the start of its path; fields as in `driver_model.Users`."""
 
     kind: RoadUser
     size: tuple[float, float, float]
     path: Path
-    begin: float
     speed: float
     enters: float
 
 
-class DrivingNumbers(NamedTuple):
-    """Cars, how their drivers differ and what they allow themselves."""
+@dataclass(frozen=True)
+class DrivingNumbers:
+    """Numbers of the cars and their drivers."""
 
     size_m: list[list[float]]  # ranges of length, width and height
-    start_gap_m: float  # between cars as traffic begins to settle
-    arriving_share: float  # of the cars that come in later
-    lot_share: float  # how likely a car starts in a parking lot, per metre of lane
-    eager: list[float]  # share of the limits that they go
-    lateral_mps2: float  # in bends
-    braking_mps2: float  # for bends
-    change_share: float  # how likely a car changes lanes on a lane that is long enough
-    change_m: list[float]  # way over which it does
+    max_first_start_m: float  # maximum distance of the first car from the middle, along each axis
+    start_gap_m: float  # between cars at the start of the warm-up
+    arriving_fraction: Fraction  # of the cars that enter later
+    parking_lot_fraction: Fraction  # density of starts in parking lots over that on streets
+    speed_limit_fraction: list[float]  # that drivers keep to
+    lateral_mps2: float  # maximum in bends
+    braking_mps2: float  # before bends
+    lane_change_fraction: Fraction  # probability of a lane change on a lane that is long enough
+    lane_change_m: list[float]  # length of a lane change
 
 
-class CyclistNumbers(NamedTuple):
-    """People on bicycles."""
+@dataclass(frozen=True)
+class CyclistNumbers:
+    """Numbers of the cyclists."""
 
     count: list[int]
-    size_m: tuple[float, float, float]  # length, width, height
+    size_m: list[float]  # length, width, height
     speed_mps: list[float]
 
 
-class PedestrianNumbers(NamedTuple):
-    """People on foot: who crosses at a crosswalk, and who walks along a kerb."""
+@dataclass(frozen=True)
+class PedestrianNumbers:
+    """Numbers of the pedestrians: crossers use crosswalks, strollers walk along kerbs."""
 
     crossers: list[int]
     strollers: list[int]
-    size_m: tuple[float, float, float]  # length, width, height
+    size_m: list[float]  # length, width, height
     speed_mps: list[float]
-    pavement_m: list[float]  # from the kerb
-
-
-def number(rng: np.random.Generator, span: list[int]) -> int:
-    """A whole number from a range."""
-    return int(rng.integers(span[0], span[1] + 1))
+    pavement_m: list[float]  # distance from the kerb
 
 
 def draw_size(rng: np.random.Generator, size_m: list[list[float]]) -> tuple[float, float, float]:
-    """Length, width and height; what is longer is wider and higher, too."""
-    share = rng.beta(2.0, 3.0)
-    length, width, height = (low + share * (high - low) for low, high in size_m)
+    """Draws length, width and height of a car from their ranges, all at the same fraction of the range."""
+    fraction = rng.beta(2.0, 3.0)
+    return to_size([low + fraction * (high - low) for low, high in size_m])
+
+
+def to_size(size_m: list[float]) -> tuple[float, float, float]:
+    """Returns length, width and height from a list."""
+    length, width, height = size_m
     return length, width, height
 
 
@@ -80,46 +87,46 @@ def draw_cars(
     reach: float,
     driving: DrivingNumbers,
 ) -> list[SimulatedUser]:
-    """Cars on random lanes, the first near the middle, and some that come in on a road later on. Fewer where there is no room."""
+    """Draws up to `count` cars on random lanes: the first near the middle, some that enter the town later."""
     entries = network.entries
     usable = [i for i, lane in enumerate(network.lanes) if lane.kind != LANE_BIKE and lane.rank == ON_ROAD]
     lengths = np.array([arc_length(network.lanes[i].points)[-1] for i in usable])
-    weights = lengths * np.array([1.0 if network.lanes[i].limit > LOT_MPS else driving.lot_share for i in usable], float)
+    densities = [1.0 if network.lanes[i].limit > PARKING_LOT_MPS else driving.parking_lot_fraction for i in usable]
+    weights = lengths * np.array(densities, float)
     inlets = [i for i in usable if not entries[i] and network.exits[i] and np.abs(network.lanes[i].points[0]).max() < 2 * reach]
-    found: list[SimulatedUser] = []
+    cars: list[SimulatedUser] = []
     places: list[np.ndarray] = []
     for _ in range(6 * count + 30):
-        if len(found) == count:
+        if len(cars) == count:
             break
         size = draw_size(rng, driving.size_m)
-        later = bool(found and inlets) and rng.random() < driving.arriving_share
-        lane = int(rng.choice(inlets)) if later else usable[int(rng.choice(len(usable), p=weights / weights.sum()))]
-        points = network.lanes[lane].points
-        row = round(size[0] / 2 / 0.25) + 2 if later else int(rng.integers(len(points)))
-        place = points[min(row, len(points) - 1)]
+        later = bool(cars and inlets) and rng.random() < driving.arriving_fraction
+        index = int(rng.choice(inlets)) if later else usable[int(rng.choice(len(usable), p=weights / weights.sum()))]
+        lane = network.lanes[index]
+        row = round(size[0] / 2 / FINE_M) + 2 if later else int(rng.integers(len(lane.points)))
+        place = lane.points[min(row, len(lane.points) - 1)]
         gap = driving.start_gap_m + size[0] / 2
-        where = _passes(rng, network.lanes[lane], row, times) if network.lanes[lane].kind == LANE_FREEWAY else place
-        near = reach if found else MIDDLE_SHARE * reach
-        if not later and (np.abs(where).max() > near or any(np.hypot(*(place - other)) < gap for other in places)):
+        expected = _predict_place(rng, lane, row, times) if lane.kind == LANE_FREEWAY else place
+        max_distance = reach if cars else driving.max_first_start_m
+        if not later and (np.abs(expected).max() > max_distance or any(np.hypot(*(place - other)) < gap for other in places)):
             continue
-        begin = float(arc_length(points[: row + 1])[-1])
-        path = _drive(rng, network, lane, begin, times, driving)
+        path = _draw_drive(rng, network, index, float(arc_length(lane.points[: row + 1])[-1]), times, driving)
         if path is None:
             continue
         if not later:
             places.append(place)
-        speed = float(path.cap[0] * rng.uniform(0.6, 1.0))
-        found.append(SimulatedUser("vehicle", size, path, 0.0, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
-    return found
+        speed = float(path.speed[0] * rng.uniform(0.6, 1.0))
+        cars.append(SimulatedUser("vehicle", size, path, speed, float(rng.uniform(times[0], times[-1])) if later else -np.inf))
+    return cars
 
 
-def _passes(rng: np.random.Generator, lane: Lane, row: int, times: Float[np.ndarray, " L"]) -> Float[np.ndarray, " 2"]:
-    """Where a fast car is at some moment of the log if it goes straight on: who is in the town then started far outside."""
-    way = lane.points[row] - lane.points[row - 1] if row else lane.points[1] - lane.points[0]
-    return lane.points[row] + lane.limit * (rng.uniform(0.0, times[-1]) - times[0]) * way / np.linalg.norm(way)
+def _predict_place(rng: np.random.Generator, lane: Lane, row: int, times: Float[np.ndarray, " L"]) -> Float[np.ndarray, " 2"]:
+    """Predicts where a fast car is at a random time of the log, straight on at the speed limit."""
+    step = lane.points[row] - lane.points[row - 1] if row else lane.points[1] - lane.points[0]
+    return lane.points[row] + lane.limit * (rng.uniform(0.0, times[-1]) - times[0]) * step / np.linalg.norm(step)
 
 
-def _drive(
+def _draw_drive(
     rng: np.random.Generator,
     network: Network,
     lane: int,
@@ -128,14 +135,19 @@ def _drive(
     driving: DrivingNumbers,
     right: float = 0.0,
 ) -> Path | None:
-    """A way long enough for the log."""
-    far = 1.1 * network.lanes[lane].limit * (times[-1] - times[0]) + 30.0
-    pieces = draw_path(rng, network, lane, begin, far, change_share=0.0 if right else driving.change_share, change_m=driving.change_m)
-    if sum(len(piece.points) for piece in pieces) * 0.25 < 15.0:
+    """Draws a path that is long enough for the log; None if the road ends too early.
+
+    Args:
+        right: distance to the right of the lane's centre, without lane changes; 0: on the centre.
+    """
+    length = 1.1 * network.lanes[lane].limit * (times[-1] - times[0]) + 30.0
+    fraction = 0.0 if right else driving.lane_change_fraction
+    pieces = draw_path(rng, network, lane, begin, length, lane_change_fraction=fraction, lane_change_m=driving.lane_change_m)
+    if sum(len(piece.points) for piece in pieces) * FINE_M < MIN_PATH_M:
         return None
     pieces = offset_path(pieces, right) if right else pieces
-    eager = draw(rng, driving.eager, "traffic.driving.eager")
-    return make_path(pieces, eager=eager, lateral=driving.lateral_mps2, braking=driving.braking_mps2)
+    limit_fraction = draw(rng, driving.speed_limit_fraction, "traffic.driving.speed_limit_fraction")
+    return make_path(pieces, limit_fraction=limit_fraction, lateral=driving.lateral_mps2, braking=driving.braking_mps2)
 
 
 def draw_cyclists(
@@ -146,45 +158,44 @@ def draw_cyclists(
     driving: DrivingNumbers,
     cyclists: CyclistNumbers,
 ) -> list[SimulatedUser]:
-    """Cyclists on the lanes that are theirs, or on the right of others."""
-    own = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_BIKE and lane.rank == ON_ROAD]
-    slow = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_STREET and lane.rank == ON_ROAD and not network.right[i]]
-    found: list[SimulatedUser] = []
-    for _ in range(number(rng, cyclists.count) if own or slow else 0):
-        lane = int(rng.choice(own if own and rng.random() < 0.7 else slow or own))
-        points = network.lanes[lane].points
-        row = int(rng.integers(len(points)))
-        if np.abs(points[row]).max() > reach:
+    """Draws cyclists on bicycle lanes and on the right side of streets."""
+    bike = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_BIKE and lane.rank == ON_ROAD]
+    street = [i for i, lane in enumerate(network.lanes) if lane.kind == LANE_STREET and lane.rank == ON_ROAD and not network.right[i]]
+    users: list[SimulatedUser] = []
+    for _ in range(draw_count(rng, cyclists.count) if bike or street else 0):
+        index = int(rng.choice(bike if bike and rng.random() < BIKE_LANE_FRACTION else street or bike))
+        lane = network.lanes[index]
+        row = int(rng.integers(len(lane.points)))
+        if np.abs(lane.points[row]).max() > reach:
             continue
-        right = 0.0 if network.lanes[lane].kind == LANE_BIKE else network.lanes[lane].width / 2 - 0.6
-        path = _drive(rng, network, lane, float(arc_length(points[: row + 1])[-1]), times, driving, right)
+        right = 0.0 if lane.kind == LANE_BIKE else lane.width / 2 - KERB_GAP_M
+        path = _draw_drive(rng, network, index, float(arc_length(lane.points[: row + 1])[-1]), times, driving, right)
         if path is not None:
             speed = draw(rng, cyclists.speed_mps, "traffic.cyclists.speed_mps")
-            path = path._replace(cap=np.minimum(path.cap, speed))
-            found.append(SimulatedUser("cyclist", cyclists.size_m, path, 0.0, speed, -np.inf))
-    return found
+            path = path._replace(speed=np.minimum(path.speed, speed))
+            users.append(SimulatedUser("cyclist", to_size(cyclists.size_m), path, speed, -np.inf))
+    return users
 
 
 def draw_crossers(
     rng: np.random.Generator, network: Network, times: Float[np.ndarray, " L"], people: PedestrianNumbers
 ) -> list[SimulatedUser]:
-    """People on foot who cross at a crosswalk at some moment of the log."""
-    found: list[SimulatedUser] = []
-    for _ in range(number(rng, people.crossers) if network.crosswalks else 0):
-        walked = int(rng.integers(len(network.crosswalks)))
-        ends = network.crosswalks[walked].ends[:: int(rng.choice([-1, 1]))]
+    """Draws pedestrians that cross at a crosswalk at a random time of the log."""
+    users: list[SimulatedUser] = []
+    for _ in range(draw_count(rng, people.crossers) if network.crosswalks else 0):
+        index = int(rng.integers(len(network.crosswalks)))
+        crosswalk = network.crosswalks[index]
+        ends, outline = crosswalk.ends[:: int(rng.choice([-1, 1]))], crosswalk.outline
         ahead = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        outline = network.crosswalks[walked].outline
         half = 0.5 * min(np.linalg.norm(outline[1] - outline[0]), np.linalg.norm(outline[2] - outline[1])) - 0.6
         side = rng.uniform(-half, half) * np.array([-ahead[1], ahead[0]])
         before, after = rng.uniform(1.5, 8.0), rng.uniform(2.0, 6.0)
-        speed = draw(rng, people.speed_mps, "traffic.people.speed_mps")
-        lit = network.crosswalks[walked].junction in network.phases
-        way = np.stack([ends[0] - before * ahead, ends[1] + after * ahead]) + side
-        path = walk(way, speed, crosswalk=(before, len(network.stops) + walked) if lit else None)
-        enters = float(rng.uniform(times[0], LATEST * times[-1]))
-        found.append(SimulatedUser("pedestrian", people.size_m, path, 0.0, speed, enters))
-    return found
+        speed = draw(rng, people.speed_mps, "traffic.pedestrians.speed_mps")
+        gate = (before, len(network.stops) + index) if crosswalk.junction in network.phases else None
+        path = walk(np.stack([ends[0] - before * ahead, ends[1] + after * ahead]) + side, speed, crosswalk=gate)
+        enters = float(rng.uniform(times[0], LAST_CROSSING * times[-1]))
+        users.append(SimulatedUser("pedestrian", to_size(people.size_m), path, speed, enters))
+    return users
 
 
 def draw_strollers(
@@ -194,21 +205,20 @@ def draw_strollers(
     seconds: float,
     people: PedestrianNumbers,
 ) -> list[tuple[Points, float]]:
-    """Ways of people on pavements, and their speeds."""
+    """Draws paths of pedestrians on pavements, and their speeds."""
     if not kerbs:
         return []
     lengths = np.array([arc_length(kerb)[-1] for kerb in kerbs])
-    found = []
-    for _ in range(number(rng, people.strollers)):
+    walks = []
+    for _ in range(draw_count(rng, people.strollers)):
         kerb = kerbs[int(rng.choice(len(kerbs), p=lengths / lengths.sum()))]
-        speed, place = draw(rng, people.speed_mps, "traffic.people.speed_mps"), arc_length(kerb)
-        need = speed * seconds + 1.0
-        if place[-1] < need + 2.0:
+        speed, place = draw(rng, people.speed_mps, "traffic.pedestrians.speed_mps"), arc_length(kerb)
+        length = speed * seconds + 1.0
+        if place[-1] < length + 2.0:
             continue
-        at = np.arange(0.0, need, STEP_M) + rng.uniform(0.0, place[-1] - need)
-        points = np.stack([np.interp(at, place, kerb[:, i]) for i in (0, 1)], axis=-1)
-        # the surface is on a kerb's left
-        points = points + draw(rng, people.pavement_m, "traffic.people.pavement_m") * change_to_right(points)
+        points = interpolate(np.arange(0.0, length, STEP_M) + rng.uniform(0.0, place[-1] - length), place, kerb)
+        # the paved surface is on the left of a kerb
+        points = points + draw(rng, people.pavement_m, "traffic.pedestrians.pavement_m") * right_normals(points)
         if not shapely.contains_xy(surface, points[:, 0], points[:, 1]).any():
-            found.append((points[:: int(rng.choice([-1, 1]))], speed))
-    return found
+            walks.append((points[:: int(rng.choice([-1, 1]))], speed))
+    return walks

@@ -1,30 +1,46 @@
-"""Where a town's streets run: nodes and the edges between them, before anything is built on them."""
+"""Draws where the streets of a town run: nodes and the edges between them."""
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.schema import ConfigError, Fraction
 from scenefactory_jax.data.generators.curves import heading
-from scenefactory_jax.data.generators.procedural.road_layout import check_range, draw
-from scenefactory_jax.data.generators.town.cross_sections import StreetClass, draw_street
-from scenefactory_jax.data.generators.town.road_network import Street
+from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count
+from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, DOUBLE_YELLOW, SOLID_YELLOW, Street
 
 Place = Float[np.ndarray, " 2"]
-CLEAR_M = 24.0  # between the middle of a street and whatever is built beside it
+MIN_LANE_WIDTH_M = 2.6
+CLEARANCE_M = 24.0  # between the middle of a street and a parking lot beside it
+BEYOND_M = 15.0  # length of road beyond the square with kerbs, so that no kerb crosses the end of a road
 
 
-BEYOND_M = 15.0  # that roads go on beyond the square with kerbs: none crosses their ends
+@dataclass(frozen=True)
+class StreetClass:
+    """Ranges and fractions from which the streets of a class are drawn."""
+
+    name: str
+    rank: int
+    lanes: list[int]  # per direction
+    lane_width_m: list[float]
+    speed_limit_mps: list[float]
+    median_m: list[float]
+    median_fraction: Fraction
+    bike_fraction: Fraction
+    bike_width_m: float
+    parking_fraction: Fraction
+    parking_width_m: float
 
 
 class Node(NamedTuple):
-    """A junction, a driveway, a parking lot, or a place beyond the town to which a street leads."""
+    """A junction, a driveway, a parking lot, or a place outside of the town to which a street leads."""
 
-    kind: Literal["junction", "outlet", "driveway", "lot"]
+    kind: Literal["junction", "roundabout", "outlet", "driveway", "lot"]
     place: Place
 
 
@@ -36,9 +52,17 @@ class Edge(NamedTuple):
     street: Street
     via: tuple[Place, ...] = ()
 
-    def ways(self, nodes: Sequence[Node]) -> list[Place]:
-        """The places that it runs through."""
+    def places(self, nodes: Sequence[Node]) -> list[Place]:
+        """Both ends and the corners between them."""
         return [nodes[self.a].place, *self.via, nodes[self.b].place]
+
+    def length(self, nodes: Sequence[Node]) -> float:
+        """Length through all corners, m."""
+        return float(sum(np.linalg.norm(b - a) for a, b in itertools.pairwise(self.places(nodes))))
+
+    def joins(self, node: int) -> bool:
+        """Whether the street begins or ends at a node."""
+        return node in (self.a, self.b)
 
 
 class Plan(NamedTuple):
@@ -47,9 +71,43 @@ class Plan(NamedTuple):
     nodes: list[Node]
     edges: list[Edge]
 
-    def at(self, node: int) -> list[int]:
+    def edges_at(self, node: int) -> list[int]:
         """Indices of the edges at a node."""
-        return [index for index, edge in enumerate(self.edges) if node in (edge.a, edge.b)]
+        return [index for index, edge in enumerate(self.edges) if edge.joins(node)]
+
+
+def draw_street(rng: np.random.Generator, classes: Sequence[StreetClass]) -> Street:
+    """Draws a street of one of the classes, all equally likely."""
+    kind = classes[int(rng.integers(len(classes)))]
+    lanes = draw_count(rng, kind.lanes)
+    width = draw(rng, kind.lane_width_m, f"{kind.name}.lane_width_m")
+    limit = draw(rng, kind.speed_limit_mps, f"{kind.name}.speed_limit_mps")
+    chance = rng.random(3)
+    median = draw(rng, kind.median_m, f"{kind.name}.median_m")
+    lines = (DOUBLE_YELLOW, SOLID_YELLOW) if lanes > 1 or kind.rank > 1 else (DOUBLE_YELLOW, SOLID_YELLOW, BROKEN_YELLOW)
+    return Street(
+        lanes=lanes,
+        width=width,
+        median=median if chance[0] < kind.median_fraction else 0.0,
+        limit=limit,
+        rank=kind.rank,
+        bike=kind.bike_width_m if chance[1] < kind.bike_fraction else 0.0,
+        parking=kind.parking_width_m if chance[2] < kind.parking_fraction else 0.0,
+        centre_line=int(rng.choice(lines)),
+    )
+
+
+def street(rng: np.random.Generator, reach: float, classes: Sequence[StreetClass], *, offset_m: float, turn_deg: list[float]) -> Plan:
+    """Draws one street through the middle of the town, with one bend.
+
+    Args:
+        offset_m: maximum distance of the bend from the middle, along each axis.
+        turn_deg: range of the angle by which the street turns, to either side.
+    """
+    corner = rng.uniform(-offset_m, offset_m, 2)
+    yaw, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]) * np.radians(draw(rng, turn_deg, "street.turn_deg"))
+    nodes = [Node("outlet", _find_outlet(corner, angle, reach, min_length=45.0)) for angle in (yaw + np.pi, yaw + turn)]
+    return Plan(nodes, [Edge(0, 1, draw_street(rng, classes), (corner,))])
 
 
 def star(
@@ -57,48 +115,50 @@ def star(
     reach: float,
     classes: Sequence[StreetClass],
     *,
+    roundabout: bool,
     arms: list[int],
     offset_m: float,
     skew_deg: float,
     bend_m: float,
 ) -> Plan:
-    """One junction, and streets that lead out of the town.
+    """Draws one junction with streets that lead out of the town.
 
     Args:
-        arms: fewest and most.
-        offset_m: how far the junction may lie from the town's middle.
-        skew_deg: how far an arm may turn from its place in a regular star; those of three and four arms are a street's two halves.
-        bend_m: how far a street may swing out of its straight way.
+        roundabout: the junction is a roundabout; else its kind is drawn.
+        arms: range of the number of streets.
+        offset_m: maximum distance of the junction from the middle, along each axis.
+        skew_deg: maximum turn of an arm from its place in a regular star. Stars of three and four arms have a straight street.
+        bend_m: maximum distance of a bend from the straight way.
     """
     check_range(arms, "star.arms", low=3.0)
-    count = int(rng.integers(arms[0], arms[1] + 1))
+    count = draw_count(rng, arms)
     centre = rng.uniform(-offset_m, offset_m, 2)
     first = rng.uniform(0, 2 * np.pi)
     yaws = first + {3: np.array([0.0, 0.5, 1.0]), 4: np.array([0.0, 0.5, 1.0, 1.5])}.get(count, 2 / count * np.arange(count)) * np.pi
     yaws = yaws + np.radians(rng.uniform(-skew_deg, skew_deg, count))
-    main, cross = (draw_street(rng, classes[int(rng.integers(len(classes)))]) for _ in range(2))
-    nodes, edges = [Node("junction", centre)], []
+    main, cross = (draw_street(rng, classes) for _ in range(2))
+    nodes, edges = [Node("roundabout" if roundabout else "junction", centre)], []
     for index, yaw in enumerate(yaws):
         street = main if index % 2 == 0 else cross
-        nodes.append(Node("outlet", _outside(centre, yaw, reach, least=60.0)))
-        edges.append(Edge(0, index + 1, street, _swing(rng, centre, nodes[-1].place, bend_m)))
+        nodes.append(Node("outlet", _find_outlet(centre, yaw, reach, min_length=60.0)))
+        edges.append(Edge(0, index + 1, street, _draw_bend(rng, centre, nodes[-1].place, bend_m)))
     return Plan(nodes, edges)
 
 
-def _swing(rng: np.random.Generator, start: Place, end: Place, most: float) -> tuple[Place, ...]:
-    """A corner somewhere on a long way, aside from the straight line; often none."""
+def _draw_bend(rng: np.random.Generator, start: Place, end: Place, max_offset: float) -> tuple[Place, ...]:
+    """Draws one corner beside the straight line of a long street, or none."""
     length = float(np.linalg.norm(end - start))
     if length < 90.0 or rng.random() < 0.5:
         return ()
     ahead = (end - start) / length
-    return (start + rng.uniform(0.45, 0.65) * length * ahead + rng.uniform(-most, most) * np.array([-ahead[1], ahead[0]]),)
+    return (start + rng.uniform(0.45, 0.65) * length * ahead + rng.uniform(-max_offset, max_offset) * np.array([-ahead[1], ahead[0]]),)
 
 
-def _outside(start: Place, yaw: float, reach: float, *, least: float) -> Place:
-    """Where a ray is beyond the square of half side `reach`, `least` metres away at least."""
+def _find_outlet(start: Place, yaw: float, reach: float, *, min_length: float) -> Place:
+    """Computes where a ray is BEYOND_M outside the square of half side `reach`, at least `min_length` from its start."""
     ahead, reach = heading(yaw), reach + BEYOND_M
-    way = np.min((np.sign(ahead) * reach - start)[np.abs(ahead) > 1e-6] / ahead[np.abs(ahead) > 1e-6])
-    return start + max(float(way), least) * ahead
+    length = np.min((np.sign(ahead) * reach - start)[np.abs(ahead) > 1e-6] / ahead[np.abs(ahead) > 1e-6])
+    return start + max(float(length), min_length) * ahead
 
 
 def grid(
@@ -110,28 +170,28 @@ def grid(
     offset_m: float,
     jitter_m: float,
     shear_deg: float,
-    keep_share: float,
+    keep_fraction: Fraction,
     inset_m: float,
 ) -> Plan | None:
-    """Streets in two directions that cross, some of them broken off at a crossing; None where not even the middle crossing is within.
+    """Draws a grid of streets with gaps; None if the middle crossing lies outside of the square.
 
     Args:
-        spacing_m: between parallel streets.
-        offset_m: how far the middle crossing may lie from the town's middle.
-        jitter_m: how far a crossing may lie from its place in the regular grid.
-        shear_deg: how far the two directions may be from a right angle.
-        keep_share: how much of the streets beside the two that cross in the middle is there.
-        inset_m: between a crossing and the square of half side `reach`.
+        spacing_m: range of the distance between parallel streets.
+        offset_m: maximum distance of the middle crossing from the middle of the town, along each axis.
+        jitter_m: maximum distance of a crossing from its place in the regular grid, along each axis.
+        shear_deg: maximum difference of the two directions from a right angle.
+        keep_fraction: of the pieces of street that exist; the two streets that cross in the middle are complete.
+        inset_m: minimum distance of a crossing from the border of the square of half side `reach`.
 
     Raises:
         ConfigError: the square holds no crossing.
     """
     if reach <= inset_m:
-        raise ConfigError(f"generate.reach_m: {reach:g}; wanted is more than generate.network.plans.grid.inset_m, {inset_m:g}")
+        raise ConfigError(f"generate.reach_m: expected more than generate.network.plans.grid.inset_m, {inset_m:g}, got {reach:g}")
     angle = rng.uniform(0, np.pi / 2)
     turn = np.stack([heading(angle), heading(angle + np.pi / 2 + np.radians(rng.uniform(-shear_deg, shear_deg)))])
-    along = [_lines(rng, reach, spacing_m, offset_m) for _ in range(2)]
-    streets = [[draw_street(rng, classes[int(rng.integers(len(classes)))]) for _ in line] for line in along]
+    along = [_draw_lines(rng, reach, spacing_m, offset_m) for _ in range(2)]
+    streets = [[draw_street(rng, classes) for _ in line] for line in along]
     nodes: list[Node] = []
     index: dict[tuple[int, int], int] = {}
     for i, u in enumerate(along[0]):
@@ -153,86 +213,94 @@ def grid(
             yaw = float(np.arctan2(ahead[1], ahead[0]))
             ends = [(line[0], yaw + np.pi), (line[-1], yaw)]
             for a, b in itertools.pairwise(line):
-                if row == middle[axis] or rng.random() < keep_share:
+                if row == middle[axis] or rng.random() < keep_fraction:
                     edges.append(Edge(a, b, streets[axis][row]))
             for node, out in ends:
-                if row == middle[axis] or rng.random() < keep_share:
-                    nodes.append(Node("outlet", _outside(nodes[node].place, out, reach, least=45.0)))
+                if row == middle[axis] or rng.random() < keep_fraction:
+                    nodes.append(Node("outlet", _find_outlet(nodes[node].place, out, reach, min_length=45.0)))
                     edges.append(Edge(node, len(nodes) - 1, streets[axis][row]))
-    return _tidy(Plan(nodes, edges), index[middle])
+    return _remove_dead_ends(Plan(nodes, edges), index[middle])
 
 
-def _lines(rng: np.random.Generator, reach: float, spacing: list[float], offset: float) -> list[float]:
-    """Places of parallel streets on both sides of one near the middle."""
-    found = [float(rng.uniform(-offset, offset))]
+def _draw_lines(rng: np.random.Generator, reach: float, spacing: list[float], offset: float) -> list[float]:
+    """Draws the places of parallel streets: one near the middle and others on both sides."""
+    places = [float(rng.uniform(-offset, offset))]
     for side in (-1.0, 1.0):
-        at = found[0]
-        while abs(at) < 1.4 * reach:
-            at += side * draw(rng, spacing, "grid.spacing_m", low=40.0)
-            found.append(at)
-    return sorted(found)
+        place = places[0]
+        while abs(place) < 1.4 * reach:
+            place += side * draw(rng, spacing, "grid.spacing_m", low=40.0)
+            places.append(place)
+    return sorted(places)
 
 
-def _tidy(plan: Plan, keep: int) -> Plan:
-    """What hangs together with one node, without streets that end within the town; a node of two streets becomes a corner of one."""
+def _remove_dead_ends(plan: Plan, keep: int) -> Plan:
+    """Removes streets that end within the town or are not connected to node `keep`; joins two streets at a node without others."""
     edges = list(plan.edges)
-    degree = lambda node: sum(node in (edge.a, edge.b) for edge in edges)  # noqa: E731
+    degree = lambda node: sum(edge.joins(node) for edge in edges)  # noqa: E731
     while dead := [edge for edge in edges if any(plan.nodes[n].kind == "junction" and degree(n) == 1 for n in (edge.a, edge.b))]:
         edges = [edge for edge in edges if edge is not dead[0]]
-    reached, open_ = set(), [keep]
-    while open_:
-        own = open_.pop()
-        if own not in reached:
-            reached.add(own)
-            open_ += [edge.b if edge.a == own else edge.a for edge in edges if own in (edge.a, edge.b)]
+    reached, pending = set(), [keep]
+    while pending:
+        node = pending.pop()
+        if node not in reached:
+            reached.add(node)
+            pending += [edge.b if edge.a == node else edge.a for edge in edges if edge.joins(node)]
     edges = [edge for edge in edges if edge.a in reached]
     for node in range(len(plan.nodes)):
-        ends = [edge for edge in edges if node in (edge.a, edge.b)]
+        ends = [edge for edge in edges if edge.joins(node)]
         if plan.nodes[node].kind == "junction" and len(ends) == 2 and node != keep:
-            one, other = ends
-            a, via = (one.a, one.via) if one.b == node else (one.b, one.via[::-1])
-            b, after = (other.b, other.via) if other.a == node else (other.a, other.via[::-1])
-            edges = [edge for edge in edges if edge is not one and edge is not other]
-            edges.append(Edge(a, b, one.street, (*via, plan.nodes[node].place, *after)))
+            first, second = ends
+            a, via = (first.a, first.via) if first.b == node else (first.b, first.via[::-1])
+            b, after = (second.b, second.via) if second.a == node else (second.a, second.via[::-1])
+            edges = [edge for edge in edges if edge is not first and edge is not second]
+            edges.append(Edge(a, b, first.street, (*via, plan.nodes[node].place, *after)))
     used = sorted({node for edge in edges for node in (edge.a, edge.b)})
     number = {node: index for index, node in enumerate(used)}
     return Plan([plan.nodes[node] for node in used], [edge._replace(a=number[edge.a], b=number[edge.b]) for edge in edges])
 
 
 def add_lots(
-    rng: np.random.Generator, plan: Plan, reach: float, driveway: Street, *, most: int, size_m: list[float], share: float, room_m: float
+    rng: np.random.Generator,
+    plan: Plan,
+    reach: float,
+    driveway: Street,
+    *,
+    max_count: int,
+    size_m: list[float],
+    fraction: Fraction,
+    room_m: float,
 ) -> Plan:
-    """The plan with parking lots beside its streets, each behind a driveway, where there is room.
+    """Adds parking lots behind driveways to the straight streets of a plan, where there is room.
 
     Args:
-        most: lots.
+        max_count: of lots.
         size_m: width and depth of the ground that a lot needs.
-        share: how many of the places that have room get one.
-        room_m: of street on both sides of a driveway.
+        fraction: of the streets with enough room that get a lot.
+        room_m: minimum length of street on both sides of a driveway.
     """
     nodes, edges = list(plan.nodes), list(plan.edges)
-    taken = [shapely.LineString(edge.ways(nodes)).buffer(CLEAR_M) for edge in edges]
+    taken = [shapely.LineString(edge.places(nodes)).buffer(CLEARANCE_M) for edge in edges]
     added = 0
     for edge in [edge for edge in plan.edges if not edge.via]:
         start, end = nodes[edge.a].place, nodes[edge.b].place
         length = float(np.linalg.norm(end - start))
-        if added == most or length < 2 * room_m or rng.random() >= share:
+        if added == max_count or length < 2 * room_m or rng.random() >= fraction:
             continue
         ahead = (end - start) / length
         for side in rng.permutation([-1.0, 1.0]):
             away = side * np.array([-ahead[1], ahead[0]])
             at = start + rng.uniform(room_m, length - room_m) * ahead
-            corners = np.array([[-0.5, CLEAR_M], [0.5, CLEAR_M], [0.5, size_m[1]], [-0.5, size_m[1]]])
+            corners = np.array([[-0.5, CLEARANCE_M], [0.5, CLEARANCE_M], [0.5, size_m[1]], [-0.5, size_m[1]]])
             ground = at + corners @ np.stack([size_m[0] * ahead, away])
             others = [area for other, area in zip(edges, taken, strict=True) if other is not edge]
             if np.abs(at).max() > reach - 20.0 or any(area.intersects(shapely.Polygon(ground)) for area in others):
                 continue
             base = len(nodes)
-            nodes += [Node("driveway", at), Node("lot", at + CLEAR_M * away)]
-            spot = next(i for i, other in enumerate(edges) if other is edge)
-            edges[spot] = edge._replace(b=base)
+            nodes += [Node("driveway", at), Node("lot", at + CLEARANCE_M * away)]
+            place = next(i for i, other in enumerate(edges) if other is edge)
+            edges[place] = edge._replace(b=base)
             edges += [edge._replace(a=base), Edge(base, base + 1, driveway)]
-            taken += [taken[spot], shapely.Polygon(ground)]
+            taken += [taken[place], shapely.Polygon(ground)]
             added += 1
             break
     return Plan(nodes, edges)

@@ -1,145 +1,211 @@
-"""A random town from a seed, in the form of a logged scene."""
+"""Generates a random town in the form of a logged scene."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number, instantiate
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
+from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive
 from scenefactory_jax.data.generators.town.road_network import Network
-from scenefactory_jax.data.generators.town.town import Log, Town, TownParts, draw_town
-from scenefactory_jax.data.generators.town.traffic import TownUser
+from scenefactory_jax.data.generators.town.traffic import TownUser, add_warmup, measure_travel
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.data.generators.town"
-REDRAWS = 40  # towns that are tried until one can be built and holds the fewest cars asked for
+MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
+MAX_TRAFFIC_REDRAWS = 3  # on one network
+
+
+class TownParts(NamedTuple):
+    """Functions that build a town, bound to their numbers; see `generate`."""
+
+    network: Callable[..., tuple[str, Network] | None]
+    kerbs: Callable[..., tuple[list[Points], list[Points], object]]
+    driveways: Callable[..., tuple[list[Points], list]]
+    gates: Callable[..., Gates]
+    traffic: Callable[..., list[TownUser]]
+
+
+class Log(NamedTuple):
+    """Numbers of the log; see `generate`."""
+
+    times: Float[np.ndarray, " L"]
+    current: int
+    warmup_s: float
+    max_sdc_distance_m: float
+    sensor_range_m: float
+    min_travel_m: float  # of a moving car, from the current step on
+    min_cars: int  # moving cars within the sensor range
+
+
+class Town(NamedTuple):
+    """A road network with its surroundings and its traffic."""
+
+    kind: str
+    network: Network
+    outer: list[Points]
+    islands: list[Points]
+    driveways: list[Points]
+    gates: Gates
+    users: list[TownUser]
+    sdc: int  # index into users
 
 
 def generate(
     seed: int,
     index: int,
     *,
-    reach_m: float,
+    kinds: list[str] | None,
+    reach_m: Positive,
     network: Mapping[str, Any],
-    surface: Mapping[str, Any],
-    aprons: Mapping[str, Any],
-    signals: Mapping[str, Any],
+    kerbs: Mapping[str, Any],
+    driveways: Mapping[str, Any],
+    traffic_lights: Mapping[str, Any],
     traffic: Mapping[str, Any],
-    lane_spacing_m: float,
-    line_spacing_m: float,
+    lane_spacing_m: Positive,
+    line_spacing_m: Positive,
     log_steps: int,
     log_current: int,
-    log_dt: float,
-    warm_s: float,
-    sdc_m: float,
-    sight_m: float,
+    log_dt: Positive,
+    warmup_s: NonNegative,
+    max_sdc_distance_m: Positive,
+    sensor_range_m: Positive,
 ) -> RawScene:
-    """Scene number `index` of the series that `seed` names: a network of blocks, lights, and traffic that drove there.
+    """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
-    The same seed, index and numbers give the same scene, whatever was generated before. Coordinates are metres around the town's middle;
-    `sdc` is one of the moving cars near it.
+    The scene depends on seed, index and numbers alone. Coordinates are metres around the middle of the town; `sdc` is a moving car near it.
 
     Args:
-        reach_m: half side of the square within which there are kerbs; roads go on to its border and beyond.
-        network: entry for the roads, `(rng, reach) -> kind, Network`, or None where what was drawn cannot be built.
-        surface: entry for the kerbs, `(network, reach) -> outer, islands, surface`.
-        aprons: entry for private driveways, `(rng, network, kerbs, surface) -> outlines, spots`.
-        signals: entry for lights, `(rng, network, times) -> Gates`.
-        traffic: entry for everybody on the road, `(rng, network, kerbs, surface, reach, times, gates) -> actors`, with its `cars`.
-        lane_spacing_m, line_spacing_m: between the points of lanes, and of painted lines.
-        log_steps, log_current, log_dt: steps of the log, the one at which a simulation takes over, and the time between two.
-        warm_s: how long traffic settles before the log.
-        sdc_m: how far from the middle the recording car may be at the current step.
-        sight_m: how far it sees: others are logged only as near as that.
+        kinds: plans of `network.plans`, or "motorway", that take turns; None: drawn.
+        reach_m: half the side of the square with kerbs; roads go on beyond it.
+        network: entry of the roads, `(rng, reach, kind) -> (kind, Network)`, or None if the drawn plan cannot be built.
+        kerbs: entry of the road edges, `(network, reach) -> outer, islands, surface`.
+        driveways: entry of the private driveways, `(rng, network, kerbs, surface) -> outlines, spots`.
+        traffic_lights: entry of the lights, `(rng, network, times) -> Gates`.
+        traffic: entry of the road users, `(rng, network, kerbs, surface, reach, times, gates) -> users`, with the range `cars`.
+        lane_spacing_m, line_spacing_m: distance between the points of lanes, and of painted lines.
+        log_steps, log_current, log_dt: steps of the log, the step at which a simulation starts, and the time step.
+        warmup_s: simulated time before the log.
+        max_sdc_distance_m: maximum distance of `sdc` from the middle at the current step, along each axis.
+        sensor_range_m: distance from `sdc` within which road users are logged.
 
     Raises:
-        ConfigError: an unknown key or a number that makes no sense, by name.
-        SceneError: no town holds the fewest cars asked for.
+        ConfigError: an unknown key or a number out of range.
+        SceneError: no drawn town has enough moving cars.
     """
-    _check(seed, index, log_steps, log_current)
-    check_number(warm_s, where="generate.warm_s", least=0)
-    numbers = {"reach_m": reach_m, "lane_spacing_m": lane_spacing_m, "line_spacing_m": line_spacing_m, "log_dt": log_dt}
-    for name, value in numbers.items():
-        check_positive(value, f"generate.{name}")
-    entries = {"network_choice": network, "kerbs": surface, "driveways": aprons, "traffic_lights": signals, "traffic": traffic}
-    places = ("network", "surface", "aprons", "signals", "traffic")
-    built = zip(entries.items(), places, strict=True)
-    parts = TownParts(*(instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{place}") for (module, entry), place in built))
-    times = log_dt * np.arange(log_steps)
-    log = Log(times, log_current, warm_s, sdc_m, sight_m, travel_m=traffic["travel_m"][0], least=traffic["cars"][0])
-    for redraw in range(REDRAWS):
-        town = draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), reach_m, parts, log)
-        if town is not None:
-            return _scene(town, log, seed, index, lane_spacing_m, line_spacing_m)
-    raise SceneError(f"generate.traffic.cars: {REDRAWS} towns held fewer than {log.least} moving cars; ask for fewer")
-
-
-def _check(seed: int, index: int, steps: int, current: int) -> None:
-    """Refuse a series that names no scene, and a log in which nothing follows the current step."""
     if seed < 0 or index < 0:
-        raise ConfigError(f"generate: seed {seed} and index {index} must not be below 0")
-    if not 0 <= current < steps - 1:
-        raise ConfigError(f"generate.log_current: {current} must lie in 0 .. log_steps - 2 = {steps - 2}")
+        raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
+    if not 0 <= log_current < log_steps - 1:
+        raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
+    modules = {"network": "network_choice"}  # of other entries: of the same name
+    entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
+    parts = TownParts(
+        *(instantiate(entry, builtins=f"{PACKAGE}.{modules.get(key, key)}", where=f"generate.{key}") for key, entry in entries.items())
+    )
+    times = log_dt * np.arange(log_steps)
+    log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, traffic["travel_m"][0], traffic["cars"][0])
+    kind = kinds[index % len(kinds)] if kinds else None
+    for redraw in range(MAX_REDRAWS):
+        town = _draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), kind, reach_m, parts, log)
+        if town is not None:
+            return _to_scene(town, log, seed, index, lane_spacing_m, line_spacing_m)
+    raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
 
 
-def _scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, line_spacing: float) -> RawScene:
-    """A town in the form of a logged scene."""
+def _draw_town(rng: np.random.Generator, kind: str | None, reach: float, parts: TownParts, log: Log) -> Town | None:
+    """Draws a town; None if its plan cannot be built or too few cars move."""
+    drawn = parts.network(rng, reach, kind)
+    if drawn is None:
+        return None
+    kind, network = drawn
+    outer, islands, surface = parts.kerbs(network, reach)
+    pavements = [] if kind == "motorway" else outer
+    driveways, spots = parts.driveways(rng, network, pavements, surface)
+    network = network._replace(spots=[*network.spots, *spots])
+    times = add_warmup(log.times, log.warmup_s)
+    gates = parts.gates(rng, network, times)
+    for _ in range(MAX_TRAFFIC_REDRAWS):
+        recorded = _record(rng, parts.traffic(rng, network, pavements, surface, reach, times, gates), log)
+        if recorded is not None:
+            return Town(kind, network, outer, islands, driveways, gates, *recorded)
+    return None
+
+
+def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[list[TownUser], int] | None:
+    """Chooses the recording car near the middle and limits the log to its sensor range.
+
+    Returns:
+        The users in range and the index of the recording car; None if too few cars move.
+    """
+    now, logs = log.current, [user.since(-len(log.times)) for user in users]
+    moving = [i for i, u in enumerate(logs) if u.kind == "vehicle" and u.valid[now] and measure_travel(u, now) > log.min_travel_m]
+    near = [i for i in moving if np.abs(logs[i].position[now]).max() <= log.max_sdc_distance_m and logs[i].valid[: now + 1].all()]
+    near = [i for i in near if logs[i].valid.all()] or near
+    if not near:
+        return None
+    sdc = int(rng.choice(near))
+    origin = logs[sdc].position
+    if sum(np.linalg.norm(logs[i].position[now] - origin[now]) <= log.sensor_range_m for i in moving) < log.min_cars:
+        return None
+    logs = [u._replace(valid=u.valid & (np.linalg.norm(u.position - origin, axis=1) <= log.sensor_range_m)) for u in logs]
+    kept = [i for i, user in enumerate(logs) if user.valid.any()]
+    return [logs[i] for i in kept], kept.index(sdc)
+
+
+def _to_scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, line_spacing: float) -> RawScene:
+    """Converts a town to a raw scene."""
     kinds = town.network.kinds
     return RawScene(
         name=f"town-{town.kind}-{seed}-{index:06d}",
         source=f"generator, seed {seed}, index {index}",
-        roads=_roads(town.network, town.outer, town.islands, town.aprons, lane_spacing, line_spacing),
-        tracks=tuple(_track(i, actor) for i, actor in enumerate(town.actors)),
+        roads=_to_polylines(town, lane_spacing, line_spacing),
+        tracks=tuple(_to_track(i, user) for i, user in enumerate(town.users)),
         times=log.times,
         current=log.current,
         sdc=town.sdc,
-        lights=_lights(town.network, town.gates, len(log.times)),
+        lights=_to_lights(town.network, town.gates, len(log.times)),
         metadata={"dataset": "town", "format": "generated", "kind": town.kind, "seed": seed, "index": index}
         | {"blocks": {name: kinds.count(name) for name in sorted(set(kinds))}},
     )
 
 
-def _roads(
-    network: Network, outer: list[Points], islands: list[Points], aprons: list[Points], lane_spacing: float, line_spacing: float
-) -> tuple[Polyline, ...]:
-    """Lanes first, so that a lane's place is its id; then lines, edges, crosswalks, driveways and stop signs."""
-    entries = network.entries
-    found = [
-        Polyline(lane.kind, _flat(resample(lane.points, lane_spacing)), i, *beside, speed_limit=lane.limit)
-        for i, (lane, *beside) in enumerate(zip(network.lanes, entries, network.exits, network.left, network.right, strict=True))
+def _to_polylines(town: Town, lane_spacing: float, line_spacing: float) -> tuple[Polyline, ...]:
+    """Lists lanes (the id is the place in the list), then lines, edges, crosswalks, driveways and stop signs."""
+    network = town.network
+    links = zip(network.lanes, network.entries, network.exits, network.left, network.right, strict=True)
+    lanes = [
+        Polyline(lane.kind, _flat(resample(lane.points, lane_spacing)), i, *ids, speed_limit=lane.limit)
+        for i, (lane, *ids) in enumerate(links)
     ]
     features = [(line.kind, resample(line.points, line_spacing)) for line in network.lines]
-    features += [(EDGE_BOUNDARY, points) for points in outer] + [(EDGE_MEDIAN, points) for points in islands]
-    features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in aprons]
+    features += [(EDGE_BOUNDARY, points) for points in town.outer] + [(EDGE_MEDIAN, points) for points in town.islands]
+    features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in town.driveways]
     features += [(STOP_SIGN, stop.post[None]) for stop in network.stops if stop.kind == "stop"]
-    return (*found, *(Polyline(kind, _flat(points), len(found) + i) for i, (kind, points) in enumerate(features)))
+    return (*lanes, *(Polyline(kind, _flat(points), len(lanes) + i) for i, (kind, points) in enumerate(features)))
 
 
 def _flat(points: Points) -> Float[np.ndarray, "N 3"]:
     return np.concatenate([points, np.zeros((len(points), 1))], axis=1)
 
 
-def _lights(network: Network, gates: Gates, steps: int) -> tuple[Light, ...]:
-    """The light of every lane that has one, and where its traffic stops."""
-    found = []
-    for index, lane in enumerate(network.lanes):
-        if lane.control is not None and network.stops[lane.control].kind == "signal":
-            stop = np.concatenate([lane.points[0], [0.0]])
-            found.append(Light(index, gates.light[lane.control, -steps:], np.ones(steps, bool), stop))
-    return tuple(found)
+def _to_lights(network: Network, gates: Gates, steps: int) -> tuple[Light, ...]:
+    """Lists the light of every lane that has one, with its stop position."""
+    return tuple(
+        Light(index, gates.light[lane.control, -steps:], np.ones(steps, bool), np.concatenate([lane.points[0], [0.0]]))
+        for index, lane in enumerate(network.lanes)
+        if lane.control is not None and network.stops[lane.control].kind == "signal"
+    )
 
 
-def _track(index: int, actor: TownUser) -> Track:
-    """An actor's log, zeros where it is not seen."""
-    mask = actor.valid
-    position = np.concatenate([actor.position, np.full((len(mask), 1), actor.size[2] / 2)], axis=1)
-    yaw = wrap_angles(actor.yaw)
-    velocity = actor.speed[:, None] * heading(actor.yaw)
-    position, velocity = (np.where(mask[:, None], column, 0.0) for column in (position, velocity))
-    return Track(index, actor.kind, actor.size, position, np.where(mask, yaw, 0.0), velocity, mask)
+def _to_track(index: int, user: TownUser) -> Track:
+    """Converts a road user to a track, with zeros at invalid steps."""
+    valid = user.valid
+    position = np.concatenate([user.position, np.full((len(valid), 1), user.size[2] / 2)], axis=1)
+    velocity = user.speed[:, None] * heading(user.yaw)
+    position, velocity = (np.where(valid[:, None], column, 0.0) for column in (position, velocity))
+    return Track(index, user.kind, user.size, position, np.where(valid, wrap_angles(user.yaw), 0.0), velocity, valid)

@@ -1,4 +1,4 @@
-"""Traffic of a town: drawn, driven, and logged, without anybody who would touch another."""
+"""Draws and simulates the traffic of a town, without collisions."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -8,10 +8,9 @@ import shapely
 from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.types import RoadUser
-from scenefactory_jax.data.generators.curves import Points, arc_length, heading
-from scenefactory_jax.data.generators.procedural.road_layout import check_positive, check_range, draw
+from scenefactory_jax.data.generators.curves import Points, arc_length, heading, interpolate
+from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count, read_group
 from scenefactory_jax.data.generators.town import road_users
-from scenefactory_jax.data.generators.town.bounds import fill
 from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
 from scenefactory_jax.data.generators.town.path_conflicts import find_conflicts
@@ -19,11 +18,12 @@ from scenefactory_jax.data.generators.town.road_network import Network
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
-WARM_STEP_S = 0.2  # while traffic settles before the log
+WARMUP_STEP_S = 0.2
+RIM_M = 6.0  # of the square with kerbs, in which cars are not checked for leaving the road
 
 
 class TownUser(NamedTuple):
-    """One road user over the whole log."""
+    """States of one road user over time."""
 
     kind: RoadUser
     size: tuple[float, float, float]
@@ -33,13 +33,13 @@ class TownUser(NamedTuple):
     valid: Bool[np.ndarray, " L"]
 
     def since(self, step: int) -> "TownUser":
-        """The log from a step on."""
+        """The states from a step on."""
         return TownUser(self.kind, self.size, self.position[step:], self.yaw[step:], self.speed[step:], self.valid[step:])
 
 
-def choose_start_times(times: Float[np.ndarray, " L"], warm_s: float) -> Float[np.ndarray, " M"]:
-    """The log's times, and those before it while traffic settles."""
-    return np.concatenate([times[0] - np.arange(round(warm_s / WARM_STEP_S), 0, -1) * WARM_STEP_S, times])
+def add_warmup(times: Float[np.ndarray, " L"], warmup_s: float) -> Float[np.ndarray, " M"]:
+    """Puts the times of the warm-up before those of the log."""
+    return np.concatenate([times[0] - np.arange(round(warmup_s / WARMUP_STEP_S), 0, -1) * WARMUP_STEP_S, times])
 
 
 def populate(
@@ -53,142 +53,138 @@ def populate(
     *,
     cars: list[int],
     travel_m: list[float],
+    parked_fraction: list[float],
     driving: Mapping[str, Any],
-    manners: Mapping[str, Any],
-    parked_share: list[float],
+    driver: Mapping[str, Any],
     cyclists: Mapping[str, Any],
-    people: Mapping[str, Any],
+    pedestrians: Mapping[str, Any],
 ) -> list[TownUser]:
-    """Everybody who is on the road over `times`, the log's and those before.
+    """Draws and simulates all road users over `times`, which include the warm-up.
 
     Args:
-        kerbs, surface: edges of the roads, and what they enclose.
-        gates: lights, signs and crosswalks at all times.
-        cars: fewest and most that drive.
-        travel_m: cars that go less far than the least stand; a log that goes farther than the most is cut there, counted from time 0.
-        driving: numbers of `crowd.Driving`.
-        manners: numbers of `drivers.Manners`.
-        parked_share: of the parking spaces that are taken.
-        cyclists, people: numbers of `crowd.Cyclists` and `crowd.People`.
+        kerbs, surface: road edges, and the paved surface.
+        gates: states of lights, signs and crosswalks at all times.
+        cars: range of the number of driving cars.
+        travel_m: minimum travel of a moving car; maximum travel since time 0, after which its log ends.
+        parked_fraction: range of the fraction of parking spaces with a car.
+        driving: numbers of `road_users.DrivingNumbers`.
+        driver: numbers of `DriverParameters`.
+        cyclists, pedestrians: numbers of `road_users.CyclistNumbers` and `road_users.PedestrianNumbers`.
 
     Raises:
-        ConfigError: a number that makes no sense, by name.
+        ConfigError: a number out of range.
     """
-    for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_share, "parked_share")):
-        check_range(span, f"traffic.{name}", low=0.0)
-    rules, taste = fill(DriverParameters, manners, "traffic.manners"), fill(road_users.DrivingNumbers, driving, "traffic.driving")
-    for name, value in rules._asdict().items():
-        check_positive(value, f"traffic.manners.{name}")
-    walking, cycling = (
-        fill(road_users.PedestrianNumbers, people, "traffic.people"),
-        fill(road_users.CyclistNumbers, cyclists, "traffic.cyclists"),
-    )
-    goers = [
-        *road_users.draw_cars(rng, network, road_users.number(rng, cars), times, reach, taste),
-        *road_users.draw_cyclists(rng, network, times, reach, taste, cycling),
-        *road_users.draw_crossers(rng, network, times, walking),
+    for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_fraction, "parked_fraction")):
+        check_range(span, f"traffic.{name}")
+    parameters = read_group(driver, DriverParameters, "traffic.driver")
+    drive = read_group(driving, road_users.DrivingNumbers, "traffic.driving")
+    walk = read_group(pedestrians, road_users.PedestrianNumbers, "traffic.pedestrians")
+    cycle = read_group(cyclists, road_users.CyclistNumbers, "traffic.cyclists")
+    simulated = [
+        *road_users.draw_cars(rng, network, draw_count(rng, cars), times, reach, drive),
+        *road_users.draw_cyclists(rng, network, times, reach, drive, cycle),
+        *road_users.draw_crossers(rng, network, times, walk),
     ]
-    strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), walking)
-    parked = _park(rng, network, draw(rng, parked_share, "traffic.parked_share"), taste.size_m, times)
-    actors = [*_drive(goers, gates, times, rules), *(_stroll(*stroll, walking.size_m, times) for stroll in strolls), *parked]
-    actors = [_cut(actor, times, travel_m[1]) for actor in actors]
-    return separate_users([actor for actor in actors if actor.kind != "vehicle" or _on_road(actor, surface, reach)])
+    strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), walk)
+    parked = _park(rng, network, draw(rng, parked_fraction, "traffic.parked_fraction"), drive.size_m, times)
+    users = [
+        *_simulate(simulated, gates, times, parameters),
+        *(_stroll(*stroll, road_users.to_size(walk.size_m), times) for stroll in strolls),
+        *parked,
+    ]
+    users = [_limit_travel(user, times, travel_m[1]) for user in users]
+    return separate_users([user for user in users if user.kind != "vehicle" or _is_on_road(user, surface, reach)])
 
 
-def _drive(
-    goers: list[road_users.SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], manners: DriverParameters
+def _simulate(
+    users: list[road_users.SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], parameters: DriverParameters
 ) -> list[TownUser]:
-    """Everybody's log as they go their ways together."""
-    if not goers:
+    """Simulates the road users along their paths."""
+    if not users:
         return []
-    paths = [goer.path for goer in goers]
-    columns = zip(*((goer.size[0], goer.size[1], goer.begin, goer.speed, goer.enters) for goer in goers), strict=True)
-    users = Users(*(np.array(column, float) for column in columns))
-    table, zones = find_conflicts(paths, users.width)
-    motion = simulate(paths, users, table, zones, gates.state, times, manners)
-    found = []
-    for own, goer in enumerate(goers):
-        row = motion.place[:, own] / STEP_M
-        at = np.arange(len(goer.path.points))
-        position = np.stack([np.interp(row, at, goer.path.points[:, i]) for i in (0, 1)], axis=-1)
-        found.append(
-            TownUser(goer.kind, goer.size, position, np.interp(row, at, goer.path.yaw), motion.speed[:, own], motion.present[:, own])
-        )
-    return found
+    paths = [user.path for user in users]
+    columns = zip(*((user.size[0], user.size[1], 0.0, user.speed, user.enters) for user in users), strict=True)
+    states = Users(*(np.array(column, float) for column in columns))
+    table, zones = find_conflicts(paths, states.width)
+    motion = simulate(paths, states, table, zones, gates.state, times, parameters)
+    logs = []
+    for i, user in enumerate(users):
+        row, rows = motion.place[:, i] / STEP_M, np.arange(len(user.path.points), dtype=float)
+        position, yaw = interpolate(row, rows, user.path.points), np.interp(row, rows, user.path.yaw)
+        logs.append(TownUser(user.kind, user.size, position, yaw, motion.speed[:, i], motion.present[:, i]))
+    return logs
 
 
 def _stroll(points: Points, speed: float, size: tuple[float, float, float], times: Float[np.ndarray, " L"]) -> TownUser:
-    """A walk at a constant speed."""
+    """Computes the log of a pedestrian with a constant speed."""
     place = arc_length(points)
     at = np.minimum(speed * (times - times[0]), place[-1])
-    position = np.stack([np.interp(at, place, points[:, i]) for i in (0, 1)], axis=-1)
     step = np.gradient(points, axis=0)
     yaw = np.interp(at, place, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
-    return TownUser("pedestrian", size, position, yaw, np.full(len(times), speed), at < place[-1])
+    return TownUser("pedestrian", size, interpolate(at, place, points), yaw, np.full(len(times), speed), at < place[-1])
 
 
 def _park(
-    rng: np.random.Generator, network: Network, share: float, size_m: list[list[float]], times: Float[np.ndarray, " L"]
+    rng: np.random.Generator, network: Network, fraction: float, size_m: list[list[float]], times: Float[np.ndarray, " L"]
 ) -> list[TownUser]:
-    """Cars that stand in some of the parking spaces all the time."""
-    found = []
+    """Draws cars in a fraction of the parking spaces."""
+    parked = []
     for spot in network.spots:
-        if rng.random() < share:
+        if rng.random() < fraction:
             size = road_users.draw_size(rng, size_m)
             place = spot.place + rng.uniform(-0.2, 0.2) * heading(spot.yaw)
-            still = np.tile(place, (len(times), 1)), np.full(len(times), spot.yaw), np.zeros(len(times)), np.ones(len(times), bool)
-            found.append(TownUser("vehicle", size, *still))
-    return found
+            states = np.tile(place, (len(times), 1)), np.full(len(times), spot.yaw), np.zeros(len(times)), np.ones(len(times), bool)
+            parked.append(TownUser("vehicle", size, *states))
+    return parked
 
 
-def _cut(actor: TownUser, times: Float[np.ndarray, " L"], most: float) -> TownUser:
-    """The log up to where it has gone farther than the most since time 0."""
-    step = np.linalg.norm(np.diff(actor.position, axis=0), axis=1) * (actor.valid[1:] & actor.valid[:-1] & (times[:-1] >= 0))
-    return actor._replace(valid=actor.valid & (np.concatenate([[0.0], np.cumsum(step)]) <= most))
+def _limit_travel(user: TownUser, times: Float[np.ndarray, " L"], max_travel: float) -> TownUser:
+    """Ends a log where the travel since time 0 exceeds the maximum."""
+    step = np.linalg.norm(np.diff(user.position, axis=0), axis=1) * (user.valid[1:] & user.valid[:-1] & (times[:-1] >= 0))
+    return user._replace(valid=user.valid & (np.concatenate([[0.0], np.cumsum(step)]) <= max_travel))
 
 
-def _on_road(actor: TownUser, surface: shapely.Geometry, reach: float) -> bool:
-    """Whether a moving car's corners stay on the surface; beyond the town it goes on unseen."""
-    if not (actor.speed > 0.1).any():
+def _is_on_road(user: TownUser, surface: shapely.Geometry, reach: float) -> bool:
+    """Checks that the corners of a moving car stay on the paved surface within the square of half side `reach`."""
+    if not (user.speed > 0.1).any():
         return True
-    rows = np.flatnonzero(actor.valid & (np.abs(actor.position).max(axis=1) < reach - 6.0))[::2]
-    points = box_corners(actor.position[rows], actor.yaw[rows], *actor.size[:2]).reshape(-1, 2)
+    rows = np.flatnonzero(user.valid & (np.abs(user.position).max(axis=1) < reach - RIM_M))[::2]
+    points = box_corners(user.position[rows], user.yaw[rows], *user.size[:2]).reshape(-1, 2)
     return bool(shapely.contains_xy(surface, points[:, 0], points[:, 1]).all())
 
 
-def separate_users(actors: list[TownUser]) -> list[TownUser]:
-    """Without those who touch somebody at any step: whoever touches most goes first."""
-    left = list(range(len(actors)))
-    touching = _touching(actors)
-    while touching:
-        counts = np.bincount(np.array(touching).ravel(), minlength=len(actors))
-        worst = int(np.argmax(counts))
-        left.remove(worst)
-        touching = [pair for pair in touching if worst not in pair]
-    return [actors[i] for i in left]
+def separate_users(users: list[TownUser]) -> list[TownUser]:
+    """Removes road users until no two overlap at any step, those with the most overlaps first."""
+    kept = list(range(len(users)))
+    pairs = _find_overlaps(users)
+    while pairs:
+        worst = int(np.argmax(np.bincount(np.array(pairs).ravel(), minlength=len(users))))
+        kept.remove(worst)
+        pairs = [pair for pair in pairs if worst not in pair]
+    return [users[i] for i in kept]
 
 
-def _touching(actors: list[TownUser]) -> list[tuple[int, int]]:
-    """Pairs whose boxes overlap at some step at which both are there."""
-    if len(actors) < 2:
+def _find_overlaps(users: list[TownUser]) -> list[tuple[int, int]]:
+    """Finds pairs with overlapping boxes at a step at which both are valid."""
+    if len(users) < 2:
         return []
-    position, valid = np.stack([a.position for a in actors]), np.stack([a.valid for a in actors])
-    size = np.array([a.size[:2] for a in actors])
+    position, valid = np.stack([u.position for u in users]), np.stack([u.valid for u in users])
+    size = np.array([u.size[:2] for u in users])
     radius = np.linalg.norm(size, axis=1) / 2
-    rows, cols = np.triu_indices(len(actors), 1)
-    # the boxes around whole tracks sort out most pairs
+    rows, cols = np.triu_indices(len(users), 1)
+    # bounding boxes of whole tracks exclude most pairs
     low = np.where(valid[..., None], position, np.inf).min(axis=1) - radius[:, None]
     high = np.where(valid[..., None], position, -np.inf).max(axis=1) + radius[:, None]
     meet = ((low[rows] < high[cols]) & (low[cols] < high[rows])).all(axis=1)
     rows, cols = rows[meet], cols[meet]
     near = np.linalg.norm(position[rows] - position[cols], axis=2) < (radius[rows] + radius[cols])[:, None]
     pair, step = np.nonzero(near & valid[rows] & valid[cols])
-    boxes = np.stack([box_corners(a.position, a.yaw, *a.size[:2]) for a in actors])
+    boxes = np.stack([box_corners(u.position, u.yaw, *u.size[:2]) for u in users])
     hit = overlaps(boxes[rows[pair], step], boxes[cols[pair], step])
     return sorted({(int(rows[p]), int(cols[p])) for p in pair[hit]})
 
 
-def move_track(actor: TownUser, current: int) -> float:
-    """Metres from a step on."""
-    rows = actor.valid[current:]
-    return float(np.linalg.norm(np.diff(actor.position[current:][rows], axis=0), axis=1).sum()) if rows.any() else 0.0
+def measure_travel(user: TownUser, current: int) -> float:
+    """Computes the distance that a road user travels from a step on, m."""
+    rows = user.valid[current:]
+    return float(np.linalg.norm(np.diff(user.position[current:][rows], axis=0), axis=1).sum()) if rows.any() else 0.0

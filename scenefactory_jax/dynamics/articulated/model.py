@@ -1,0 +1,179 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
+"""The car as a MuJoCo model: one box chassis on four sprung wheels, 6 + 10 degrees of freedom.
+
+Each wheel is one body with its joints in a row (suspension slide, steering hinge in front, spin hinge) instead of a carrier, a knuckle and
+a wheel. The motion is the same, and the kinematic tree is two levels deep instead of four. The parts that do not spin add to the wheel
+body's mass, and to its inertia about the two axes across the spin axis.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, compute_unsprung
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FRONT_WHEELS, LEFT, MIN_FRICTION_LOSS, WHEELS, CarParameters, Solver
+
+PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
+
+
+def build_mjspec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:
+    """Builds one car without ground: body `chassis`, joints `root`, `suspension_*`, `steer_*`, `spin_*`, geoms `box` and `tyre_*`.
+
+    Args:
+        visual: add cabin, cylinder wheels and a spoke. They do not change the physics, and MJX is faster without them.
+        brake_rows: compile a friction loss into the wheel joints, for friction brakes.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "car"
+    spec.compiler.autolimits = False
+    chassis = spec.worldbody.add_body(name="chassis", pos=[0, 0, car.wheel_radius - car.wheel_height])
+    chassis.add_freejoint(name="root")
+    _set_inertia(chassis, car.mass, car.inertia, position=[car.mass_forward, 0.0, car.mass_height])
+    half = [car.length / 2, car.width / 2, car.height / 2]
+    _add_geom(chassis, "box", mujoco.mjtGeom.mjGEOM_BOX, half, rgba=[*PAINT[:3], 0.0] if visual else PAINT)
+    if visual:
+        _add_visual_body(chassis, half)
+    for wheel in range(4):
+        _add_wheel(chassis, wheel, car, visual=visual, brake_rows=brake_rows)
+    return spec
+
+
+def _add_wheel(chassis: mujoco.MjsBody, index: int, car: CarParameters, *, visual: bool, brake_rows: bool) -> None:
+    """Adds a wheel body with its joints and its tyre geom."""
+    name, position = WHEELS[index], [AHEAD[index] * car.wheelbase / 2, LEFT[index] * car.track / 2, car.wheel_height]
+    wheel = chassis.add_body(name=f"wheel_{name}", pos=position)
+    hinge, slide = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    spring = wheel.add_joint(name=f"suspension_{name}", type=slide, axis=[0, 0, 1])
+    spring.stiffness, spring.damping = _linear(car.suspension_stiffness), _linear(car.suspension_damping)
+    spring.springref = -compute_loads(car)[index] * car.suspension_preload / car.suspension_stiffness
+    if name in FRONT_WHEELS:
+        steer = wheel.add_joint(name=f"steer_{name}", type=hinge, axis=[0, 0, 1], armature=car.steering_inertia)
+        steer.damping = _linear(car.steering_friction)
+    spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
+    spin.damping = _linear(car.wheel_damping)
+    spin.frictionloss = max(car.rolling_torque, MIN_FRICTION_LOSS) if brake_rows else 0.0
+    spin.solimp_friction = [car.brake_impedance, car.brake_impedance, 1e-3, 0.5, 2.0]
+    mass, about, across = compute_unsprung(car)
+    _set_inertia(wheel, mass[index], [across[index], about, across[index]], position=[0.0, 0.0, 0.0])
+    radii = [car.wheel_radius, car.wheel_width / 2, car.wheel_radius]
+    tyre = _add_geom(wheel, f"tyre_{name}", mujoco.mjtGeom.mjGEOM_ELLIPSOID, radii, rgba=RUBBER)
+    if visual:
+        tyre.rgba = [0, 0, 0, 0]
+        size, along_axle = [car.wheel_radius, car.wheel_width / 2, 0.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0]
+        _add_geom(wheel, f"rim_{name}", mujoco.mjtGeom.mjGEOM_CYLINDER, size, rgba=RUBBER, quat=along_axle)
+        spoke = [0.9 * car.wheel_radius, car.wheel_width / 2 + 0.005, 0.04]
+        _add_geom(wheel, f"spoke_{name}", mujoco.mjtGeom.mjGEOM_BOX, spoke, rgba=[0.8, 0.8, 0.8, 1.0])
+
+
+def _add_visual_body(chassis: mujoco.MjsBody, half: Sequence[float]) -> None:
+    """Adds a lower body, a cabin and lamps in place of the box."""
+    length, width, height = half
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    _add_geom(chassis, "hull", box, [length, 0.9 * width, 0.5 * height], rgba=PAINT, pos=[0.0, 0.0, -0.5 * height])
+    glass = [0.5 * length, 0.8 * width, 0.5 * height]
+    _add_geom(chassis, "cabin", box, glass, rgba=[0.15, 0.2, 0.3, 1.0], pos=[-0.12 * length, 0.0, 0.5 * height])
+    for side in (-1, 1):
+        y, lamp = 0.6 * side * width, [0.02, 0.15 * width, 0.08 * height]
+        _add_geom(chassis, f"head_{side}", box, lamp, rgba=[1.0, 1.0, 0.8, 1.0], pos=[length, y, -0.25 * height])
+        _add_geom(chassis, f"tail_{side}", box, lamp, rgba=[0.8, 0.1, 0.1, 1.0], pos=[-length, y, -0.25 * height])
+
+
+class ModelAddresses(NamedTuple):
+    """Indices of the compiled car's parts in MuJoCo's arrays, wheels in the order of `WHEELS`; all static."""
+
+    chassis: int  # body
+    wheel: np.ndarray  # bodies
+    tyre: np.ndarray  # geoms
+    suspension: np.ndarray  # joints
+    suspension_q: np.ndarray  # in qpos
+    suspension_v: np.ndarray  # in qvel
+    steer_q: np.ndarray  # of the front wheels
+    steer_v: np.ndarray
+    spin_v: np.ndarray
+
+
+def find_addresses(model: mujoco.MjModel) -> ModelAddresses:
+    """Looks the indices up by name."""
+
+    def find(lookup: Any, prefix: str, attribute: str, wheels: Sequence[str] = WHEELS) -> np.ndarray:
+        return np.array([np.atleast_1d(getattr(lookup(f"{prefix}_{wheel}"), attribute))[0] for wheel in wheels])
+
+    return ModelAddresses(
+        chassis=model.body("chassis").id,
+        wheel=find(model.body, "wheel", "id"),
+        tyre=find(model.geom, "tyre", "id"),
+        suspension=find(model.joint, "suspension", "id"),
+        suspension_q=find(model.joint, "suspension", "qposadr"),
+        suspension_v=find(model.joint, "suspension", "dofadr"),
+        steer_q=find(model.joint, "steer", "qposadr", FRONT_WHEELS),
+        steer_v=find(model.joint, "steer", "dofadr", FRONT_WHEELS),
+        spin_v=find(model.joint, "spin", "dofadr"),
+    )
+
+
+def _linear(coefficient: float) -> list[float]:
+    """MuJoCo's springs and dampers are cubic polynomials; MJX reads the linear coefficient only."""
+    return [coefficient, 0.0, 0.0]
+
+
+def _set_inertia(body: mujoco.MjsBody, mass: float, inertia: Sequence[float], position: Sequence[float]) -> None:
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos = mass, list(inertia), list(position)
+
+
+def _add_geom(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Sequence[float], **options: Sequence[float]) -> mujoco.MjsGeom:
+    """Adds a geom without mass that collides with nothing: contacts are explicit pairs."""
+    return body.add_geom(name=name, type=kind, size=list(size), mass=0, contype=0, conaffinity=0, **options)
+
+
+def add_ground_pairs(spec: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "") -> None:
+    """Adds the tyres' contacts with the geom `ground` as explicit pairs: MuJoCo would otherwise take the larger friction of the two geoms.
+
+    The contact is softer than MuJoCo's default in both directions. The convex contact model lifts what slides: a rigid wheel with the
+    default friction reference hops (normal force 0 to 60 kN in the converged solver) and needs many iterations. With the soft contact,
+    1, 2 and 100 Newton iterations agree to a centimetre.
+    """
+    for name in WHEELS:
+        pair = spec.add_pair(name=f"{prefix}ground_{name}", geomname1=ground, geomname2=f"{prefix}tyre_{name}")
+        pair.condim = 3
+        pair.friction = [1.0, 1.0, 0.005, 1e-4, 1e-4]
+        pair.solref = [car.tyre_time_constant, 1.0]
+        pair.solimp = [car.tyre_impedance, car.tyre_impedance, 1e-3, 0.5, 2.0]
+        pair.solreffriction = [-1e-3, -car.tyre_slip_damping]  # direct form, at rest; friction has no position for the first to act on
+
+
+def set_options(spec: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> None:
+    """Sets time step and solver of a model with cars."""
+    option, integrators = spec.option, mujoco.mjtIntegrator
+    option.timestep = physics_dt
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.integrator = integrators.mjINT_EULER if solver.integrator == "Euler" else integrators.mjINT_IMPLICITFAST
+    option.iterations, option.ls_iterations, option.tolerance = solver.iterations, solver.line_search, solver.tolerance
+    option.impratio = solver.friction_ratio
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # the dampings are stable at 120 Hz without a second factorisation
+
+
+def build_standalone_model(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool, brake_rows: bool) -> mujoco.MjModel:
+    """Compiles one car on an infinite flat ground."""
+    spec = build_mjspec(car, visual=visual, brake_rows=brake_rows)
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
+    add_ground_pairs(spec, car, ground="ground")
+    set_options(spec, solver, physics_dt=physics_dt)
+    return spec.compile()
+
+
+def find_rest_pose(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
+    """Computes the joint positions of the car at rest on the ground: 5 s of settling in the C engine."""
+    data, addresses = mujoco.MjData(model), find_addresses(model)
+    for _ in range(round(5.0 / model.opt.timestep)):
+        travel = data.qpos[addresses.suspension_q]
+        stop = travel - np.clip(travel, -car.suspension_travel, car.suspension_travel)
+        data.qfrc_applied[addresses.suspension_v] = -car.stop_stiffness * stop
+        mujoco.mj_step(model, data)
+    pose = model.qpos0.copy()
+    pose[2], pose[addresses.suspension_q] = data.qpos[2], data.qpos[addresses.suspension_q]
+    return pose

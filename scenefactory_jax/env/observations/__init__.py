@@ -1,0 +1,59 @@
+"""Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent.
+
+A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them, and the observation is the dictionary of their results. A
+group of one's own has a dotted target. The policy encodes vectors and sets by their type, so that a new group needs no other change.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.types import Observation, Scene, SetObservation, State
+from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
+from scenefactory_jax.env.observations.lane_vector import lane
+from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
+from scenefactory_jax.env.observations.road_set import road
+from scenefactory_jax.env.observations.state_vectors import ego, weather, yaw_rate_and_steer
+
+__all__ = [
+    "ANY",
+    "FRACTION",
+    "LENGTH",
+    "SIGNED",
+    "Group",
+    "bound_observation",
+    "closest_approach",
+    "ego",
+    "lane",
+    "make",
+    "neighbours",
+    "observe",
+    "road",
+    "weather",
+    "yaw_rate_and_steer",
+]
+
+Group = Callable[[Scene, State], Float[Array, "A F"] | SetObservation]
+
+
+def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "observations", **context: Any) -> dict[str, Group]:
+    """Binds config entries: name -> group; an entry of null is left out."""
+    return {
+        name: instantiate(entry, builtins=__name__, where=f"{where}.{name}", **context)
+        for name, entry in entries.items()
+        if entry is not None
+    }
+
+
+def observe(scene: Scene, state: State, groups: Mapping[str, Group]) -> Observation:
+    """Computes all groups; zeros and false masks for agents that are not active."""
+
+    def hide(leaf: Array) -> Array:
+        mask = state.active.reshape((-1,) + (1,) * (leaf.ndim - 1))
+        return jnp.where(mask, leaf, jnp.zeros((), leaf.dtype))
+
+    return {name: jax.tree.map(hide, group(scene, state)) for name, group in groups.items()}

@@ -1,0 +1,46 @@
+"""Observation vectors of the car's own state and road condition."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.geometry import safe_norm, to_frame
+from scenefactory_jax.core.schema import ConfigError, Positive
+from scenefactory_jax.core.types import SURFACES, Scene, State
+from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
+from scenefactory_jax.weather.patches import read_condition
+
+
+@bound_observation(ANY, ANY, SIGNED, SIGNED, LENGTH, ANY, ANY)
+def ego(scene: Scene, state: State, *, distance_scale_m: Positive, speed_scale_mps: Positive) -> Float[Array, "A 7"]:
+    """Goal x, y in the car's frame; sine and cosine of its bearing; its distance; the car's velocity x, y (paper, section 4)."""
+    motion = state.motion
+    goal = to_frame(state.agents.goal - motion.position[:, :2], motion.yaw)
+    distance = safe_norm(goal)
+    bearing = goal / jnp.maximum(distance, 1e-6)[:, None]
+    velocity = to_frame(motion.velocity[:, :2], motion.yaw)
+    parts = [goal / distance_scale_m, bearing[:, 1:], bearing[:, :1], distance[:, None] / distance_scale_m, velocity / speed_scale_mps]
+    return jnp.concatenate(parts, axis=1)
+
+
+@bound_observation(LENGTH, FRACTION)
+def weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: list[str]) -> Float[Array, "A F"]:
+    """Water film and one-hot surface at each car, [film, AC, SMA, OGFC] in Eq. 2 of the paper.
+
+    Args:
+        film_scale_mm: the film that reads 1.
+        surfaces: columns of the one-hot; another surface reads zeros.
+
+    Raises:
+        ConfigError: an unknown surface, by name.
+    """
+    if unknown := [name for name in surfaces if name not in SURFACES]:
+        raise ConfigError(f"observations.weather.surfaces: expected names of {', '.join(SURFACES)}, got {unknown[0]!r}")
+    film_mm, surface = read_condition(state.weather, state.motion.position[:, :2])
+    columns = jnp.array([SURFACES.index(name) for name in surfaces], jnp.int32)
+    one_hot = (surface[:, None] == columns).astype(jnp.float32)
+    return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
+
+
+def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:
+    """Yaw rate, and the mean angle of the front wheels."""
+    return jnp.stack([state.motion.yaw_rate / turn_scale_radps, state.motion.steer / steer_scale_rad], axis=1)

@@ -1,0 +1,80 @@
+"""Schemas of what an evaluation is asked for: episodes, failures and the video."""
+
+import importlib.util
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed
+
+Frequency = Annotated[float, Bounds(min=0.1)]
+
+
+@dataclass(frozen=True)
+class Video:
+    """The video of an evaluation."""
+
+    enable: bool
+    worlds: Seed
+    seconds: Frequency
+    stride: Count
+    fps: Frequency
+    columns: Count
+    panel: Annotated[int, Bounds(min=120)]
+    trail_s: NonNegative
+    suffix: Literal[".gif", ".mp4"]
+
+    def __post_init__(self) -> None:
+        if self.enable and self.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+            raise ConfigError("suffix: .mp4 needs ffmpeg, which is missing; `pip install 'scenefactory_jax[video]'`, or choose .gif")
+
+
+@dataclass(frozen=True)
+class FailureNotes:
+    """Thresholds of the failure signals."""
+
+    moving_mps: NonNegative
+    lane_m: NonNegative
+    against_cos: Annotated[float, Bounds(min=-1)]
+    wrong_way_m: NonNegative
+    rest_m: NonNegative
+    near_m: NonNegative
+
+
+@dataclass(frozen=True)
+class FailureKinds:
+    """Thresholds of the failure types."""
+
+    own_share: NonNegative
+    own_mps: NonNegative
+    stuck_s: NonNegative
+    away_m: NonNegative
+
+
+@dataclass(frozen=True)
+class FailurePictures:
+    """Pictures of the worst failures."""
+
+    enable: bool
+    panels: Count
+    before_s: NonNegative
+    video: bool
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The group `failures`."""
+
+    notes: FailureNotes
+    kinds: FailureKinds
+    pictures: FailurePictures
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How many episodes are evaluated, and how their metrics are estimated."""
+
+    seed: Seed
+    repeats: Count
+    chunk_steps: Count
+    ttc_limit_s: NonNegative
+    bootstrap: Count

@@ -1,0 +1,44 @@
+"""The config group `ppo`."""
+
+import dataclasses
+from typing import Annotated, Literal
+
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Numbers of PPO (Schulman et al. 2017), with the learning rate of RSL-RL."""
+
+    horizon: Count  # actions of a rollout, of `actions.action_repeat` control steps each
+    epochs: Count  # passes over a rollout
+    minibatches: Count  # gradient steps of a pass
+    sample_fraction: Annotated[
+        float, Bounds(above=0, max=1)
+    ]  # of a rollout's samples in a pass, active agents first
+    shards: (
+        int | None
+    )  # groups of worlds whose samples are shuffled separately; None: one a device
+    permutation: Literal["once", "each_epoch"]  # of samples to minibatches: once a rollout (RSL-RL) or in each pass
+    learning_rate: float  # of Adam, at the beginning
+    desired_kl: Positive | None  # nats; the learning rate follows the KL divergence between its bounds; None: it is constant
+    learning_rate_min: Positive
+    learning_rate_max: float
+    learning_rate_half_life: (
+        Positive | None
+    )  # iterations that halve learning_rate_max; None: constant
+    gamma: Fraction  # discount of an action
+    gae_lambda: Fraction
+    clip_eps: Positive  # bound of the probability ratio
+    value_clip: Positive | None  # bound of the change of a value in the value loss; None: not bounded
+    ent_coef: NonNegative
+    vf_coef: NonNegative
+    max_grad_norm: Positive
+    normalize_advantages: bool  # over the active samples of a rollout
+    stagger_episodes: bool  # worlds start at random times of their episodes, so that they do not reach the time limit together
+    parameter_ema_decay: Fraction | None  # of the running mean of the parameters, which is evaluated; None: the last parameters are
+
+    def __post_init__(self) -> None:
+        if not self.learning_rate_min <= self.learning_rate <= self.learning_rate_max:
+            bounds = f"[learning_rate_min, learning_rate_max] = [{self.learning_rate_min}, {self.learning_rate_max}]"
+            raise ConfigError(f"learning_rate: expected a number in {bounds}, got {self.learning_rate}")

@@ -1,0 +1,164 @@
+"""Collects samples: a scan over time of policy, environment and restarts, for all worlds at once."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.pytree import pytree_dataclass, tree_where
+from scenefactory_jax.core.types import Env, Observation, Policy, Scene, State, StepResult
+from scenefactory_jax.env import environment
+from scenefactory_jax.learning.gaussian import log_probability
+
+
+@pytree_dataclass
+class EpisodeStats:
+    """Sums over each agent's episode so far."""
+
+    returns: Float[Array, "W A"]  # undiscounted
+    steps: Float[Array, "W A"]
+
+
+@pytree_dataclass
+class SceneStats:
+    """Counts of each world since its scene was placed there."""
+
+    episodes: Int[Array, " W"]  # of agents, ended by an event or by the time limit
+    successes: Int[Array, " W"]  # goals reached
+
+
+@pytree_dataclass
+class Worlds:
+    """The worlds of one device between two rollouts."""
+
+    state: State  # with the axis W in front
+    observation: Observation
+    episode_stats: EpisodeStats
+
+
+@pytree_dataclass
+class Sample:
+    """One action of every slot, and its results until the next action."""
+
+    observation: Observation
+    action: Float[Array, "W A 3"]  # before the environment's clipping
+    mean: Float[Array, "W A 3"]
+    log_probability: Float[Array, "W A"]
+    value: Float[Array, "W A"]
+    reward: Float[Array, "W A"]  # sum over the control steps
+    active: Bool[Array, "W A"]  # before the action
+    terminated: Bool[Array, "W A"]  # by an event
+    truncated: Bool[Array, "W A"]  # active when the world reached the time limit
+
+
+Counts = dict[str, Array]
+"""Sums over worlds, agents and time, from which metrics are computed."""
+
+
+def collect_rollout(
+    env: Env, policy: Policy, parameters: Any, scenes: Scene, worlds: Worlds, key: PRNGKeyArray, *, horizon: int, axis: str | None = None
+) -> tuple[Worlds, Sample, Counts, SceneStats]:
+    """Acts `horizon` times in `W` worlds; a world that is done restarts with a new key before it is observed.
+
+    An action is held for `env.action_repeat` control steps.
+
+    Args:
+        axis: mesh axis of the devices that share the worlds, see `sharding`.
+
+    Returns:
+        The worlds to continue from, samples `[T, W, A]`, the counts of all steps, and the counts of each world.
+    """
+
+    def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Sample, Counts]]:
+        action_key, start_key = jax.random.split(key)
+        before = worlds.state
+        mean, log_std, value = policy.apply(parameters, worlds.observation)
+        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(sharding.world_keys(action_key, len(mean), axis))
+        action = mean + jnp.exp(log_std) * noise
+        control = lambda state: jax.vmap(env.control_step)(scenes, state, action)  # noqa: E731
+        after, stats, result, counts = environment.repeat_action(
+            control, before, worlds.episode_stats, action_repeat=env.action_repeat, note=_count_step
+        )
+        sample = Sample(
+            observation=worlds.observation,
+            action=action,
+            mean=mean,
+            log_probability=log_probability(action, mean, log_std),
+            value=value,
+            active=before.active,
+            reward=result.reward,
+            terminated=result.terminated,
+            truncated=environment.find_truncated_agents(result, before.active),
+        )
+        fresh = jax.vmap(env.init_state)(sharding.world_keys(start_key, len(result.world_done), axis), scenes)
+        state = tree_where(result.world_done, fresh, after)
+        return Worlds(state, jax.vmap(env.observe)(scenes, state), stats), (sample, counts)
+
+    worlds, (samples, counts) = jax.lax.scan(step, worlds, jax.random.split(key, horizon))
+    scene_stats = SceneStats(*(jnp.sum(counts[name], axis=0).astype(jnp.int32) for name in ("ended", "events/goal_reached")))
+    return worlds, samples, jax.tree.map(jnp.sum, counts), scene_stats
+
+
+def make_empty_scene_stats(state: State) -> SceneStats:
+    """Zero counts."""
+    return SceneStats(jnp.zeros(len(state.step), jnp.int32), jnp.zeros(len(state.step), jnp.int32))
+
+
+def make_empty_episode_stats(state: State) -> EpisodeStats:
+    """Zero sums."""
+    return EpisodeStats(jnp.zeros(state.active.shape, jnp.float32), jnp.zeros(state.active.shape, jnp.float32))
+
+
+def _count_step(stats: EpisodeStats, before: State, result: StepResult) -> tuple[EpisodeStats, Counts]:
+    """Adds a control step to the episodes' sums, and counts it for each world: one sum over all worlds stalls a GPU at every step.
+
+    Float32 holds sums of up to 16.7 million agent steps exactly.
+    """
+
+    def total(x: Array, where: Array) -> Array:
+        return jnp.sum(jnp.where(where, x, 0), axis=1, dtype=jnp.float32)
+
+    active = before.active
+    ended = active & (result.terminated | result.truncated[:, None])
+    reward = jnp.where(active, result.reward, 0.0)
+    stats = EpisodeStats(stats.returns + reward, stats.steps + active)
+    counts = {
+        "spawned": jnp.sum(before.agents.present, axis=1, dtype=jnp.int32),
+        "active": total(active, active),
+        "reward": total(reward, active),
+        "speed": total(result.metrics.speed, active & ~result.metrics.events.numerical_error),  # 0 where the state is not finite
+        "ended": total(ended, ended),
+        "return": total(stats.returns, ended),
+        "length": total(stats.steps, ended),
+        **{f"reward/{name}": total(term, active) for name, term in result.terms.items()},
+        **{f"events/{name}": total(event, active) for name, event in vars(result.events).items()},
+    }
+    closed = ended | result.world_done[:, None]
+    return EpisodeStats(jnp.where(closed, 0.0, stats.returns), jnp.where(closed, 0.0, stats.steps)), counts
+
+
+def compute_rollout_metrics(counts: Counts) -> dict[str, Float[Array, ""]]:
+    """Computes the metrics of a rollout that do not depend on the algorithm.
+
+    `reward` and `reward/...`: mean per step of an active agent. `events/...`: new events per episode of an agent that ended, by event or by
+    time limit; `count/...`: their number. `episode/...`: undiscounted return and steps of these episodes. `active_fraction`: active steps
+    among the steps of spawned slots; `steps/...`: of this rollout. `speed`: m/s.
+    """
+    steps, ends = jnp.maximum(counts["active"], 1.0), jnp.maximum(counts["ended"], 1.0)
+    spawned = counts["spawned"].astype(jnp.float32)
+    metrics = {name: counts[name] / steps for name in counts if name == "reward" or name.startswith("reward/")}
+    for name in (name.removeprefix("events/") for name in counts if name.startswith("events/")):
+        metrics[f"events/{name}"] = counts[f"events/{name}"] / ends
+        metrics[f"count/{name}"] = counts[f"events/{name}"]
+    return {
+        **metrics,
+        "episode/return": counts["return"] / ends,
+        "episode/steps": counts["length"] / ends,
+        "count/episodes": counts["ended"],
+        "active_fraction": counts["active"] / jnp.maximum(spawned, 1.0),
+        "steps/spawned": spawned,
+        "steps/active": counts["active"],
+        "speed": counts["speed"] / steps,
+    }

@@ -1,0 +1,215 @@
+"""The interface of a learning algorithm: a train state, and compiled functions that advance it.
+
+An algorithm has `init(key, scenes) -> TrainState` and `train_iteration(train_state, scenes) -> (TrainState, metrics)` for the worlds of one
+device; `compile_trainer` makes a `Trainer` of them, on one device or on a mesh. The training loop, checkpoints and loggers see no more:
+
+    trainer = ppo.make_trainer(env, policy, config, episode_steps=1500)
+    train_state = trainer.init(key, scenes)                                   # scenes: worlds stacked along the first axis
+    train_state, metrics = trainer.train_iteration(train_state, scenes)       # `train_state` is donated: use the returned one
+    train_state, scenes = trainer.replace_scenes(train_state, scenes, rows, new)    # other scenes in some worlds; both are donated
+
+Scenes are an argument of the compiled functions, never a constant in them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core import sharding
+from scenefactory_jax.core.pytree import pytree_dataclass, replace, to_strong_type
+from scenefactory_jax.core.types import Env, Observation, Policy, Scene
+from scenefactory_jax.learning.rollout import SceneStats, Worlds, make_empty_episode_stats, make_empty_scene_stats
+
+Metrics = dict[str, Float[Array, ""]]
+MILLION = 1_000_000
+
+
+@pytree_dataclass
+class TrainState:
+    """All that a training carries from one iteration to the next; a run that is resumed from it continues bit for bit."""
+
+    parameters: Any
+    ema_parameters: Any  # running mean of the parameters, which is evaluated; None: the config asks for none
+    optimizer: optax.OptState
+    worlds: Worlds
+    scene_stats: SceneStats  # of all worlds, on every device
+    key: PRNGKeyArray
+    iteration: Int[Array, ""]
+    steps: Int[Array, " 2"]  # steps of spawned slots so far: millions and the rest, since int32 ends at 2.1 billion
+
+
+class Trainer(NamedTuple):
+    """A learning algorithm as compiled functions of a train state.
+
+    `restart` starts new episodes in other scenes and keeps what was learnt. `replace_scenes` does so in some worlds and leaves the others
+    as they are: (train state, scenes, distinct indices of worlds, as many scenes of the same sizes) -> (train state, scenes).
+    """
+
+    init: Callable[[PRNGKeyArray, Scene], TrainState]
+    train_iteration: Callable[[TrainState, Scene], tuple[TrainState, Metrics]]
+    restart: Callable[[TrainState, Scene], TrainState]
+    replace_scenes: Callable[[TrainState, Scene, Int[Array, " N"], Scene], tuple[TrainState, Scene]]
+
+
+def split_key(key: PRNGKeyArray) -> Array:
+    """Splits a run's key into three: for the policy's parameters, for the first episodes and for the iterations."""
+    return jax.random.split(key, 3)
+
+
+def init_parameters(key: PRNGKeyArray, policy: Policy, observation: Observation) -> Any:
+    """Samples the parameters of a policy before training.
+
+    Args:
+        key: of the run, `jax.random.key(seed)`.
+        observation: of one world or more, along the first axis; only its shapes matter.
+    """
+    return policy.init(split_key(key)[0], jax.tree.map(lambda leaf: leaf[:1], observation))
+
+
+def init_train_state(
+    key: PRNGKeyArray, scenes: Scene, env: Env, policy: Policy, optimizer: optax.GradientTransformation, *, starts: int, ema: bool
+) -> TrainState:
+    """Computes the train state before the first iteration.
+
+    Args:
+        starts: worlds begin at random at one of the first `starts` actions of their episodes; 1: all at the beginning.
+        ema: keep a running mean of the parameters.
+    """
+    _, start_key, next_key = split_key(key)
+    worlds = start_worlds(env, start_key, scenes, starts=starts)
+    parameters = init_parameters(key, policy, worlds.observation)
+    train_state = TrainState(
+        parameters=parameters,
+        ema_parameters=parameters if ema else None,
+        optimizer=optimizer.init(parameters),
+        worlds=worlds,
+        scene_stats=make_empty_scene_stats(worlds.state),
+        key=next_key,
+        iteration=jnp.int32(0),
+        steps=jnp.zeros(2, jnp.int32),
+    )
+    return _copy(train_state)
+
+
+def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
+    """Starts an episode in every world, each at one of the first `starts` actions of its episode."""
+
+    def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Observation]:
+        step_key, state_key = jax.random.split(key)
+        state = env.init_state(state_key, scene, env.action_repeat * jax.random.randint(step_key, (), 0, starts))
+        return state, env.observe(scene, state)
+
+    state, observation = jax.vmap(start)(jax.random.split(key, jax.tree.leaves(scenes)[0].shape[0]), scenes)
+    return Worlds(state, observation, make_empty_episode_stats(state))
+
+
+def advance_ema(train_state: TrainState, parameters: Any, decay: float | None) -> Any:
+    """Computes the running mean of parameters (Polyak and Juditsky 1992): of all, later of about the last 1 / (1 - decay) iterations."""
+    if decay is None:
+        return None
+    weight = jnp.minimum(decay, train_state.iteration / (train_state.iteration + 1.0))
+    return jax.tree.map(lambda old, new: weight * old + (1.0 - weight) * new, train_state.ema_parameters, parameters)
+
+
+def add_steps(steps: Int[Array, " 2"], more: Int[Array, ""]) -> Int[Array, " 2"]:
+    """Adds to a number of steps that is stored as millions and the rest."""
+    rest = steps[1] + more
+    return jnp.stack([steps[0] + rest // MILLION, rest % MILLION])
+
+
+def count_spawned_steps(train_state: TrainState) -> int:
+    """Steps of spawned slots since the start of training, on the host."""
+    millions, rest = (int(x) for x in train_state.steps)
+    return millions * MILLION + rest
+
+
+def get_policy_parameters(train_state: TrainState) -> Any:
+    """The parameters to evaluate, on one device: the running mean, if there is one."""
+    parameters = train_state.parameters if train_state.ema_parameters is None else train_state.ema_parameters
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), parameters)
+
+
+def restart(train_state: TrainState, scenes: Scene, *, env: Env, starts: int) -> TrainState:
+    """Starts new episodes in all worlds; parameters, optimizer and counts of steps stay."""
+    start_key, key = jax.random.split(train_state.key)
+    worlds = start_worlds(env, start_key, scenes, starts=starts)
+    return _copy(replace(train_state, worlds=worlds, scene_stats=make_empty_scene_stats(worlds.state), key=key))
+
+
+def replace_scenes(
+    train_state: TrainState, scenes: Scene, rows: Int[Array, " N"], new: Scene, *, env: Env, axis: str | None
+) -> tuple[TrainState, Scene]:
+    """Puts new scenes into some worlds, on every device: all start the new episodes, each keeps those of its own worlds.
+
+    Episodes start at their beginning, whatever `stagger_episodes` says: an episode that the time limit cuts short counts as a failure.
+    """
+    start_key, key = jax.random.split(train_state.key)
+    started = start_worlds(env, start_key, new)
+    local = sharding.to_local_index(rows, len(train_state.worlds.state.step), axis)
+
+    def put(old: Any, new: Any) -> Any:
+        return jax.tree.map(lambda leaf, row: leaf.at[local].set(row, mode="drop"), old, new)
+
+    worlds, scenes = put((train_state.worlds, scenes), (started, new))
+    scene_stats = jax.tree.map(lambda count: count.at[rows].set(0), train_state.scene_stats)
+    return to_strong_type(replace(train_state, worlds=worlds, scene_stats=scene_stats, key=key)), scenes
+
+
+def compile_trainer(
+    init: Callable[[PRNGKeyArray, Scene], TrainState],
+    train_iteration: Callable[[TrainState, Scene], tuple[TrainState, Metrics]],
+    env: Env,
+    *,
+    starts: int,
+    mesh: Mesh | None,
+) -> Trainer:
+    """Compiles an algorithm's functions; on a mesh each device runs `train_iteration` on its own worlds.
+
+    Args:
+        starts: see `start_worlds`.
+        mesh: of devices with the axis `sharding.AXIS`, along which worlds are divided; None: one device.
+    """
+    axis = None if mesh is None else sharding.AXIS
+    begin, swap = functools.partial(restart, env=env, starts=starts), functools.partial(replace_scenes, env=env, axis=axis)
+    if mesh is None:
+        compiled = jax.jit(train_iteration, donate_argnums=0), jax.jit(begin, donate_argnums=0), jax.jit(swap, donate_argnums=(0, 1))
+        return Trainer(jax.jit(init), *compiled)
+
+    def place(train_state: TrainState) -> TrainState:
+        return jax.lax.with_sharding_constraint(train_state, jax.tree.map(functools.partial(NamedSharding, mesh), _make_specs(train_state)))
+
+    def sharded_train_iteration(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
+        arguments = [(train_state, _make_specs(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
+        specs = lambda result: (_make_specs(result[0]), sharding.make_replicated_specs(result[1]))  # noqa: E731
+        return sharding.map_over_devices(train_iteration, arguments, specs, mesh)
+
+    def sharded_replace_scenes(train_state: TrainState, scenes: Scene, rows: Array, new: Scene) -> tuple[TrainState, Scene]:
+        arguments = [(train_state, _make_specs(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
+        arguments += [(part, sharding.make_replicated_specs(part)) for part in (rows, new)]
+        specs = lambda result: (_make_specs(result[0]), sharding.make_sharded_specs(result[1]))  # noqa: E731
+        return sharding.map_over_devices(swap, arguments, specs, mesh)
+
+    return Trainer(
+        init=jax.jit(lambda key, scenes: place(init(key, scenes))),
+        train_iteration=jax.jit(sharded_train_iteration, donate_argnums=0),
+        restart=jax.jit(lambda train_state, scenes: place(begin(train_state, scenes)), donate_argnums=0),
+        replace_scenes=jax.jit(sharded_replace_scenes, donate_argnums=(0, 1)),
+    )
+
+
+def _make_specs(train_state: TrainState) -> Any:
+    """Partition specs of a train state: worlds are divided over the devices, all else is replicated."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: PartitionSpec(sharding.AXIS) if path[0].name == "worlds" else PartitionSpec(), train_state
+    )
+
+
+def _copy(tree: Any) -> Any:
+    """Copies buffers: `jit` may return an argument (a scene's spawn points) as it is, and donating it would delete the scene."""
+    return jax.tree.map(jnp.copy, to_strong_type(tree))

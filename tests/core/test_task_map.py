@@ -1,0 +1,87 @@
+"""Processes that work for this one: what signals to stop and an error do to them."""
+
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+
+from scenefactory_jax.core.parallel.task_map import open_pool
+
+
+def interrupted(seconds):
+    """What terminals and schedulers do to every process of a command, and then some work."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(os.getpid(), number)
+    time.sleep(seconds)
+    return "done"
+
+
+def test_an_interrupt_is_for_the_process_that_started_them():
+    with open_pool(1) as task_map:
+        assert list(task_map(interrupted, [0.2])) == ["done"]
+
+
+def lead(beat):
+    """Starts a worker that works on and on, and tells it by a file."""
+    with open_pool(1) as task_map:
+        list(task_map(beats, [beat]))
+
+
+def beats(beat):
+    while True:
+        beat.touch()
+        time.sleep(0.05)
+
+
+def test_they_end_with_the_process_that_started_them(tmp_path):
+    first = multiprocessing.get_context("spawn").Process(target=lead, args=(tmp_path / "beat",))
+    first.start()
+    until(lambda: (tmp_path / "beat").is_file())
+    first.kill()
+    first.join(timeout=60)
+    seen = [0]
+
+    def still():
+        time.sleep(0.5)
+        seen.append((tmp_path / "beat").stat().st_mtime_ns)
+        return seen[-1] == seen[-2]
+
+    until(still)
+
+
+def until(true, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def note(folder_and_seconds):
+    """Leaves its process's number in a file, then works."""
+    folder, seconds = folder_and_seconds
+    (folder / str(os.getpid())).touch()
+    time.sleep(seconds)
+
+
+def test_an_error_ends_them_whatever_they_are_at(tmp_path):
+    with pytest.raises(KeyboardInterrupt), open_pool(2) as task_map:
+        results = iter(task_map(note, [(tmp_path, 0.0), *[(tmp_path, 600.0)] * 3]))
+        assert next(results) is None
+        until(lambda: len(list(tmp_path.iterdir())) == 2)
+        begun = time.monotonic()
+        raise KeyboardInterrupt
+    assert time.monotonic() - begun < 60.0
+    for path in tmp_path.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.name), 0)
+
+
+def twice(item):
+    return 2 * item
+
+
+def test_processes_stay_between_calls():
+    with open_pool(1) as task_map:
+        assert [list(task_map(twice, items)) for items in ([1, 2], [], [3])] == [[2, 4], [], [6]]
