@@ -104,7 +104,7 @@ def _ends(lanes: list[Polyline], end: int, inner: int) -> Ends:
 def _find_meeting_ends(ends: Ends, others: Ends, *, gap_m: float, turn_deg: float, height_m: float) -> Relation:
     """Pairs of different lanes whose ends lie together and have the same direction.
 
-    WOMD cuts lanes down to a point at the rim of its maps. Such a lane has no direction: it meets lanes that have one, but not other points.
+    WOMD cuts lanes down to a point at the rim of its maps. Such a lane has no direction: it meets lanes with one, but not other points.
     """
     near = KDTree(ends.xyz[:, :2]).sparse_distance_matrix(KDTree(others.xyz[:, :2]), gap_m, output_type="ndarray")
     one, other = near["i"], near["j"]

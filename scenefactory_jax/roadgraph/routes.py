@@ -157,7 +157,9 @@ def find_routes(
     return sorted(found, key=lambda route: route.cost)
 
 
-def _match_lanes(lanes: LaneGraph, point: np.ndarray, yaw: float | None, radius_m: float, turn_deg: float, height_m: float) -> LaneProjections:
+def _match_lanes(
+    lanes: LaneGraph, point: np.ndarray, yaw: float | None, radius_m: float, turn_deg: float, height_m: float
+) -> LaneProjections:
     """Projections of a pose onto candidate lanes."""
     places = lane_graph.project(lanes, point[None], within_m=radius_m)
     fits = np.abs(places.xyz[:, 2] - point[2]) <= height_m

@@ -45,9 +45,9 @@ def attach_grid(scene: Scene, *, radius_m: float, size_m: float, capacity: Mappi
     """
     midpoint, valid = np.asarray(scene.road.midpoint), np.asarray(scene.road.valid)
     margin = radius_m + size_m  # lists of cells at the rim are empty; they stand for everything beyond
-    corners = [(xy[mask].min(axis=0), xy[mask].max(axis=0)) if mask.any() else (np.zeros(2), np.zeros(2)) for xy, mask in zip(midpoint, valid, strict=True)]
-    origin = np.stack([low - margin for low, _ in corners])
-    width = max(float((high - low).max()) for low, high in corners) + 2 * margin
+    points = [xy[mask] if mask.any() else np.zeros((1, 2)) for xy, mask in zip(midpoint, valid, strict=True)]
+    origin = np.stack([xy.min(axis=0) - margin for xy in points])
+    width = max(float(np.ptp(xy, axis=0).max()) for xy in points) + 2 * margin
     needed = {"side": int(np.ceil(width / size_m)) + 1}
     side = max(needed["side"], 0 if capacity is None else capacity["side"])
     lists = [_build_lists(*world, side=side, radius_m=radius_m, size_m=size_m) for world in zip(midpoint, valid, origin, strict=True)]

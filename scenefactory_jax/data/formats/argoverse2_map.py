@@ -100,7 +100,8 @@ def _lane(record: dict[str, Any], centres: Mapping[int, Points], where: str) -> 
     values.check_finite(xyz, f"{where}: centre")
     links = {"entry": "predecessors", "exit": "successors"}
     linked = {
-        name: tuple(values.expect(lane, int, f"{where}.{key}") for lane in values.get(record, key, list, where)) for name, key in links.items()
+        relation: tuple(values.expect(lane, int, f"{where}.{key}") for lane in values.get(record, key, list, where))
+        for relation, key in links.items()
     }
     for side in SIDES:
         other, key = record.get(f"{side}_neighbor_id"), f"{where}.{side}_neighbor_id"

@@ -122,7 +122,8 @@ def _read(path: Path, file_limit_mb: int) -> bytes:
         with open(path, "rb") as file:
             start = file.read(2)
             if len(start) < 2 or start[0] != 0x80 or start[1] not in PROTOCOLS:
-                raise FormatMismatch(f"{path}: expected a pickle of protocol {', '.join(map(str, PROTOCOLS))}, got a file that begins with {start!r}")
+                protocols = ", ".join(map(str, PROTOCOLS))
+                raise FormatMismatch(f"{path}: expected a pickle of protocol {protocols}, got a file that begins with {start!r}")
             if (size_mb := Path(path).stat().st_size / 1e6) > file_limit_mb:
                 raise SceneError(f"{path}: a pickle of {size_mb:.0f} MB; file_limit_mb is {file_limit_mb}")
             return start + file.read()

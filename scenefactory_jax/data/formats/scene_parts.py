@@ -46,7 +46,7 @@ def check_motion(
     turns = np.where(valid, np.abs(heading), 0.0)
     if not degrees and turns.max(initial=0.0) > FULL_TURN:
         step = int(np.argmax(turns))
-        raise SceneError(f"{where}.heading[{step}]: expected an angle in radians, got {heading[step]}; for degrees see heading_unit of GPUDrive's reader")
+        raise SceneError(f"{where}.heading[{step}]: expected an angle in radians, got {heading[step]}")
 
 
 def make_light(lane: int, codes: Int[np.ndarray, " L"], stop: Float[np.ndarray, "3"] | None) -> Light:

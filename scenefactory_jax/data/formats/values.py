@@ -1,4 +1,4 @@
-"""Checks of the values of a source. Errors name the file, the key and the value: `FILE: objects[3].position[10].x: expected ..., got ...`."""
+"""Checks of the values of a source. Errors name file, key and value: `FILE: objects[3].position[10].x: expected ..., got ...`."""
 
 import contextlib
 import operator
