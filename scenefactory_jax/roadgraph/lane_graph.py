@@ -78,17 +78,24 @@ def point_at(
     return lanes.xyz[segment] + fraction * along, along[:, :2] / step[:, None]
 
 
-def project(
-    lanes: LaneGraph, points: Float[np.ndarray, "P 3"], *, within_m: float | None = None, lane: Int[np.ndarray, " P"] | None = None
+def project(lanes: LaneGraph, points: Float[np.ndarray, "P 3"], *, within_m: float) -> LaneProjections:
+    """Projects points, in the plane, onto every lane within a distance."""
+    shapes = lane_shapes(lanes)
+    point, lane = shapely.STRtree(shapes).query(shapely.points(points[:, :2]), predicate="dwithin", distance=within_m)
+    return project_onto(lanes, points, shapes, point, lane)
+
+
+def project_onto(
+    lanes: LaneGraph, points: Float[np.ndarray, "P 3"], shapes: np.ndarray, point: Int[np.ndarray, " K"], lane: Int[np.ndarray, " K"]
 ) -> LaneProjections:
-    """Projects points, in the plane, onto every lane within a distance, or each point onto the lane given for it."""
-    owner = np.repeat(np.arange(len(lanes.id)), np.diff(lanes.first))
-    shapes = np.asarray(shapely.linestrings(lanes.xyz[:, :2], indices=owner), object)
-    shapely_points = np.asarray(shapely.points(points[:, :2]), object)
-    point = np.arange(len(points))
-    if lane is None:
-        point, lane = shapely.STRtree(shapes).query(shapely_points, predicate="dwithin", distance=within_m)
-    arc = shapely.line_locate_point(shapes[lane], shapely_points[point])
+    """Projects chosen points, in the plane, onto chosen lanes; `shapes` are the `lane_shapes` of all lanes."""
+    arc = shapely.line_locate_point(shapes[lane], shapely.points(points[point, :2]))
     xyz, direction = point_at(lanes, lane, arc)
     distance = np.linalg.norm(points[point, :2] - xyz[:, :2], axis=1)
     return LaneProjections(point=point, lane=lane, arc=arc, distance=distance, xyz=xyz, direction=direction)
+
+
+def lane_shapes(lanes: LaneGraph) -> np.ndarray:
+    """The lanes as shapely's lines."""
+    owner = np.repeat(np.arange(len(lanes.id)), np.diff(lanes.first))
+    return np.asarray(shapely.linestrings(lanes.xyz[:, :2], indices=owner), object)

@@ -92,7 +92,7 @@ def _lane_changes(
     if not len(node):
         return np.zeros((0, 2), int), np.zeros(0)
     xyz, direction = lane_graph.point_at(net.lanes, net.lane[node], net.arc[node])
-    place = lane_graph.project(net.lanes, xyz, lane=other)
+    place = lane_graph.project_onto(net.lanes, xyz, lane_graph.lane_shapes(net.lanes), np.arange(len(xyz)), other)
     aligned = np.sum(direction * place.direction, axis=1) >= np.cos(np.deg2rad(turn_deg))
     target = _node_before(net, other, place.arc + change_m)
     length = net.arc[target] - place.arc  # below `change_m`, because it ends at a node

@@ -43,12 +43,12 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
     folder = tmp_path / "in"
     folder.mkdir()
     files = {
-        "cut.json": (whole[: len(whole) // 3], "no valid JSON, damaged or cut short after"),
+        "cut.json": (whole[: len(whole) // 3], "not valid JSON, damaged or cut short after"),
         "laneless.json": (document(roads=edge), "no driving lane"),
-        "nan.json": (nan, "objects[1].position[4].y: nan is not finite"),
-        "infinite.json": (infinite, "roads[1].geometry[2].x: inf is not finite"),
-        "foreign.json": ({"map": []}, "no reader knows this format"),
-        "text.txt": ("hello", "no reader knows this format"),
+        "nan.json": (nan, "objects[1].position[4].y: expected a finite number, got nan"),
+        "infinite.json": (infinite, "roads[1].geometry[2].x: expected a finite number, got inf"),
+        "foreign.json": ({"map": []}, "unknown format"),
+        "text.txt": ("hello", "unknown format"),
     }
     for name, (content, _) in files.items():
         written(folder, content, name)

@@ -116,7 +116,7 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_on_the_way(tmp_path, com
     readers = reader_selection.make(
         {name: entry | ({"file_limit_mb": 1} if "file_limit_mb" in entry else {}) for name, entry in FORMATS.items()}
     )
-    with pytest.raises(SceneError, match="holds more than 1 MB, unpacked if it is compressed; file_limit_mb"):
+    with pytest.raises(SceneError, match="expected a content of up to 1 MB, got more; see file_limit_mb"):
         list(reader_selection.read(path, readers))
     assert fuzzing.peak_of(lambda path: reader_selection.read(path, readers), path) < 16_000_000  # xz itself asks for 8 MB
 

@@ -266,7 +266,7 @@ def test_files_stream_and_what_cannot_be_used_is_left_out_by_name(tmp_path):
     sizes = measured(files)
     batch = batches.load(files, [0, 1, 2], sizes, on_overflow="cut")
     assert list(batch.indices) == [1, 1, 2] and list(batch.refused) == [str(tmp_path / "broken.json")]
-    with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*no reader knows this format"):
+    with pytest.raises(SceneError, match=r"none of 1 scenes to load can be used: .*broken\.json: .*unknown format"):
         batches.load(files, [0], sizes, on_overflow="cut")
 
 

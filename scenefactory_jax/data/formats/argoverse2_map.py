@@ -99,7 +99,7 @@ def _lane(record: dict[str, Any], centres: Mapping[int, Points], where: str) -> 
     xyz = centres[record["id"]]
     values.check_finite(xyz, f"{where}: centre")
     links = {"entry": "predecessors", "exit": "successors"}
-    linked = {
+    linked: dict[str, Any] = {
         relation: tuple(values.expect(lane, int, f"{where}.{key}") for lane in values.get(record, key, list, where))
         for relation, key in links.items()
     }

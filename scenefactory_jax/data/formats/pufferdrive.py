@@ -103,17 +103,11 @@ def _track(entity: _Entity, index: int, words: np.ndarray, numbers: np.ndarray, 
     flags = words[end - entity.count : end]
     if np.any(wrong := (flags != 0) & (flags != 1)):
         raise SceneError(f"{where}.valid: expected 0 or 1, got {flags[wrong][0]}")
-    motion = {"position": np.stack([x, y, z], axis=1), "velocity": np.stack([vx, vy], axis=1), "heading": heading}
-    scene_parts.check_motion(where, flags == 1, **motion)
+    xyz, velocity, valid = np.stack([x, y, z], axis=1), np.stack([vx, vy], axis=1), flags == 1
+    scene_parts.check_motion(where, valid, position=xyz, velocity=velocity, heading=heading)
     width, length, height = (float(number) for number in numbers[end : end + 3])
     return scene_parts.make_track(
-        id=index,
-        kind=OBJECTS[entity.type],
-        size=(length, width, height),
-        xyz=motion["position"],
-        yaw=heading,
-        velocity=motion["velocity"],
-        valid=flags == 1,
+        id=index, kind=OBJECTS[entity.type], size=(length, width, height), xyz=xyz, yaw=heading, velocity=velocity, valid=valid
     )
 
 

@@ -121,7 +121,7 @@ def _explain(path: Path, refusals: Sequence[str]) -> str:
         return "an empty file"
     if name := _find_foreign_format(head):
         return f"this is {name}: it is not read"
-    return f"no reader knows this format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
+    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
 
 
 def _find_foreign_format(head: bytes) -> str | None:

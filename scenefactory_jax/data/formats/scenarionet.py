@@ -154,7 +154,7 @@ def _track(track: Mapping[str, Any], number: int, steps: int, where: str) -> Tra
     valid, yaw = column("valid") != 0, column("heading")
     xyz, velocity = (_points(values.get(state, key, None, where_state), f"{where_state}.{key}") for key in ("position", "velocity"))
     for name, table in (("position", xyz), ("velocity", velocity)):
-        values.check_length(table, steps, f"{where_state}.{name}")  # pyright: ignore[reportArgumentType]
+        values.check_length(table, steps, f"{where_state}.{name}")
     scene_parts.check_motion(where_state, valid, position=xyz, velocity=velocity, heading=yaw, degrees=True)
     last = np.flatnonzero(valid)[-1] if valid.any() else -1
     length, width, height = (float(column(key)[last]) for key in ("length", "width", "height"))
@@ -191,13 +191,14 @@ def _polyline(feature: Mapping[str, Any], number: int, kind: int, ids: Mapping[s
     values.check_finite(xyz, f"{where}.{shape}")
     if kind not in LANES:
         return Polyline(kind=kind, xyz=xyz, id=number)
-    links = {"entry": "entry_lanes", "exit": "exit_lanes", "left": "left_neighbor", "right": "right_neighbor"}
+    keys = {"entry": "entry_lanes", "exit": "exit_lanes", "left": "left_neighbor", "right": "right_neighbor"}
+    links: dict[str, Any] = {name: _lanes(feature.get(key), ids, f"{where}.{key}") for name, key in keys.items()}
     return Polyline(
         kind=kind,
         xyz=xyz * (1.0, 1.0, 0.0) if poses else xyz,
         id=number,
         speed_limit=_speed_limit(feature, where),
-        **{name: _lanes(feature.get(key), ids, f"{where}.{key}") for name, key in links.items()},
+        **links,
     )
 
 

@@ -13,12 +13,13 @@ from scenefactory_jax.core.types import ROAD_USERS, RoadUser
 from scenefactory_jax.data.formats import values
 
 INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")  # a text that converts to an integer of 64 bits and back
+KINDS: dict[str, RoadUser] = {kind: kind for kind in ROAD_USERS}
 AXES = ("x", "y", "z")
 
 
 def road_user(name: str) -> RoadUser:
     """The kind of road user of that name, in any case; `other` for unknown names."""
-    return next((kind for kind in ROAD_USERS if kind == name.lower()), "other")
+    return KINDS.get(name.lower(), "other")
 
 
 def make_track(

@@ -3,7 +3,7 @@
 import contextlib
 import operator
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ def list_keys(record: Mapping[Any, Any]) -> str:
     return ", ".join(map(str, record)) or "none"
 
 
-def check_length(values: Sequence[Any], length: int | None, where: str) -> None:
+def check_length(values: Sized, length: int | None, where: str) -> None:
     """Refuses a list of another length than one entry for each step; None: any length."""
     if length is not None and len(values) != length:
         raise SceneError(f"{where}: expected {length} entries, one for each step, got {len(values)}")
