@@ -40,12 +40,10 @@ def read(
     """Reads the scene of a parquet file and the map beside it. Tracks with other names than integers (the recording car's, "AV") get one.
 
     Args:
-        path: the parquet file; the map's own path is a companion.
+        path, point_spacing_m, file_limit_mb: see `formats`; the map's own path is a companion.
         sizes_m: type -> length, width and height, with an entry `other` for all other types.
-        point_spacing_m: maximum between the points of the map's lines.
         cut_m: the map was cut where an outline of the drivable area comes so near to a lane's centre: there is no road edge.
         row_limit: longer tables are refused unread.
-        file_limit_mb: larger contents are refused.
     """
     columns = _read_columns(path, row_limit, file_limit_mb)
     if "other" not in sizes_m or any(len(size) != 3 for size in sizes_m.values()):

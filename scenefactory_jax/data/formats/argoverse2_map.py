@@ -41,11 +41,7 @@ def read_roads(
 ) -> tuple[tuple[Polyline, ...], dict[str, list[int]]]:
     """Reads the map's lanes, painted lines, road edges and crosswalks, and lists the lanes on intersections and those for buses.
 
-    Args:
-        path: of the JSON file.
-        point_spacing_m: maximum between the points of a lane, line or edge; the file has little more than corners.
-        cut_m: the map was cut where an outline comes so near to a lane's centre.
-        file_limit_mb: larger files are refused.
+    The map was cut where an outline comes as near as `cut_m` to a lane's centre; see `formats` for the other numbers.
     """
     document = file_content.load_json(path, file_limit_mb=file_limit_mb)
     if not is_map(document):

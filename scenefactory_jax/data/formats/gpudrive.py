@@ -23,15 +23,12 @@ ELEMENTS = {"lane": 2, "road_line": 6, "road_edge": 15, "stop_sign": 17, "crossw
 def read(
     path: Path, *, step_s: float, current: int, heading_unit: Literal["layout", "degrees", "radians"], height_m: float, file_limit_mb: int
 ) -> Iterator[RawScene]:
-    """Reads the scene of a file.
+    """Reads the scene of a file: JSON, plain, gzip or xz.
 
     Args:
-        path: JSON, plain, gzip or xz.
-        step_s: time between two steps, which the format does not have.
-        current: the step at which the simulation takes over, which the format does not have (10 in WOMD).
+        path, step_s, current, file_limit_mb: see `formats`.
         heading_unit: `layout`: degrees in the old layout (no map elements, no metadata), else radians.
         height_m: height of objects without one (old layout).
-        file_limit_mb: larger contents are refused.
     """
     document = file_content.load_json(path, file_limit_mb=file_limit_mb)
     if missing := [key for key in ("objects", "roads") if key not in document]:

@@ -35,15 +35,7 @@ class _Entity(NamedTuple):
 
 
 def read(path: Path, *, step_s: float, current: int, point_spacing_m: float, file_limit_mb: int) -> Iterator[RawScene]:
-    """Reads the scene of a file. Objects and roads are numbered in their order.
-
-    Args:
-        path: the binary map.
-        step_s: time between two steps, which the format does not have.
-        current: the step at which the simulation takes over, which the format does not have (10 in WOMD).
-        point_spacing_m: maximum between the points of lanes, lines and edges; the format drops those on straight pieces.
-        file_limit_mb: larger contents are refused.
-    """
+    """Reads the scene of a file; see `formats` for the numbers. Objects and roads are numbered in their order."""
     _check_start(path)
     content = file_content.unpack(path, file_limit_mb=file_limit_mb)
     words = np.frombuffer(content, "<i4", len(content) // WORD)

@@ -65,12 +65,9 @@ def read(
     """Reads the scene of a file. Ids that are not integers are numbered after the largest; `metadata["tokens"]` keeps the texts.
 
     Args:
-        path: a pickle, read by `safe_pickle.load`.
-        current: the step at which the simulation takes over, where the file has none (all but WOMD's).
+        path, current, point_spacing_m, file_limit_mb: see `formats`; only WOMD's files have a current step, and dense lines.
         outlines_are_edges: whether lines named `boundary_N`, the drivable area's outline in nuScenes and nuPlan, become road edges, and
             the rim of MetaDrive's own maps, of which `metadata["edges_from_lines"]` counts the lines.
-        point_spacing_m: maximum between the points of a line; WOMD's are dense, others may have corners only.
-        file_limit_mb: larger files are refused.
         opcode_limit: longer pickles are refused.
     """
     if Path(path).name in (SUMMARY, MAPPING):  # by name: those of large databases are larger than any scenario

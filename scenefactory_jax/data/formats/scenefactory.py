@@ -22,12 +22,10 @@ def read(
     """Reads the scene of a file. Each agent is a track of two valid steps: its start at step 0, its end at step `t_idx + 1`.
 
     Args:
-        path: JSON, plain, gzip or xz.
-        step_s: time between two steps of the log that the file was made from (0.1 in WOMD).
+        path, step_s, file_limit_mb: see `formats`.
         size_m: length, width and height of every agent, which the format does not have.
         include_sdc: whether the recording car is an agent (the published loader leaves it out).
         all_vehicles: whether every agent is a vehicle (the published loader turns pedestrians and cyclists into cars).
-        file_limit_mb: larger contents are refused.
     """
     document = file_content.load_json(path, file_limit_mb=file_limit_mb)
     road = document.get("road")
@@ -50,9 +48,7 @@ def read(
         name=Path(path).name,
         source=str(path),
         roads=tuple(_polyline(record, i, f"{path}: road.polylines[{i}]") for i, record in enumerate(lines)),
-        tracks=tuple(
-            _track(record, end, steps, size, all_vehicles, where) for (record, where), end in zip(records, ends, strict=True)
-        ),
+        tracks=tuple(_track(record, end, steps, size, all_vehicles, where) for (record, where), end in zip(records, ends, strict=True)),
         times=scene_parts.even_times(steps, step_s),
         current=0,
         sdc=sdc,

@@ -116,9 +116,9 @@ def _integers(features: Features, key: str, where: str, *, length: int | None = 
     if found.dtype == np.int64:
         return found
     values.check_finite(found, f"{where}{key}")
-    whole = np.clip(found, -(2**53), 2**53).astype(np.int64)  # beyond, not every integer is a float
-    _require(whole == found, found, f"{where}{key}", "a whole number")
-    return whole
+    integers = np.clip(found, -(2**53), 2**53).astype(np.int64)  # beyond, not every integer is a float
+    _require(integers == found, found, f"{where}{key}", "a whole number")
+    return integers
 
 
 def _floats(features: Features, key: str, where: str, *, length: int) -> Float[np.ndarray, " N"]:
@@ -156,10 +156,11 @@ def _states(features: Features, objects: int, where: str) -> _States:
         valid = _flags(features, f"{prefix}valid", where, count).reshape(objects, -1)
         if period == "future" and not valid.any():
             continue
-        columns = [_floats(features, f"{prefix}{name}", where, length=count).reshape(objects, -1) for name in STATE]
+        columns = [_floats(features, f"{prefix}{name}", where, length=count) for name in STATE]
+        for name, column in zip(STATE, columns, strict=True):
+            values.check_finite(column, f"{where}{prefix}{name}", rows=valid.ravel())
         stamps = _integers(features, f"{prefix}timestamp_micros", where, length=count).reshape(objects, -1)
-        table = np.stack(columns, axis=-1)
-        _require_finite(table, valid, prefix, where)
+        table = np.stack(columns, axis=-1).reshape(objects, -1, len(STATE))
         if not (known := valid.any(axis=0)).all():
             raise SceneError(f"{where}{prefix}valid: no object is valid at step {int(np.argmin(known))}, so its time is not known")
         periods.append((period, table, valid, np.where(valid, stamps, np.iinfo(np.int64).min).max(axis=0)))
@@ -168,15 +169,6 @@ def _states(features: Features, objects: int, where: str) -> _States:
     check_times(times, f"{where}state/{{past,current,future}}/timestamp_micros")
     numbers, valid = (np.concatenate([entry[column] for entry in periods], axis=1) for column in (1, 2))
     return _States(numbers, valid, times, current)
-
-
-def _require_finite(table: Float[np.ndarray, "A T 9"], valid: Bool[np.ndarray, "A T"], prefix: str, where: str) -> None:
-    """Refuses NaN and infinity at valid steps, naming the key and the place in it."""
-    bad = ~np.isfinite(table) & valid[:, :, None]
-    if bad.any():
-        row, step, column = np.argwhere(bad)[0]
-        place = f"{prefix}{STATE[column]}[{row * table.shape[1] + step}]"
-        raise SceneError(f"{where}{place}: expected a finite number, got {table[row, step, column]}")
 
 
 def _metadata(features: Features, ids: Int[np.ndarray, " A"], real: Bool[np.ndarray, " A"], where: str) -> dict[str, Any]:
@@ -235,9 +227,7 @@ def _lights(features: Features, times: Float[np.ndarray, " L"], where: str) -> t
     return tuple(lights), moved
 
 
-def _align(
-    times: Float[np.ndarray, " L"], rows: Float[np.ndarray, " R"]
-) -> tuple[Int[np.ndarray, " L"], Bool[np.ndarray, " L"]]:
+def _align(times: Float[np.ndarray, " L"], rows: Float[np.ndarray, " R"]) -> tuple[Int[np.ndarray, " L"], Bool[np.ndarray, " L"]]:
     """For each step the row that is nearest in time, and a mask of those within half a step."""
     apart = np.abs(times[:, None] - rows)
     nearest = np.argmin(apart, axis=1)
