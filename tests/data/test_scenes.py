@@ -149,6 +149,7 @@ def damaged(path, value):
         (["roads", 0, "map_element_id"], "edge", r"roads\[0\]\.map_element_id: expected an integer, got 'edge'"),
         (["roads", 0], 7, r"roads\[0\]: expected an object, got 7"),
         (["metadata", "sdc_track_index"], 9, r"sdc_track_index: expected a track, 0 to 1, got 9"),
+        (["metadata", "objects_of_interest"], [[1.0]], r"metadata\.objects_of_interest\[0\]: expected an integer, got \[1\.0\]"),
         (["objects", 0, "valid"], [True] * 3, r"formats\.gpudrive\.current: expected a step of the log, 0 to 2, got 10"),
     ],
 )
@@ -166,6 +167,7 @@ def test_a_bad_value_is_named(tmp_path, readers, path, value, message):
         (lambda whole: whole["agents"].pop("items"), r"agents\.items: missing"),
         (lambda whole: whole["agents"]["items"][0]["start"].pop("x"), r"agents\.items\[0\]\.start\.x: missing"),
         (lambda whole: whole["agents"]["items"][0]["end"].__setitem__("t_idx", -1), r"agents\.items\[0\]\.end\.t_idx: expected .*, got -1"),
+        (lambda whole: whole["agents"]["items"][0].__setitem__("agent_id", float("nan")), r"agent_id: expected a finite number, got nan"),
         (lambda whole: whole.pop("agents"), r"scene\.json: agents: missing"),
     ],
 )
