@@ -13,12 +13,12 @@ from rich.progress import Progress
 from scenefactory_jax.core import markdown
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
-from scenefactory_jax.core.safe_names import escape_for_terminal, to_file_name
+from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import duplicates, operations
 from scenefactory_jax.data.curation.features import COLUMNS, EVERY_BANK
-from scenefactory_jax.data.export import files, gpudrive, scenarionet
+from scenefactory_jax.data.export import gpudrive, scenarionet
 from scenefactory_jax.data.loading import scene_source
 
 SHOWN = 10  # groups of duplicates, and values of a text, that are printed
@@ -118,7 +118,6 @@ def export(config: Mapping[str, Any]) -> int:
     bank, check = _open(_path(config)), scene_source.make_packing(config["scenes"])["check"]
     refused: list[str] = []
     repaired: Counter[str] = Counter()
-    files.make_folder(Path(out))
     with Progress(disable=not config["progress"], transient=True) as bar:
         whole = bar.track(banks.read_raws(bank, range(len(bank))), total=len(bank), description="export")
         written = EXPORTS[name](_checked(whole, check, refused, repaired), Path(out), refused)
@@ -142,24 +141,10 @@ def _checked(scenes: Iterable[RawScene], check: Callable[..., Any], refused: lis
         yield whole
 
 
-def _as_json(scenes: Iterable[RawScene], folder: Path, refused: list[str]) -> int:
-    """A file for each scene, in the layout of GPUDrive."""
-    written: set[Path] = set()
-    for raw in scenes:
-        path = folder / f"{to_file_name(raw.name)}.json"
-        try:
-            if path in written:
-                raise SceneError(f"{raw.source}: {path} is written already; two scenes need two names")
-            content = gpudrive.encode_json(raw)
-        except SceneError as error:
-            refused.append(f"{raw.name}: {error}")
-            continue
-        files.write(path, content)
-        written.add(path)
-    return len(written)
-
-
-EXPORTS: dict[str, Callable[[Iterable[RawScene], Path, list[str]], int]] = {"gpudrive": _as_json, "scenarionet": scenarionet.write_all}
+EXPORTS: dict[str, Callable[[Iterable[RawScene], Path, list[str]], int]] = {
+    "gpudrive": gpudrive.write_all,
+    "scenarionet": scenarionet.write_all,
+}
 
 
 def _path(config: Mapping[str, Any]) -> str:

@@ -139,7 +139,7 @@ class SpatialGrid:
     side: int = static()  # cells
     size_m: float = static()
     radius_m: float = static()
-    most: int = static()  # rows of the longest list
+    longest_list: int = static()  # entries of the longest list
 
 
 @pytree_dataclass

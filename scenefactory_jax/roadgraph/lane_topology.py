@@ -1,8 +1,8 @@
-"""Which lane leads into which, and which lies beside which, worked out from geometry where the source does not say.
+"""Links between lanes inferred from geometry, where the source has none.
 
-GPUDrive's, PufferDrive's and SceneFactory's files keep the lanes of the Waymo Open Motion Dataset but drop how they hang together. There a
-lane begins exactly where the one before it ends, so a link is a matter of ends that meet. Neighbours follow WOMD's own lists: lanes of one
-direction a lane's width apart over some length that never cross, and lanes that part from, or end in, the same lane.
+The files of GPUDrive, PufferDrive and SceneFactory keep the lanes of the Waymo Open Motion Dataset (WOMD) but drop their links. In WOMD a
+lane begins exactly where its predecessor ends. Neighbours follow WOMD's own lists: lanes of one direction, a lane's width apart over some
+length, that do not cross; and lanes that diverge from, or merge into, the same lane.
 """
 
 from dataclasses import replace
@@ -17,16 +17,18 @@ from scenefactory_jax.core.raw_scene import Polyline, RawScene
 from scenefactory_jax.core.types import DRIVABLE
 from scenefactory_jax.roadgraph import lane_graph
 
+Relation = Bool[np.ndarray, "N N"]  # [i, j]: lane i is related to lane j
+
 
 class Ends(NamedTuple):
-    """Where lanes begin, or where they end, and the unit directions in which they run there; zeros where a lane is a single point."""
+    """First or last points of lanes and the unit directions there; zero directions for lanes of a single point."""
 
     xyz: Float[np.ndarray, "N 3"]
     direction: Float[np.ndarray, "N 2"]
 
 
-class Stations(NamedTuple):
-    """Points at even distances along lanes, the lane of each, its unit direction there and how much of the lane it stands for."""
+class Samples(NamedTuple):
+    """Points at even distances along lanes: lane, position, unit direction, and the length that a point represents."""
 
     lane: Int[np.ndarray, " S"]
     xyz: Float[np.ndarray, "S 3"]
@@ -37,92 +39,84 @@ class Stations(NamedTuple):
 def infer_lane_links(
     raw: RawScene,
     *,
-    link_gap_m: float,
-    link_turn_deg: float,
-    rise_m: float,
-    beside_m: list[float],
-    beside_turn_deg: float,
-    overlap_m: float,
-    station_m: float,
+    max_link_gap_m: float,
+    max_link_turn_deg: float,
+    max_height_difference_m: float,
+    neighbour_distance_m: list[float],
+    max_neighbour_turn_deg: float,
+    min_overlap_m: float,
+    sample_spacing_m: float,
 ) -> RawScene:
-    """The scene with entries and exits if no lane of it has any, and with lanes to the left and right if none has any.
+    """The scene with entries and exits if no lane has any, and with left and right neighbours if no lane has any.
 
-    Only lanes for cars are linked; bicycle lanes stay as they are, for WOMD links none of them. Lanes of which something was worked out are
-    marked `rebuilt`. A scene whose source knows both comes back unchanged.
+    Only lanes for cars are linked: WOMD links no bicycle lanes. Lanes with inferred links are marked `rebuilt`. A scene whose source has
+    both is returned unchanged.
 
     Args:
-        link_gap_m: an exit begins no farther than this from the end of a lane, in the plane.
-        link_turn_deg: ... and turns off by no more than this.
-        rise_m: ends and neighbours farther apart in height lie on different levels.
-        beside_m: least and most distance between the centres of two lanes that lie beside each other; closer than the least, they cross.
-        beside_turn_deg: their directions differ by no more than this.
-        overlap_m: ... over at least this length.
-        station_m: how finely lanes are compared.
+        max_link_gap_m: distance in the plane between the end of a lane and the start of its exit.
+        max_link_turn_deg: angle between their directions.
+        max_height_difference_m: between ends and between neighbours; beyond, they are on different levels.
+        neighbour_distance_m: range of the distance between the centres of neighbours; lanes that come closer cross.
+        max_neighbour_turn_deg: angle between the directions of neighbours.
+        min_overlap_m: length over which they are neighbours.
+        sample_spacing_m: distance of the points at which lanes are compared.
 
     Raises:
-        ConfigError: `beside_m` is no range, or `station_m` not above 0.
+        ConfigError: `neighbour_distance_m` or `sample_spacing_m` out of range.
     """
-    check_range(beside_m, where="lanes.topology.beside_m")
-    check_number(station_m, where="lanes.topology.station_m", above=0)
+    check_range(neighbour_distance_m, where="lanes.topology.neighbour_distance_m")
+    check_number(sample_spacing_m, where="lanes.topology.sample_spacing_m", above=0)
     order = [index for index, line in enumerate(raw.roads) if line.kind in DRIVABLE and len(line.xyz)]
     lanes = [raw.roads[index] for index in order]
-    linked = any(line.entry or line.exit for line in raw.roads)
-    beside = any(line.left or line.right for line in raw.roads)
-    if not lanes or (linked and beside):
+    has_links = any(line.entry or line.exit for line in raw.roads)
+    has_neighbours = any(line.left or line.right for line in raw.roads)
+    if not lanes or (has_links and has_neighbours):
         return raw
-    starts, stops = _ends(lanes)
-    found = {}
-    if not linked:
-        follows = _meet(stops, starts, link_gap_m, link_turn_deg, rise_m)
-        found |= {"exit": _by_lane(lanes, follows), "entry": _by_lane(lanes, follows.T)}
-    if not beside:
-        stations = _stations(lanes, station_m)
-        left = _part(starts, stops, stations, link_gap_m, link_turn_deg, rise_m)
-        left |= _lie_left(stations, len(lanes), beside_m, beside_turn_deg, overlap_m, rise_m)
-        found |= {"left": _by_lane(lanes, left), "right": _by_lane(lanes, left.T)}
+    starts, stops = _ends(lanes, 0, 1), _ends(lanes, -1, -2)
+    link = {"gap_m": max_link_gap_m, "turn_deg": max_link_turn_deg, "height_m": max_height_difference_m}
+    relations: dict[str, Relation] = {}
+    if not has_links:
+        exits = _find_meeting_ends(stops, starts, **link)
+        relations |= {"exit": exits, "entry": exits.T}
+    if not has_neighbours:
+        samples = _sample(lanes, sample_spacing_m)
+        left = _find_left_branches(starts, stops, samples, **link)
+        left |= _find_left_neighbours(
+            samples, len(lanes), neighbour_distance_m, max_neighbour_turn_deg, min_overlap_m, max_height_difference_m
+        )
+        relations |= {"left": left, "right": left.T}
+    ids = np.array([lane.id for lane in lanes])
     roads = list(raw.roads)
-    for number, index in enumerate(order):
-        roads[index] = replace(roads[index], rebuilt=True, **{name: ids[number] for name, ids in found.items()})
+    for row, index in enumerate(order):
+        links = {name: tuple(ids[related[row]].tolist()) for name, related in relations.items()}
+        roads[index] = replace(roads[index], rebuilt=True, **links)
     return replace(raw, roads=tuple(roads))
 
 
-def _by_lane(lanes: list[Polyline], related: Bool[np.ndarray, "N N"]) -> list[tuple[int, ...]]:
-    """Ids of the lanes that each lane is related to."""
-    ids = np.array([lane.id for lane in lanes])
-    return [tuple(ids[row].tolist()) for row in related]
+def _ends(lanes: list[Polyline], end: int, inner: int) -> Ends:
+    """The points with index `end` of all lanes, and the directions of travel between them and the points with index `inner`."""
+    xyz = np.stack([lane.xyz[end] for lane in lanes])
+    step = (np.stack([lane.xyz[inner if len(lane.xyz) > 1 else end] for lane in lanes]) - xyz)[:, :2] * (1.0 if end == 0 else -1.0)
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return Ends(xyz, np.divide(step, length, out=np.zeros_like(step), where=length > 0))
 
 
-def _ends(lanes: list[Polyline]) -> tuple[Ends, Ends]:
-    """Where lanes begin, and where they end."""
-    points = [lane.xyz for lane in lanes]
-    start, second = np.stack([xyz[0] for xyz in points]), np.stack([xyz[min(1, len(xyz) - 1)] for xyz in points])
-    stop, before = np.stack([xyz[-1] for xyz in points]), np.stack([xyz[max(len(xyz) - 2, 0)] for xyz in points])
-    return Ends(start, _unit(second - start)), Ends(stop, _unit(stop - before))
+def _find_meeting_ends(ends: Ends, others: Ends, *, gap_m: float, turn_deg: float, height_m: float) -> Relation:
+    """Pairs of different lanes whose ends lie together and have the same direction.
 
-
-def _unit(vector: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
-    """Direction in the plane; zero where there is none."""
-    length = np.linalg.norm(vector[:, :2], axis=1, keepdims=True)
-    return np.divide(vector[:, :2], length, out=np.zeros_like(vector[:, :2]), where=length > 0)
-
-
-def _meet(one: Ends, other: Ends, gap_m: float, turn_deg: float, rise_m: float) -> Bool[np.ndarray, "N N"]:
-    """Whether an end of one lane lies on an end of another lane that runs the same way.
-
-    A lane of a single point has no direction: it meets lanes that have one, for WOMD cuts lanes down to a point at the rim of its maps, but
-    not other single points.
+    WOMD cuts lanes down to a point at the rim of its maps. Such a lane has no direction: it meets lanes with one, but not other points.
     """
-    near = KDTree(one.xyz[:, :2]).sparse_distance_matrix(KDTree(other.xyz[:, :2]), gap_m, output_type="ndarray")
-    here, there = near["i"], near["j"]
-    level = np.abs(one.xyz[here, 2] - other.xyz[there, 2]) <= rise_m
-    aligned = np.sum(one.direction[here] * other.direction[there], axis=1) >= np.cos(np.deg2rad(turn_deg))
-    single = one.direction[here].any(axis=1) != other.direction[there].any(axis=1)
-    found = np.zeros((len(one.xyz), len(other.xyz)), bool)
-    found[here, there] = level & (aligned | single) & (here != there)
-    return found
+    near = KDTree(ends.xyz[:, :2]).sparse_distance_matrix(KDTree(others.xyz[:, :2]), gap_m, output_type="ndarray")
+    one, other = near["i"], near["j"]
+    level = np.abs(ends.xyz[one, 2] - others.xyz[other, 2]) <= height_m
+    aligned = np.sum(ends.direction[one] * others.direction[other], axis=1) >= np.cos(np.deg2rad(turn_deg))
+    single = ends.direction[one].any(axis=1) != others.direction[other].any(axis=1)
+    related = np.zeros((len(ends.xyz), len(others.xyz)), bool)
+    related[one, other] = level & (aligned | single) & (one != other)
+    return related
 
 
-def _stations(lanes: list[Polyline], spacing_m: float) -> Stations:
+def _sample(lanes: list[Polyline], spacing_m: float) -> Samples:
     """The middles of equal pieces of about that length; none on a lane without length."""
     graph = lane_graph.make(lanes)
     row = {lane.id: number for number, lane in enumerate(lanes)}
@@ -131,48 +125,50 @@ def _stations(lanes: list[Polyline], spacing_m: float) -> Stations:
     piece = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     span = (graph.length / count)[owner]
     xyz, direction = lane_graph.point_at(graph, owner, (piece + 0.5) * span)
-    return Stations(np.array([row[lane] for lane in graph.id.tolist()], int)[owner], xyz, direction, span)
+    return Samples(np.array([row[lane] for lane in graph.id.tolist()], int)[owner], xyz, direction, span)
 
 
-def _part(starts: Ends, stops: Ends, stations: Stations, gap_m: float, turn_deg: float, rise_m: float) -> Bool[np.ndarray, "N N"]:
-    """[i, j]: lane j parts to the left from lane i where both begin, or comes in from its left where both end."""
+def _find_left_branches(starts: Ends, stops: Ends, samples: Samples, **link: float) -> Relation:
+    """[i, j]: lane j diverges to the left of lane i where both begin, or merges from its left where both end."""
     lanes = len(starts.xyz)
-    count = np.bincount(stations.lane, minlength=lanes)
+    count = np.bincount(samples.lane, minlength=lanes)
     first = np.cumsum(count) - count
-    long = np.outer(count, count) > 0  # single points part from nothing
+    long = np.outer(count, count) > 0  # single points do not branch
     left = np.zeros((lanes, lanes), bool)
-    for ends, back in ((starts, False), (stops, True)):
-        one, other = np.nonzero(_meet(ends, ends, gap_m, turn_deg, rise_m) & long)
-        along = (np.minimum(count[one], count[other]) - 1) // 2  # halfway along the shorter they are well apart
-        here, there = (stations.xyz[first[lane] + (count[lane] - 1 - along if back else along), :2] for lane in (one, other))
+    for ends, backwards in ((starts, False), (stops, True)):
+        one, other = np.nonzero(_find_meeting_ends(ends, ends, **link) & long)
+        along = (np.minimum(count[one], count[other]) - 1) // 2  # halfway along the shorter lane they are well apart
+        here, there = (
+            samples.xyz[first[lane] + (count[lane] - 1 - along if backwards else along), :2] for lane in (one, other)
+        )
         ahead, offset = ends.direction[one], there - here
         left[one, other] |= ahead[:, 0] * offset[:, 1] - ahead[:, 1] * offset[:, 0] > 0
     return left
 
 
-def _lie_left(
-    stations: Stations, lanes: int, beside_m: list[float], turn_deg: float, overlap_m: float, rise_m: float
-) -> Bool[np.ndarray, "N N"]:
-    """[i, j]: lane j runs to the left of lane i, the same way, for long enough, and they come nowhere closer."""
-    least, most = beside_m
-    lane, xyz, direction, span = stations
+def _find_left_neighbours(
+    samples: Samples, lanes: int, distance_m: list[float], turn_deg: float, overlap_m: float, height_m: float
+) -> Relation:
+    """[i, j]: lane j is to the left of lane i in the same direction over the overlap, and they come nowhere closer than the range."""
+    low, high = distance_m
+    lane, xyz, direction, span = samples
     if not len(lane):
         return np.zeros((lanes, lanes), bool)
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
     tree = KDTree(xyz[:, :2])
     # a lane at the right distance passes through a small circle a lane's width to the left
-    radius = np.hypot((most - least) / 2, span.max() / 2)
-    circles = KDTree(xyz[:, :2] + (least + most) / 2 * normal)
+    radius = np.hypot((high - low) / 2, span.max() / 2)
+    circles = KDTree(xyz[:, :2] + (low + high) / 2 * normal)
     pairs = circles.sparse_distance_matrix(tree, radius, output_type="ndarray")
     one, other = pairs["i"], pairs["j"]
     offset = xyz[other] - xyz[one]
     along, across = (np.sum(offset[:, :2] * axis[one], axis=1) for axis in (direction, normal))
-    fits = (np.abs(along) <= span[one] / 2) & (across >= least) & (across <= most) & (np.abs(offset[:, 2]) <= rise_m)
+    fits = (np.abs(along) <= span[one] / 2) & (across >= low) & (across <= high) & (np.abs(offset[:, 2]) <= height_m)
     fits &= np.sum(direction[one] * direction[other], axis=1) >= np.cos(np.deg2rad(turn_deg))
-    pieces = np.unique(one[fits] * lanes + lane[other[fits]])  # a piece of a lane counts once for a neighbour
+    pieces = np.unique(one[fits] * lanes + lane[other[fits]])  # a piece of a lane counts once per neighbour
     overlap = np.bincount(lane[pieces // lanes] * lanes + pieces % lanes, weights=span[pieces // lanes], minlength=lanes**2)
-    close = tree.query_pairs(least, output_type="ndarray")
-    close = close[np.abs(xyz[close[:, 0], 2] - xyz[close[:, 1], 2]) <= rise_m]
-    touch = np.zeros((lanes, lanes), bool)
-    touch[lane[close[:, 0]], lane[close[:, 1]]] = True
-    return (overlap.reshape(lanes, lanes) >= overlap_m) & ~(touch | touch.T)
+    close = tree.query_pairs(low, output_type="ndarray")
+    close = close[np.abs(xyz[close[:, 0], 2] - xyz[close[:, 1], 2]) <= height_m]
+    crossing = np.zeros((lanes, lanes), bool)
+    crossing[lane[close[:, 0]], lane[close[:, 1]]] = True
+    return (overlap.reshape(lanes, lanes) >= overlap_m) & ~(crossing | crossing.T)

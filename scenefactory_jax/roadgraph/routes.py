@@ -1,4 +1,4 @@
-"""Ways over lanes from a pose to a goal: the shortest, and others that take different lanes."""
+"""Routes over lanes from a pose to a goal: the cheapest, and alternatives over other lanes."""
 
 import itertools
 from typing import NamedTuple
@@ -13,38 +13,54 @@ from scenefactory_jax.roadgraph.lane_graph import LaneGraph, LaneProjections
 
 
 class Network(NamedTuple):
-    """Lanes cut into pieces. A node is the beginning of a piece; its edges lead to the next piece, the next lanes, or a lane beside it."""
+    """Lanes cut into pieces. A node is the start of a piece; its edges lead to the next piece, to successors and to neighbouring lanes."""
 
     lanes: LaneGraph
     lane: Int[np.ndarray, " N"]
-    arc: Float[np.ndarray, " N"]  # of the beginning
+    arc: Float[np.ndarray, " N"]  # of the start of the piece
     first: Int[np.ndarray, " M"]  # the first node of each lane, and the number of nodes
-    edge: Int[np.ndarray, "E 2"]  # sorted, no two between the same nodes
+    edge: Int[np.ndarray, "E 2"]  # sorted, at most one between two nodes
     cost: Float[np.ndarray, " E"]
-    change: float  # what a change of lanes costs beyond its length
+    lane_change_cost: float  # beyond the length of the change
 
 
 class Route(NamedTuple):
-    """One way over the lanes."""
+    """A route over lanes."""
 
-    lanes: tuple[int, ...]  # ids in the order in which they are driven
-    xyz: Float[np.ndarray, "N 3"]  # along the centres of the lanes, from the place of the start to that of the goal
+    lanes: tuple[int, ...]  # ids in driving order
+    xyz: Float[np.ndarray, "N 3"]  # along the centres of the lanes, from the projection of the start to that of the goal
     length: float  # of `xyz` in the plane
     changes: int  # of lanes
-    cost: float  # length with what changes of lanes, and places beside a lane, cost
+    cost: float  # length, lane changes, and distances of start and goal from their lanes
 
 
-def network(lanes: LaneGraph, *, piece_m: float, change_m: float, change_cost_m: float, change_turn_deg: float, aside_m: float) -> Network:
-    """What routes over these lanes are sought on.
+class RoutePath(NamedTuple):
+    """A cheapest path: indices of its start and goal among the candidates, and its nodes."""
+
+    start: int
+    goal: int
+    nodes: list[int]
+
+
+def build_network(
+    lanes: LaneGraph,
+    *,
+    node_spacing_m: float,
+    lane_change_m: float,
+    lane_change_cost_m: float,
+    max_lane_change_turn_deg: float,
+    max_lane_distance_m: float,
+) -> Network:
+    """Builds the network on which routes are searched.
 
     Args:
-        piece_m: about the length of the pieces that lanes are cut into; a change of lanes begins and ends where a piece does.
-        change_m: driven along the lanes during a change.
-        change_cost_m: length that a change costs beyond what is driven.
-        change_turn_deg: between the directions of two lanes where one is left for the other.
-        aside_m: between their centres there: lanes that part from each other are neighbours, but only near where they part.
+        node_spacing_m: approximate length of the pieces; lane changes start and end at nodes.
+        lane_change_m: distance along the lanes of a lane change.
+        lane_change_cost_m: cost of a lane change beyond its length.
+        max_lane_change_turn_deg: angle between the two lanes at the change.
+        max_lane_distance_m: distance between their centres there; lanes that diverge are neighbours only near their fork.
     """
-    count = np.maximum(1, np.round(lanes.length / piece_m)).astype(int)
+    count = np.maximum(1, np.round(lanes.length / node_spacing_m)).astype(int)
     first = np.cumsum([0, *count])
     lane = np.repeat(np.arange(len(count)), count)
     piece = np.arange(first[-1]) - first[lane]
@@ -54,17 +70,20 @@ def network(lanes: LaneGraph, *, piece_m: float, change_m: float, change_cost_m:
     last = first[1:] - 1
     along = np.stack([inner, inner + 1], axis=1)
     links = np.stack([last[lanes.successor[:, 0]], first[lanes.successor[:, 1]]], axis=1)
-    bare = Network(lanes, lane, arc, first, np.concatenate([along, links]), length[np.concatenate([inner, links[:, 0]])], change_cost_m)
-    beside, distance = _changes(bare, change_m, change_turn_deg, aside_m)
-    edge, cost = np.concatenate([bare.edge, beside]), np.concatenate([bare.cost, distance + change_cost_m])
-    order = np.lexsort((cost, edge[:, 1], edge[:, 0]))  # of several edges between two nodes the cheapest counts
+    edge, cost = np.concatenate([along, links]), length[np.concatenate([inner, links[:, 0]])]
+    net = Network(lanes, lane, arc, first, edge, cost, lane_change_cost_m)
+    changes, distance = _lane_changes(net, lane_change_m, max_lane_change_turn_deg, max_lane_distance_m)
+    edge, cost = np.concatenate([edge, changes]), np.concatenate([cost, distance + lane_change_cost_m])
+    order = np.lexsort((cost, edge[:, 1], edge[:, 0]))  # of several edges between two nodes the cheapest is kept
     edge, cost = edge[order], cost[order]
-    fresh = np.concatenate([[True], np.diff(edge, axis=0).any(axis=1)])[: len(edge)]
-    return bare._replace(edge=edge[fresh], cost=cost[fresh])
+    new = np.concatenate([[True], np.diff(edge, axis=0).any(axis=1)])[: len(edge)]
+    return net._replace(edge=edge[new], cost=cost[new])
 
 
-def _changes(net: Network, change_m: float, turn_deg: float, aside_m: float) -> tuple[Int[np.ndarray, "E 2"], Float[np.ndarray, " E"]]:
-    """Edges from the nodes of a lane to those ahead on the lanes beside it, and the metres along the lanes that they take."""
+def _lane_changes(
+    net: Network, change_m: float, turn_deg: float, distance_m: float
+) -> tuple[Int[np.ndarray, "E 2"], Float[np.ndarray, " E"]]:
+    """Edges from the nodes of each lane to nodes ahead on its neighbours, and their lengths along the lanes."""
     pairs = np.concatenate([net.lanes.left, net.lanes.right])
     pairs = pairs[np.lexsort(pairs.T)]
     size = np.diff(net.first)[pairs[:, 0]]
@@ -73,19 +92,19 @@ def _changes(net: Network, change_m: float, turn_deg: float, aside_m: float) -> 
     if not len(node):
         return np.zeros((0, 2), int), np.zeros(0)
     xyz, direction = lane_graph.point_at(net.lanes, net.lane[node], net.arc[node])
-    place = lane_graph.project_on(net.lanes, xyz, other)
+    place = lane_graph.project_onto(net.lanes, xyz, lane_graph.lane_shapes(net.lanes), np.arange(len(xyz)), other)
     aligned = np.sum(direction * place.direction, axis=1) >= np.cos(np.deg2rad(turn_deg))
     target = _node_before(net, other, place.arc + change_m)
-    metres = net.arc[target] - place.arc  # less than `change_m`, for it ends where a piece begins
-    fits = aligned & (place.distance <= aside_m) & (metres >= change_m / 2)
-    return np.stack([node[fits], target[fits]], axis=1), metres[fits]
+    length = net.arc[target] - place.arc  # below `change_m`, because it ends at a node
+    fits = aligned & (place.distance <= distance_m) & (length >= change_m / 2)
+    return np.stack([node[fits], target[fits]], axis=1), length[fits]
 
 
 def _node_before(net: Network, lane: Int[np.ndarray, " K"], arc: Float[np.ndarray, " K"]) -> Int[np.ndarray, " K"]:
-    """The last node on each lane that does not lie beyond a length along it."""
+    """The last node of each lane at or before a length along it."""
     count = np.diff(net.first)[lane]
-    piece = net.lanes.length[lane] / count
-    return net.first[lane] + np.clip(np.floor(arc / piece).astype(int), 0, count - 1)
+    spacing = net.lanes.length[lane] / count
+    return net.first[lane] + np.clip(np.floor(arc / spacing).astype(int), 0, count - 1)
 
 
 def find_routes(
@@ -95,99 +114,97 @@ def find_routes(
     goal: Float[np.ndarray, "3"],
     goal_yaw: float | None,
     *,
-    reach_m: float,
-    turn_deg: float,
-    rise_m: float,
-    aside_cost: float,
+    match_radius_m: float,
+    max_turn_deg: float,
+    max_height_difference_m: float,
+    offset_cost: float,
     count: int,
-    detour: float,
-    penalty: float,
+    max_cost_ratio: float,
+    reuse_penalty: float,
 ) -> list[Route]:
-    """Ways from a pose to a goal, the cheapest first; none where no lane leads there.
+    """Finds routes from a pose to a goal, the cheapest first; an empty list where no lane leads there.
 
-    Alternatives are found by making the lanes of the ways found so far dearer (the penalty method); a way is another one if it takes a lane
-    that those do not.
+    Alternatives come from the penalty method: the lanes of the routes found so far become more expensive. An alternative has a lane that
+    no other route has.
 
     Args:
-        goal_yaw: None where any direction will do.
-        reach_m: from a pose to the centre of a lane that it may be on.
-        turn_deg: between the direction of a pose and that of such a lane.
-        rise_m: between their heights.
-        aside_cost: metres that a metre between a pose and the lane's centre costs.
-        count: of ways, at most.
-        detour: ways whose cost is more than this times the least are left out.
-        penalty: share by which the lanes of a way become dearer.
+        goal_yaw: None: any direction.
+        match_radius_m: distance from a pose to the centre of a candidate lane.
+        max_turn_deg: angle between a pose and such a lane.
+        max_height_difference_m: between them.
+        offset_cost: cost of a metre between a pose and the lane's centre, in metres along the lane.
+        count: maximum number of routes.
+        max_cost_ratio: alternatives that cost more than this times the cheapest route are left out.
+        reuse_penalty: increase of the cost of the lanes of a route, as a fraction.
     """
-    begins = _match(net.lanes, start, yaw, reach_m, turn_deg, rise_m)
-    ends = _match(net.lanes, goal, goal_yaw, reach_m, turn_deg, rise_m)
-    if not len(begins.lane) or not len(ends.lane):
+    limits = (match_radius_m, max_turn_deg, max_height_difference_m)
+    starts, goals = _match_lanes(net.lanes, start, yaw, *limits), _match_lanes(net.lanes, goal, goal_yaw, *limits)
+    if not len(starts.lane) or not len(goals.lane):
         return []
     found: list[Route] = []
     factor = np.ones(len(net.lanes.id))
-    for _ in range(2 * count - 1):  # a search may come upon a way that is known
-        way = _cheapest(net, begins, ends, factor, aside_cost)
-        if way is None:
+    for _ in range(2 * count - 1):  # a search may return a route that is known
+        path = _find_cheapest_path(net, starts, goals, factor, offset_cost)
+        if path is None:
             break
-        begin, end, nodes = way
-        route = _route(net, begins, begin, ends, end, nodes, aside_cost)
+        route = _assemble_route(net, starts, goals, path, offset_cost)
         known = {frozenset(other.lanes) for other in found}
-        if frozenset(route.lanes) not in known and (not found or route.cost <= detour * found[0].cost):
+        if frozenset(route.lanes) not in known and (not found or route.cost <= max_cost_ratio * found[0].cost):
             found.append(route)
         if len(found) == count:
             break
-        factor[np.isin(net.lanes.id, route.lanes)] += penalty
+        factor[np.isin(net.lanes.id, route.lanes)] += reuse_penalty
     return sorted(found, key=lambda route: route.cost)
 
 
-def _match(lanes: LaneGraph, point: np.ndarray, yaw: float | None, reach_m: float, turn_deg: float, rise_m: float) -> LaneProjections:
-    """Places on lanes that a pose may be on."""
-    places = lane_graph.project(lanes, point[None], within_m=reach_m)
-    fits = np.abs(places.xyz[:, 2] - point[2]) <= rise_m
+def _match_lanes(
+    lanes: LaneGraph, point: np.ndarray, yaw: float | None, radius_m: float, turn_deg: float, height_m: float
+) -> LaneProjections:
+    """Projections of a pose onto candidate lanes."""
+    places = lane_graph.project(lanes, point[None], within_m=radius_m)
+    fits = np.abs(places.xyz[:, 2] - point[2]) <= height_m
     if yaw is not None:
         fits &= places.direction @ np.array([np.cos(yaw), np.sin(yaw)]) >= np.cos(np.deg2rad(turn_deg))
     return LaneProjections(*(column[fits] for column in places))
 
 
-def _cheapest(
-    net: Network, begins: LaneProjections, ends: LaneProjections, factor: Float[np.ndarray, " N"], aside_cost: float
-) -> tuple[int, int, list[int]] | None:
-    """The best of the starts and goals, and the nodes from the piece of the one to that of the other."""
-    begin_node, end_node = (_node_before(net, places.lane, places.arc) for places in (begins, ends))
-    size, starts = len(net.lane), len(begin_node)
-    dear = net.cost * factor[net.lane[net.edge[:, 0]]]
-    # every start is a node of its own, with the edges of its piece less what lies behind it
-    number, row = np.nonzero(net.edge[:, 0] == begin_node[:, None])
-    driven = (begins.arc - net.arc[begin_node]) * factor[begins.lane]
+def _find_cheapest_path(
+    net: Network, starts: LaneProjections, goals: LaneProjections, factor: Float[np.ndarray, " N"], offset_cost: float
+) -> RoutePath | None:
+    """The cheapest path from any start to any goal, with the costs of lanes multiplied by `factor`."""
+    start_node, goal_node = (_node_before(net, places.lane, places.arc) for places in (starts, goals))
+    size, count = len(net.lane), len(start_node)
+    edge_cost = net.cost * factor[net.lane[net.edge[:, 0]]]
+    # every start is a further node, with the edges of its piece less the length behind it
+    number, row = np.nonzero(net.edge[:, 0] == start_node[:, None])
+    behind = (starts.arc - net.arc[start_node]) * factor[starts.lane]
     edge = np.concatenate([net.edge, np.stack([size + number, net.edge[row, 1]], axis=1)])
-    cost = np.concatenate([dear, np.maximum(dear[row] - driven[number], 0.0)])  # rounding may leave less than nothing
-    graph = csr_array((cost, edge.T), shape=(size + starts, size + starts))
-    distance, before = dijkstra(graph, indices=size + np.arange(starts), return_predecessors=True)
-    total = distance[:, end_node] + (ends.arc - net.arc[end_node]) * factor[ends.lane]
+    cost = np.concatenate([edge_cost, np.maximum(edge_cost[row] - behind[number], 0.0)])  # rounding may give less than zero
+    graph = csr_array((cost, edge.T), shape=(size + count, size + count))
+    distance, before = dijkstra(graph, indices=size + np.arange(count), return_predecessors=True)
+    total = distance[:, goal_node] + (goals.arc - net.arc[goal_node]) * factor[goals.lane]
     # a goal ahead on the piece of the start is reached without any node
-    ahead = (begin_node[:, None] == end_node) & (ends.arc >= begins.arc[:, None])
-    total = np.where(ahead, (ends.arc - begins.arc[:, None]) * factor[begins.lane][:, None], total)
-    total = total + aside_cost * (begins.distance[:, None] + ends.distance)
-    begin, end = (int(index) for index in np.unravel_index(np.argmin(total), total.shape))
-    if not np.isfinite(total[begin, end]):
+    ahead = (start_node[:, None] == goal_node) & (goals.arc >= starts.arc[:, None])
+    total = np.where(ahead, (goals.arc - starts.arc[:, None]) * factor[starts.lane][:, None], total)
+    total = total + offset_cost * (starts.distance[:, None] + goals.distance)
+    start, goal = (int(index) for index in np.unravel_index(np.argmin(total), total.shape))
+    if not np.isfinite(total[start, goal]):
         return None
-    nodes = [int(end_node[end])]
-    while not ahead[begin, end] and before[begin, nodes[-1]] != size + begin:
-        nodes.append(int(before[begin, nodes[-1]]))
-    return begin, end, nodes[::-1] if ahead[begin, end] else [int(begin_node[begin]), *nodes[::-1]]
+    nodes = [int(goal_node[goal])]
+    while not ahead[start, goal] and before[start, nodes[-1]] != size + start:
+        nodes.append(int(before[start, nodes[-1]]))
+    return RoutePath(start, goal, nodes[::-1] if ahead[start, goal] else [int(start_node[start]), *nodes[::-1]])
 
 
-def _route(
-    net: Network, begins: LaneProjections, begin: int, ends: LaneProjections, end: int, nodes: list[int], aside_cost: float
-) -> Route:
-    """The way through these nodes."""
-    # stretches driven on one lane: from where it is entered to where it is left
-    stretches: list[list[float]] = [[int(begins.lane[begin]), float(begins.arc[begin]), float(net.arc[nodes[0]])]]
-    linked = {(int(a), int(b)) for a, b in net.lanes.successor}
+def _assemble_route(net: Network, starts: LaneProjections, goals: LaneProjections, path: RoutePath, offset_cost: float) -> Route:
+    """The route along a path."""
+    # stretches: lane, and the lengths along it at which the route enters and leaves it
+    stretches: list[list[float]] = [[int(starts.lane[path.start]), float(starts.arc[path.start]), float(net.arc[path.nodes[0]])]]
+    successors = {(int(one), int(other)) for one, other in net.lanes.successor}
     changes = 0
-    for before, node in itertools.pairwise(nodes):
+    for before, node in itertools.pairwise(path.nodes):
         one, other = int(net.lane[before]), int(net.lane[node])
-        follows = before == net.first[one + 1] - 1 and node == net.first[other] and (one, other) in linked
-        if follows:
+        if before == net.first[one + 1] - 1 and node == net.first[other] and (one, other) in successors:
             stretches[-1][2] = float(net.lanes.length[one])
             stretches.append([other, 0.0, 0.0])
         elif one != other:
@@ -196,17 +213,17 @@ def _route(
             stretches.append([other, float(net.arc[node]), float(net.arc[node])])
         else:
             stretches[-1][2] = float(net.arc[node])
-    stretches[-1][2] = float(ends.arc[end])
-    xyz = np.concatenate([_stretch(net.lanes, int(lane), low, high) for lane, low, high in stretches])
-    new = np.concatenate([[True], np.diff(xyz[:, :2], axis=0).any(axis=1)])
-    xyz = xyz[new]
+    stretches[-1][2] = float(goals.arc[path.goal])
+    xyz = np.concatenate([_stretch_points(net.lanes, int(lane), low, high) for lane, low, high in stretches])
+    xyz = xyz[np.concatenate([[True], np.diff(xyz[:, :2], axis=0).any(axis=1)])]
     length = float(np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1).sum())
-    cost = length + changes * net.change + aside_cost * float(begins.distance[begin] + ends.distance[end])
+    offset = float(starts.distance[path.start] + goals.distance[path.goal])
+    cost = length + changes * net.lane_change_cost + offset_cost * offset
     return Route(tuple(int(net.lanes.id[int(lane)]) for lane, *_ in stretches), xyz, length, changes, cost)
 
 
-def _stretch(lanes: LaneGraph, lane: int, low: float, high: float) -> Float[np.ndarray, "N 3"]:
-    """The points of a lane between two lengths along it, both ends included."""
+def _stretch_points(lanes: LaneGraph, lane: int, low: float, high: float) -> Float[np.ndarray, "N 3"]:
+    """The points of a lane between two lengths along it, both included."""
     arc = lanes.arc[lanes.first[lane] : lanes.first[lane + 1]]
     inside = arc[(arc > low) & (arc < high)]
     places = np.concatenate([[low], inside, [max(low, high)]])

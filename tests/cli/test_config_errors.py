@@ -43,12 +43,12 @@ def test_files_that_cannot_be_used_are_listed_and_the_rest_goes_on(tmp_path, cap
     folder = tmp_path / "in"
     folder.mkdir()
     files = {
-        "cut.json": (whole[: len(whole) // 3], "no valid JSON, damaged or cut short after"),
+        "cut.json": (whole[: len(whole) // 3], "not valid JSON, damaged or cut short after"),
         "laneless.json": (document(roads=edge), "no driving lane"),
-        "nan.json": (nan, "objects[1].position[4].y: nan is not finite"),
-        "infinite.json": (infinite, "roads[1].geometry[2].x: inf is not finite"),
-        "foreign.json": ({"map": []}, "no reader knows this format"),
-        "text.txt": ("hello", "no reader knows this format"),
+        "nan.json": (nan, "objects[1].position[4].y: expected a finite number, got nan"),
+        "infinite.json": (infinite, "roads[1].geometry[2].x: expected a finite number, got inf"),
+        "foreign.json": ({"map": []}, "unknown format"),
+        "text.txt": ("hello", "unknown format"),
     }
     for name, (content, _) in files.items():
         written(folder, content, name)
@@ -98,7 +98,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
     ("override", "message"),
     [
         ("quality.reject=[level]", "quality.reject: 'level' is no rule; valid: missing_map, "),
-        ("lanes.topology.beside_m=[5.0,2.0]", "lanes.topology.beside_m: expected [min, max], got [5.0, 2.0]"),
+        ("lanes.topology.neighbour_distance_m=[5.0,2.0]", "lanes.topology.neighbour_distance_m: expected [min, max], got [5.0, 2.0]"),
         ("features.streets.one_in=0", "features.streets.one_in: expected a number > 0, got 0"),
         ("spread.timeout_s=0.0", "spread.timeout_s: expected a number > 0, got 0"),
         ("scenes.workers=0", "spread.workers: expected a number >= 1, got 0"),

@@ -477,10 +477,10 @@ def test_a_file_that_gave_nothing_is_read_again(tmp_path):
 
 def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
     folder = streets(tmp_path / "in", "a", "b", "c")
-    wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"beside_m": [5.0, 2.0]})
+    wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"neighbour_distance_m": [5.0, 2.0]})
     for workers in (1, 2):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
-        with pytest.raises(ConfigError, match=r"lanes\.topology\.beside_m: expected .*, got \[5\.0, 2\.0\]"):
+        with pytest.raises(ConfigError, match=r"lanes\.topology\.neighbour_distance_m: expected .*, got \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
         with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
             source = scene_source.open_files(folder, reader_selection.make(FORMATS))

@@ -21,7 +21,7 @@ from support.format_documents import (
 from support.scene_documents import FORMATS, document, scenefactory_document, thing
 
 from scenefactory_jax.core.raw_scene import Reject, SceneError
-from scenefactory_jax.data.formats import json_documents, reader_selection, tfrecord
+from scenefactory_jax.data.formats import file_content, reader_selection, tfrecord
 from scenefactory_jax.data.loading import scene_source
 
 JSON_JUNK = tuple(value for value in fuzzing.JUNK if not isinstance(value, (bytes, set, np.ndarray)))
@@ -116,7 +116,7 @@ def test_what_unpacks_to_more_than_the_limit_is_refused_on_the_way(tmp_path, com
     readers = reader_selection.make(
         {name: entry | ({"file_limit_mb": 1} if "file_limit_mb" in entry else {}) for name, entry in FORMATS.items()}
     )
-    with pytest.raises(SceneError, match="holds more than 1 MB, unpacked if it is compressed; file_limit_mb"):
+    with pytest.raises(SceneError, match="expected a content of up to 1 MB, got more; see file_limit_mb"):
         list(reader_selection.read(path, readers))
     assert fuzzing.peak_of(lambda path: reader_selection.read(path, readers), path) < 16_000_000  # xz itself asks for 8 MB
 
@@ -133,12 +133,12 @@ def test_a_parquet_file_that_unpacks_to_more_than_the_limit_is_refused_unread(tm
 
 @pytest.mark.parametrize("document", [scenefactory_document(), {"a": 1}], ids=["the second reader's", "none's"])
 def test_a_file_is_unpacked_once_however_many_readers_try_it(tmp_path, monkeypatch, readers, document):
-    path, read, counts = tmp_path / "a.xz", json_documents._read, []
+    path, read, counts = tmp_path / "a.xz", file_content._read, []
     path.write_bytes(lzma.compress(encoded(document)))
-    monkeypatch.setattr(json_documents, "_read", lambda path, count: counts.append(count) or read(path, count))
+    monkeypatch.setattr(file_content, "_read", lambda path, count: counts.append(count) or read(path, count))
     [found] = scene_source.read_file(path, readers)
     assert isinstance(found, Reject) == ("road" not in document)
-    assert sum(count > json_documents.HEAD for count in counts) == 1
+    assert sum(count > file_content.HEAD for count in counts) == 1
 
 
 def test_a_record_of_any_length_is_not_read(tmp_path, readers):

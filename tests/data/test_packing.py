@@ -71,7 +71,7 @@ def assert_same_grid(scene, size_m=5.0, side=30):
     valid[::7] = False
     numbers = {"side": side, "radius_m": 10.0, "size_m": size_m}
     origin = midpoint.min(axis=0) - 4.0  # some cells lie outside the grid
-    fast, plain = (lists(midpoint, valid, origin, **numbers) for lists in (spatial_grid._lists, plain_packing.lists))
+    fast, plain = (lists(midpoint, valid, origin, **numbers) for lists in (spatial_grid._build_lists, plain_packing.lists))
     for found, wanted in zip(fast, plain, strict=True):
         np.testing.assert_array_equal(found, wanted)
         assert len(found)

@@ -68,7 +68,7 @@ def test_anything_is_read_from_python(tmp_path):
     written(tmp_path, document(), "a.json")
     (tmp_path / "b.json").write_text("{}")
     raw, reason = sf.read(tmp_path)
-    assert raw.roads and reason.startswith(f"{tmp_path / 'b.json'}: no reader knows this format")
+    assert raw.roads and reason.startswith(f"{tmp_path / 'b.json'}: unknown format")
     bank_reader.write(tmp_path / "bank", [raw], settings={})
     [again] = sf.read(tmp_path / "bank")
     assert again.name == raw.name and again.metadata == raw.metadata
@@ -130,26 +130,27 @@ def damaged(path, value):
 @pytest.mark.parametrize(
     "path, value, message",
     [
-        (["objects", 1, "position", 10, "x"], float("nan"), r"objects\[1\]\.position\[10\]\.x: nan is not finite"),
-        (["objects", 1, "position", 10, "x"], "far", r"objects\[1\]\.position\[10\]\.x: 'far' is not a number"),
+        (["objects", 1, "position", 10, "x"], float("nan"), r"objects\[1\]\.position\[10\]\.x: expected a finite number, got nan"),
+        (["objects", 1, "position", 10, "x"], "far", r"objects\[1\]\.position\[10\]\.x: expected a number, got 'far'"),
         (["objects", 1, "position", 10, "y"], ..., r"objects\[1\]\.position\[10\]\.y: missing; there are: x, z"),
-        (["objects", 1, "position", 10], 3, r"objects\[1\]\.position\[10\]: 3 is not an object"),
-        pytest.param(["objects", 1, "position", 10, "x"], 10**400, r"objects\[1\]\.position\[10\]\.x: an integer of 1329", id="huge x"),
-        pytest.param(["objects", 1, "heading", 2], -(10**400), r"objects\[1\]\.heading\[2\]: an integer of 1329", id="huge heading"),
-        pytest.param(["objects", 1, "length"], 10**400, r"objects\[1\]\.length: an integer of 1329", id="huge length"),
-        (["objects", 1, "heading"], [0.0], r"objects\[1\]\.heading: 1 entries; there must be 12"),
-        (["objects", 1, "heading", 3], 90.0, r"objects\[1\]\.heading\[3\]: 90.0 is no angle in radians"),
-        (["objects", 1, "heading", 3], True, r"objects\[1\]\.heading\[3\]: True is not a number"),
-        (["objects", 1, "valid", 2], "yes", r"objects\[1\]\.valid\[2\]: 'yes'"),
-        (["objects", 1, "length"], None, r"objects\[1\]\.length: None is not a number"),
+        (["objects", 1, "position", 10], 3, r"objects\[1\]\.position\[10\]: expected an object, got 3"),
+        pytest.param(["objects", 1, "position", 10, "x"], 10**400, r"position\[10\]\.x: .*of 1329", id="huge x"),
+        pytest.param(["objects", 1, "heading", 2], -(10**400), r"heading\[2\]: .*of 1329", id="huge heading"),
+        pytest.param(["objects", 1, "length"], 10**400, r"objects\[1\]\.length: expected .*, got an integer of 1329", id="huge length"),
+        (["objects", 1, "heading"], [0.0], r"objects\[1\]\.heading: expected 12 entries, .*, got 1"),
+        (["objects", 1, "heading", 3], 90.0, r"objects\[1\]\.heading\[3\]: expected an angle in radians, got 90.0"),
+        (["objects", 1, "heading", 3], True, r"objects\[1\]\.heading\[3\]: expected a number, got True"),
+        (["objects", 1, "valid", 2], "yes", r"objects\[1\]\.valid\[2\]: expected true or false, got 'yes'"),
+        (["objects", 1, "length"], None, r"objects\[1\]\.length: expected a number, got None"),
         (["objects", 1, "type"], ..., r"objects\[1\]\.type: missing"),
-        (["objects"], [], r"objects: none"),
-        (["objects"], {}, r"objects: \{\} is not a list"),
-        (["roads", 0, "geometry", 5, "y"], float("inf"), r"roads\[0\]\.geometry\[5\]\.y: inf is not finite"),
-        (["roads", 0, "map_element_id"], "edge", r"roads\[0\]\.map_element_id: 'edge' is not an integer"),
-        (["roads", 0], 7, r"roads\[0\]: 7 is not an object"),
-        (["metadata", "sdc_track_index"], 9, r"sdc_track_index: 9 is no object; valid: 0 to 1"),
-        (["objects", 0, "valid"], [True] * 3, r"3 steps, so no step 10"),
+        (["objects"], [], r"objects: expected at least one, got none"),
+        (["objects"], {}, r"objects: expected a list, got \{\}"),
+        (["roads", 0, "geometry", 5, "y"], float("inf"), r"roads\[0\]\.geometry\[5\]\.y: expected a finite number, got inf"),
+        (["roads", 0, "map_element_id"], "edge", r"roads\[0\]\.map_element_id: expected an integer, got 'edge'"),
+        (["roads", 0], 7, r"roads\[0\]: expected an object, got 7"),
+        (["metadata", "sdc_track_index"], 9, r"sdc_track_index: expected a track, 0 to 1, got 9"),
+        (["metadata", "objects_of_interest"], [[1.0]], r"metadata\.objects_of_interest\[0\]: expected an integer, got \[1\.0\]"),
+        (["objects", 0, "valid"], [True] * 3, r"formats\.gpudrive\.current: expected a step of the log, 0 to 2, got 10"),
     ],
 )
 def test_a_bad_value_is_named(tmp_path, readers, path, value, message):
@@ -161,11 +162,12 @@ def test_a_bad_value_is_named(tmp_path, readers, path, value, message):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda whole: whole["road"]["polylines"][0]["xyz"].__setitem__(3, [1.0]), r"road\.polylines\[0\]\.xyz\[3\]: \[1\.0\] is no point"),
+        (lambda whole: whole["road"]["polylines"][0]["xyz"].__setitem__(3, [1.0]), r"xyz\[3\]: expected .*, got \[1\.0\]"),
         (lambda whole: whole["road"]["polylines"][0].pop("type"), r"road\.polylines\[0\]\.type: missing"),
         (lambda whole: whole["agents"].pop("items"), r"agents\.items: missing"),
         (lambda whole: whole["agents"]["items"][0]["start"].pop("x"), r"agents\.items\[0\]\.start\.x: missing"),
-        (lambda whole: whole["agents"]["items"][0]["end"].__setitem__("t_idx", -1), r"agents\.items\[0\]\.end\.t_idx: -1 is no step"),
+        (lambda whole: whole["agents"]["items"][0]["end"].__setitem__("t_idx", -1), r"agents\.items\[0\]\.end\.t_idx: expected .*, got -1"),
+        (lambda whole: whole["agents"]["items"][0].__setitem__("agent_id", float("nan")), r"agent_id: expected a finite number, got nan"),
         (lambda whole: whole.pop("agents"), r"scene\.json: agents: missing"),
     ],
 )
@@ -188,7 +190,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, readers):
     binary = tmp_path / "scene.bin"
     binary.write_bytes(bytes(range(200)))
     other = written(tmp_path, {"lanes": []}, "other.json")
-    cases = {cut: "cut short", squeezed: "begins as xz", fake: "begins as gzip", binary: "no reader", other: "'objects'.*road.pol"}
+    cases = {cut: "cut short", squeezed: "begins as xz", fake: "begins as gzip", binary: "unknown format", other: "'objects'.*road.pol"}
     cases |= {wrong: "begins as gzip"}
     for path, message in cases.items():
         with pytest.raises(SceneError, match=message) as caught:

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from support import womd_records as records
 from support.scene_documents import FORMATS, checker, document, packer, written
-from support.womd_records import JUMP_M, saved, scenes
+from support.womd_records import saved, scenes
 
 from scenefactory_jax.core.raw_scene import FormatMismatch, RawScene, Reject, SceneError
-from scenefactory_jax.data.formats import reader_selection, tfrecord, womd
+from scenefactory_jax.data.formats import reader_selection, tfrecord
 from scenefactory_jax.data.loading import scene_source
 
 
 def outcome(path):
     """Scenes and rejects of a file, or its refusal; anything else a reader may raise fails the test."""
     try:
-        found = list(womd.read(path, jump_m=JUMP_M))
+        found = list(records.read(path))
     except SceneError as error:
         assert str(error)
         return error
@@ -40,7 +40,7 @@ def test_a_damaged_record_is_named_and_the_others_are_read(tmp_path, three):
     data, starts = three
     content = bytearray(records.framed(*data))
     content[starts[1] + 500] ^= 1
-    one, two, last = womd.read(saved(tmp_path, bytes(content)), jump_m=JUMP_M)
+    one, two, last = records.read(saved(tmp_path, bytes(content)))
     assert (one.name, last.name) == ("street", "street") and last.metadata["record"] == 2
     assert two == Reject(None, f"record 1 at byte {starts[1]}: the checksum of its data does not match")
     content = bytearray(records.framed(*data))
@@ -151,7 +151,7 @@ def test_foreign_files_are_refused_and_go_to_their_readers(tmp_path):
     later = outcome(saved(tmp_path, records.framed(records.scenario().SerializeToString(), b"\x0a\x03abc")))
     assert "neither a Scenario nor a tf.Example" in later[1].reason
     with pytest.raises(SceneError, match="cannot be read"):
-        list(womd.read(tmp_path / "nowhere", jump_m=JUMP_M))
+        list(records.read(tmp_path / "nowhere"))
 
 
 def test_the_checksum_is_the_published_one():
@@ -171,27 +171,27 @@ def bent(change):
 
 SCENARIO_FAULTS = [
     (lambda m: m.tracks[1].states[6].ClearField("center_y"), r"tracks\[1\]\.states\[6\]\.center_y: missing"),
-    (lambda m: setattr(m.tracks[1].states[6], "heading", float("nan")), r"tracks\[1\]\.states\[6\]\.heading: nan is not finite"),
-    (lambda m: setattr(m.tracks[0], "object_type", 9), r"tracks\[0\]\.object_type: 9 is no type of object; valid: 0 to 4"),
+    (lambda m: setattr(m.tracks[1].states[6], "heading", float("nan")), r"tracks\[1\]\.states\[6\]\.heading: .*, got nan"),
+    (lambda m: setattr(m.tracks[0], "object_type", 9), r"tracks\[0\]\.object_type: expected a type of object, 0 to 4, got 9"),
     (lambda m: m.tracks[0].ClearField("id"), r"tracks\[0\]\.id: missing"),
-    (lambda m: m.tracks[1].states.pop(), r"tracks\[1\]\.states: 11 entries; there must be 12"),
-    (lambda m: setattr(m, "sdc_track_index", 2), r"sdc_track_index: 2 is no track; valid: 0 to 1"),
-    (lambda m: setattr(m, "current_time_index", -1), r"current_time_index: -1 is no step of the log; valid: 0 to 11"),
+    (lambda m: m.tracks[1].states.pop(), r"tracks\[1\]\.states: expected 12 entries, .*, got 11"),
+    (lambda m: setattr(m, "sdc_track_index", 2), r"sdc_track_index: expected a track, 0 to 1, got 2"),
+    (lambda m: setattr(m, "current_time_index", -1), r"current_time_index: expected a step of the log, 0 to 11, got -1"),
     (lambda m: m.ClearField("current_time_index"), r"current_time_index: missing"),
-    (lambda m: m.timestamps_seconds.__setitem__(4, 0.0), r"timestamps_seconds\[4\]: 0\.0 s does not come after 0\.3"),
-    (lambda m: m.timestamps_seconds.__setitem__(4, float("inf")), r"timestamps_seconds\[4\]: inf is not finite"),
-    (lambda m: m.ClearField("timestamps_seconds"), r"timestamps_seconds: none"),
-    (lambda m: setattr(m.tracks_to_predict[0], "track_index", 5), r"tracks_to_predict\[0\]\.track_index: 5 is no track"),
-    (lambda m: setattr(m.map_features[0].lane, "type", 4), r"map_features\[0\]\.lane\.type: 4 is no type of lane; valid: 0 to 3"),
-    (lambda m: setattr(m.map_features[1].road_edge, "type", 3), r"map_features\[1\]\.road_edge\.type: 3 is no type of road_edge"),
-    (lambda m: setattr(m.map_features[0].lane, "speed_limit_mph", -5.0), r"map_features\[0\]\.lane\.speed_limit_mph: -5\.0 is no speed"),
-    (lambda m: setattr(m.map_features[0].lane.polyline[7], "z", float("nan")), r"map_features\[0\]\.lane\.polyline\[7\]\.z: nan"),
+    (lambda m: m.timestamps_seconds.__setitem__(4, 0.0), r"timestamps_seconds\[4\]: expected a time after 0\.3.* s, got 0\.0 s"),
+    (lambda m: m.timestamps_seconds.__setitem__(4, float("inf")), r"timestamps_seconds\[4\]: expected a finite number, got inf"),
+    (lambda m: m.ClearField("timestamps_seconds"), r"timestamps_seconds: expected at least one step, got none"),
+    (lambda m: setattr(m.tracks_to_predict[0], "track_index", 5), r"tracks_to_predict\[0\]\.track_index: expected a track, 0 to 1, got 5"),
+    (lambda m: setattr(m.map_features[0].lane, "type", 4), r"map_features\[0\]\.lane\.type: expected a type of lane, 0 to 3, got 4"),
+    (lambda m: setattr(m.map_features[1].road_edge, "type", 3), r"map_features\[1\]\.road_edge\.type: .*, got 3"),
+    (lambda m: setattr(m.map_features[0].lane, "speed_limit_mph", -5.0), r"map_features\[0\]\.lane\.speed_limit_mph: .*, got -5\.0"),
+    (lambda m: setattr(m.map_features[0].lane.polyline[7], "z", float("nan")), r"map_features\[0\]\.lane\.polyline\[7\]\.z: .*, got nan"),
     (lambda m: m.map_features[0].lane.polyline[7].ClearField("x"), r"map_features\[0\]\.lane\.polyline\[7\]\.x: missing"),
     (lambda m: m.map_features[3].stop_sign.ClearField("position"), r"map_features\[3\]\.stop_sign\.position: missing"),
     (lambda m: m.map_features[2].ClearField("id"), r"map_features\[2\]\.id: missing"),
-    (lambda m: setattr(m.dynamic_map_states[6].lane_states[0], "state", 9), r"dynamic_map_states\[6\]\.lane_states\[0\]\.state: 9 is no"),
+    (lambda m: setattr(m.dynamic_map_states[6].lane_states[0], "state", 9), r"dynamic_map_states\[6\]\.lane_states\[0\]\.state: .*, got 9"),
     (lambda m: m.dynamic_map_states[6].lane_states[0].ClearField("lane"), r"dynamic_map_states\[6\]\.lane_states\[0\]\.lane: missing"),
-    (lambda m: m.dynamic_map_states.add(), r"dynamic_map_states: 13 entries; there are only 12"),
+    (lambda m: m.dynamic_map_states.add(), r"dynamic_map_states: expected at most 12 entries, .*, got 13"),
 ]
 
 
@@ -207,24 +207,24 @@ EXAMPLE_FAULTS = [
     ("state/past/x", ..., r"state/past/x: missing"),
     ("state/past/valid", ..., r"state/past/valid: missing"),
     ("state/current/y", ..., r"state/current/y: missing"),
-    ("state/current/x", np.zeros(7), r"state/current/x: 7 numbers; there must be 4"),
-    ("state/past/valid", np.zeros(7, int), r"state/past/valid: 7 numbers; there must be a multiple of 4"),
-    ("state/future/width", np.zeros(3), r"state/future/width: 3 numbers; there must be 32"),
-    ("state/future/x", b"text", r"state/future/x: 0 numbers; there must be 32"),
-    (("state/past/bbox_yaw", 2), np.nan, r"state/past/bbox_yaw\[2\]: nan is not finite"),
-    (("state/past/valid", 0), 7, r"state/past/valid\[0\]: 7 is no flag"),
-    (("state/id", 0), 7.5, r"state/id\[0\]: 7\.5 is no whole number"),
-    (("state/id", 0), -1.0, r"state/id\[0\]: -1 is no id, though the object is valid"),
-    (("state/type", 2), 6.0, r"state/type\[2\]: 6 is no type of object"),
-    (("state/is_sdc", 2), 1, r"state/is_sdc: 2 objects are the recording car"),
-    ("state/id", np.zeros(0), r"state/id: none"),
-    (("roadgraph_samples/type", 3), 4, r"roadgraph_samples/type\[3\]: 4 is no map element"),
-    (("roadgraph_samples/xyz", 10), np.inf, r"roadgraph_samples/xyz\[3\]\.y: inf is not finite"),
-    ("roadgraph_samples/valid", np.zeros(3, int), r"roadgraph_samples/valid: 3 numbers; there must be"),
+    ("state/current/x", np.zeros(7), r"state/current/x: expected 4 numbers, got 7"),
+    ("state/past/valid", np.zeros(7, int), r"state/past/valid: expected a multiple of 4 numbers, .*, got 7"),
+    ("state/future/width", np.zeros(3), r"state/future/width: expected 32 numbers, got 3"),
+    ("state/future/x", b"text", r"state/future/x: expected 32 numbers, got 0"),
+    (("state/past/bbox_yaw", 2), np.nan, r"state/past/bbox_yaw\[2\]: expected a finite number, got nan"),
+    (("state/past/valid", 0), 7, r"state/past/valid\[0\]: expected 1, 0 or, as padding, -1, got 7"),
+    (("state/id", 0), 7.5, r"state/id\[0\]: expected a whole number, got 7\.5"),
+    (("state/id", 0), -1.0, r"state/id\[0\]: expected an id, 0 or more, .*, got -1"),
+    (("state/type", 2), 6.0, r"state/type\[2\]: expected a type of object, 0 to 4, got 6"),
+    (("state/is_sdc", 2), 1, r"state/is_sdc: expected one recording car at most, got 2"),
+    ("state/id", np.zeros(0), r"state/id: expected at least one object, got none"),
+    (("roadgraph_samples/type", 3), 4, r"roadgraph_samples/type\[3\]: expected a map element, 0 to 20 without 4, got 4"),
+    (("roadgraph_samples/xyz", 10), np.inf, r"roadgraph_samples/xyz\[3\]\.y: expected a finite number, got inf"),
+    ("roadgraph_samples/valid", np.zeros(3, int), r"roadgraph_samples/valid: expected \d+ numbers, got 3"),
     ("roadgraph_samples/id", ..., r"roadgraph_samples/id: missing"),
-    (("traffic_light_state/future/state", 13), 12, r"traffic_light_state/future/state\[13\]: 12 is no state of a light"),
-    (("traffic_light_state/future/x", 13), np.nan, r"traffic_light_state/future/x\[13\]: nan is not finite"),
-    ("traffic_light_state/current/id", np.zeros(0, int), r"traffic_light_state/current/state: 3 numbers; there must be 0"),
+    (("traffic_light_state/future/state", 13), 12, r"traffic_light_state/future/state\[13\]: expected a state of a light, 0 to 8, got 12"),
+    (("traffic_light_state/future/x", 13), np.nan, r"traffic_light_state/future/x\[13\]: expected a finite number, got nan"),
+    ("traffic_light_state/current/id", np.zeros(0, int), r"traffic_light_state/current/state: expected 0 numbers, got 3"),
 ]
 
 

@@ -112,7 +112,7 @@ def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
 def test_first_hits_keeps_storage_order():
     rng = np.random.default_rng(1)
     hits = rng.random((7, 90)) < 0.2
-    index, mask = queries.first_edge_hits(jnp.asarray(hits), count=12)
+    index, mask = queries.find_first_true(jnp.asarray(hits), count=12)
     for row in range(7):
         expected = np.flatnonzero(hits[row])[:12]
         assert list(np.asarray(index[row])[np.asarray(mask[row])]) == list(expected)

@@ -1,13 +1,12 @@
 """The kernels of sets against plain JAX, in Pallas's interpreter; that they lower to a GPU's code."""
 
-import contextlib
 import itertools
-from importlib.metadata import version
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.abstract_gpu import abstract_gpu
 
 from scenefactory_jax.learning.networks import late_fusion, set_kernel
 
@@ -78,14 +77,6 @@ def test_which_layers_they_are_made_for(sizes, made):
     assert set_kernel.fits(layers(jax.random.key(0), *sizes)) == made
 
 
-def imagined_gpu():
-    """Since 0.11 JAX wants to know for which GPU it lowers a kernel, where there is none."""
-    if not hasattr(jax.sharding, "AbstractDevice") or version("jaxlib") < "0.11":
-        return contextlib.nullcontext()
-    gpu = jax.sharding.AbstractDevice("NVIDIA H200", None, "cuda")
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), abstract_device=gpu))
-
-
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
     weights = layers(jax.random.key(0), 5, 96, 96)
@@ -93,7 +84,7 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
 
     def text(kernels, platform):
         loss = jax.jit(jax.grad(lambda weights: late_fusion.encode_set("elu", dtype, kernels, weights, x, mask).sum()))
-        with imagined_gpu():
+        with abstract_gpu():
             return loss.trace(weights).lower(lowering_platforms=(platform,)).as_text()
 
     assert "encode_set" in text(True, "cuda") and "encode_set_gradient" in text(True, "cuda")

@@ -155,7 +155,7 @@ def test_the_topology_of_womd_is_found_again(shared_data, names, links, neighbou
 
 
 def test_numbers_that_make_no_sense_are_refused():
-    for wrong in ({"beside_m": [4.0, 2.0]}, {"station_m": 0.0}):
+    for wrong in ({"neighbour_distance_m": [4.0, 2.0]}, {"sample_spacing_m": 0.0}):
         with pytest.raises(ConfigError, match=rf"lanes\.topology\.{next(iter(wrong))}: "):
             rebuild(scene(lane(1, (0, 0), (9, 0))), **wrong)
 
@@ -215,11 +215,11 @@ def test_a_goal_behind_on_the_same_piece_is_reached_by_driving_round():
 def test_lanes_are_changed_only_where_they_are_neighbours_and_at_a_cost():
     right, left = lane(1, (0, 0), (100, 0)), lane(2, (0, 3.5), (100, 3.5))
     joined = network([replace(right, left=(2,)), replace(left, right=(1,))])
-    (route,) = search(joined, (5, 0), 0.0, (95, 3.5), 0.0, reach_m=2.0)
+    (route,) = search(joined, (5, 0), 0.0, (95, 3.5), 0.0, match_radius_m=2.0)
     assert route.lanes == (1, 2) and route.changes == 1
-    assert 90 < route.length < 91.5 and route.cost == pytest.approx(route.length + NUMBERS["network"]["change_cost_m"])
-    assert search(network([right, left]), (5, 0), 0.0, (95, 3.5), 0.0, reach_m=2.0) == []
-    assert search(joined, (85, 0), 0.0, (90, 3.5), 0.0, reach_m=2.0) == []  # no room left
+    assert 90 < route.length < 91.5 and route.cost == pytest.approx(route.length + NUMBERS["network"]["lane_change_cost_m"])
+    assert search(network([right, left]), (5, 0), 0.0, (95, 3.5), 0.0, match_radius_m=2.0) == []
+    assert search(joined, (85, 0), 0.0, (90, 3.5), 0.0, match_radius_m=2.0) == []  # no room left
 
 
 def test_alternatives_take_other_lanes_the_shortest_first():
@@ -231,7 +231,7 @@ def test_alternatives_take_other_lanes_the_shortest_first():
     assert [route.lanes for route in found] == [(1, 3, 5), (1, 2, 5), (1, 4, 5)]
     np.testing.assert_allclose([route.length for route in found], [76, 36 + 2 * np.hypot(20, 12), 36 + 2 * np.hypot(20, 20)], atol=1e-6)
     assert [route.lanes for route in search(net, (2, 0), 0.0, (78, 0), 0.0, count=2)] == [(1, 3, 5), (1, 2, 5)]
-    assert [route.lanes for route in search(net, (2, 0), 0.0, (78, 0), 0.0, detour=1.01)] == [(1, 3, 5)]
+    assert [route.lanes for route in search(net, (2, 0), 0.0, (78, 0), 0.0, max_cost_ratio=1.01)] == [(1, 3, 5)]
 
 
 @pytest.mark.parametrize("index", range(KINDS))

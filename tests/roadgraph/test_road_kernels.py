@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_set_kernel import imagined_gpu
+from support.abstract_gpu import abstract_gpu
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import geometry
@@ -22,7 +22,7 @@ def scenes():
     """Two worlds with more segments than a program takes at once, the second with gaps in its tables."""
     loaded = scene_source.load_training_scenes(load_config("train", "scenes.count=2")["scenes"]).scene
     loaded = spatial_grid.attach_grid(jax.tree.map(np.asarray, replace(loaded, road_grid=None)), radius_m=10.0, size_m=5.0)
-    assert min(loaded.lanes.valid.shape[1], loaded.edges.valid.shape[1]) >= road_kernels.LOOK
+    assert min(loaded.lanes.valid.shape[1], loaded.edges.valid.shape[1]) >= road_kernels.QUERY_BLOCK
     gaps = {name: np.array(getattr(loaded, name).valid) for name in ("lanes", "edges")}
     for valid in gaps.values():
         valid[1, ::3] = False
@@ -51,7 +51,7 @@ def cars(scenes):
 @pytest.fixture(scope="module", autouse=True)
 def small_blocks():
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("LOOK", "GATHER"):
+        for name in ("QUERY_BLOCK", "GATHER_BLOCK"):
             patch.setattr(road_kernels, name, 64)  # several blocks of what is small enough for a test
         yield
 
@@ -138,8 +138,8 @@ def test_a_gpu_gets_kernels_and_other_devices_plain_jax(scenes, cars):
             seen = queries.gather_segments(scene, position, yaw, active, count=20, **ROWS, kernels=kernels)
             return seen, queries.query_road(scene, circles, radius, velocity, yaw, position, active, **EDGES, kernels=kernels)
 
-        with imagined_gpu():
+        with abstract_gpu():
             return jax.jit(jax.vmap(both)).trace(scenes, *cars).lower(lowering_platforms=(platform,)).as_text()
 
-    assert "look_at_road" in text(True, "cuda") and "gather_road" in text(True, "cuda")
+    assert "query_road" in text(True, "cuda") and "gather_segments" in text(True, "cuda")
     assert "triton" not in text(True, "cpu") and "triton" not in text(False, "cuda")

@@ -65,7 +65,7 @@ def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
         found, wanted = find(one, position), find(replace(one, road_grid=None), position)
         jax.tree.map(np.testing.assert_array_equal, found, wanted)
         assert wanted.mask.any(axis=1).sum() > PLACES // 4 and not wanted.mask[-2:].any()
-        assert int(one.road_grid.most) < int(one.road.valid.sum())
+        assert int(one.road_grid.longest_list) < int(one.road.valid.sum())
 
 
 def test_a_larger_radius_looks_through_all(scenes):
@@ -78,7 +78,7 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
     road = scenes.road
     bare = unchecked(type(scenes), **(vars(scenes) | {"road": unchecked(type(road), **(vars(road) | {"valid": road.valid & False}))}))
     made = spatial_grid.attach_grid(bare, radius_m=10.0, size_m=5.0).road_grid
-    assert not made.first.any() and made.most == 1
+    assert not made.first.any() and made.longest_list == 1
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), made)
     _, listed = spatial_grid.list_segments(one, *spatial_grid.find_cell_bounds(one, jnp.zeros((3, 2))))
     assert not listed.any()

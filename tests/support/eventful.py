@@ -11,7 +11,7 @@ from scenefactory_jax.core.raw_scene import Companion, Reject
 from scenefactory_jax.data import conversion
 from scenefactory_jax.data.formats import gpudrive
 
-plainly = functools.partial(gpudrive.read, step_s=0.1, current=10, headings="layout", height_m=1.5)
+plainly = functools.partial(gpudrive.read, step_s=0.1, current=10, heading_unit="layout", height_m=1.5, file_limit_mb=32)
 
 
 def read(path):

@@ -5,10 +5,11 @@ import struct
 import google_crc32c
 import numpy as np
 
-from scenefactory_jax.data.formats import womd, womd_schema
+from scenefactory_jax.data.formats import reader_selection, womd_schema
 from support.scene_documents import FORMATS
 
 JUMP_M = FORMATS["womd"]["jump_m"]
+read = reader_selection.make({"womd": FORMATS["womd"]})["womd"]
 
 STEPS, CURRENT = 12, 3
 TIMES_MICROS = 100_000 * np.arange(STEPS) + np.arange(STEPS) % 3  # a clock with jitter
@@ -137,7 +138,7 @@ def saved(folder, content, name="scenes"):
 def scenes(folder, *messages):
     """What the reader makes of records of these messages."""
     content = framed(*(message.SerializeToString() for message in messages))
-    return list(womd.read(saved(folder, content), jump_m=JUMP_M))
+    return list(read(saved(folder, content)))
 
 
 def varints(data):

@@ -1,16 +1,18 @@
-"""A scene as GPUDrive's JSON, for GPUDrive, PufferDrive's converter and everything else that reads it.
+"""Writes scenes as GPUDrive's JSON, for GPUDrive, PufferDrive's converter and all other readers of it.
 
-What the format cannot hold: the lanes' connections, neighbours and speed limits, the dataset's name, the origin, the current step, and
-times: its readers take WOMD, 10 Hz and step 10, and GPUDrive itself expects 91 steps.
+The format has no lane links, speed limits, dataset name, origin, current step and times: its readers expect WOMD's 10 Hz and step 10, and
+GPUDrive itself 91 steps.
 """
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.export import files
 
 NOWHERE = -10000.0  # every value at an invalid step
@@ -21,36 +23,28 @@ TYPES = (  # map elements -> the type's name
 
 
 def write(raw: RawScene, path: Path | str) -> None:
-    """Write one scene to a JSON file.
+    """Writes one scene to a JSON file.
 
     Raises:
-        SceneError: a map element that the format does not know, a number that is not finite, or a file that cannot be written.
+        SceneError: a map element that the format does not have, a number that is not finite, or a file that cannot be written.
     """
     files.write(path, encode_json(raw))
+
+
+def write_all(scenes: Iterable[RawScene], folder: Path | str, refused: list[str]) -> int:
+    """Writes a JSON file for each scene, see `files.write_scenes`; returns the number of files."""
+    return len(files.write_scenes(scenes, folder, refused, lambda raw: (f"{to_file_name(raw.name)}.json", encode_json(raw), None)))
 
 
 def encode_json(raw: RawScene) -> bytes:
     """The content of a scene's file.
 
     Raises:
-        SceneError: a map element that the format does not know, or a number that is not finite.
-    """
-    whole = document(raw)
-    try:
-        return json.dumps(whole, allow_nan=False).encode()
-    except ValueError as error:
-        raise SceneError(f"{raw.source}: scene {raw.name!r}: a number that is not finite, which JSON cannot hold: {error}") from error
-
-
-def document(raw: RawScene) -> dict[str, Any]:
-    """The JSON document of a scene.
-
-    Raises:
-        SceneError: a map element that the format does not know.
+        SceneError: a map element that the format does not have, or a number that is not finite.
     """
     experts, chosen = (set(raw.metadata.get(key, ())) for key in ("experts", "tracks_to_predict"))
     predicted = [{"track_index": index, "difficulty": 0} for index, track in enumerate(raw.tracks) if track.id in chosen]
-    return {
+    document = {
         "name": raw.name,
         "scenario_id": str(raw.metadata.get("scenario_id", raw.name)),
         "objects": [_object(track, track.id in experts) for track in raw.tracks],
@@ -62,6 +56,10 @@ def document(raw: RawScene) -> dict[str, Any]:
             "objects_of_interest": list(raw.metadata.get("objects_of_interest", ())),
         },
     }
+    try:
+        return json.dumps(document, allow_nan=False).encode()
+    except ValueError as error:
+        raise SceneError(f"{raw.source}: scene {raw.name!r}: a number that is not finite, which JSON does not have: {error}") from error
 
 
 def _rows(table: np.ndarray, axes: str) -> list[dict[str, float]]:
@@ -69,7 +67,7 @@ def _rows(table: np.ndarray, axes: str) -> list[dict[str, float]]:
 
 
 def _object(track: Track, expert: bool) -> dict[str, Any]:
-    """One track; its goal is where it was seen last."""
+    """One track; its goal is its last valid position."""
     length, width, height = track.size
     last = np.flatnonzero(track.valid)[-1] if track.valid.any() else -1
     hidden = ~track.valid[:, None]
@@ -92,12 +90,12 @@ def _road(line: Polyline, source: str) -> dict[str, Any]:
     """One feature of the map."""
     name = next((name for kinds, name in TYPES if line.kind in kinds), None)
     if name is None:
-        raise SceneError(f"{source}: road {line.id}: GPUDrive has no type for the map element {line.kind}; valid: 0 to 20")
+        raise SceneError(f"{source}: road {line.id}: GPUDrive has no type for the map element {line.kind}; expected 0 to 20")
     return {"geometry": _rows(line.xyz, "xyz"), "type": name, "map_element_id": line.kind, "id": line.id}
 
 
 def _light(light: Light) -> dict[str, list[Any]]:
-    """A light at the steps at which anything is said of it; its stop point is repeated at each."""
+    """A light at its valid steps; each repeats its stop point."""
     steps = np.flatnonzero(light.valid).tolist()
     place = {} if light.stop is None else {axis: [value] * len(steps) for axis, value in zip("xyz", light.stop.tolist(), strict=True)}
     return {"state": [LIGHT_STATES[light.state[step]] for step in steps], **place, "time_index": steps}

@@ -1,8 +1,8 @@
-"""Scenes as ScenarioNet's pickles, for MetaDrive and everything else that reads a ScenarioNet database.
+"""Writes scenes as ScenarioNet's pickles, for MetaDrive and all other readers of a ScenarioNet database.
 
-Only texts, numbers, containers and numpy arrays are written, under module names that numpy 1 and 2 both know. What the format cannot hold:
-that a topology was rebuilt, a scene's origin, and metadata of other formats. A neighbour is its id alone, without the stretch beside which
-it lies; a light without a stop point gets its lane's first point, as MetaDrive wants one. MetaDrive needs a recording car to simulate.
+Files have only texts, numbers, containers and numpy arrays, under module names of both numpy 1 and 2. The format has no mark of inferred
+lane links, no origin and no metadata of other formats. A neighbour is an id without the stretch of lane; a light without a stop point gets
+its lane's first point, which MetaDrive requires. MetaDrive needs a recording car to simulate.
 """
 
 import pickle
@@ -18,66 +18,44 @@ from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawSc
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.core.types import LINES, POLYGONS, STOP_SIGN
 from scenefactory_jax.data.export import files
-from scenefactory_jax.data.formats.scenarionet import DATASETS, ELEMENTS, KEPT, LANES, MAPPING, SUMMARY, UNITS
+from scenefactory_jax.data.formats.scenarionet import DATASETS, ELEMENTS, LANES, MAPPING, SUMMARY, TEXTS, UNITS
 
 VERSION = "MetaDrive v0.3.0.1"  # of the format, as WOMD's converter writes it
 NAMES = {element: name for name, element in ELEMENTS.items()}
-MOVES_M = 1.0  # MetaDrive counts an object as moving that goes farther
-PROTOCOL = 3  # the last one whose module names stand as lines of text, not in frames of a known length
+MOVES_M = 1.0  # distance above which MetaDrive counts an object as moving
+PROTOCOL = 3  # the last protocol with module names as lines of text, not in frames of a known length
 
 
 def write(raw: RawScene, path: Path | str) -> dict[str, Any]:
-    """Write one scene to a pickle, whose name should be `sd_*.pkl`: MetaDrive reads no other. Returns the scenario's metadata.
+    """Writes one scene to a pickle and returns its metadata. MetaDrive reads only files named `sd_*.pkl`.
 
     Raises:
-        SceneError: a map element that the format does not know, or a file that cannot be written.
+        SceneError: a map element that the format does not have, or a file that cannot be written.
     """
-    whole = scenario(raw)
-    files.write(path, _pickled(whole))
-    return whole["metadata"]
+    _, content, metadata = _encode(raw)
+    files.write(path, content)
+    return metadata
 
 
 def write_all(scenes: Iterable[RawScene], folder: Path | str, refused: list[str]) -> int:
-    """Write a database: a pickle for each scene, and at last the summary and the mapping of all. Returns how many scenes.
-
-    Args:
-        scenes: taken one at a time.
-        folder: to write into.
-        refused: a line is added for each scene that is left out: of a name that was written already, or with a map element that the
-            format does not know.
-
-    Raises:
-        SceneError: a file that cannot be written.
-    """
-    folder = Path(folder)
-    files.make_folder(folder)
-    summary: dict[str, Any] = {}
-    for raw in scenes:
-        name = file_name(raw)
-        try:
-            if name in summary:
-                raise SceneError(f"{raw.source}: {folder / name} is written already; two scenes need two names")
-            whole = scenario(raw)
-        except SceneError as error:
-            refused.append(f"{raw.name}: {error}")
-            continue
-        files.write(folder / name, _pickled(whole))
-        summary[name] = whole["metadata"]
-    files.write(folder / SUMMARY, _pickled(summary))
-    files.write(folder / MAPPING, _pickled(dict.fromkeys(summary, "")))
+    """Writes a database: a pickle for each scene (see `files.write_scenes`), then summary and mapping; returns the number of scenes."""
+    summary = files.write_scenes(scenes, folder, refused, _encode)
+    files.write(Path(folder) / SUMMARY, _pickled(summary))
+    files.write(Path(folder) / MAPPING, _pickled(dict.fromkeys(summary, "")))
     return len(summary)
 
 
-def file_name(raw: RawScene) -> str:
-    """The name that ScenarioNet gives a scenario's file: `sd_DATASET_SCENARIO.pkl`."""
-    return to_file_name(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl")
+def _encode(raw: RawScene) -> tuple[str, bytes, dict[str, Any]]:
+    """The name that ScenarioNet gives a scenario's file, its content, and the scenario's metadata."""
+    document = scenario(raw)
+    return to_file_name(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl"), _pickled(document), document["metadata"]
 
 
 def scenario(raw: RawScene) -> dict[str, Any]:
-    """The scenario of a scene, as ScenarioNet describes it.
+    """The document of a scene (ScenarioNet, "Scenario Description").
 
     Raises:
-        SceneError: a map element that the format does not know.
+        SceneError: a map element that the format does not have.
     """
     tokens = raw.metadata.get("tokens", {})
     names = _names([track.id for track in raw.tracks], tokens.get("tracks", {}))
@@ -112,24 +90,24 @@ def _scenario_id(raw: RawScene) -> str:
 
 
 def _sign_lanes(found: Mapping[str, list[int]] | list[Mapping[str, Any]]) -> Mapping[str, list[int]]:
-    """The lanes of each stop sign by its id; older banks of WOMD's protos hold a list of records."""
-    return {str(one["sign"]): one["lanes"] for one in found} if isinstance(found, list) else found
+    """The lanes of each stop sign by its id; older banks of WOMD's protos have a list of records."""
+    return {str(record["sign"]): record["lanes"] for record in found} if isinstance(found, list) else found
 
 
 def _names(ids: list[int], tokens: Mapping[str, int]) -> list[str]:
-    """Keys for ids: the texts that they stood for, or the numbers; an id that occurs again gets a suffix."""
-    texts = {identity: text for text, identity in tokens.items()}
-    seen: Counter[str] = Counter()
+    """Keys for ids: the texts of the source, or the numbers; an id that occurs again gets a suffix."""
+    texts = {number: text for text, number in tokens.items()}
+    count: Counter[str] = Counter()
     names = []
-    for identity in ids:
-        name = texts.get(identity, str(identity))
-        names.append(f"{name}_{seen[name]}" if seen[name] else name)
-        seen[name] += 1
+    for number in ids:
+        name = texts.get(number, str(number))
+        names.append(f"{name}_{count[name]}" if count[name] else name)
+        count[name] += 1
     return names
 
 
 def _track(track: Track, name: str, dataset: str) -> dict[str, Any]:
-    """An object's states; zeros where it is not valid, its size too."""
+    """An object's states, with zeros at invalid steps, also of its size."""
     length, width, height = (np.where(track.valid, side, 0.0) for side in track.size)
     kind, steps = track.kind.upper(), len(track.valid)
     state = {"position": track.xyz, "length": length, "width": width, "height": height, "heading": track.yaw}
@@ -142,9 +120,9 @@ def _track(track: Track, name: str, dataset: str) -> dict[str, Any]:
 
 
 def _feature(line: Polyline, lanes: Mapping[int, str], signs: Mapping[str, list[int]], source: str) -> dict[str, Any]:
-    """One feature of the map; lanes are called by their keys."""
+    """One feature of the map; lanes are referred to by their keys."""
     if line.kind not in NAMES:
-        raise SceneError(f"{source}: road {line.id}: MetaDrive has no type for the map element {line.kind}; valid: {sorted(NAMES)}")
+        raise SceneError(f"{source}: road {line.id}: MetaDrive has no type for the map element {line.kind}; expected {sorted(NAMES)}")
     keys = lambda ids: [lanes.get(lane, str(lane)) for lane in ids]  # noqa: E731
     feature: dict[str, Any] = {"type": NAMES[line.kind]}
     xyz = np.ascontiguousarray(line.xyz)
@@ -170,14 +148,14 @@ def _light(light: Light, key: str, lane: Polyline | None, dataset: str) -> dict[
 
 
 def _metadata(raw: RawScene, names: list[str], tracks: dict[str, Any], lights: dict[str, Any], features: dict[str, Any]) -> dict[str, Any]:
-    """What MetaDrive and ScenarioNet's filters ask of a scenario without reading the rest."""
+    """Metadata for MetaDrive and ScenarioNet's filters, which do not read the rest."""
     by_id = {track.id: name for track, name in zip(raw.tracks, names, strict=True)}
     chosen = {key: [by_id[i] for i in raw.metadata.get(key, ()) if i in by_id] for key in ("objects_of_interest", "tracks_to_predict")}
     index = {name: place for place, name in enumerate(names)}
-    kept = {key: raw.metadata[key] for key in KEPT if isinstance(raw.metadata.get(key), str)}
+    texts = {key: raw.metadata[key] for key in TEXTS if isinstance(raw.metadata.get(key), str)}
     sdc = {} if raw.sdc is None else {"sdc_id": names[raw.sdc], "sdc_track_index": raw.sdc}
     summary = {name: _summary(name, track) for name, track in tracks.items()}
-    return kept | sdc | {
+    return texts | sdc | {
         "id": _scenario_id(raw),
         "scenario_id": _scenario_id(raw),
         "dataset": _dataset(raw),
@@ -197,22 +175,22 @@ def _metadata(raw: RawScene, names: list[str], tracks: dict[str, Any], lights: d
 
 
 def _summary(name: str, track: Mapping[str, Any]) -> dict[str, Any]:
-    """One object in the summary: how long it is there, and how far it goes."""
+    """One object in the summary: valid steps and distance."""
     valid = track["state"]["valid"]
-    way = track["state"]["position"][valid, :2]
+    path = track["state"]["position"][valid, :2]
     start = int(np.argmax(valid))
     return {
         "type": track["type"],
         "object_id": name,
         "track_length": len(valid),
-        "moving_distance": float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
+        "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         "valid_length": int(valid.sum()),
         "continuous_valid_length": int(np.argmin(valid[start:])) if valid.any() and not valid[start:].all() else int(valid.sum()),
     }
 
 
 def _numbers(summary: Mapping[str, Any], lights: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, Any]:
-    """Counts over the scenario, under ScenarioNet's names."""
+    """Counts over the scenario, with ScenarioNet's names."""
     kinds = Counter(entry["type"] for entry in summary.values())
     moving = Counter(entry["type"] for entry in summary.values() if entry["moving_distance"] > MOVES_M)
     states = Counter(state for light in lights.values() for state in light["state"]["object_state"] if state is not None)
@@ -233,7 +211,7 @@ def _numbers(summary: Mapping[str, Any], lights: Mapping[str, Any], features: Ma
 
 
 def _pickled(value: Any) -> bytes:
-    """The pickle under numpy 1's module names: numpy 2 reads both, numpy 1 only its own."""
+    """The pickle with numpy 1's module names, which both numpy 1 and 2 read."""
     content = pickle.dumps(value, protocol=PROTOCOL)
     pieces, done = [], 0
     for opcode, argument, place in pickletools.genops(content):

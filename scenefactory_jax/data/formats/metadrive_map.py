@@ -1,8 +1,8 @@
-"""MetaDrive's own maps: which of their lines are the rim of the road.
+"""The rim of the road in MetaDrive's own maps.
 
 MetaDrive has a type for the side of the road (`PGLineType.SIDE`) but writes it as a solid white line, and a guardrail as a line of no known
-type (`PGMap.get_line_type`), so a map has no road edges. Beside such a line there is a lane on one side only; beside the solid lines that
-separate lanes there is one on both.
+type (`PGMap.get_line_type`), so a map has no road edges. Such a line has a lane on one side only; a solid line that separates lanes has
+one on both sides.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from scenefactory_jax.data.formats.polylines import densify
 
-BESIDE_M = 0.5  # how far beside a line lanes are looked for: less than half a lane, more than the slits between lanes in curves
-SPACING_M = 1.0  # of the places along it
+BESIDE_M = 0.5  # distance beside a line at which lanes are searched: less than half a lane, more than the slits between lanes in curves
+SPACING_M = 1.0  # between the places along it
 
 
 def find_rims(lines: Sequence[Float[np.ndarray, "_ 3"]], lanes: Sequence[Float[np.ndarray, "_ 2"]]) -> list[bool]:

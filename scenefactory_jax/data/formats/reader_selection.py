@@ -1,6 +1,7 @@
-"""From a path to scenes: which files there are, and which reader reads each."""
+"""Finds the files below a path, and the reader of each file."""
 
 import os
+import re
 import stat
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,15 +10,35 @@ from typing import Any
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import FormatMismatch, OtherContent, RawScene, Reject, SceneError
-from scenefactory_jax.data.formats import foreign, json_documents
+from scenefactory_jax.data.formats import file_content
 
-REASON = 80  # characters of what one reader says of a file that is not its own
+MAX_REASON = 80  # characters of a reader's refusal
 BANK_INDEX = "bank.json"  # the file that makes a folder a bank
+HEAD = 16_384  # bytes that identify formats without a reader: SUMO's networks begin with a comment of some thousand
+STARTS = {
+    b"SQLite format 3\0": "an SQLite database, such as nuPlan's logs",
+    b"\x89HDF": "HDF5",
+    b"PK\x03\x04": "a ZIP archive",
+    b"BZh": "a file compressed by bzip2",
+    b"\x28\xb5\x2f\xfd": "a file compressed by Zstandard",
+    b"track_id,frame_id,timestamp_ms,": "a recording of INTERACTION (CSV)",
+}
+ROOTS = {
+    "OpenDRIVE": "OpenDRIVE",
+    "OpenSCENARIO": "OpenSCENARIO",
+    "commonRoad": "CommonRoad",
+    "osm": "OpenStreetMap XML, such as the Lanelet2 maps of INTERACTION",
+    "net": "a network of SUMO",
+    "routes": "routes of SUMO",
+    "additional": "additional elements of SUMO",
+    "sumoConfiguration": "a configuration of SUMO",
+}
+BEFORE_ROOT = re.compile(r"<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>", re.DOTALL)  # declaration, comments and document type
 Reader = Callable[[Path], Iterator[RawScene | Reject]]
 
 
 def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
-    """Config entries -> readers, in the order in which they are tried.
+    """Makes the readers of config entries, in the order in which they are tried.
 
     Raises:
         ConfigError: an entry that cannot be built, by name.
@@ -26,12 +47,12 @@ def make(formats: Mapping[str, Any]) -> dict[str, Reader]:
 
 
 def find(path: Path | str) -> list[Path]:
-    """The file itself, or every file below a folder in sorted order; hidden ones, and banks that lie among them, are left out.
+    """Finds the file itself, or every file below a folder in sorted order, without hidden files and banks.
 
-    A folder that cannot be listed stands for what is in it: reading it says why.
+    A folder that cannot be listed is in the list: reading it raises the reason.
 
     Raises:
-        SceneError: no such path, a bank, or nothing in it.
+        SceneError: no such path, a bank, or an empty folder.
     """
     path = Path(path)
     if path.is_file():
@@ -44,15 +65,14 @@ def find(path: Path | str) -> list[Path]:
     for folder, folders, names in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
         folders[:] = [name for name in folders if not name.startswith(".")]
         if BANK_INDEX not in names:
-            found.extend(file for name in names if not name.startswith(".") and _holds_content(file := Path(folder, name)))
-    files = sorted(found)
-    if not files:
+            found.extend(file for name in names if not name.startswith(".") and _is_regular(file := Path(folder, name)))
+    if not found:
         raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
-    return files
+    return sorted(found)
 
 
-def _holds_content(path: Path) -> bool:
-    """Whether this is a file, no pipe or device; one of which that cannot be found out is, and reading it says why."""
+def _is_regular(path: Path) -> bool:
+    """Whether this is not a pipe or a device; a file without access counts as regular, and reading it raises the reason."""
     try:
         return stat.S_ISREG(path.stat().st_mode)
     except OSError:
@@ -60,45 +80,57 @@ def _holds_content(path: Path) -> bool:
 
 
 def read(path: Path | str, formats: Mapping[str, Reader]) -> Iterator[RawScene | Reject]:
-    """The scenes of one file, and its records that could not be read, by the first reader that knows its format.
+    """Reads the scenes of one file by the first reader of its format, with a `Reject` for each record that could not be read.
 
     Raises:
         Companion: the file belongs to scenes beside it.
-        SceneError: a folder that cannot be listed; a format that no reader knows, named if it can be told; or what the reader that knows
-            the format found wrong.
+        SceneError: a folder that cannot be listed; an unknown format, by name if possible; or an error of the reader.
     """
-    if Path(path).is_dir():
+    path = Path(path)
+    if path.is_dir():
         raise SceneError(f"{path}: a folder that cannot be listed; allow it to be read, or give the files beside it")
-    with json_documents.unpacked_once():
-        first, scenes = _begin(Path(path), formats)
+    with file_content.unpacked_once():
+        first, scenes = _find_reader(path, formats)
     yield first
     yield from scenes
 
 
-def _begin(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
-    """What the first reader that knows the format yields first, and the rest of it. See `read`."""
-    near: list[str] = []
+def _find_reader(path: Path, formats: Mapping[str, Reader]) -> tuple[RawScene | Reject, Iterator[RawScene | Reject]]:
+    """The first scene of the first reader that accepts the file, and the iterator over the others."""
+    refusals: list[str] = []
     for name, reader in formats.items():
         scenes = iter(reader(path))
         try:
             first = next(scenes, None)
         except OtherContent as refusal:
-            near.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", REASON))
+            refusals.append(textwrap.shorten(f"{name}: {str(refusal).removeprefix(f'{path}: ')}", MAX_REASON))
             continue
         except FormatMismatch:
             continue
         if first is None:
-            raise SceneError(f"{path}: no scene in it, says the reader {name!r}")
+            raise SceneError(f"{path}: the reader {name!r} found no scene")
         return first, scenes
-    raise SceneError(f"{path}: {_refusal(path, near)}; formats: {', '.join(formats) or 'none'}")
+    raise SceneError(f"{path}: {_explain(path, refusals)}; formats: {', '.join(formats) or 'none'}")
 
 
-def _refusal(path: Path, near: Sequence[str]) -> str:
-    """Why no reader reads a file: what it is, or else what those say that read other files of its kind, or else how it begins."""
+def _explain(path: Path, refusals: Sequence[str]) -> str:
+    """Why no reader accepts a file: its format, or the refusals of readers of the same container, or its first bytes."""
     with path.open("rb") as file:
-        head = file.read(foreign.HEAD)
+        head = file.read(HEAD)
     if not head:
         return "an empty file"
-    if name := foreign.find_name(head):
+    if name := _find_foreign_format(head):
         return f"this is {name}: it is not read"
-    return f"no reader knows this format: {'; '.join(near) or f'it begins with {head[:16]!r}'}"
+    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
+
+
+def _find_foreign_format(head: bytes) -> str | None:
+    """The name of a format without a reader, with an article where it needs one; None if it is not known."""
+    for start, name in STARTS.items():
+        if head.startswith(start):
+            return name
+    text = head.decode("utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig", errors="ignore").lstrip()
+    root = re.match(r"<(?:\w+:)?([\w.-]+)", BEFORE_ROOT.sub("", text).lstrip()) if text.startswith("<") else None
+    if root is None:
+        return None
+    return ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")

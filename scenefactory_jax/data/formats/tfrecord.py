@@ -15,7 +15,7 @@ from typing import NamedTuple
 import google_crc32c
 
 from scenefactory_jax.core.raw_scene import FormatMismatch, Reject, SceneError
-from scenefactory_jax.data.formats.json_documents import take_key
+from scenefactory_jax.data.formats.file_content import read_bytes
 
 HEADER = struct.Struct("<QI")  # length of the data, masked checksum of the length
 FOOTER = struct.Struct("<I")  # masked checksum of the data
@@ -36,22 +36,22 @@ class Record(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """What stands between one record's start and the next one's."""
+    """The content between the start of a record and the start of the next."""
 
     data: bytes = b""
-    fault: str = ""  # why the data cannot be used
+    fault: str = ""  # reason why the data cannot be used
     known: bool = True  # a checksum matches, so this is a TFRecord
-    last: bool = False  # nothing can be read behind it
+    last: bool = False  # reading cannot go on
 
 
 def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
-    """The records of a file, plain or gzip (told by its first bytes), and a `Reject` for each that is damaged.
+    """Reads the records of a file, plain or gzip, and yields a `Reject` for each that is damaged.
 
-    Reading goes on behind a damaged record as long as its length can be trusted: the length's checksum matches, or the data's does.
+    Reading goes on after a damaged record as long as its length can be trusted: the checksum of the length matches, or that of the data.
 
     Args:
         path: of the file, which may be larger than memory.
-        record_limit_mb: a longer record is rejected unread, and what follows it with it.
+        record_limit_mb: a longer record is rejected unread, and so is the rest of the file.
 
     Raises:
         FormatMismatch: the file does not begin as a TFRecord.
@@ -64,16 +64,16 @@ def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
     with stream:
         number = offset = 0
         while True:
-            place = f"record {number} at byte {offset}"
             try:
                 frame = _read_frame(stream, None if size is None else size - offset, record_limit_mb)
             except (OSError, EOFError, zlib.error) as error:
                 frame = _Frame(fault=f"damaged or cut short: {error}", known=number > 0, last=True)
             if number == 0 and (frame is None or not frame.known):
-                raise FormatMismatch(f"{path}: no TFRecord: {'it is empty' if frame is None else frame.fault}")
+                raise FormatMismatch(f"{path}: not a TFRecord: {'it is empty' if frame is None else frame.fault}")
             if frame is None:
                 return
-            yield Reject(None, f"{place}: {frame.fault}") if frame.fault else Record(number, offset, frame.data)
+            record = Record(number, offset, frame.data)
+            yield Reject(None, f"{record.place}: {frame.fault}") if frame.fault else record
             if frame.last:
                 return
             number, offset = number + 1, offset + HEADER.size + len(frame.data) + FOOTER.size
@@ -86,40 +86,37 @@ def mask(data: bytes) -> int:
 
 
 def _open(path: Path) -> tuple[BufferedIOBase, int | None]:
-    """The file, unpacked as it is read, and its size, which gzip does not tell."""
+    """The file, unpacked as it is read, and its size, which is not known of gzip."""
     stream = path.open("rb")
-    packed = stream.read(len(GZIP)) == GZIP
-    if not packed:
-        stream.seek(0)
-        return stream, path.stat().st_size
-    stream.close()
-    return gzip.open(path), None
+    if stream.read(len(GZIP)) == GZIP:
+        stream.close()
+        return gzip.open(path), None
+    stream.seek(0)
+    return stream, path.stat().st_size
 
 
 def _read_frame(stream: BufferedIOBase, left: int | None, limit_mb: int) -> _Frame | None:
-    """The next frame of a file of which `left` bytes are left, if that is known; none at its end."""
-    header = take_key(stream, HEADER.size)
+    """Reads the next frame of a file of which `left` bytes are left, if that is known; None at its end."""
+    header = read_bytes(stream, HEADER.size)
     if not header:
         return None
     if len(header) < HEADER.size:
         return _Frame(fault=f"truncated: {len(header)} bytes are left, but a header has {HEADER.size}", known=False, last=True)
     length, checksum = HEADER.unpack(header)
-    sound = checksum == mask(header[:8])
-    lost = f"the checksum of its length ({length}) does not match, so where the next record begins is not known"
+    known = checksum == mask(header[:8])
+    lost = f"the checksum of its length ({length}) does not match, so the start of the next record is not known"
+    end = lambda fault: _Frame(fault=fault if known else lost, known=known, last=True)  # noqa: E731
     if left is not None and length > (room := left - HEADER.size - FOOTER.size):
-        fault = f"truncated: it declares {length} bytes of data, and there can be {max(room, 0)} at most"
-        return _Frame(fault=fault if sound else lost, known=sound, last=True)
+        return end(f"truncated: it declares {length} bytes of data, and there can be {max(room, 0)} at most")
     if length > limit_mb * 10**6:
-        fault = f"it declares {length} bytes of data; formats.womd.record_limit_mb is {limit_mb}"
-        return _Frame(fault=fault if sound else lost, known=sound, last=True)
-    data = take_key(stream, length)
-    footer = take_key(stream, FOOTER.size)
+        return end(f"it declares {length} bytes of data; formats.womd.record_limit_mb is {limit_mb}")
+    data = read_bytes(stream, length)
+    footer = read_bytes(stream, FOOTER.size)
     if len(data) + len(footer) < length + FOOTER.size:
-        fault = f"truncated: it declares {length} bytes of data, and there are {len(data)}"
-        return _Frame(fault=fault if sound else lost, known=sound, last=True)
+        return end(f"truncated: it declares {length} bytes of data, and there are {len(data)}")
     intact = FOOTER.unpack(footer)[0] == mask(data)
-    if sound and intact:
+    if known and intact:
         return _Frame(data)
-    if sound or intact:
-        return _Frame(data, fault=f"the checksum of its {'data' if sound else 'length'} does not match")
-    return _Frame(fault=lost, known=False, last=True)
+    if known or intact:
+        return _Frame(data, fault=f"the checksum of its {'data' if known else 'length'} does not match")
+    return end(lost)

@@ -2,9 +2,8 @@
 
 Names and numbers are those of `scenario.proto` and `map.proto` (github.com/waymo-research/waymo-open-dataset) and of
 TensorFlow's `example.proto` and `feature.proto`. Fields that no reader uses (lidar, camera tokens, boundaries of lanes) are left out:
-protobuf skips them. Three things are declared as others that look the same in a file: enumerations as integers, so that a value outside
-them is seen and refused instead of read as the default; texts as bytes, so that one that is no UTF-8 is no accident; and the map of
-features as the list of its entries.
+protobuf skips them. Three types are declared as others of the same encoding: enumerations as integers, so that an unknown value is refused
+instead of read as the default; texts as bytes, because they may not be UTF-8; and the map of features as the list of its entries.
 """
 
 from typing import Any
@@ -13,7 +12,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-PACKAGE = "scenefactory.womd"  # a pool of our own knows these messages by it
+PACKAGE = "scenefactory.womd"  # of these messages in their own pool
 CHOICE = "feature_data"  # the name of MapFeature's oneof
 
 # message -> fields, written as in a .proto; `oneof` marks those of CHOICE
@@ -103,7 +102,7 @@ def _describe() -> FileDescriptorProto:
 
 
 def _build() -> tuple[Any, Any]:
-    """The classes of the two messages that a record may hold; a pool of one's own meets no generated module of the same names."""
+    """The classes of the two messages of records, in a pool of their own: generated modules may have the same names."""
     pool = DescriptorPool()
     pool.AddSerializedFile(_describe().SerializeToString())
     scenario, example = (GetMessageClass(pool.FindMessageTypeByName(f"{PACKAGE}.{name}")) for name in ("Scenario", "Example"))

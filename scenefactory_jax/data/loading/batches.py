@@ -104,7 +104,7 @@ def _measure_scene(read: Callable[[], Scene], *, grid: Mapping[str, Any]) -> dic
         return needed
     found = spatial_grid.attach_grid(scene, **grid).road_grid
     assert found is not None
-    return needed | {"side": found.side, "rows": found.rows.shape[-1], "most": found.most}
+    return needed | {"side": found.side, "rows": found.rows.shape[-1], "longest_list": found.longest_list}
 
 
 def require_memory(sizes: Mapping[str, int], worlds: int, *, gib: float) -> None:
