@@ -1,5 +1,6 @@
 """A command's config as YAML with the comments of the files that it is composed of, for `COMMAND --help`."""
 
+import itertools
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -22,15 +23,20 @@ def annotate(command: str, *overrides: str) -> str:
         ConfigError: see `config.load`.
     """
     composed, choices = configs.load_with_choices(command, *overrides)
+    options = {findfind_place(group): (group.partition("@")[0], chosen) for group, chosen in choices.items()}
+    return "\n".join(_lines(composed, (), collect_comments(command, choices), options))
+
+
+def collect_comments(command: str, choices: Mapping[str, Any]) -> dict[Place, str]:
+    """Returns the comments of the files that a command's config is composed of, by key."""
     comments: dict[Place, str] = {}
     for file, place in _files(command, choices):
         comments |= _comments(file.read_text(), place)
-    options = {_place(group): (group.partition("@")[0], chosen) for group, chosen in choices.items()}
-    return "\n".join(_lines(composed, (), comments, options))
+    return comments
 
 
-def _place(group: str) -> Place:
-    """Where the keys of a group lie: `failures@evaluation.failures`, `dynamics/randomization`."""
+def find_place(group: str) -> Place:
+    """Returns where the keys of a group are: `failures@evaluation.failures`, `dynamics/randomization`."""
     name, _, package = group.partition("@")
     return tuple((package or name.replace("/", ".")).split("."))
 
@@ -41,7 +47,7 @@ def _files(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[Path, Pla
     yield from _with_bases(configs.find_config(command), ())
     for group, chosen in choices.items():
         for option in chosen if isinstance(chosen, list) else [chosen]:
-            yield from _with_bases(root / group.partition("@")[0] / f"{option}.yaml", _place(group))
+            yield from _with_bases(root / group.partition("@")[0] / f"{option}.yaml", find_place(group))
 
 
 def _with_bases(file: Path, place: Place) -> Iterator[tuple[Path, Place]]:
@@ -59,9 +65,8 @@ def _with_bases(file: Path, place: Place) -> Iterator[tuple[Path, Place]]:
 def _comments(text: str, place: Place) -> dict[Place, str]:
     """Key -> the comment behind it; the comment at the head of the file belongs to the group."""
     lines, found = text.splitlines(), dict[Place, str]()
-    head = [line.lstrip("# ") for line in lines[: next((i for i, line in enumerate(lines) if not line.startswith("#")), 0)]]
-    if place and (told := " ".join(line for line in head if not line.startswith("@package"))):
-        found[place] = told
+    if place and (head := read_head(text)):
+        found[place] = head
 
     def visit(node: yaml.Node | None, place: Place) -> None:
         if not isinstance(node, yaml.MappingNode):
@@ -69,8 +74,8 @@ def _comments(text: str, place: Place) -> dict[Place, str]:
         for key, value in node.value:
             last = key if isinstance(value, yaml.MappingNode) and not value.flow_style else value
             behind = lines[last.end_mark.line][last.end_mark.column :] if last.end_mark.line < len(lines) else ""
-            if told := re.search(r"#\s*(.*)", behind):
-                found[(*place, key.value)] = told.group(1)
+            if comment := re.search(r"#\s*(.*)", behind):
+                found[(*place, key.value)] = comment.group(1)
             if last is key:  # what stands in braces shares one comment
                 visit(value, (*place, key.value))
 
@@ -78,17 +83,23 @@ def _comments(text: str, place: Place) -> dict[Place, str]:
     return found
 
 
+def read_head(text: str) -> str:
+    """Returns the comment at the head of a config file."""
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return " ".join(line.lstrip("# ") for line in lines if "@package" not in line)
+
+
 def _lines(node: Mapping[str, Any], place: Place, comments: Mapping[Place, str], options: Mapping[Place, tuple[str, Any]]) -> Iterator[str]:
     """One line for each value; a mapping's keys stand below its own."""
     indent = "  " * len(place)
     for key, value in node.items():
         here = (*place, str(key))
-        told = [comments[here]] if here in comments else []
+        parts = [comments[here]] if here in comments else []
         if here in options:
-            told.insert(0, _options(*options[here]))
+            parts.insert(0, _list_options(*options[here]))
         nested = isinstance(value, Mapping) and bool(value)
         line = f"{indent}{key}:" if nested else f"{indent}{key}: {_plain(value)}"
-        comment = f"# {' '.join(told)}" if told else ""
+        comment = f"# {' '.join(parts)}" if parts else ""
         if len(line) + len(comment) < WIDTH:
             yield f"{line} {comment}".rstrip()
         else:
@@ -98,8 +109,8 @@ def _lines(node: Mapping[str, Any], place: Place, comments: Mapping[Place, str],
             yield from _lines(value, here, comments, options)
 
 
-def _options(group: str, chosen: Any) -> str:
-    """What a group is set to, and what else there is."""
+def _list_options(group: str, chosen: Any) -> str:
+    """Returns the chosen option of a group, and the others."""
     others = [file.stem for file in sorted((configs.find_conf() / group).glob("*.yaml")) if file.stem != chosen]
     return f"{group}={chosen or 'null'}{'; or ' if others else ''}{', '.join(others)}."
 
