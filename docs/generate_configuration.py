@@ -30,9 +30,9 @@ GROUPS = {field.name: field.type for field in dataclasses.fields(EnvConfig)} | {
 
 HEAD = """# Configuration
 
-All keys with types, defaults and meaning, generated from `conf/` and the code that checks it. On the terminal, `COMMAND --help` shows the same
-for one command, and `COMMAND --cfg job` the config of a command line. A key of a group is `group.key` (`timing.episode_s=20`), an option
-replaces a group (`dynamics=bicycle`).
+All keys with types, defaults and meaning, generated from `conf/` and the code that checks it. On the terminal, `COMMAND --help` shows
+the same for one command, and `COMMAND --cfg job` the config of a command line. A key of a group is `group.key` (`timing.episode_s=20`),
+an option replaces a group (`dynamics=bicycle`).
 """
 
 
