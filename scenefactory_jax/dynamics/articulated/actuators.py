@@ -6,28 +6,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.dynamics.articulated import equations_of_motion
-from scenefactory_jax.dynamics.articulated.constants import CarConstants
-from scenefactory_jax.dynamics.articulated.contact_solver import IMPEDANCE_RANGE, MIN_REGULARIZATION, BrakeRows
 from scenefactory_jax.dynamics.articulated.equations_of_motion import FRONT, Forces
 from scenefactory_jax.dynamics.articulated.parameters import (
     AHEAD,
     DRIVE_FADE_FRACTION,
     LEFT,
-    MIN_FRICTION_LOSS,
-    ROLLBACK_SPIN,
     CarParameters,
 )
 from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.vector import Number, Vector, cross, dot, length, sum_vectors
-
-BRAKE_TIME_CONSTANT = 0.02  # s, MuJoCo's default, with its damping ratio of 1: a brake has no position and therefore no stiffness
 
 
 class Command(NamedTuple):
     """Actuator commands of one car, constant in a control step."""
 
     steer: Float[Array, "*cars"]  # angle of the front wheels, rad
-    drive_torque: Float[Array, "*cars"]  # of each front wheel, N m
+    throttle: Float[Array, "*cars"]  # -1 to 1; below zero: reverse gear
     brake_torque: Float[Array, "*cars 4"]  # of each wheel, N m
 
 
@@ -39,48 +33,34 @@ class PlanarForce(NamedTuple):
 
 
 def compute_command(car: CarParameters, action: Float[Array, "A 3"]) -> Command:
-    """Computes the actuator commands from an action: throttle, steer and brake in [-1, 1]."""
+    """Computes the actuator commands from an action: throttle, steer and brake in [-1, 1]; a brake below zero is released."""
     throttle, steer, brake = jnp.clip(action, -1.0, 1.0).T
     brake = jnp.maximum(brake, 0.0)
     front, rear = car.brake_torque_front * brake, car.brake_torque_rear * brake
-    drive_torque = car.drive_torque * jnp.maximum(throttle, 0.0)
-    return Command(car.steering_limit * steer, drive_torque, jnp.stack([front, front, rear, rear], axis=-1))
+    return Command(car.steering_limit * steer, throttle, jnp.stack([front, front, rear, rear], axis=-1))
 
 
-def compute_wheel_torques(
-    car: CarParameters, command: Command, spin: Float[Array, "4"]
-) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Computes drive torque and friction loss of each wheel joint, N m, for brakes that are joint friction.
+def compute_drive_torque(car: CarParameters, throttle: Number, state: CarState) -> Number:
+    """Computes the engine's torque on each wheel, N m: front wheels only.
 
-    A wheel that turns forward is accelerated by drive - brake. MuJoCo's joint friction is soft: a joint that holds a torque yields at a
-    rate proportional to it, and a car would creep against its brakes. So the part that drive and brake have in common is subtracted from
-    both. A wheel that rolls back is slowed by both, and both stay.
+    A throttle above zero asks for its fraction of the torque that the engine has at the wheel's spin: `drive_torque`, at most half of
+    `drive_power` over the spin. A throttle below zero asks for the same backwards, if the car rolls forward slower than
+    `reverse_speed`; above it, the reverse gear cannot be engaged and the engine idles. The torque falls to zero over the last tenth of
+    `spin_limit`, backwards of `reverse_spin_limit`.
     """
-    drive, brake = compute_drive_torque(car, command.drive_torque, spin), command.brake_torque + car.rolling_torque
-    common = jnp.where(spin > -ROLLBACK_SPIN, jnp.minimum(drive, brake), 0.0)
-    return drive - common, jnp.maximum(brake - common, MIN_FRICTION_LOSS)
+    speed = jnp.abs(state.spin)
+    available = jnp.minimum(car.drive_torque, 0.5 * car.drive_power / jnp.maximum(speed, 1.0))
+    limit = jnp.where(throttle < 0.0, car.reverse_spin_limit, car.spin_limit)
+    fade = jnp.clip((limit - speed) / (DRIVE_FADE_FRACTION * limit), 0.0, 1.0)
+    engaged = (throttle >= 0.0) | (state.velocity.x < car.reverse_speed)
+    return jnp.where(engaged, throttle, 0.0) * available * fade * FRONT
 
 
-def compute_drive_torque(car: CarParameters, drive_torque: Float[Array, ""], spin: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Computes the engine's torque on each wheel, N m: front wheels only, falling to zero over the last tenth of `spin_limit`."""
-    fade = jnp.clip((car.spin_limit - spin) / (DRIVE_FADE_FRACTION * car.spin_limit), 0.0, 1.0)
-    return drive_torque * fade * FRONT
-
-
-def make_brake_rows(constants: CarConstants, spin: Number, friction_loss: Float[Array, "4"], *, physics_dt: float) -> BrakeRows:
-    """Computes the constraint rows of the wheels' joint friction; their Jacobian is the spin itself."""
-    impedance = jnp.clip(constants.car.brake_impedance, *IMPEDANCE_RANGE)
-    damping = 2.0 / (impedance * max(BRAKE_TIME_CONSTANT, 2 * physics_dt))
-    weight = 1.0 / jnp.maximum(constants.spin_weight * (1.0 - impedance) / impedance, MIN_REGULARIZATION)
-    return BrakeRows(-damping * spin, weight, friction_loss)
-
-
-def compute_applied_forces(car: CarParameters, state: CarState, steer: Number, wheel_torque: Number, push: PlanarForce) -> Forces:
-    """Computes all forces that MuJoCo's model of the car lacks.
+def compute_applied_forces(car: CarParameters, state: CarState, steer: Number, push: PlanarForce) -> Forces:
+    """Computes all forces that MuJoCo's model of the car lacks, but those of tyres, engine and brakes.
 
     Args:
         steer: commanded angle, rad.
-        wheel_torque: of engine and latched brakes on each wheel, N m.
         push: from other cars and objects.
     """
     servo = car.steering_stiffness * (steer - state.steer) - car.steering_damping * state.steer_rate
@@ -100,7 +80,7 @@ def compute_applied_forces(car: CarParameters, state: CarState, steer: Number, w
     )
     torque = torque + Vector(0.0, 0.0, -car.yaw_damping * state.rate.z)
     ground, ground_torque = compute_body_ground_force(car, state)
-    return Forces(drag_force + push_force + ground, torque + ground_torque, suspension=stop, spin=wheel_torque, steer=FRONT * servo)
+    return Forces(drag_force + push_force + ground, torque + ground_torque, suspension=stop, spin=jnp.zeros(4), steer=FRONT * servo)
 
 
 def compute_suspension_forces(car: CarParameters, state: CarState) -> Forces:

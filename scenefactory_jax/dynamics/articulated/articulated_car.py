@@ -24,7 +24,13 @@ from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
 from scenefactory_jax.dynamics.articulated.constants import CarConstants, compute_rest_pose, derive_constants
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, Solver, check_stability, read_parameters
-from scenefactory_jax.dynamics.articulated.tyres import TyreInput, Tyres, compute_slip_damping
+from scenefactory_jax.dynamics.articulated.tyres import (
+    Tyres,
+    compute_generalized_forces,
+    compute_outputs,
+    compute_tyre_forces,
+    find_contact_patches,
+)
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
 from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
 
@@ -35,7 +41,7 @@ class CarCarry(NamedTuple):
     qpos: Float[Array, "17"]
     qvel: Float[Array, "16"]
     qacc_warmstart: Float[Array, "16"]
-    spin_sign: Float[Array, "4"]
+    tyres: Tyres
 
 
 @pytree_dataclass
@@ -45,7 +51,6 @@ class Body:
     qpos: Float[Array, "A 17"]
     qvel: Float[Array, "A 16"]
     qacc_warmstart: Float[Array, "A 16"]
-    spin_sign: Float[Array, "A 4"]  # last direction of each wheel; only latched brakes read it
     contact_force: Float[Array, " A"]
     tyres: Tyres
     constants: CarConstants | None  # of cars that differ
@@ -58,7 +63,7 @@ class CompiledCar(NamedTuple):
     sample: Callable[..., CarParameters] | None  # (key, scene) -> parameters of the cars of an episode
     mjx_car: mjx_backend.MjxCar | None  # with the solver `newton`
     addresses: models.ModelAddresses
-    latched: bool
+    abs_enabled: bool
     solver: Solver
     rest_pose: np.ndarray  # qpos
     physics_dt: float
@@ -70,7 +75,7 @@ def make(
     car: dict[str, Any],
     solver: dict[str, Any],
     contact: dict[str, Any],
-    brakes: Literal["friction", "latched"],
+    abs: bool,
     randomization: dict[str, Any] | None,
     friction: Callable[..., Any],
     physics_dt: float,
@@ -82,8 +87,7 @@ def make(
         car: values of `CarParameters`.
         solver: values of `Solver`.
         contact: values of `collision.make`; its height is the car's.
-        brakes: `friction`: locking and standstill by the solver. `latched`: the published torque against a remembered spin direction,
-            which flips every substep when a wheel is locked.
+        abs: whether the brakes have an anti-lock controller (`tyres.compute_tyre_forces`).
         randomization: null: all cars are the reference car. An entry whose target, such as `car_parameter_sampler`, returns a function
             (key, scene) -> parameters with an agent axis, called at every start without recompilation. It may declare `car` and
             `physics_dt`.
@@ -94,7 +98,7 @@ def make(
         ConfigError: an unknown or missing number by name, a spring too stiff for the time step, or time steps that do not fit.
     """
     parameters, settings = read_parameters({"car": car, "solver": solver})
-    compiled = compile_car(parameters, settings, brakes=brakes, physics_dt=physics_dt, control_dt=control_dt)
+    compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)
     forces = collision.make_contact(contact, height=parameters.height, physics_dt=physics_dt)
     if randomization is not None:
         module = "scenefactory_jax.dynamics.articulated.randomization"
@@ -104,31 +108,27 @@ def make(
 
 
 def compile_car(
-    car: CarParameters, solver: Solver, *, brakes: Literal["friction", "latched"], physics_dt: float, control_dt: float
+    car: CarParameters, solver: Solver, *, abs_enabled: bool, physics_dt: float, control_dt: float
 ) -> CompiledCar:  # fmt: skip
     """Compiles the reference car.
 
     Raises:
-        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `closed_form` lacks, or rolling
-            resistance with latched brakes, which have no joint friction.
+        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `closed_form` lacks,.
     """
     check_stability(car, physics_dt=physics_dt, where="dynamics.car")
     if solver.algorithm == "closed_form" and solver.integrator != "Euler":
         raise ConfigError(f"dynamics.solver.integrator: expected Euler with algorithm closed_form, got {solver.integrator}")
-    if brakes == "latched" and car.rolling_torque != 0.0:
-        raise ConfigError(f"dynamics.car.rolling_torque: expected 0 with latched brakes, got {car.rolling_torque:g}")
     substeps = round(control_dt / physics_dt)
     if substeps < 1 or abs(substeps * physics_dt - control_dt) > 1e-6 * control_dt:
         raise ConfigError(f"dynamics: control_dt: expected a whole multiple of physics_dt {physics_dt}, got {control_dt}")
-    model = models.build_standalone_model(car, solver, physics_dt=physics_dt, visual=False, brake_rows=brakes == "friction")
+    model = models.build_standalone_model(car, solver, physics_dt=physics_dt, visual=False)
     at = models.find_addresses(model)
-    weights = (model.dof_invweight0[at.spin_v], model.body_invweight0[at.wheel, 0])
     return CompiledCar(
-        constants=CarConstants(car, *(jnp.asarray(weight, jnp.float32) for weight in weights)),
+        constants=CarConstants(car, jnp.asarray(model.body_invweight0[at.wheel, 0], jnp.float32)),
         sample=None,
         mjx_car=mjx_backend.put_model(model) if solver.algorithm == "newton" else None,
         addresses=at,
-        latched=brakes == "latched",
+        abs_enabled=abs_enabled,
         solver=solver,
         rest_pose=models.find_rest_pose(model, car),
         physics_dt=physics_dt,
@@ -154,7 +154,9 @@ def init(compiled: CompiledCar, key: PRNGKeyArray, scene: Scene) -> Body:
     zero = jnp.zeros_like(half)
     qpos = jnp.tile(jnp.asarray(compiled.rest_pose, jnp.float32), (count, 1))
     constants = None if compiled.sample is None else jax.vmap(derive_constants)(compiled.sample(key, scene))
+    load = jnp.broadcast_to(equations_of_motion.compute_wheel_loads(compiled.constants.car), (count, 4)).astype(jnp.float32)
     if constants is not None:
+        load = jax.vmap(equations_of_motion.compute_wheel_loads)(constants.car)
         height, travel = jax.vmap(functools.partial(compute_rest_pose, physics_dt=compiled.physics_dt))(constants)
         qpos = qpos.at[:, 2].set(height).at[:, at.suspension_q].set(travel)
     qpos = qpos.at[:, :2].set(agents.position).at[:, 3:7].set(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1))
@@ -165,11 +167,16 @@ def init(compiled: CompiledCar, key: PRNGKeyArray, scene: Scene) -> Body:
         qpos=qpos,
         qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),
         qacc_warmstart=jnp.zeros((count, 16), jnp.float32),
-        spin_sign=jnp.ones((count, 4), jnp.float32),
         contact_force=jnp.zeros((count,), jnp.float32),
-        tyres=Tyres(*(jnp.zeros((count, 4), jnp.float32) for _ in range(4))),  # separate arrays: none may be donated twice
+        tyres=place_tyres(load),
         constants=constants,
     )
+
+
+def place_tyres(load: Float[Array, "A 4"]) -> Tyres:
+    """Places tyres without deflection under their load, N."""
+    zero = [jnp.zeros_like(load) for _ in range(5)]  # separate arrays: none may be donated twice
+    return Tyres(zero[0], zero[1], load, *zero[2:])
 
 
 def control_step(
@@ -198,14 +205,14 @@ def control_step(
     def substep(body: Body, time: Float[Array, ""]) -> tuple[Body, None]:
         boxes = collect_boxes(read(compiled, body), scene.agents.size, active, mass)
         force, torque, strength = contact.forces(boxes, advance_boxes(neighbours, time))
-        carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.spin_sign)
-        carry, tyres = step(constants, fields, carry, command, PlanarForce(force, torque), mu)
-        return replace(body, **carry._asdict(), contact_force=jnp.maximum(body.contact_force, strength), tyres=tyres), None
+        carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
+        carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu)
+        return replace(body, **carry._asdict(), contact_force=jnp.maximum(body.contact_force, strength)), None
 
     zero = jnp.zeros_like(body.contact_force)
     times = compiled.physics_dt * jnp.arange(compiled.substeps)
     after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), times)
-    return tree_where(active, after, replace(body, contact_force=zero, tyres=jax.tree.map(jnp.zeros_like, body.tyres)))
+    return tree_where(active, after, replace(body, contact_force=zero, tyres=replace(body.tyres, tangent=jnp.zeros_like(zero)[:, None] * body.tyres.tangent)))
 
 
 def physics_step(
@@ -216,7 +223,7 @@ def physics_step(
     command: Command,
     push: PlanarForce,
     mu: Float[Array, "4"],
-) -> tuple[CarCarry, Tyres]:
+) -> CarCarry:
     """Computes one physics step of one car.
 
     Args:
@@ -225,20 +232,21 @@ def physics_step(
         mu: friction coefficient under each wheel.
     """
     car, state = constants.car, states.from_mujoco(constants.car, carry.qpos, carry.qvel)
-    spin_sign = jnp.where(jnp.abs(state.spin) > 1e-4, jnp.sign(state.spin), carry.spin_sign)
-    if compiled.latched:
-        drive = actuators.compute_drive_torque(car, command.drive_torque, state.spin)
-        wheel_torque, friction_loss = drive - command.brake_torque * spin_sign, None
-    else:
-        wheel_torque, friction_loss = actuators.compute_wheel_torques(car, command, state.spin)
-    forces = actuators.compute_applied_forces(car, state, command.steer, wheel_torque, push)
-    tyre = TyreInput(mu, compute_slip_damping(car, state))
-    inputs = constants, state, forces, friction_loss, tyre, carry.qpos, carry.qvel, carry.qacc_warmstart
+    patch = find_contact_patches(car, state)
+    drive = actuators.compute_drive_torque(car, command.throttle, state)
+    brake = command.brake_torque + car.rolling_torque
+    switches = {"abs_enabled": compiled.abs_enabled, "physics_dt": compiled.physics_dt}
+    tyre = compute_tyre_forces(car, state, patch, carry.tyres, mu, drive, brake, **switches)
+    forces = actuators.compute_applied_forces(car, state, command.steer, push)
+    forces = jax.tree.map(jnp.add, forces, compute_generalized_forces(state, patch, tyre, drive))
+    joints = carry.qpos, carry.qvel, carry.qacc_warmstart
     if compiled.mjx_car is None:
-        qpos, qvel, acceleration, tyres = closed_form_step.step(*inputs, solver=compiled.solver, physics_dt=compiled.physics_dt)
+        iterations, dt = compiled.solver.iterations, compiled.physics_dt
+        after = closed_form_step.step(constants, state, patch, forces, *joints, iterations=iterations, physics_dt=dt)
     else:
-        qpos, qvel, acceleration, tyres = mjx_backend.step(compiled.mjx_car, fields, *inputs, solver=compiled.solver)
-    return CarCarry(qpos, qvel, acceleration, spin_sign), tyres
+        after = mjx_backend.step(compiled.mjx_car, fields, state, forces, *joints)
+    qpos, qvel, acceleration, normal = after
+    return CarCarry(qpos, qvel, acceleration, compute_outputs(patch, tyre, normal, mu))
 
 
 def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Float[Array, " A"]) -> Float[Array, "A 4 2"]:

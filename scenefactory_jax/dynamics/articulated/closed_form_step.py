@@ -1,4 +1,4 @@
-"""One physics step of a car in closed form: equations of motion, constraint rows of tyres and brakes, and the contact solver.
+"""One physics step of a car in closed form: equations of motion, normal rows of the tyres, and the contact solver.
 
 MJX computes the same in stages for any tree of bodies (`mjx_backend`), with gathers, factorisations and scans. Here it is arithmetic on
 scalars that XLA fuses into few loops.
@@ -12,56 +12,41 @@ from scenefactory_jax.dynamics.articulated import actuators, contact_solver, equ
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.constants import CarConstants
 from scenefactory_jax.dynamics.articulated.equations_of_motion import Forces
-from scenefactory_jax.dynamics.articulated.parameters import Solver
 from scenefactory_jax.dynamics.articulated.state import CarState
-from scenefactory_jax.dynamics.articulated.tyres import Patch, TyreInput, Tyres
+from scenefactory_jax.dynamics.articulated.tyres import Patch
 
 
 def step(
     constants: CarConstants,
     state: CarState,
+    patch: Patch,
     forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
     *,
-    solver: Solver,
+    iterations: int,
     physics_dt: float,
-) -> tuple[Float[Array, "17"], Float[Array, "16"], Float[Array, "16"], Tyres]:
-    """Computes position, velocity and acceleration after the step, and the tyres' outputs.
+) -> tuple[Float[Array, "17"], Float[Array, "16"], Float[Array, "16"], Float[Array, "4"]]:
+    """Computes position, velocity and acceleration after the step, and the normal forces of the tyres, N.
 
     Args:
         constants: of this car.
         state: `from_mujoco` of position and velocity.
-        forces: that MuJoCo's model lacks (`actuators.compute_applied_forces`).
-        friction_loss: of each wheel joint, N m; None with latched brakes.
-        tyre: inputs of the tyres.
+        forces: that MuJoCo's model lacks: tyres and actuators.
         qpos, qvel: in MuJoCo's order.
         start: initial acceleration of the solver: that of the previous step.
     """
-    patch = tyres.find_contact_patches(constants.car, state)
-    problem = make_contact_problem(
-        constants, state, patch, forces, friction_loss, tyre, friction_ratio=solver.friction_ratio, physics_dt=physics_dt
-    )
+    problem = make_contact_problem(constants, state, patch, forces, physics_dt=physics_dt)
     initial = contact_solver.Acceleration(*states.unflatten(start, state))
-    solution, force = contact_solver.solve_contacts(problem, initial, iterations=solver.iterations, line_search=solver.line_search)
+    solution, normal = contact_solver.solve_contacts(problem, initial, iterations=iterations)
     acceleration = states.flatten(solution.base, solution.wheel, state)
     moved = states.integrate(qpos, qvel, acceleration, physics_dt=physics_dt)
-    return *moved, acceleration, tyres.compute_tyre_outputs(state, patch, force, tyre)
+    return *moved, acceleration, normal
 
 
 def make_contact_problem(
-    constants: CarConstants,
-    state: CarState,
-    patch: Patch,
-    forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
-    *,
-    friction_ratio: float,
-    physics_dt: float,
+    constants: CarConstants, state: CarState, patch: Patch, forces: Forces, *, physics_dt: float
 ) -> contact_solver.Problem:
     """Computes MuJoCo's convex problem of this step, in the car's axes."""
     drift = equations_of_motion.compute_bias_acceleration(state)
@@ -69,16 +54,12 @@ def make_contact_problem(
     springs = actuators.compute_suspension_forces(constants.car, state)
     bias = equations_of_motion.compute_bias_force(constants.car, state, drift)
     smooth = jax.tree.map(lambda a, b, c: a + b - c, forces, springs, bias)
-    zero = jnp.zeros(4)
     problem = contact_solver.Problem(
         base=base,
         across=across,
         wheel=wheel,
         force_base=[*smooth.force, *smooth.torque],
         force_wheel=[smooth.suspension, smooth.spin, smooth.steer],
-        tyre=tyres.make_tyre_rows(constants, state, patch, drift, tyre, friction_ratio=friction_ratio, physics_dt=physics_dt),
-        brake=contact_solver.BrakeRows(zero, zero, zero)
-        if friction_loss is None
-        else actuators.make_brake_rows(constants, state.spin, friction_loss, physics_dt=physics_dt),
+        rows=tyres.make_normal_rows(constants, state, patch, physics_dt=physics_dt),
     )
     return jax.tree.map(lambda number: jnp.asarray(number, jnp.float32), problem)

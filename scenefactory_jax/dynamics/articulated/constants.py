@@ -15,7 +15,6 @@ class CarConstants:
     """Constants of one car, or of the cars of a world (every leaf with the agent axis first)."""
 
     car: CarParameters
-    spin_weight: Float[Array, "*cars 4"]  # inverse inertia of each spin joint in the rest pose (dof_invweight0)
     wheel_weight: Float[Array, "*cars 4"]  # inverse mass at each wheel centre, mean over directions (body_invweight0)
 
 
@@ -35,7 +34,7 @@ def derive_constants(car: CarParameters) -> CarConstants:
     along = jnp.stack([forward, aside])[..., :, None] * jnp.stack([forward, aside])[..., None, :]  # [2, wheels, 6, 6]
     flat = (along * inverse).sum((0, -2, -1))  # as sums: XLA's Triton has no kernel for so small a product in deterministic mode
     unsprung = equations_of_motion.compute_unsprung(car)
-    return CarConstants(car, 1.0 / unsprung.about + inverse[4, 4] * one, (flat + 1.0 / unsprung.mass) / 3)
+    return CarConstants(car, (flat + 1.0 / unsprung.mass) / 3)
 
 
 def compute_rest_pose(constants: CarConstants, *, physics_dt: float) -> tuple[Float[Array, ""], Float[Array, "4"]]:
@@ -51,6 +50,5 @@ def compute_rest_pose(constants: CarConstants, *, physics_dt: float) -> tuple[Fl
     beyond = (rest - car.suspension_stiffness * car.suspension_travel) / (car.suspension_stiffness + car.stop_stiffness)
     travel = jnp.where(free > car.suspension_travel, car.suspension_travel + beyond, free)
     time_constant = jnp.maximum(car.tyre_time_constant, 2 * physics_dt)
-    wheel_load = load + equations_of_motion.compute_unsprung(car).mass * GRAVITY
-    depth = wheel_load * constants.wheel_weight * (1.0 - car.tyre_impedance) * time_constant**2
+    depth = equations_of_motion.compute_wheel_loads(car) * constants.wheel_weight * (1.0 - car.tyre_impedance) * time_constant**2
     return (car.wheel_radius - car.wheel_height - depth - travel).mean(), travel

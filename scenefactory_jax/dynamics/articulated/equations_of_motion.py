@@ -65,6 +65,11 @@ def compute_loads(car: CarParameters) -> Number:
     return 0.5 * car.mass * GRAVITY * (0.5 + AHEAD * (car.mass_forward / car.wheelbase))
 
 
+def compute_wheel_loads(car: CarParameters) -> Number:
+    """Computes the load of each tyre at rest, N."""
+    return compute_loads(car) + compute_unsprung(car).mass * GRAVITY
+
+
 def compute_bias_acceleration(state: CarState) -> WheelAcceleration:
     """Computes centripetal, Coriolis and gyroscopic accelerations."""
     rate, up = state.rate, Vector(0.0, 0.0, 1.0)

@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, compute_unsprung
-from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FRONT_WHEELS, LEFT, MIN_FRICTION_LOSS, WHEELS, CarParameters, Solver
+from scenefactory_jax.dynamics import mujoco_car
+from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, compute_unsprung, total_mass
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FRONT_WHEELS, LEFT, WHEELS, CarParameters, Solver
 
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
 
 
-def build_mjspec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoco.MjSpec:
+def build_mjspec(car: CarParameters, *, visual: bool) -> mujoco.MjSpec:
     """Builds one car without ground: body `chassis`, joints `root`, `suspension_*`, `steer_*`, `spin_*`, geoms `box` and `tyre_*`.
 
     Args:
         visual: add cabin, cylinder wheels and a spoke. They do not change the physics, and MJX is faster without them.
-        brake_rows: compile a friction loss into the wheel joints, for friction brakes.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "car"
@@ -37,11 +37,11 @@ def build_mjspec(car: CarParameters, *, visual: bool, brake_rows: bool) -> mujoc
     if visual:
         _add_visual_body(chassis, half)
     for wheel in range(4):
-        _add_wheel(chassis, wheel, car, visual=visual, brake_rows=brake_rows)
+        _add_wheel(chassis, wheel, car, visual=visual)
     return spec
 
 
-def _add_wheel(chassis: mujoco.MjsBody, index: int, car: CarParameters, *, visual: bool, brake_rows: bool) -> None:
+def _add_wheel(chassis: mujoco.MjsBody, index: int, car: CarParameters, *, visual: bool) -> None:
     """Adds a wheel body with its joints and its tyre geom."""
     name, position = WHEELS[index], [AHEAD[index] * car.wheelbase / 2, LEFT[index] * car.track / 2, car.wheel_height]
     wheel = chassis.add_body(name=f"wheel_{name}", pos=position)
@@ -54,8 +54,6 @@ def _add_wheel(chassis: mujoco.MjsBody, index: int, car: CarParameters, *, visua
         steer.damping = _linear(car.steering_friction)
     spin = wheel.add_joint(name=f"spin_{name}", type=hinge, axis=[0, 1, 0])
     spin.damping = _linear(car.wheel_damping)
-    spin.frictionloss = max(car.rolling_torque, MIN_FRICTION_LOSS) if brake_rows else 0.0
-    spin.solimp_friction = [car.brake_impedance, car.brake_impedance, 1e-3, 0.5, 2.0]
     mass, about, across = compute_unsprung(car)
     _set_inertia(wheel, mass[index], [across[index], about, across[index]], position=[0.0, 0.0, 0.0])
     radii = [car.wheel_radius, car.wheel_width / 2, car.wheel_radius]
@@ -138,11 +136,32 @@ def add_ground_pairs(spec: mujoco.MjSpec, car: CarParameters, *, ground: str, pr
     """
     for name in WHEELS:
         pair = spec.add_pair(name=f"{prefix}ground_{name}", geomname1=ground, geomname2=f"{prefix}tyre_{name}")
-        pair.condim = 3
-        pair.friction = [1.0, 1.0, 0.005, 1e-4, 1e-4]
+        pair.condim = 1
         pair.solref = [car.tyre_time_constant, 1.0]
         pair.solimp = [car.tyre_impedance, car.tyre_impedance, 1e-3, 0.5, 2.0]
-        pair.solreffriction = [-1e-3, -car.tyre_slip_damping]  # direct form, at rest; friction has no position for the first to act on
+
+
+def add_actuators(spec: mujoco.MjSpec, car: CarParameters, *, abs_enabled: bool, prefixes: Sequence[str] = ("",)) -> None:
+    """Adds what `dynamics/mujoco_car.py` needs to drive the cars with MuJoCo alone: steering servos, inputs, and the field `car`.
+
+    The inputs `throttle` and `brake` of a car have no force of their own: the torques of engine and brakes depend on the tyres.
+    """
+    for prefix in prefixes:
+        for name, wheel in {"steer": "front_left", "steer_right": "front_right"}.items():
+            servo = _add_input(spec, f"{prefix}{name}", f"{prefix}steer_{wheel}", (-car.steering_limit, car.steering_limit))
+            servo.gainprm[0] = car.steering_stiffness
+            servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            servo.biasprm[1], servo.biasprm[2] = -car.steering_stiffness, -car.steering_damping
+            servo.forcelimited, servo.forcerange = True, [-car.steering_torque, car.steering_torque]
+        for name, low in {"throttle": -1.0, "brake": 0.0}.items():
+            _add_input(spec, f"{prefix}{name}", f"{prefix}spin_front_left", (low, 1.0)).gainprm[0] = 0.0
+    numbers = {**vars(car), "mass_total": total_mass(car), "spin_inertia": car.wheel_inertia[0], "abs_enabled": float(abs_enabled)}
+    data = [float(numbers[name]) for name in mujoco_car.PARAMETERS]
+    spec.add_numeric(name="car", data=data, size=len(data))
+
+
+def _add_input(spec: mujoco.MjSpec, name: str, joint: str, limits: tuple[float, float]) -> mujoco.MjsActuator:
+    return spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True, ctrlrange=list(limits))
 
 
 def set_options(spec: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> None:
@@ -153,13 +172,12 @@ def set_options(spec: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> No
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.integrator = integrators.mjINT_EULER if solver.integrator == "Euler" else integrators.mjINT_IMPLICITFAST
     option.iterations, option.ls_iterations, option.tolerance = solver.iterations, solver.line_search, solver.tolerance
-    option.impratio = solver.friction_ratio
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # the dampings are stable at 120 Hz without a second factorisation
 
 
-def build_standalone_model(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool, brake_rows: bool) -> mujoco.MjModel:
+def build_standalone_model(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool) -> mujoco.MjModel:
     """Compiles one car on an infinite flat ground."""
-    spec = build_mjspec(car, visual=visual, brake_rows=brake_rows)
+    spec = build_mjspec(car, visual=visual)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
     add_ground_pairs(spec, car, ground="ground")
     set_options(spec, solver, physics_dt=physics_dt)

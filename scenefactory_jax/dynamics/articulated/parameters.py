@@ -18,8 +18,6 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")  # the order o
 FRONT_WHEELS = WHEELS[:2]
 AHEAD, LEFT = np.array([1.0, 1.0, -1.0, -1.0]), np.array([1.0, -1.0, 1.0, -1.0])  # signs of the wheels' x and y
 GRAVITY = 9.81  # m/s^2, MuJoCo's default
-MIN_FRICTION_LOSS = 1e-3  # N m; MuJoCo compiles the brakes' solver rows only if the friction loss is positive
-ROLLBACK_SPIN = 0.5  # rad/s; a wheel that turns backwards faster is slowed by drive torque and brake torque together
 DRIVE_FADE_FRACTION = 0.1  # of the spin limit, over which the drive torque falls to zero
 
 
@@ -49,7 +47,7 @@ class CarParameters:
     wheel_mass: Positive  # spinning part, kg
     wheel_inertia: Moments  # spinning part: about and across the spin axis, kg m^2
     wheel_damping: NonNegative  # viscous drag of a wheel bearing, N m s/rad
-    rolling_torque: NonNegative  # rolling resistance of a wheel (coefficient x load x radius), N m; friction brakes only
+    rolling_torque: NonNegative  # rolling resistance of a wheel (coefficient x load x radius), N m
     carrier_mass: NonNegative  # part of a wheel that does not spin, kg
     carrier_inertia: NonNegative  # the same part, about any axis, kg m^2
     knuckle_mass: NonNegative  # steering knuckle, front only, kg
@@ -65,11 +63,15 @@ class CarParameters:
     steering_torque: NonNegative  # largest torque of the steering servo, N m
     steering_friction: NonNegative  # viscous, steering joint, N m s/rad
     steering_inertia: NonNegative  # steering wheel, rack and motor, reduced to a front wheel's joint, kg m^2
-    drive_torque: NonNegative  # per front wheel at full throttle, N m
+    drive_torque: NonNegative  # per front wheel at full throttle and low speed, N m
+    drive_power: NonNegative  # of the engine, W
     spin_limit: Positive  # rad/s; the drive torque falls to zero over the last 10 %
+    reverse_spin_limit: Positive  # rad/s, of the reverse gear
+    reverse_speed: NonNegative  # m/s forward, below which the reverse gear engages
     brake_torque_front: NonNegative  # per front wheel at full brake, N m
     brake_torque_rear: NonNegative  # per rear wheel at full brake, N m
-    brake_impedance: OpenFraction  # solimp of the brakes: a locked wheel creeps by torque x (1 - impedance)
+    abs_slip: OpenFraction  # slip that the anti-lock controller holds at most
+    abs_speed: NonNegative  # m/s of a wheel's centre, above which it acts
     body_stiffness: NonNegative  # chassis corner on the ground (roll-over), N/m
     body_damping: NonNegative  # chassis corner on the ground, N s/m
     body_friction: NonNegative  # chassis corner on the ground, Coulomb coefficient
@@ -78,8 +80,13 @@ class CarParameters:
     air_drag: NonNegative  # force over speed squared: 1/2 density x drag area, N s^2/m^2
     tyre_time_constant: Positive  # solref of the ground contact, s
     tyre_impedance: OpenFraction  # solimp of the ground contact: at 0.5 the tyre sinks in 2 cm under its load, at 0.95 it is rigid
-    tyre_slip_damping: NonNegative  # solreffriction of the ground contact, 1/s: friction saturates at about 1 m/s of slip
-    tyre_slip_speed: Positive  # m/s; above it the slip damping falls with 1/speed (`tyres.compute_slip_damping`)
+    tyre_slip_stiffness: Positive  # slip stiffness over load, per rad of slip angle or unit of slip
+    tyre_relaxation_length: Positive  # m
+    tyre_shape: Annotated[float, Bounds(above=1.0, below=2.0)]  # shape factor of the magic formula
+    tyre_stiffness_fall: NonNegative  # relative fall of the slip stiffness over load at twice the nominal load
+    tyre_peak_fall: NonNegative  # the same of the friction coefficient
+    tyre_sliding_fraction: Annotated[float, Bounds(above=0.0, max=1.0)]  # friction at a high sliding speed over the peak
+    tyre_sliding_speed: Positive  # m/s, over which sliding friction falls
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,9 +96,8 @@ class Solver:
     algorithm: Literal["closed_form", "newton"]  # `contact_solver`, or `mjx.step` with MJX's Newton (`mjx_backend`)
     integrator: Literal["Euler", "implicitfast"]
     iterations: Count
-    line_search: Count  # iterations
+    line_search: Count  # iterations; `newton` only
     tolerance: NonNegative  # `newton` only
-    friction_ratio: Positive  # MuJoCo's impratio: impedance of friction over that of the normal force
 
 
 def read_parameters(entry: Mapping[str, Any]) -> tuple[CarParameters, Solver]:
@@ -125,12 +131,6 @@ def check_stability(car: CarParameters, *, physics_dt: float, where: str) -> Non
     Raises:
         ConfigError: naming `where`, the spring, the sum and the bound.
     """
-    slip = car.tyre_slip_damping * physics_dt / car.tyre_impedance
-    if slip >= 2.0:
-        raise ConfigError(
-            f"{where}: the tyres' slip cannot be integrated: tyre_slip_damping dt / tyre_impedance: expected below 2, "
-            f"got {slip:.2f} at physics_dt {physics_dt:.5f}"
-        )
     steering_inertia = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia + car.steering_inertia
     suspension = car.suspension_stiffness + car.stop_stiffness
     springs = {  # name: mass, stiffness, damping
