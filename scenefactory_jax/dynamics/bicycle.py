@@ -17,7 +17,7 @@ from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.dynamics.collision import advance_boxes, collect_boxes, make_contact
+from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
 
 
 @pytree_dataclass
@@ -72,14 +72,14 @@ def make(
     Raises:
         ConfigError: a number out of range, or an unknown, missing or wrong value of `contact`, by name.
     """
-    collision = make_contact(contact, height=math.inf)
+    collision = make_contact(contact, height=math.inf, step_s=REPORT_S)
     limits = Limits(wheelbase, rear_length, steering_limit, acceleration, deceleration, rolling, drag, air_drag, speed_limit)
 
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         moved = integrate_bicycle(body, jnp.clip(action, -1.0, 1.0), limits, dt=control_dt)
         mu = friction(scene.weather, body.position, body.speed)
         cars = collect_boxes(read(moved, height=centre_height), scene.agents.size, active, mass)
-        _, _, force = collision.forces(cars, advance_boxes(collision.neighbours(cars, scene.traffic), control_dt))
+        force = report_forces(collision, cars, scene.traffic, control_dt)
         along, across = (moved.speed - body.speed) / control_dt, moved.yaw_rate * moved.speed
         acceleration = safe_norm(jnp.stack([along, across], axis=-1))
         moved = replace(moved, contact_force=force, mu=mu, friction_utilization=acceleration / (mu * GRAVITY))

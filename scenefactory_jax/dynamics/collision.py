@@ -1,8 +1,18 @@
-"""Contact forces between cars, and of other objects on cars: boxes seen from above, pushed apart by spring-dampers with friction.
+"""Contact forces between cars, and of other objects on cars: boxes seen from above that crush and rub.
 
 Every unordered pair of cars is evaluated once, and its force acts on both with opposite sign at the same point: linear and angular
-momentum are conserved to rounding. Depth and normal come from the separating-axis theorem. The face of least depth is clipped against the
-other box's nearest face, which leaves two contact points, each with half the stiffness.
+momentum are conserved to rounding.
+
+**Normal.** The separating-axis theorem has four candidate axes for two boxes. While boxes are apart, their velocities say on which axis they
+touch last; once they overlap, this axis stays theirs until they are apart. So it depends neither on the phase of the time step nor on how
+deep a fast box is when it is first seen. The face of the axis is clipped against the other box's nearest face, which leaves two contact
+points, each with half the stiffness. A contact that begins within a step acts for the rest of the step.
+
+**Force.** F = stiffness depth (1 + dissipation closing speed), never negative: K. H. Hunt and F. R. E. Crossley, Coefficient of restitution
+interpreted as damping in vibroimpact, Journal of Applied Mechanics 42 (1975). Its restitution falls with the speed v of the impact, from 1
+to 1 / (dissipation v). With 1 s/m it is 0.3 at 3 m/s and 0.1 at 10 m/s. Cars: 0.2 to 0.4 in impacts of some m/s, and about 0.1 at medium
+and high speed (R. P. Howard, J. Bomar and C. Bare, SAE 931842, 1993; K. L. Monson and G. J. Germane, SAE 1999-01-0097, 1999). The force is
+implicit in the closing speed: it is stable at any stiffness of the dissipation, and stops two boxes at any speed.
 """
 
 import functools
@@ -21,57 +31,88 @@ from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
+REPORT_S = 1e-3  # time step of forces that are reported and do not move cars
+NO_AXIS = -1  # of boxes that have not been seen yet
+
+
+class Separation(NamedTuple):
+    """Two boxes along their four candidate axes: the first box's two, then the second's."""
+
+    axes: Float[Array, "4 2"]
+    sign: Float[Array, "4"]  # of the second box's side
+    gap: Float[Array, "4"]  # m; below zero: overlap
+    closing: Float[Array, "4"]  # m/s
 
 
 class BoxContact(NamedTuple):
-    """Contact of two boxes. The normal points from the first to the second; a depth <= 0 is a point that does not touch."""
+    """Contact points of two boxes. The normal points from the first to the second."""
 
     normal: Float[Array, "2"]
     points: Float[Array, "2 2"]
-    depths: Float[Array, "2"]
+    depths: Float[Array, "2"]  # m; below zero: apart
+
+
+class ContactState(NamedTuple):
+    """Axis of every pair, times two, plus one for the negative side; `NO_AXIS` for a new pair."""
+
+    cars: Int[Array, "A A"]  # row: the first car of a pair; only pairs with a second of a larger index are used
+    traffic: Int[Array, "A M"]
+
+
+class Neighbours(NamedTuple):
+    """Objects that each car can touch in a control step."""
+
+    boxes: Boxes  # [A, K, ...]
+    rows: Int[Array, "A K"]  # of the traffic
 
 
 class Contact(NamedTuple):
     """The contact model. Neighbours are selected once per control step, forces computed once per physics step."""
 
-    neighbours: Callable[[Boxes, Boxes], Boxes]  # (cars, traffic) -> neighbours [A, K, ...]
-    forces: Callable[[Boxes, Boxes], tuple[Array, Array, Array]]  # (cars, neighbours) -> see `compute_forces`
+    init: Callable[[int, int], ContactState]  # (cars, objects of traffic)
+    neighbours: Callable[[Boxes, Boxes], Neighbours]  # (cars, traffic)
+    forces: Callable[[ContactState, Boxes, Neighbours], tuple[ContactState, Array, Array, Array]]  # see `compute_forces`
 
 
-def make_contact(entry: Mapping[str, Any], *, height: float, physics_dt: float | None = None) -> Contact:
+def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> Contact:
     """Makes the contact model of a config's `dynamics.contact`: see `make`."""
-    target = {**entry, "_target_": "make"}
-    return instantiate(target, builtins=__name__, where="dynamics.contact", height=height, physics_dt=physics_dt)()
+    return instantiate({**entry, "_target_": "make"}, builtins=__name__, where="dynamics.contact", height=height, step_s=step_s)()
 
 
 def make(
     *,
     stiffness: Positive,
-    damping: NonNegative,
+    dissipation: NonNegative,
     friction: NonNegative,
     mass: Positive,
     momentum_transfer_s: Positive,
     max_neighbours: Annotated[int, Bounds(min=0)],
     height: float,
-    physics_dt: float | None = None,
+    step_s: float,
 ) -> Contact:
     """Binds `find_neighbours` and `compute_forces` to their parameters.
 
     Args:
         max_neighbours: objects that a car may touch, beside other cars; 0: none.
-        physics_dt: s, if the forces move cars; None: they are only reported.
+        step_s: time step of the forces, s.
 
     Raises:
-        ConfigError: a number out of range, or a contact too stiff for `physics_dt`, by name.
+        ConfigError: a number out of range, or a contact too stiff for `step_s`, by name.
     """
-    load = OFF_CENTRE * (stiffness * (physics_dt or 0.0) + 2 * damping) * (physics_dt or 0.0) / (mass / 2)
+    load = OFF_CENTRE * stiffness * step_s**2 / (mass / 2)
     if load >= 4.0:  # see `compute_forces`
         raise ConfigError(
-            f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {OFF_CENTRE} (k dt + 2 c) dt / m, m "
-            f"half the mass: expected below 4, got {load:.2f} at physics_dt {physics_dt:.5f}"
+            f"dynamics.contact.stiffness: {stiffness:g} cannot be integrated: {OFF_CENTRE} k dt^2 / m, m half the mass: expected below 4, "
+            f"got {load:.2f} at a time step of {step_s:.5f} s"
         )
-    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height)
-    return Contact(functools.partial(find_neighbours, max_neighbours=max_neighbours), functools.partial(compute_forces, **law))
+    law = dict(stiffness=stiffness, dissipation=dissipation, friction=friction, mass=mass, height=height, step_s=step_s)
+    forces = functools.partial(compute_forces, momentum_transfer_s=momentum_transfer_s, **law)
+    return Contact(init, functools.partial(find_neighbours, max_neighbours=max_neighbours), forces)
+
+
+def init(cars: int, objects: int) -> ContactState:
+    """Pairs that have not been seen yet."""
+    return ContactState(jnp.full((cars, cars), NO_AXIS), jnp.full((cars, objects), NO_AXIS))
 
 
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
@@ -88,13 +129,13 @@ def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array,
     )
 
 
-def find_neighbours(cars: Boxes, traffic: Boxes, *, max_neighbours: int) -> Boxes:
-    """Finds the boxes of `traffic` nearest to each car, by the distance to their bounding circles: leaves `[A, K, ...]`."""
+def find_neighbours(cars: Boxes, traffic: Boxes, *, max_neighbours: int) -> Neighbours:
+    """Finds the boxes of `traffic` nearest to each car, by the distance to their bounding circles."""
     reach = 0.5 * safe_norm(traffic.size)
     gap = safe_norm(traffic.position[None] - cars.position[:, None]) - reach
     gap = jnp.where(_is_valid(traffic) & jnp.isfinite(gap), gap, jnp.inf)
     _, rows = jax.lax.top_k(-gap, min(max_neighbours, gap.shape[1]))
-    return jax.tree.map(lambda leaf: leaf[rows], traffic)
+    return Neighbours(jax.tree.map(lambda leaf: leaf[rows], traffic), rows)
 
 
 def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
@@ -106,50 +147,62 @@ def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
     return jax.vmap(move)(boxes)
 
 
+def report_forces(contact: Contact, cars: Boxes, traffic: Boxes, seconds: float) -> Float[Array, " A"]:
+    """Computes the largest contact force of each car now, N, for cars that contacts do not move; `traffic` is as it was `seconds` ago."""
+    beside = contact.neighbours(cars, traffic)
+    beside = beside._replace(boxes=advance_boxes(beside.boxes, seconds))
+    return contact.forces(contact.init(cars.mass.shape[0], traffic.mass.shape[0]), cars, beside)[3]
+
+
 def compute_forces(
+    state: ContactState,
     cars: Boxes,
-    neighbours: Boxes,
+    neighbours: Neighbours,
     *,
     stiffness: float,
-    damping: float,
+    dissipation: float,
     friction: float,
     mass: float,
     momentum_transfer_s: float,
     height: float,
-) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
+    step_s: float,
+) -> tuple[ContactState, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
-    Stiffness and damping of a pair scale with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
+    The stiffness of a pair scales with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
     pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and 0.26 off centre
-    (`OFF_CENTRE`). Semi-implicit Euler with an explicit damper is stable while that plus 2 c dt / m is below 4; 2 c dt / m is 0.58 and
-    2.1 with 3e4 N s/m.
+    (`OFF_CENTRE`). Semi-implicit Euler is stable while that is below 4.
 
     Args:
         cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
             more than `height` do not touch.
-        neighbours: of each car, leaves `[A, K, ...]`: see `find_neighbours`. They follow their path and feel no force. If their mass is
-            finite, the force is limited to what gives them the car's speed within `momentum_transfer_s`.
+        neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
+            speed within `momentum_transfer_s`.
         stiffness: of a contact along a whole face of two cars, N/m.
-        damping: along the same face, N s/m. A contact never pulls.
-        friction: Coulomb coefficient of the bodies. Below the limit `damping` resists sliding, which is as stable as the normal force.
-        mass: of the two cars that `stiffness` and `damping` are meant for, kg.
+        dissipation: s/m.
+        friction: Coulomb coefficient of the bodies; below the limit, what ends the sliding within four steps.
+        mass: of the two cars that `stiffness` is meant for, kg.
         momentum_transfer_s: s.
         height: of the boxes, m.
+        step_s: s.
     """
-    count, beside = neighbours.mass.shape
-    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, height=height)
+    count, beside = neighbours.rows.shape
+    law = dict(stiffness=stiffness, dissipation=dissipation, friction=friction, mass=mass, height=height, step_s=step_s)
     cars = _sanitize(cars, mass)
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if beside:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
-        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours), mass)
-        pair_force, pair_torque, _ = _compute_pair_forces(first, second, momentum_transfer_s, **law)
+        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), mass)
+        places = jnp.arange(count)[:, None], neighbours.rows
+        axis, pair_force, pair_torque, _ = _compute_pair_forces(state.traffic[places].ravel(), first, second, momentum_transfer_s, **law)
+        state = state._replace(traffic=jnp.full_like(state.traffic, NO_AXIS).at[places].set(axis.reshape(count, beside)))
         pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        force, torque_first, torque_second = _compute_pair_forces(first, second, None, **law)
+        axis, force, torque_first, torque_second = _compute_pair_forces(state.cars[rows_first, rows_second], first, second, None, **law)
+        state = state._replace(cars=state.cars.at[rows_first, rows_second].set(axis))
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
         scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
@@ -162,7 +215,7 @@ def compute_forces(
         force = scale[..., None] * pair_force
         total, torque = total - force.sum(1), torque + (scale * pair_torque).sum(1)
         largest = jnp.maximum(largest, safe_norm(force).max(1))
-    return total, torque, largest
+    return state, total, torque, largest
 
 
 def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -175,37 +228,60 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _compute_pair_forces(
+    axis: Int[Array, " N"],
     first: Boxes,
     second: Boxes,
     momentum_transfer_s: float | None,
     *,
     stiffness: float,
-    damping: float,
+    dissipation: float,
     friction: float,
     mass: float,
     height: float,
-) -> tuple[Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
-    """Computes the force on the second box of each pair (the first has the opposite), and the torques on both."""
-    normal, points, depths = jax.vmap(find_box_contact)(
-        first.position, first.yaw, first.size / 2.0, second.position, second.yaw, second.size / 2.0
-    )
-    near = first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
-    depths = jnp.where(near[:, None], depths, 0.0)
+    step_s: float,
+) -> tuple[Int[Array, " N"], Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
+    """Computes the axis of each pair, the force on its second box (the first has the opposite), and the torques on both."""
+    separation = jax.vmap(compute_separation)(first, second)
+    axis = jax.vmap(select_axis)(separation, axis)
+    begin, touches = jax.vmap(functools.partial(find_begin, step_s=step_s))(separation, axis)
+    first, second = (replace(box, position=box.position + begin[:, None] * box.velocity) for box in (first, second))
+    normal, points, depths = jax.vmap(find_contact_points)(axis, first, second)
+    near = touches & first.present & second.present & (jnp.abs(first.elevation - second.elevation) < height)
 
     arm_first, arm_second = points - first.position[:, None], points - second.position[:, None]
     speed = _velocity_at(arm_second, second.velocity, second.yaw_rate) - _velocity_at(arm_first, first.velocity, first.yaw_rate)
     tangent = _rotate_90(normal)
     closing = -dot(speed, normal[:, None])
     sliding = dot(speed, tangent[:, None])
+    left = step_s - begin[:, None]  # of the step
+    depth = _average_depth(depths, closing, left) * jnp.where(near[:, None], left / step_s, 0.0)
     scale = (2.0 / (mass / first.mass + mass / second.mass))[:, None]
-    push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * stiffness * depths + 0.5 * damping * closing), 0.0), 0.0)
+    spring = 0.5 * stiffness * scale * depth
+    levers = 1.0 / first.mass[:, None] + 1.0 / second.mass[:, None]
+    levers = levers + _lever(arm_first, normal, first) + _lever(arm_second, normal, second)
+    implicit = 1.0 + step_s * dissipation * spring.sum(1, keepdims=True) * levers
+    push = spring * jnp.maximum(1.0 + dissipation * closing, 0.0) / implicit
+    reduced = 0.5 * mass * scale
     if momentum_transfer_s is not None:
-        reduced = 0.5 * mass * scale
         limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # per contact point
         push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
-    drag = jnp.clip(scale * (0.5 * damping * sliding), -friction * push, friction * push)
+    drag = jnp.clip(0.125 * reduced / step_s * sliding, -friction * push, friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
-    return force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
+    return axis, force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
+
+
+def _average_depth(depth: Float[Array, "N 2"], closing: Float[Array, "N 2"], seconds: Float[Array, "N 1"]) -> Float[Array, "N 2"]:
+    """Computes the mean of max(0, depth) over a time with a constant closing speed, m."""
+    after = depth + closing * seconds
+    low, high = jnp.minimum(depth, after), jnp.maximum(depth, after)
+    partly = 0.5 * jnp.maximum(high, 0.0) ** 2 / jnp.maximum(high - low, 1e-9)
+    return jnp.where(low >= 0.0, 0.5 * (low + high), partly)
+
+
+def _lever(arm: Float[Array, "N 2 2"], normal: Float[Array, "N 2"], box: Boxes) -> Float[Array, "N 2"]:
+    """Computes what rotation adds to the inverse mass of a contact point, 1/kg; a box has the inertia of a homogeneous one."""
+    inertia = box.mass * (box.size**2).sum(-1) / 12.0
+    return cross(arm, normal[:, None]) ** 2 / inertia[:, None]
 
 
 def _is_valid(boxes: Boxes) -> Bool[Array, "*n"]:
@@ -227,25 +303,44 @@ def _find_pairs(count: int) -> Int[np.ndarray, "A partners"]:
     return np.stack([np.flatnonzero(bodies == car) for car in range(count)])
 
 
-def find_box_contact(
-    centre: Float[Array, "2"],
-    yaw: Float[Array, ""],
-    half: Float[Array, "2"],
-    other_centre: Float[Array, "2"],
-    other_yaw: Float[Array, ""],
-    other_half: Float[Array, "2"],
-) -> BoxContact:
-    """Computes the contact of two oriented boxes with half sizes `half`; depths are not positive if they do not overlap."""
-    gap = other_centre - centre
-    axes, other_axes = _axes(yaw), _axes(other_yaw)
-    candidates = jnp.concatenate([axes, other_axes])  # separating axes
-    reach = jnp.abs(candidates @ axes.T) @ half + jnp.abs(candidates @ other_axes.T) @ other_half
-    along = candidates @ gap
-    overlap = reach - jnp.abs(along)
-    best = jnp.argmin(overlap)
-    normal = candidates[best] * jnp.where(along[best] < 0.0, -1.0, 1.0)
+def compute_separation(first: Boxes, second: Boxes) -> Separation:
+    """Computes gaps and closing speeds of two boxes along their candidate axes."""
+    offset, speed = second.position - first.position, second.velocity - first.velocity
+    axes, other_axes = _axes(first.yaw), _axes(second.yaw)
+    candidates = jnp.concatenate([axes, other_axes])
+    reach = jnp.abs(candidates @ axes.T) @ (first.size / 2.0) + jnp.abs(candidates @ other_axes.T) @ (second.size / 2.0)
+    along = candidates @ offset
+    sign = jnp.where(along < 0.0, -1.0, 1.0)
+    return Separation(candidates, sign, jnp.abs(along) - reach, -sign * (candidates @ speed))
 
-    # the box of the best axis has the reference face, the other box touches it with its nearest ("incident") face
+
+def select_axis(separation: Separation, previous: Int[Array, ""]) -> Int[Array, ""]:
+    """Selects the axis on which two boxes touch last, or touched: see the module."""
+    apart = separation.gap > 0.0
+    seconds = jnp.where(separation.closing > 0.0, separation.gap / jnp.where(separation.closing > 0.0, separation.closing, 1.0), 1e6)
+    best = jnp.where(apart.any(), jnp.argmax(jnp.where(apart, seconds, -1.0)), jnp.argmax(separation.gap))
+    found = 2 * best + (separation.sign[best] < 0.0)
+    return jnp.where(apart.any() | (previous == NO_AXIS), found, previous)
+
+
+def find_begin(separation: Separation, axis: Int[Array, ""], *, step_s: float) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Computes when in this step the contact of two boxes begins, s, and whether they touch in it at all."""
+    chosen = jnp.arange(4) == axis // 2
+    gap, closing = separation.gap[axis // 2], separation.closing[axis // 2]
+    begin = jnp.where(gap > 0.0, jnp.where(closing > 0.0, gap / jnp.where(closing > 0.0, closing, 1.0), step_s), 0.0)
+    begin = jnp.clip(begin, 0.0, step_s)
+    beside = separation.gap - separation.closing * begin
+    return begin, (begin < step_s) & jnp.all((beside < 0.0) | chosen)
+
+
+def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes) -> BoxContact:
+    """Computes the contact points of two boxes whose reference face has the axis `axis` (see `ContactState`)."""
+    best, sign = axis // 2, 1.0 - 2.0 * (axis % 2)
+    axes, other_axes = _axes(first.yaw), _axes(second.yaw)
+    gap, half, other_half = second.position - first.position, first.size / 2.0, second.size / 2.0
+    normal = jnp.concatenate([axes, other_axes])[best] * sign
+
+    # the box of the axis has the reference face, the other box touches it with its nearest ("incident") face
     pick = functools.partial(jnp.where, best < 2)
     outward = pick(normal, -normal)
     reference_half = pick(half, other_half)
@@ -265,8 +360,8 @@ def find_box_contact(
     ends = jnp.clip(jnp.stack([low, high]), -1.0, 1.0)
     points = middle + ends[:, None] * along_face
     depths = front - points @ outward
-    points = points + 0.5 * depths[:, None] * outward + pick(centre, other_centre)
-    return BoxContact(normal=normal, points=points, depths=jnp.where(overlap[best] > 0.0, depths, jnp.minimum(depths, 0.0)))
+    points = points + 0.5 * depths[:, None] * outward + pick(first.position, second.position)
+    return BoxContact(normal=normal, points=points, depths=depths)
 
 
 def _axes(yaw: Float[Array, ""]) -> Float[Array, "2 2"]:

@@ -12,7 +12,7 @@ from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.pytree import pytree_dataclass, replace, tree_where
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import Dynamics, Motion, Scene
-from scenefactory_jax.dynamics.collision import advance_boxes, collect_boxes, make_contact
+from scenefactory_jax.dynamics.collision import REPORT_S, collect_boxes, make_contact, report_forces
 
 
 @pytree_dataclass
@@ -38,7 +38,7 @@ def make(
     Raises:
         ConfigError: an unknown or missing value of `contact`.
     """
-    collision = make_contact(contact, height=math.inf)
+    collision = make_contact(contact, height=math.inf, step_s=REPORT_S)
 
     def read_log(scene: Scene, steps: Int[Array, " A"]) -> Motion:
         log = scene.log
@@ -66,7 +66,7 @@ def make(
     def advance(scene: Scene, body: Body, action: Float[Array, "A 3"], active: Bool[Array, " A"]) -> Body:
         motion = read_log(scene, body.steps + 1)
         cars = collect_boxes(motion, scene.agents.size, active, mass)
-        _, _, force = collision.forces(cars, advance_boxes(collision.neighbours(cars, scene.traffic), control_dt))
+        force = report_forces(collision, cars, scene.traffic, control_dt)
         moved = Body(steps=body.steps + 1, motion=replace(motion, contact_force=force))
         return tree_where(active, moved, replace(body, motion=replace(body.motion, contact_force=jnp.zeros_like(force))))
 

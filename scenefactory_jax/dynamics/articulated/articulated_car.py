@@ -32,7 +32,7 @@ from scenefactory_jax.dynamics.articulated.tyres import (
     find_contact_patches,
 )
 from scenefactory_jax.dynamics.articulated.vector import Vector, dot
-from scenefactory_jax.dynamics.collision import Contact, advance_boxes, collect_boxes
+from scenefactory_jax.dynamics.collision import Contact, ContactState, advance_boxes, collect_boxes
 
 
 class CarCarry(NamedTuple):
@@ -52,6 +52,7 @@ class Body:
     qvel: Float[Array, "A 16"]
     qacc_warmstart: Float[Array, "A 16"]
     contact_force: Float[Array, " A"]
+    contact: ContactState
     tyres: Tyres
     constants: CarConstants | None  # of cars that differ
 
@@ -99,7 +100,7 @@ def make(
     """
     parameters, settings = read_parameters({"car": car, "solver": solver})
     compiled = compile_car(parameters, settings, abs_enabled=abs, physics_dt=physics_dt, control_dt=control_dt)
-    forces = collision.make_contact(contact, height=parameters.height, physics_dt=physics_dt)
+    forces = collision.make_contact(contact, height=parameters.height, step_s=physics_dt)
     if randomization is not None:
         module = "scenefactory_jax.dynamics.articulated.randomization"
         entry = instantiate(randomization, builtins=module, where="dynamics.randomization", car=parameters, physics_dt=physics_dt)
@@ -143,10 +144,10 @@ def make_dynamics(compiled: CompiledCar, contact: Contact, friction: Callable[..
         with jax.default_matmul_precision("highest"):  # TF32 costs accuracy and buys 8 %
             return control_step(compiled, contact, friction, scene, body, action, active)
 
-    return Dynamics(init=functools.partial(init, compiled), advance=advance, read=functools.partial(read, compiled))
+    return Dynamics(init=functools.partial(init, compiled, contact), advance=advance, read=functools.partial(read, compiled))
 
 
-def init(compiled: CompiledCar, key: PRNGKeyArray, scene: Scene) -> Body:
+def init(compiled: CompiledCar, contact: Contact, key: PRNGKeyArray, scene: Scene) -> Body:
     """Places cars at their starts, at rest height, with rolling wheels."""
     agents, at = scene.agents, compiled.addresses
     count = agents.yaw.shape[0]
@@ -168,6 +169,7 @@ def init(compiled: CompiledCar, key: PRNGKeyArray, scene: Scene) -> Body:
         qvel=qvel.at[:, at.spin_v].set((agents.speed / radius)[:, None]),
         qacc_warmstart=jnp.zeros((count, 16), jnp.float32),
         contact_force=jnp.zeros((count,), jnp.float32),
+        contact=contact.init(count, scene.traffic.mass.shape[0]),
         tyres=place_tyres(load),
         constants=constants,
     )
@@ -204,15 +206,17 @@ def control_step(
 
     def substep(body: Body, time: Float[Array, ""]) -> tuple[Body, None]:
         boxes = collect_boxes(read(compiled, body), scene.agents.size, active, mass)
-        force, torque, strength = contact.forces(boxes, advance_boxes(neighbours, time))
+        beside = neighbours._replace(boxes=advance_boxes(neighbours.boxes, time))
+        state, force, torque, strength = contact.forces(body.contact, boxes, beside)
         carry = CarCarry(body.qpos, body.qvel, body.qacc_warmstart, body.tyres)
         carry = step(constants, fields, carry, command, PlanarForce(force, torque), mu)
-        return replace(body, **carry._asdict(), contact_force=jnp.maximum(body.contact_force, strength)), None
+        return replace(body, **carry._asdict(), contact=state, contact_force=jnp.maximum(body.contact_force, strength)), None
 
     zero = jnp.zeros_like(body.contact_force)
     times = compiled.physics_dt * jnp.arange(compiled.substeps)
     after, _ = jax.lax.scan(substep, replace(body, contact_force=zero), times)
-    return tree_where(active, after, replace(body, contact_force=zero, tyres=replace(body.tyres, tangent=jnp.zeros_like(zero)[:, None] * body.tyres.tangent)))
+    still = replace(body.tyres, tangent=jnp.zeros_like(body.tyres.tangent), slip=jnp.zeros_like(body.tyres.slip))
+    return tree_where(active, after, replace(body, contact_force=zero, tyres=still))
 
 
 def physics_step(
