@@ -354,10 +354,10 @@ def test_lights_of_gpudrive_json(tmp_path, readers):
     assert found.lane == 1 and found.valid.nonzero()[0].tolist() == [0, 4] and found.stop.tolist() == [1, 2, 3]
     assert [LIGHT_STATES[code] for code in found.state[[0, 4]]] == ["stop", "go"]
     bad = {
-        r"tl_states\.1\.state\[0\]: expected one of .*, got 'red'": light | {"state": ["red", "go"]},
-        r"tl_states\.1\.time_index\[1\]: expected a step, 0 to 11, got 12": light | {"time_index": [0, 12]},
-        r"tl_states\.1\.state: expected 1 entries, .*, got 2": light | {"time_index": [0]},
-        r"tl_states\.1\.x: expected 2 entries, .*, got 1": light | {"x": [1.0]},
+        r"tl_states\['1'\]\.state\[0\]: expected one of .*, got 'red'": light | {"state": ["red", "go"]},
+        r"tl_states\['1'\]\.time_index\[1\]: expected a step, 0 to 11, got 12": light | {"time_index": [0, 12]},
+        r"tl_states\['1'\]\.state: expected 1 entries, .*, got 2": light | {"time_index": [0]},
+        r"tl_states\['1'\]\.x: expected 2 entries, .*, got 1": light | {"x": [1.0]},
     }
     for message, record in bad.items():
         with pytest.raises(SceneError, match=message):

@@ -5,9 +5,9 @@ import gzip
 import json
 import lzma
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextvars import ContextVar
-from io import BufferedIOBase, BufferedReader
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
@@ -76,19 +76,14 @@ def _read(path: Path, count: int) -> bytes:
     name = None
     try:
         with open(path, "rb") as stream:
-            name, opener = _find_compression(stream)
+            start = stream.peek(max(map(len, MAGIC)))
+            entries = (entry for magic, entry in MAGIC.items() if start.startswith(magic))
+            name, opener = next(entries, (None, contextlib.nullcontext))
             with opener(stream) as unpacked:
                 return read_bytes(unpacked, count)
     except DAMAGE as error:
-        unreadable = f"cannot be read: {getattr(error, 'strerror', None) or error}"
-        damaged = f"begins as {name} but cannot be unpacked, damaged or cut short: {error}"
-        raise SceneError(f"{path}: {unreadable if name is None else damaged}") from error
-
-
-def _find_compression(stream: BufferedReader) -> tuple[str | None, Callable[[Any], Any]]:
-    """The name of the compression, by the first bytes, and the function that opens it."""
-    start = stream.peek(max(map(len, MAGIC)))
-    return next((entry for magic, entry in MAGIC.items() if start.startswith(magic)), (None, contextlib.nullcontext))
+        fault = "cannot be read" if name is None else f"begins as {name} but cannot be unpacked, damaged or cut short"
+        raise SceneError(f"{path}: {fault}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def read_bytes(stream: BufferedIOBase, count: int) -> bytes:

@@ -1,20 +1,19 @@
-"""Parts of a raw scene in the form that all readers share: tracks, lights, times, and ids that are texts in the source."""
+"""Parts of a raw scene in the form that all readers share: tracks, lights, and ids that are texts in the source."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import Light, SceneError, Track
-from scenefactory_jax.core.scene_arrays import FULL_TURN, wrap_angles
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, RoadUser
-from scenefactory_jax.data.formats import values
+from scenefactory_jax.data.formats.values import AXES, check_finite
 
 INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")  # a text that converts to an integer of 64 bits and back
 KINDS: dict[str, RoadUser] = {kind: kind for kind in ROAD_USERS}
-AXES = ("x", "y", "z")
 
 
 def road_user(name: str) -> RoadUser:
@@ -23,41 +22,37 @@ def road_user(name: str) -> RoadUser:
 
 
 def make_track(
+    where: str,
     *,
     id: int,
     kind: RoadUser,
-    size: tuple[float, float, float],
-    xyz: Float[np.ndarray, "L 3"],
-    yaw: Float[np.ndarray, " L"],
+    size: Sequence[float],
+    position: Float[np.ndarray, "L 3"],
+    heading: Float[np.ndarray, " L"],
     velocity: Float[np.ndarray, "L 2"],
     valid: Bool[np.ndarray, " L"],
+    max_heading: float = np.inf,
 ) -> Track:
-    """A track with zeros at invalid steps, where a source may have any value, and a yaw in [-pi, pi)."""
-    mask = valid[:, None]
-    motion = {"xyz": np.where(mask, xyz, 0.0), "yaw": np.where(valid, wrap_angles(yaw), 0.0), "velocity": np.where(mask, velocity, 0.0)}
-    return Track(id=id, kind=kind, size=size, valid=valid, **motion)
+    """A track with zeros at invalid steps, where a source may have any value, and a yaw in [-pi, pi).
 
-
-def check_motion(
-    where: str, valid: Bool[np.ndarray, " L"], *, position: np.ndarray, velocity: np.ndarray, heading: np.ndarray, degrees: bool = False
-) -> None:
-    """Refuses a track whose motion at valid steps is not finite or has a heading of more than a turn in radians."""
+    Raises:
+        SceneError: motion at a valid step that is not finite, or a heading beyond `max_heading` (rad).
+    """
     for name, table in (("position", position), ("velocity", velocity), ("heading", heading)):
-        values.check_finite(table, f"{where}.{name}", rows=valid, keys=AXES)
+        check_finite(table, f"{where}.{name}", rows=valid, keys=AXES)
     turns = np.where(valid, np.abs(heading), 0.0)
-    if not degrees and turns.max(initial=0.0) > FULL_TURN:
+    if turns.max(initial=0.0) > max_heading:
         step = int(np.argmax(turns))
         raise SceneError(f"{where}.heading[{step}]: expected an angle in radians, got {heading[step]}")
+    length, width, height = map(float, size)
+    xyz, velocity = (np.where(valid[:, None], table, 0.0) for table in (position, velocity))
+    yaw = np.where(valid, wrap_angles(heading), 0.0)
+    return Track(id=id, kind=kind, size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)
 
 
 def make_light(lane: int, codes: Int[np.ndarray, " L"], stop: Float[np.ndarray, "3"] | None) -> Light:
     """The light of a lane from an index into LIGHT_STATES for each step; -1: no state at that step."""
     return Light(lane=lane, state=np.maximum(codes, 0), valid=codes >= 0, stop=stop)
-
-
-def even_times(steps: int, step_s: float) -> Float[np.ndarray, " L"]:
-    """Times of a log whose format has none."""
-    return step_s * np.arange(steps, dtype=np.float64)
 
 
 def to_xyz(table: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N 3"]:

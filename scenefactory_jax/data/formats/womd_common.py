@@ -25,20 +25,22 @@ def check_times(times: Float[np.ndarray, " L"], where: str) -> None:
 
 
 def make_tracks(
-    numbers: Float[np.ndarray, "A L 9"], valid: Bool[np.ndarray, "A L"], *, ids: Sequence[int], kinds: Sequence[int], current: int
+    numbers: Float[np.ndarray, "A L 9"],
+    valid: Bool[np.ndarray, "A L"],
+    *,
+    ids: Sequence[int],
+    kinds: Sequence[int],
+    current: int,
+    where: str,
 ) -> tuple[Track, ...]:
-    """Makes tracks of their columns STATE. The size is that of the current step or, where it is invalid, of the first valid step.
+    """Makes tracks of their columns STATE, with any values at invalid steps, and their kinds, indices into OBJECT_TYPES.
 
-    Args:
-        numbers: of all objects, with any values at invalid steps.
-        valid: steps at which they count.
-        ids: of the objects.
-        kinds: indices into OBJECT_TYPES.
-        current: the step at which the simulation takes over.
+    The size is that of the current step or, where it is invalid, of the first valid step.
     """
     tracks = []
     for number, kind, table, mask in zip(ids, kinds, numbers, valid, strict=True):
-        length, width, height = np.where(mask[:, None], table, 0.0)[current if mask[current] else np.argmax(mask), 6:9].tolist()
-        motion = {"xyz": table[:, 0:3], "yaw": table[:, 3], "velocity": table[:, 4:6]}
-        tracks.append(make_track(id=number, kind=OBJECT_TYPES[kind], size=(length, width, height), valid=mask, **motion))
+        step = current if mask[current] else np.argmax(mask)
+        size = table[step, 6:9].tolist() if mask[step] else (0.0, 0.0, 0.0)
+        motion = {"position": table[:, 0:3], "heading": table[:, 3], "velocity": table[:, 4:6]}
+        tracks.append(make_track(f"{where}track {number}", id=number, kind=OBJECT_TYPES[kind], size=size, valid=mask, **motion))
     return tuple(tracks)
