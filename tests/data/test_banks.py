@@ -333,7 +333,7 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     assert opened.metadata["format"].to_pylist() == ["gpudrive", "gpudrive", "scenefactory"]
     lines = summary_text.describe(summary)
     assert lines[-1] == "3 scenes with 3 agents from 4 files, 1 rejected" and any("rejected" in line and "b.json" in line for line in lines)
-    assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for others"
+    assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for other numbers"
 
 
 def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
