@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import FormatMismatch, SceneError
+from scenefactory_jax.data.formats import file_content
 
 PROTOCOLS = (3, 4, 5)
 GLOBALS = {  # names in real files -> their meaning here; numpy._core of numpy 2 is numpy.core
@@ -67,14 +68,18 @@ def load(path: Path, *, file_limit_mb: int, opcode_limit: int) -> Any:
 
     Args:
         path: of the file.
-        file_limit_mb: larger files are refused unread.
+        file_limit_mb: larger contents are refused.
         opcode_limit: longer programs are refused; an opcode makes at most one object.
 
     Raises:
         FormatMismatch: not a pickle.
         SceneError: too large, damaged, cut short, or not plain data, naming the global or the opcode that is refused.
     """
-    data = _read(path, file_limit_mb)
+    head = file_content.read_head(path)
+    if len(head) < 2 or head[0] != 0x80 or head[1] not in PROTOCOLS:
+        protocols = ", ".join(map(str, PROTOCOLS))
+        raise FormatMismatch(f"{path}: expected a pickle of protocol {protocols}, got a file that begins with {head[:2]!r}")
+    data = file_content.unpack(path, file_limit_mb=file_limit_mb)
     machine, place = _Machine(len(data)), 0
     try:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):  # noqa: B007
@@ -89,21 +94,6 @@ def load(path: Path, *, file_limit_mb: int, opcode_limit: int) -> Any:
     except DAMAGE as error:
         raise SceneError(f"{path}: not a valid pickle, damaged or cut short at byte {place} of {len(data)}: {error}") from error
     return value
-
-
-def _read(path: Path, file_limit_mb: int) -> bytes:
-    """Reads a file that begins as a pickle."""
-    try:
-        with open(path, "rb") as file:
-            start = file.read(2)
-            if len(start) < 2 or start[0] != 0x80 or start[1] not in PROTOCOLS:
-                protocols = ", ".join(map(str, PROTOCOLS))
-                raise FormatMismatch(f"{path}: expected a pickle of protocol {protocols}, got a file that begins with {start!r}")
-            if (size_mb := Path(path).stat().st_size / 1e6) > file_limit_mb:
-                raise SceneError(f"{path}: a pickle of {size_mb:.0f} MB; file_limit_mb is {file_limit_mb}")
-            return start + file.read()
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 class _Machine:
