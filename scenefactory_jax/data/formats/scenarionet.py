@@ -19,35 +19,21 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, Light, OtherContent, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.types import (
-    CROSSWALK,
-    DRIVEWAY,
-    EDGE_BOUNDARY,
-    EDGE_MEDIAN,
-    EDGES,
-    LANE_BIKE,
-    LANE_FREEWAY,
-    LANE_STREET,
-    LINES,
-    POLYGONS,
-    SPEED_BUMP,
-    STOP_SIGN,
-)
+from scenefactory_jax.core.types import EDGE_BOUNDARY, EDGES, LINES, POLYGONS
 from scenefactory_jax.data.formats import metadrive_map, polylines, safe_pickle, scenarionet_legacy, scene_parts, values
 from scenefactory_jax.data.formats.values import Node
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"  # beside the scenarios of a database
-LANE_UNKNOWN, LINE_UNKNOWN, EDGE_UNKNOWN = 0, 5, 14  # map elements of WOMD for features of an unknown kind
-ELEMENTS = {  # MetaDriveType -> WOMD map element
-    "LANE_UNKNOWN": LANE_UNKNOWN, "LANE_FREEWAY": LANE_FREEWAY, "LANE_SURFACE_STREET": LANE_STREET, "LANE_BIKE_LANE": LANE_BIKE,
-    "UNKNOWN_LINE": LINE_UNKNOWN, "ROAD_LINE_BROKEN_SINGLE_WHITE": 6, "ROAD_LINE_SOLID_SINGLE_WHITE": 7,
-    "ROAD_LINE_SOLID_DOUBLE_WHITE": 8, "ROAD_LINE_BROKEN_SINGLE_YELLOW": 9, "ROAD_LINE_BROKEN_DOUBLE_YELLOW": 10,
-    "ROAD_LINE_SOLID_SINGLE_YELLOW": 11, "ROAD_LINE_SOLID_DOUBLE_YELLOW": 12, "ROAD_LINE_PASSING_DOUBLE_YELLOW": 13,
-    "UNKNOWN": EDGE_UNKNOWN, "ROAD_EDGE_BOUNDARY": EDGE_BOUNDARY, "ROAD_EDGE_MEDIAN": EDGE_MEDIAN,
-    "STOP_SIGN": STOP_SIGN, "CROSSWALK": CROSSWALK, "SPEED_BUMP": SPEED_BUMP, "DRIVEWAY": DRIVEWAY,
+ELEMENTS = {  # MetaDriveType -> WOMD map element, see `core.types`
+    "LANE_UNKNOWN": 0, "LANE_FREEWAY": 1, "LANE_SURFACE_STREET": 2, "LANE_BIKE_LANE": 3,
+    "UNKNOWN_LINE": 5, "ROAD_LINE_BROKEN_SINGLE_WHITE": 6, "ROAD_LINE_SOLID_SINGLE_WHITE": 7, "ROAD_LINE_SOLID_DOUBLE_WHITE": 8,
+    "ROAD_LINE_BROKEN_SINGLE_YELLOW": 9, "ROAD_LINE_BROKEN_DOUBLE_YELLOW": 10, "ROAD_LINE_SOLID_SINGLE_YELLOW": 11,
+    "ROAD_LINE_SOLID_DOUBLE_YELLOW": 12, "ROAD_LINE_PASSING_DOUBLE_YELLOW": 13,
+    "UNKNOWN": 14, "ROAD_EDGE_BOUNDARY": 15, "ROAD_EDGE_MEDIAN": 16,
+    "STOP_SIGN": 17, "CROSSWALK": 18, "SPEED_BUMP": 19, "DRIVEWAY": 20,
 }  # fmt: skip
-OTHER_NAMES = {"LANE_SURFACE_UNSTRUCTURE": LANE_STREET, "CROSS_WALK": CROSSWALK, "ROAD_LINE_DOUBLE_WHITE": 8}  # nuPlan's; older ones
-LANES = (LANE_UNKNOWN, LANE_FREEWAY, LANE_STREET, LANE_BIKE)
+OTHER_NAMES = {"LANE_SURFACE_UNSTRUCTURE": 2, "CROSS_WALK": 18, "ROAD_LINE_DOUBLE_WHITE": 8}  # nuPlan's; older ones
+LANES = (0, 1, 2, 3)
 SIGNALS = {f"LANE_STATE_{name.upper()}": index for index, name in enumerate(LIGHT_STATES)} | {
     f"TRAFFIC_LIGHT_{colour}": LIGHT_STATES.index(name)  # nuPlan's and MetaDrive's own
     for colour, name in (("UNKNOWN", "unknown"), ("RED", "stop"), ("YELLOW", "caution"), ("GREEN", "go"))
@@ -56,7 +42,7 @@ DATASETS = {"waymo": "WOMD", "nuscenes": "nuScenes", "nuplan": "nuPlan", "av2": 
 UNITS = {"speed_limit_mph": 1609.344 / 3600, "speed_limit_kmh": 1 / 3.6}  # in m/s
 MAX_SPEED_LIMIT = 160 / 3.6  # m/s, the highest on any sign (United Arab Emirates)
 METADRIVE = "metadrive"  # `dataset` of its own maps
-SOLID = (LINE_UNKNOWN, 7, 8, 11, 12)  # lines that may not be crossed, and lines of an unknown kind
+SOLID = (5, 7, 8, 11, 12)  # lines that may not be crossed, and lines of an unknown kind
 TEXTS = ("scenario_id", "source_file", "map", "date")  # keys of the file's metadata that are kept where they are texts
 
 
@@ -164,7 +150,7 @@ def _roads(
         name = feature["type"].expect(str)
         kind = ELEMENTS.get(name, OTHER_NAMES.get(name))
         if name == "UNKNOWN" and "entry_lanes" in feature:  # the type of a lane in older layouts
-            kind = LANE_UNKNOWN
+            kind = ELEMENTS["LANE_UNKNOWN"]
         elif outlines_are_edges and kind in LINES and str(key).startswith("boundary_"):
             kind = EDGE_BOUNDARY
         if kind is None:

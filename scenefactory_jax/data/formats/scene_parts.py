@@ -13,6 +13,8 @@ from scenefactory_jax.core.types import ROAD_USERS, RoadUser
 from scenefactory_jax.data.formats.values import AXES, check_finite
 
 INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")  # a text that converts to an integer of 64 bits and back
+WOMD_TYPES: tuple[RoadUser, ...] = ("other", *ROAD_USERS)  # Track.ObjectType: unset, vehicle, pedestrian, cyclist, other
+STATE = ("x", "y", "z", "yaw", "velocity_x", "velocity_y", "length", "width", "height")  # columns of a table of states
 KINDS: dict[str, RoadUser] = {kind: kind for kind in ROAD_USERS}
 
 
@@ -48,6 +50,38 @@ def make_track(
     xyz, velocity = (np.where(valid[:, None], table, 0.0) for table in (position, velocity))
     yaw = np.where(valid, wrap_angles(heading), 0.0)
     return Track(id=id, kind=kind, size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)
+
+
+def check_times(times: Float[np.ndarray, " L"], where: str) -> None:
+    """Refuses a log without steps, and times that are not finite or do not increase, naming the first such time."""
+    if not len(times):
+        raise SceneError(f"{where}: expected at least one step, got none")
+    check_finite(times, where)
+    if (falls := np.flatnonzero(np.diff(times) <= 0)).size:
+        step = int(falls[0]) + 1
+        raise SceneError(f"{where}[{step}]: expected a time after {times[step - 1]} s, got {times[step]} s")
+
+
+def make_womd_tracks(
+    numbers: Float[np.ndarray, "A L 9"],
+    valid: Bool[np.ndarray, "A L"],
+    *,
+    ids: Sequence[int],
+    kinds: Sequence[int],
+    current: int,
+    where: str,
+) -> tuple[Track, ...]:
+    """The tracks of WOMD: columns STATE, with any values at invalid steps, and kinds, indices into WOMD_TYPES.
+
+    The size is that of the current step or, where it is invalid, of the first valid step.
+    """
+    tracks = []
+    for number, kind, table, mask in zip(ids, kinds, numbers, valid, strict=True):
+        step = current if mask[current] else np.argmax(mask)
+        size = table[step, 6:9].tolist() if mask[step] else (0.0, 0.0, 0.0)
+        motion = {"position": table[:, 0:3], "heading": table[:, 3], "velocity": table[:, 4:6]}
+        tracks.append(make_track(f"{where}track {number}", id=number, kind=WOMD_TYPES[kind], size=size, valid=mask, **motion))
+    return tuple(tracks)
 
 
 def make_light(lane: int, codes: Int[np.ndarray, " L"], stop: Float[np.ndarray, "3"] | None) -> Light:

@@ -15,14 +15,13 @@ from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError
 from scenefactory_jax.core.types import STOP_SIGN
-from scenefactory_jax.data.formats import womd_common, womd_schema
-from scenefactory_jax.data.formats.scene_parts import make_light
+from scenefactory_jax.data.formats import scene_parts, womd_schema
+from scenefactory_jax.data.formats.scene_parts import WOMD_TYPES, check_times, make_light, make_womd_tracks
 from scenefactory_jax.data.formats.tfrecord import Record
 from scenefactory_jax.data.formats.values import AXES, check_finite
-from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, check_times, make_tracks
 
 PERIODS = ("past", "current", "future")
-STATE = tuple("bbox_yaw" if name == "yaw" else name for name in womd_common.STATE)
+STATE = tuple("bbox_yaw" if name == "yaw" else name for name in scene_parts.STATE)
 ELEMENTS = (*range(0, 4), *range(5, 21))  # map element ids; without 4
 POLYGONS = 17  # stop signs and polygons have this id or a larger one; they are not split at long steps
 MICROSECONDS = 1e6
@@ -100,8 +99,8 @@ def make(features: Features, *, path: Path, record: Record, jump_m: float) -> Ra
     real = ids >= 0  # other rows are padding
     features.require(real | ~valid.any(axis=1), ids, "state/id", "an id, 0 or more, of an object with valid steps")
     kinds = features.integers("state/type", len(ids))
-    known = (kinds >= 0) & (kinds < len(OBJECT_TYPES))
-    features.require(known | ~real, kinds, "state/type", f"a type of object, 0 to {len(OBJECT_TYPES) - 1}")
+    known = (kinds >= 0) & (kinds < len(WOMD_TYPES))
+    features.require(known | ~real, kinds, "state/type", f"a type of object, 0 to {len(WOMD_TYPES) - 1}")
     sdc = np.flatnonzero(features.flags("state/is_sdc", len(ids)) & real)
     if len(sdc) > 1:
         raise SceneError(f"{where}state/is_sdc: expected one recording car at most, got {len(sdc)}")
@@ -111,7 +110,7 @@ def make(features: Features, *, path: Path, record: Record, jump_m: float) -> Ra
         name=features.name or f"{Path(path).name}#{record.number}",
         source=str(path),
         roads=roads,
-        tracks=make_tracks(
+        tracks=make_womd_tracks(
             numbers[real], valid[real], ids=ids[real].tolist(), kinds=kinds[real].tolist(), current=current, where=where
         ),
         times=times,

@@ -18,10 +18,9 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, SPEED_BUMP, STOP_SIGN
 from scenefactory_jax.data.formats import values, womd_schema
-from scenefactory_jax.data.formats.scene_parts import make_light
+from scenefactory_jax.data.formats.scene_parts import WOMD_TYPES, check_times, make_light, make_womd_tracks
 from scenefactory_jax.data.formats.tfrecord import Record
 from scenefactory_jax.data.formats.values import AXES
-from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, check_times, make_tracks
 
 Message = Any  # protobuf's classes are made at run time: type checkers know none of their fields
 
@@ -35,7 +34,7 @@ FEATURES = {
     "speed_bump": (range(SPEED_BUMP, SPEED_BUMP + 1), "polygon"),
     "driveway": (range(DRIVEWAY, DRIVEWAY + 1), "polygon"),
 }
-STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y", "length", "width", "height")  # as womd_common.STATE
+STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y", "length", "width", "height")  # as scene_parts.STATE
 PLANE = 2  # the first columns of AXES and of STATE: protobuf reads a missing number as zero, and positions in a log are not zero
 
 
@@ -103,7 +102,7 @@ def _tracks(messages: Sequence[Message], steps: int, current: int, where: str) -
     for place, message in enumerate(messages):
         values.check_length(message.states, steps, f"{where}tracks[{place}].states")
         _require(message, "id", f"{where}tracks[{place}].")
-        values.check_index(message.object_type, OBJECT_TYPES, "type of object", f"{where}tracks[{place}].object_type")
+        values.check_index(message.object_type, WOMD_TYPES, "type of object", f"{where}tracks[{place}].object_type")
     states = enumerate(chain.from_iterable(message.states for message in messages))
     by_row = {row: state for row, state in states if state.valid}
     rows = list(by_row)
@@ -112,7 +111,7 @@ def _tracks(messages: Sequence[Message], steps: int, current: int, where: str) -
     valid[rows] = True
     numbers, valid = numbers.reshape(len(messages), steps, len(STATE)), valid.reshape(len(messages), steps)
     ids, kinds = [message.id for message in messages], [message.object_type for message in messages]
-    return make_tracks(numbers, valid, ids=ids, kinds=kinds, current=current, where=where)
+    return make_womd_tracks(numbers, valid, ids=ids, kinds=kinds, current=current, where=where)
 
 
 def _polyline(message: Message, where: str) -> Polyline | None:

@@ -37,12 +37,9 @@ def check(
         track_speed_limit_m_s: a step between two positions that needs more than this speed is reported as a jump.
         car_size_m: length, width, height given to objects whose logged size is not positive.
         max_coordinate_m: largest coordinate, and largest yaw in radians.
-        max_segment_m: largest distance between neighbouring points of a polyline.
-        max_lanes_m: largest length of all driving lanes together.
-        max_size_m: largest length, width and height of an object.
-        max_speed_m_s: largest velocity along x or y.
-        max_steps: most steps of a log.
-        step_s: shortest and longest step of a log.
+        max_segment_m, max_lanes_m: largest length of a segment, and of all driving lanes together.
+        max_size_m, max_speed_m_s: largest side of an object, and velocity along x or y.
+        max_steps, step_s: largest number of steps, and shortest and longest step of a log.
         uneven_fraction: logs whose steps differ from the median step by more than the first fraction of it and
             by no more than the second are resampled to even steps; logs that are more uneven stay as they are.
 
