@@ -32,7 +32,7 @@ def _read_annotation(annotation: Any, part: str) -> Column:
     """The column of an annotation such as `Float[Array, "P 2"]`."""
     dtype = next(dtype for name, dtype in DTYPES.items() if annotation.dtypes[0].startswith(name))
     names = AXES | {"P": part}
-    return Column(dtype, tuple(int(axis) if axis.isdigit() else names.get(axis, axis) for axis in annotation.dim_str.split()))
+    return Column(dtype, tuple(int(axis) if axis.isdigit() else (names.get(axis) or axis) for axis in annotation.dim_str.split()))
 
 
 def _describe(kind: Any, prefix: str = "") -> dict[str, Column]:

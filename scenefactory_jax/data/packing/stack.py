@@ -1,7 +1,7 @@
 """Scenes of different sizes -> one padded `Scene` of worlds, with a report of what a capacity cut."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +15,18 @@ from scenefactory_jax.data.packing import columns
 AXES = (*columns.ROADS, "agents", "steps", "traffic")
 ROW_MULTIPLE = 256
 Leaves = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Rows of each axis; None: what the largest world needs."""
+
+    road: schema.Count | None = None
+    lanes: schema.Count | None = None
+    edges: schema.Count | None = None
+    agents: schema.Count | None = None
+    steps: schema.Count | None = None
+    traffic: Annotated[int, schema.Bounds(min=0)] | None = None
 
 
 @dataclass(frozen=True)
@@ -46,8 +58,7 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
 
     Args:
         scenes: single worlds, of any sizes.
-        capacity: axis (road, lanes, edges, agents, steps, traffic) -> rows; null or missing: what the largest world needs (segments rounded
-            up to a multiple of 256). Only traffic may be 0.
+        capacity: see `Capacity`; segments are rounded up to a multiple of 256.
 
     Raises:
         SceneError: no scenes.
@@ -56,12 +67,9 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     if not scenes:
         raise SceneError("no scenes to stack; give at least one")
     worlds = [_drop_padding(columns.flatten(scene)) for scene in scenes]
-    schema.check_names(dict(capacity), list(AXES), where="capacity", required=[])
-    sizes = {}
-    for axis in AXES:
-        least = 0 if axis == "traffic" else 1
-        rows = schema.read_value(capacity.get(axis), Annotated[int, schema.Bounds(min=least)] | None, where=f"capacity.{axis}")
-        sizes[axis] = round_rows(axis, max(least, *(_count(world, axis) for world in worlds))) if rows is None else rows
+    sizes = asdict(schema.read(dict(capacity), Capacity, where="capacity"))
+    for axis in [axis for axis, rows in sizes.items() if rows is None]:
+        sizes[axis] = round_rows(axis, max(int(axis != "traffic"), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
     stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}

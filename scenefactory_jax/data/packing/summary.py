@@ -65,7 +65,7 @@ def summarise_packed(
     return summarise(counts, files=files, rejects=[*earlier, *entries["rejects"]], companions=entries["companions"])
 
 
-def list_entries(rejects: Iterable[Reject]) -> dict[str, tuple[dict[str, Any], ...]]:
+def list_entries(rejects: Iterable[Reject]) -> dict[str, Any]:
     """The entries `rejects` and `companions` of `bank.json`."""
     entries: dict[str, list[dict[str, Any]]] = {"rejects": [], "companions": []}
     for reject in rejects:

@@ -99,8 +99,8 @@ def _check_map(raw: RawScene, points: Points, max_coordinate_m: float, max_segme
     bad = ~(np.abs(points.xyz) <= max_coordinate_m)
     if bad.any():
         row, axis = np.argwhere(bad)[0]
-        where, number = place(int(row))
-        raise SceneError(f"{where}: xyz[{number}][{axis}]: {_describe_bound(points.xyz[row, axis], max_coordinate_m, 'max_coordinate_m')}")
+        (where, number), value = place(int(row)), points.xyz[row, axis]
+        raise SceneError(f"{where}: xyz[{number}][{axis}]: {_describe_bound(float(value), max_coordinate_m, 'max_coordinate_m')}")
     owner = np.repeat(np.arange(len(raw.roads)), np.diff(points.bounds))
     length = np.linalg.norm(np.diff(points.xyz, axis=0), axis=1) * (owner[1:] == owner[:-1])
     if (bad := np.flatnonzero(length > max_segment_m)).size:
@@ -120,9 +120,9 @@ def _check_tracks(raw: RawScene, logs: Logs, max_coordinate_m: float, max_speed_
         bad = ~(np.abs(table) <= bound) & logs.valid[..., None]
         if bad.any():
             index, step, axis = np.argwhere(bad)[0]
-            faults.append((int(index), f"{name}[{step}]: {_describe_bound(table[index, step, axis], bound, key)}"))
+            faults.append((int(index), f"{name}[{step}]: {_describe_bound(float(table[index, step, axis]), bound, key)}"))
     for index, axis in np.argwhere(np.isfinite(logs.size) & (logs.size > max_size_m))[:1]:
-        faults.append((int(index), f"size[{axis}]: {_describe_bound(logs.size[index, axis], max_size_m, 'max_size_m')}"))
+        faults.append((int(index), f"size[{axis}]: {_describe_bound(float(logs.size[index, axis]), max_size_m, 'max_size_m')}"))
     if faults:
         index, fault = min(faults, key=lambda fault: fault[0])
         raise SceneError(f"{_name_track(raw, index)}: {fault}")
@@ -179,7 +179,7 @@ def _repair_tracks(
     raw: RawScene, logs: Logs, car_size: tuple[float, float, float], lines: list[str]
 ) -> tuple[tuple[Track, ...], int | None]:
     """The tracks with a valid step, with positive sizes and zeros at invalid steps; and the new index of the recording car."""
-    present, hidden = logs.valid.any(axis=1), ~logs.valid
+    present, hidden = np.asarray(logs.valid.any(axis=1)), ~logs.valid
     sized = np.logical_and.reduce(np.isfinite(logs.size) & (logs.size > 0), axis=1)
     non_zero = [(getattr(logs, name) != 0).reshape(*hidden.shape, -1).any(axis=2) for name in ("xyz", "yaw", "velocity")]
     stale = (np.logical_or.reduce(non_zero) & hidden).any(axis=1)
