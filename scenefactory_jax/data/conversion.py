@@ -45,20 +45,19 @@ def convert(
     compression: Compression,
     on_file: Callable[[int, int], None] | None = None,
 ) -> Summary:
-    """Reads every file below `path` into the bank `out`. A stopped conversion goes on where it stopped; a complete one takes up new files.
+    """Reads every file below `path` into the bank `out`. A stopped conversion continues; a complete one adds new files.
 
-    Files that could not be read are read again: they may have been repaired.
+    Files that could not be read are read again.
 
     Args:
-        path: a file, or a folder with its subfolders.
-        out: the bank's folder.
-        settings: the config behind `tools`, stored in the bank; a bank made with others is not continued.
+        path, out: a file or a folder with its subfolders; the bank's folder.
+        settings: the config behind `tools`, stored in the bank; a bank with other settings is refused.
         spread: task map over the files; order and result do not depend on it.
         shard_scenes, compression: of the bank's files, see `bank_writer.append_files`.
         on_file: called with (files done, files in all) after each file.
 
     Raises:
-        SceneError: no files, `out` is no bank or one made with other settings, or not one usable scene, with the first reasons.
+        SceneError: no files, `out` is not a bank or has other settings, or no usable scene, with the first reasons.
         ConfigError: a number that a part refuses.
         folder_lock.Busy: another command writes to `out`.
     """

@@ -61,14 +61,14 @@ def find(path: Path | str) -> list[Path]:
         raise SceneError(f"{path}: no such file or folder; give a scene file or a folder of them")
     if (path / BANK_INDEX).is_file():
         raise SceneError(f"{path}: a bank already; give the files that it was made from")
-    found: list[Path] = []
-    for folder, folders, names in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
+    files: list[Path] = []
+    for folder, folders, names in os.walk(path, onerror=lambda error: files.append(Path(error.filename))):
         folders[:] = [name for name in folders if not name.startswith(".")]
         if BANK_INDEX not in names:
-            found.extend(file for name in names if not name.startswith(".") and _is_regular(file := Path(folder, name)))
-    if not found:
+            files.extend(file for name in names if not name.startswith(".") and _is_regular(file := Path(folder, name)))
+    if not files:
         raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
-    return sorted(found)
+    return sorted(files)
 
 
 def _is_regular(path: Path) -> bool:

@@ -300,10 +300,10 @@ def box_corners(
 def overlaps(box: Float[np.ndarray, "*#N 4 2"], others: Float[np.ndarray, "N 4 2"]) -> Bool[np.ndarray, " N"]:
     """Whether a box, or each of as many, shares area with each of the others: no side separates them (separating axis theorem)."""
     separated = np.zeros(len(others), bool)
-    own = np.broadcast_to(box, others.shape)
-    for sides in (own, others):
+    boxes = np.broadcast_to(box, others.shape)
+    for sides in (boxes, others):
         axes = sides[:, 1:3] - sides[:, 0:2]  # two neighbouring sides: their directions are the normals of all four
-        first, second = np.einsum("nad,npd->nap", axes, own), np.einsum("nad,npd->nap", axes, others)
+        first, second = np.einsum("nad,npd->nap", axes, boxes), np.einsum("nad,npd->nap", axes, others)
         separated |= ((first.max(2) <= second.min(2)) | (second.max(2) <= first.min(2))).any(axis=1)
     return ~separated
 
