@@ -111,10 +111,10 @@ def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, 
 
 
 def test_a_mistake_in_the_config_is_no_scene_s_fault_in_a_stream():
-    config = hydra_config.load_config("scenes", "scenes.pack.scene_size_m=-1.0")["scenes"]
+    config = hydra_config.load_config("scenes", "scenes.pack.car_size_m=[4.0]")["scenes"]
     source, grid = scene_source.open_source(config), {"radius_m": None}
     loader = batches.BatchLoader(source, **scene_source.make_packing(config), grid=grid, task_map=task_map.in_process)
-    with pytest.raises(ConfigError, match=r"^scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
+    with pytest.raises(ConfigError, match=r"^scenes\.pack\.car_size_m: expected \[length, width\] or null, got \[4.0\]"):
         batches.measure(loader, sample=1, headroom=1.0, given={}, seed=0)
 
 

@@ -99,8 +99,8 @@ def test_a_capacity_cuts_what_is_farthest_and_says_so(street):
     inside = np.array([tuple(point) in kept for point in scene.road.midpoint.tolist()])
     assert inside.sum() == 40 and distance[inside].max() <= distance[~inside].min() + 1e-5
     assert stacked.road.kind[0].tolist() == sorted(stacked.road.kind[0].tolist())
-    for wrong, message in (({"road": 0}, "capacity.road: 0"), ({"lane": 3}, "capacity.lane: unknown; valid: road, lanes")):
-        with pytest.raises(SceneError, match=message):
+    for wrong, message in (({"road": 0}, "capacity.road: expected .* >= 1 or null, got 0"), ({"lane": 3}, "capacity.lane: unknown key")):
+        with pytest.raises(ConfigError, match=message):
             stack.stack([scene], capacity=wrong)
     with pytest.raises(SceneError, match="no scenes"):
         stack.stack([], capacity=NONE)
@@ -333,7 +333,7 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     assert opened.metadata["format"].to_pylist() == ["gpudrive", "gpudrive", "scenefactory"]
     lines = summary_text.describe(summary)
     assert lines[-1] == "3 scenes with 3 agents from 4 files, 1 rejected" and any("rejected" in line and "b.json" in line for line in lines)
-    assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for others"
+    assert lines[-2] == "packing with these numbers refuses: 1 no agent left; such scenes stay in a bank, for other numbers"
 
 
 def test_a_scene_that_packing_refuses_stays_for_another_box(tmp_path):
@@ -482,9 +482,9 @@ def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
         spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
         with pytest.raises(ConfigError, match=r"lanes\.topology\.neighbour_distance_m: expected .*, got \[5\.0, 2\.0\]"):
             conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
-        with pytest.raises(ConfigError, match=r"scenes\.pack\.scene_size_m: expected a number > 0, got -1"):
+        with pytest.raises(ConfigError, match=r"scenes\.pack\.car_size_m: expected \[length, width\] or null, got \[4.0\]"):
             source = scene_source.open_files(folder, reader_selection.make(FORMATS))
-            scene_source.pack_all(source, check=checker(), pack=packer(scene_size_m=-1.0), workers=workers)
+            scene_source.pack_all(source, check=checker(), pack=packer(car_size_m=[4.0]), workers=workers)
     assert not (tmp_path / "bank").exists()
 
 

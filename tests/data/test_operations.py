@@ -400,10 +400,10 @@ def test_banks_are_judged_and_compared(town, tmp_path):
         (["op=sheet"], "out: null; give a folder"),
         (["op=info", "scenes.path=null"], "scenes.path: null; op=info needs a bank"),
         (["op=verify", "scenes.path=null"], "scenes.path: null; op=verify needs a bank"),
-        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: expected a number >= 0, got -1"),
+        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: expected an integer >= 0, got -1"),
         (["scenes.pack.scene_size_m=0.0"], "scenes.pack.scene_size_m: expected a number > 0, got 0"),
-        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: \[4.0\]; wanted are length and width"),
-        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: \[4.0, -2.0\]; wanted are length and width"),
+        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: expected \[length, width\] or null, got \[4.0\]"),
+        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: expected .* > 0 or null, got \[4.0, -2.0\]"),
     ],
 )
 def test_what_cannot_be_done_is_named(town, overrides, message):
