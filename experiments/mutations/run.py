@@ -111,7 +111,7 @@ MUTATIONS = (
              "found[-1] if iteration is None", "found[0] if iteration is None",
              "learning/test_checkpoint.py"),
     Mutation("checkpoints", "what is judged is the last step, not the running mean", "learning/checkpoint.py",
-             "AVERAGED if AVERAGED in held else LEARNT", "LEARNT", "learning/test_checkpoint.py"),
+             "(averaged or last)", "last", "learning/test_checkpoint.py"),
 )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
 from scenefactory_jax.evaluation import episodes, failures
-from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment
+from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.learning.training_loop import make_policy
 
@@ -53,7 +53,7 @@ def make_episode_runner(
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
-    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], signals=thresholds["signals"])
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], thresholds=SignalThresholds(**thresholds["signals"]))
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -90,7 +90,7 @@ def make_episode_runner(
         state, metrics = jax.device_get((episode.state, episode.carry))
         records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
         signals = _make_signals(metrics, state, first.agents.present, control_hz)
-        records |= failures.classify({**records, **signals}, **thresholds["types"])
+        records |= failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)

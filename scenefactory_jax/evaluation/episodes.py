@@ -4,8 +4,6 @@ Events are counted from the step metrics, not from the exclusive events that rew
 one step has both events. Nothing is counted after an agent or its world has ended.
 """
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -14,8 +12,7 @@ from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Events, State
 from scenefactory_jax.env import termination
 from scenefactory_jax.env.rollout import ControlStep, Hook
-from scenefactory_jax.evaluation import failure_signals
-from scenefactory_jax.evaluation.failure_signals import FailureSignals
+from scenefactory_jax.evaluation.failure_signals import FailureSignals, SignalThresholds, begin_signals, update_signals
 
 
 @pytree_dataclass
@@ -69,27 +66,24 @@ def make_metrics(state: State) -> EpisodeMetrics:
         friction_utilization_sum=zero,
         min_stopping_margin=zero + jnp.inf,
         max_contact_force=zero,
-        signals=failure_signals.begin(state, distance),
+        signals=begin_signals(state, distance),
     )
 
 
-def make_hook(env: Env, *, ttc_limit_s: float, signals: Mapping[str, float]) -> Hook:
+def make_hook(env: Env, *, ttc_limit_s: float, thresholds: SignalThresholds) -> Hook:
     """Returns the hook of a rollout that updates `EpisodeMetrics` and gives an `EpisodeFrame` a step.
 
     Args:
         ttc_limit_s: TTC is clamped to it in an agent's mean (the published evaluation: 10 s).
-        signals: numbers of `failure_signals.update`.
     """
 
     def hook(metrics: EpisodeMetrics, step: ControlStep) -> tuple[EpisodeMetrics, EpisodeFrame]:
-        before, state, result = step.before, step.after, step.result
+        before, state, result, lanes = step.before, step.after, step.result, step.scene.lanes
         boxes = env.current_scene(step.scene, state).traffic
-        found = failure_signals.update(
-            metrics.signals, metrics.past_events, step.scene.lanes, boxes, before, state, result.metrics, **signals
-        )
+        signals = update_signals(metrics.signals, metrics.past_events, lanes, boxes, before, state, result.metrics, thresholds)
         position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events)
-        return _update(metrics, step, found, ttc_limit_s=ttc_limit_s), frame
+        return _update(metrics, step, signals, ttc_limit_s=ttc_limit_s), frame
 
     return hook
 

@@ -1,13 +1,14 @@
 """Records of an evaluation: one row for every spawned agent and episode, in memory and as files."""
 
 import csv
+import lzma
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core import result_file, text_file
+from scenefactory_jax.core import result_file
 
 Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # what was evaluated, beside the records
@@ -57,7 +58,7 @@ def write_records(path: Path, records: Records) -> None:
     """
     check_records(records)
     columns = [np.asarray(column).tolist() for column in records.values()]
-    with text_file.open_text(path, "w") as file:
+    with _open_csv(path, "wt") as file:
         writer = csv.writer(file)
         writer.writerow(records)
         writer.writerows(zip(*columns, strict=True))
@@ -71,7 +72,7 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
     """
     if not path.is_file():
         raise RecordsError(f"{path}: file not found; expected the CSV of an evaluation")
-    with text_file.open_text(path, "r") as file:
+    with _open_csv(path, "rt") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
@@ -86,6 +87,11 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
         records[name] = column
     check_records(records)
     return records
+
+
+def _open_csv(path: Path, mode: str) -> Any:
+    """Opens a text file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
+    return (lzma.open if path.suffix == ".xz" else open)(path, mode, newline="", encoding="utf-8")
 
 
 def _parse(cells: list[str], kind: type) -> np.ndarray | None:

@@ -5,7 +5,7 @@ resample draws seeds with replacement, scenes with replacement (the same for all
 (the same for all seeds). The interval of one run measures how well one set of weights is known, that of several how well their recipe is.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -63,9 +63,9 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
         if estimate.method == NONE and estimate.count:
             values = np.asarray(METRICS[name].value(records), float)[np.asarray(METRICS[name].counted(records), bool)]
             draws = np.random.default_rng(seed).multinomial(len(values), np.full(len(values), 1 / len(values)), size=bootstrap)
-            low, high = _percentiles(draws @ values / len(values))
-            if _varies(low, high):
-                found[name] = estimate._replace(low=low, high=high, method=AGENTS)
+            interval = _compute_percentiles(draws @ values / len(values))
+            if interval is not None and _varies(interval):
+                found[name] = estimate._replace(low=interval[0], high=interval[1], method=AGENTS)
     return found
 
 
@@ -135,9 +135,6 @@ def newcombe(before: tuple[float, int], after: tuple[float, int]) -> tuple[float
     return float(low), float(high)
 
 
-# ---- estimates of one or several runs
-
-
 def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
     (table,) = _tabulate([runs])
     values = _ratios(table, *_ones(table))[0]
@@ -145,16 +142,11 @@ def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[s
     draws = np.concatenate([_ratios(table, *one) for one in weights])
     found = {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        value, count = float(values[m]), int(table.counts[:, :, m].sum())
-        low, high = _percentiles(draws[:, m])
-        if not np.isfinite(value):
-            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
-        elif _varies(low, high):
-            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
-        elif metric.rate:
-            found[name] = Estimate(value, *wilson(min(max(value, 0.0), 1.0), _count_agents(table, m)), count, metric.unit, WILSON)
-        else:
-            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
+        interval = _compute_percentiles(draws[:, m])
+        score = lambda m=m: wilson(min(max(float(values[m]), 0.0), 1.0), _count_agents(table, m))  # noqa: E731
+        found[name] = _make_estimate(
+            metric, values[m], table.counts[:, :, m].sum(), interval if _varies(interval) else None, agents, WILSON, score
+        )
     return found
 
 
@@ -170,40 +162,50 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
     draws, found = np.concatenate(draws), {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        value, count = float(new[m] - old[m]), min(int(table.counts[:, :, m].sum()) for table in tables)
-        low, high = _percentiles(draws[:, m])
-        one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
-        if not np.isfinite(value):
-            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
-        elif low is not None and not one_scene and (_varies(low, high) or not metric.rate):
-            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
-        elif metric.rate:
-            ends = newcombe(*((float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)))
-            found[name] = Estimate(value, *ends, count, metric.unit, NEWCOMBE)
-        else:
-            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
+        interval, count = _compute_percentiles(draws[:, m]), min(table.counts[:, :, m].sum() for table in tables)
+        is_one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
+        if is_one_scene or (metric.rate and not _varies(interval)):
+            interval = None
+        rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
+        score = lambda rates=rates: newcombe(*rates)  # noqa: E731
+        found[name] = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
     return found
 
 
-def _percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float | None, float | None]:
-    """The middle 95 % of the draws that have a value."""
+def _make_estimate(
+    metric: Metric,
+    value: float,
+    count: float,
+    interval: tuple[float, float] | None,
+    agents: bool,
+    score_method: str,
+    score: Callable[[], tuple[float, float]],
+) -> Estimate:
+    """The estimate with its bootstrap interval; without one a rate takes the score interval, a mean none."""
+    if not np.isfinite(value):
+        return Estimate(None, None, None, 0, metric.unit, NONE)
+    if interval is not None:
+        return Estimate(float(value), *interval, int(count), metric.unit, LEVELS if agents else SCENES)
+    low, high = score() if metric.rate else (None, None)
+    return Estimate(float(value), low, high, int(count), metric.unit, score_method if metric.rate else NONE)
+
+
+def _compute_percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float, float] | None:
+    """The middle 95 % of the draws that have a value; None: none has."""
     finite = draws[np.isfinite(draws)]
     if not len(finite):
-        return None, None
+        return None
     low, high = np.percentile(finite, [2.5, 97.5])
     return float(low), float(high)
 
 
-def _varies(low: float | None, high: float | None) -> bool:
-    return low is not None and high is not None and high - low >= 1e-9
+def _varies(interval: tuple[float, float] | None) -> bool:
+    return interval is not None and interval[1] - interval[0] >= 1e-9
 
 
 def _count_agents(table: Table, m: int) -> int:
     """Distinct agents: an agent that two seeds controlled is one."""
     return max(1, int((table.counts[:, :, m].sum(axis=0) > 0).sum()))
-
-
-# ---- tables and resamples
 
 
 def _tabulate(every: Sequence[Runs]) -> list[Table]:

@@ -148,7 +148,7 @@ def test_bfloat16_is_near_and_stays_inside(tiny):
 
 
 def test_mistakes_are_named(tiny):
-    with pytest.raises(ConfigError, match=r"policy\.trunk: expected a list of integers >= 1, got \[\]"):
+    with pytest.raises(ConfigError, match=r"policy\.trunk: expected one width or more, got \[\]"):
         late_fusion.make(**{**TINY, "trunk": []})
     with pytest.raises(ConfigError, match=r"policy\.mean_init: expected 3 numbers"):
         late_fusion.make(**{**TINY, "mean_init": [0.0]})
