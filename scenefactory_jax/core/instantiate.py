@@ -22,7 +22,6 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
     """Returns the function that `_target_` names with the numbers of `entry` bound.
 
     Args:
-        entry: mapping with `_target_`, and a value for every keyword-only parameter of the target.
         builtins: module of targets without a dot.
         where: key of the entry, for messages ("reward.progress").
         context: values that the program supplies to targets that declare them (time steps, friction): they need no key.
@@ -65,8 +64,8 @@ def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str)
     function = getattr(module, name, None)
     foreign = module.__name__.partition(".")[0] != __name__.partition(".")[0]
     if not callable(function) or name.startswith("_") or not (foreign or _is_defined_in(function, module)):
-        found = [name for name, value in vars(module).items() if inspect.isfunction(value) and _is_defined_in(value, module)]
-        valid = ", ".join(sorted(name for name in found if not name.startswith("_")))
+        functions = [name for name, value in vars(module).items() if inspect.isfunction(value) and _is_defined_in(value, module)]
+        valid = ", ".join(sorted(name for name in functions if not name.startswith("_")))
         raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path")
     return function
 

@@ -51,12 +51,9 @@ def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -
     """Checks shape and kind of number of a struct's fields against their annotations. Only shapes and dtypes are read.
 
     Args:
-        where: name of the value, for messages.
-        sizes: axis -> size, None if it is not known yet; sizes that are found are filled in. These axes have one size in all parts of the
-            value, other axes have their own in each part.
-
-    Raises:
-        ValueError: naming the field, what it is, and what was expected.
+        where: name of the value, for the ValueError.
+        sizes: axis -> size, None if it is not known yet; unknown sizes are filled in. These axes have one size in all parts of the value,
+            other axes have their own in each part.
     """
     if not isinstance(value, kind):
         raise ValueError(f"{where}: expected a {kind.__name__}, got {type(value).__name__}")
@@ -74,28 +71,24 @@ def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -
 def check_array(
     leaf: Any, expected: Any, *, where: str, sizes: dict[str, int | None], own: dict[str, int | None] | None = None
 ) -> None:  # fmt: skip
-    """Checks shape and kind of number of an array against a jaxtyping annotation; `own`: sizes of the axes that `sizes` does not name.
-
-    Raises:
-        ValueError: naming the array, what it is, and what was expected.
-    """
+    """Checks one array, as `check`; `own`: sizes of the axes that `sizes` does not name."""
     own, axes = {} if own is None else own, expected.dim_str.split()
     kind = next(kind for kind in KINDS if expected.dtypes[0].startswith(kind))
     if leaf is None:
-        raise ValueError(f"{where}: missing; expected {kind} of shape {_shown(axes)}")
+        raise ValueError(f"{where}: missing; expected {kind} of shape {_format_shape(axes)}")
     shape, dtype = jnp.shape(leaf), jnp.result_type(leaf)
     known = [int(axis) if axis.isdigit() else (sizes if axis in sizes else own).get(axis) for axis in axes]
     if len(shape) != len(axes) or any(size not in (None, given) for size, given in zip(known, shape, strict=True)):
         worlds = "; for many worlds map over them with jax.vmap" if len(shape) == len(axes) + 1 else ""
-        wanted = [axis if size is None else size for axis, size in zip(axes, known, strict=True)]
-        raise ValueError(f"{where}: expected shape {_shown(wanted)}, got {_shown(shape)}{worlds}")
+        expected_shape = [axis if size is None else size for axis, size in zip(axes, known, strict=True)]
+        raise ValueError(f"{where}: expected shape {_format_shape(expected_shape)}, got {_format_shape(shape)}{worlds}")
     if not jnp.issubdtype(dtype, KINDS[kind]):
         raise ValueError(f"{where}: expected {kind}, got {dtype}")
     for axis, size in zip(axes, shape, strict=True):
         (sizes if axis in sizes else own)[axis] = size
 
 
-def _shown(shape: Iterable[Any]) -> str:
+def _format_shape(shape: Iterable[Any]) -> str:
     return f"({', '.join(map(str, shape))})"
 
 

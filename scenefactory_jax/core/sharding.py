@@ -66,14 +66,14 @@ def map_over_devices(run: Callable, trees: Sequence[Any], in_specs: Sequence[Spe
     results = []
 
     def each(*leaves: Any) -> tuple[Any, Any]:
-        found = run(*map(_fill, leaves, parts))
-        specs = out_specs(found)
-        results.append(_describe(found, specs, lambda rows: rows * mesh.size))
+        result = run(*map(_fill, leaves, parts))
+        specs = out_specs(result)
+        results.append(_describe(result, specs, lambda rows: rows * mesh.size))
         keep = lambda sharded: lambda leaf, spec: leaf if leaf.size and (AXIS in spec) == sharded else None  # noqa: E731
-        return jax.tree.map(keep(True), found, specs), jax.tree.map(keep(False), found, specs)
+        return jax.tree.map(keep(True), result, specs), jax.tree.map(keep(False), result, specs)
 
-    given = tuple(specs(tree) for specs, tree in zip(in_specs, full, strict=True))
-    mapped = jax.shard_map(each, mesh=mesh, in_specs=given, out_specs=(PartitionSpec(AXIS), PartitionSpec()), check_vma=False)
+    specs_of_parts = tuple(specs(tree) for specs, tree in zip(in_specs, full, strict=True))
+    mapped = jax.shard_map(each, mesh=mesh, in_specs=specs_of_parts, out_specs=(PartitionSpec(AXIS), PartitionSpec()), check_vma=False)
     sharded, replicated = mapped(*full)
     return _fill(jax.tree.map(lambda one, other: other if one is None else one, sharded, replicated, is_leaf=_is_none), results[-1])
 

@@ -159,10 +159,10 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
         outline = lambda index: (users.position[index], users.yaw[index], half[index])  # noqa: E731
         return find_box_contact(*outline(row), *outline(column))
 
-    found = jax.vmap(lambda row: jax.vmap(lambda column: find_contact(row, column))(columns))(rows)
-    depth = jnp.where(users.present & (rows[:, None] != columns), found.depths.max(-1), -jnp.inf)
+    contact = jax.vmap(lambda row: jax.vmap(lambda column: find_contact(row, column))(columns))(rows)
+    depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)
     partner = jnp.argmax(jnp.where(jnp.isfinite(depth), depth, -jnp.inf), axis=1).astype(jnp.int32)
-    normal, point = found.normal[rows, partner], found.points[rows, partner].mean(1)
+    normal, point = contact.normal[rows, partner], contact.points[rows, partner].mean(1)
 
     def speed_along_normal(index: Int[Array, " A"]) -> Float[Array, " A"]:
         arm = point - users.position[index]

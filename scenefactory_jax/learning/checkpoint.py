@@ -77,18 +77,18 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
         ConfigError: the checkpoint was made with another config, the message names the arrays that differ; or it is damaged.
     """
     file = _find(folder, iteration)
-    held = {name: value for name, value in _load(file).items() if name != HOST}
-    if all(name.startswith((PARAMETERS, AVERAGED)) for name in held):
+    stored = {name: value for name, value in _load(file).items() if name != HOST}
+    if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
         raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
     leaves = _name_leaves(like)
-    _check_same_arrays(held, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
-    return jax.tree.unflatten(jax.tree.structure(like), [_place(held.get(name), leaf) for name, leaf in leaves.items()])
+    _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
+    return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
 
 
 def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, Any] | None:
     """Reads the JSON values that were saved with a train state; None if there were none. Raises as `restore`."""
-    held = _load(_find(folder, iteration), HOST)
-    return json.loads(str(held[HOST])) if held else None
+    stored = _load(_find(folder, iteration), HOST)
+    return json.loads(str(stored[HOST])) if stored else None
 
 
 def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
@@ -101,12 +101,12 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
     if iteration is None and exported.is_file():
         if damage := _find_damage(exported):
             raise ConfigError(f"{exported}: damaged: {damage}; restore it from a copy")
-        found = _load(exported)
+        arrays = _load(exported)
     else:
         file = _find(folder, iteration)
         averaged, last = _load(file, AVERAGED), _load(file, PARAMETERS)
-        found = {name.partition("/")[2]: value for name, value in (averaged or last).items()}
-    return jax.tree.map(jnp.array, unflatten_dict(found, sep="/"))
+        arrays = {name.partition("/")[2]: value for name, value in (averaged or last).items()}
+    return jax.tree.map(jnp.array, unflatten_dict(arrays, sep="/"))
 
 
 def write_parameters(folder: Path | str, parameters: Any) -> Path:
@@ -127,16 +127,16 @@ def _list_iterations(folder: Path | str) -> list[int]:
 
 def _find(folder: Path | str, iteration: int | None) -> Path:
     """Finds the file of a checkpoint (None: the newest) and compares its checksums."""
-    found = _list_iterations(folder)
-    if not found:
+    iterations = _list_iterations(folder)
+    if not iterations:
         raise FileNotFoundError(f"{folder}: no checkpoint there")
-    if iteration is not None and iteration not in found:
-        raise FileNotFoundError(f"{folder}: no checkpoint of iteration {iteration}; there are {', '.join(map(str, found))}")
-    step = found[-1] if iteration is None else iteration
-    file = _path(folder, step)
+    if iteration is not None and iteration not in iterations:
+        raise FileNotFoundError(f"{folder}: no checkpoint of iteration {iteration}; there are {', '.join(map(str, iterations))}")
+    chosen = iterations[-1] if iteration is None else iteration
+    file = _path(folder, chosen)
     if damage := _find_damage(file):
         hint = "the folder has no complete checkpoint before it: restore it from a copy"
-        if before := [one for one in found if one < step and not _find_damage(_path(folder, one))]:
+        if before := [earlier for earlier in iterations if earlier < chosen and not _find_damage(_path(folder, earlier))]:
             hint = f"checkpoint {before[-1]} before it is complete: remove {file}, and the same command uses that one"
         raise ConfigError(f"{file}: damaged: {damage}; {hint}")
     return file
@@ -160,18 +160,18 @@ def _write(file: Path, arrays: Mapping[str, np.ndarray], *, savez: Callable[...,
 def _load(file: Path, prefix: str = "") -> Arrays:
     """Reads the arrays whose names begin with a prefix; numpy reads bfloat16 as two bytes without a type."""
     with np.load(file) as stored:
-        found = {name: stored[name] for name in stored.files if name.startswith(prefix)}
-    return {name: value.view(jnp.bfloat16) if value.dtype.kind == "V" else value for name, value in found.items()}
+        arrays = {name: stored[name] for name in stored.files if name.startswith(prefix)}
+    return {name: value.view(jnp.bfloat16) if value.dtype.kind == "V" else value for name, value in arrays.items()}
 
 
-def _check_same_arrays(held: Mapping[str, Any], expected: Mapping[str, Any], file: Path) -> None:
+def _check_same_arrays(stored: Mapping[str, Any], expected: Mapping[str, Any], file: Path) -> None:
     """Checks that a checkpoint has the expected arrays, with their shapes and types."""
-    there, here = ({name: f"{tuple(leaf.shape)} {leaf.dtype}" for name, leaf in tree.items()} for tree in (held, expected))
-    differ = [name for name in sorted(there.keys() | here.keys()) if there.get(name) != here.get(name)]
+    old, new = ({name: f"{tuple(leaf.shape)} {leaf.dtype}" for name, leaf in tree.items()} for tree in (stored, expected))
+    differ = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
     if not differ:
         return
     named = [name for name in differ if name.startswith(PARAMETERS)] or differ  # optimizer states differ where parameters do
-    lines = [f"{name}: it has {there.get(name, 'none')}, the config expects {here.get(name, 'none')}" for name in named[:4]]
+    lines = [f"{name}: it has {old.get(name, 'none')}, the config expects {new.get(name, 'none')}" for name in named[:4]]
     more = f"; and {len(named) - 4} more" if len(named) > 4 else ""
     raise ConfigError(f"{file} does not fit this config: {'; '.join(lines)}{more}; use the settings of the run, or another folder")
 

@@ -75,12 +75,7 @@ def init_parameters(key: PRNGKeyArray, policy: Policy, observation: Observation)
 def init_train_state(
     key: PRNGKeyArray, scenes: Scene, env: Env, policy: Policy, optimizer: optax.GradientTransformation, *, starts: int, ema: bool
 ) -> TrainState:
-    """Computes the train state before the first iteration.
-
-    Args:
-        starts: worlds begin at random at one of the first `starts` actions of their episodes; 1: all at the beginning.
-        ema: keep a running mean of the parameters.
-    """
+    """Computes the train state before the first iteration; `starts`: see `start_worlds`, `ema`: keep a running mean of the parameters."""
     _, start_key, next_key = split_key(key)
     worlds = start_worlds(env, start_key, scenes, starts=starts)
     parameters = init_parameters(key, policy, worlds.observation)
@@ -98,7 +93,7 @@ def init_train_state(
 
 
 def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
-    """Starts an episode in every world, each at one of the first `starts` actions of its episode."""
+    """Starts an episode in every world, each at one of its first `starts` actions, at random; 1: all at the beginning."""
 
     def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Observation]:
         step_key, state_key = jax.random.split(key)

@@ -31,7 +31,7 @@ MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | 
 
 
 class Prepared(NamedTuple):
-    """What runs share that differ only in seed, scenes or budget, so that they compile once.
+    """Shared parts of runs that differ only in seed, scenes or budget, so that they compile once.
 
     `scenes`: to train on, before `scenes.take`; None: they are read again.
     """
@@ -55,11 +55,7 @@ class Run(NamedTuple):
 
 
 def prepare(config: Mapping[str, Any]) -> Prepared:
-    """Builds environment, policy and trainer of a config.
-
-    Raises:
-        ConfigError: a key that does not fit, by name.
-    """
+    """Builds environment, policy and trainer of a config."""
     env, policy, mesh = environment.make_env(config), make_policy(config), sharding.make_mesh(config["devices"])
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 

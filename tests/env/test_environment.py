@@ -377,7 +377,7 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     end, _ = rollout.rollout(env, broken, None, two_cars, start, jax.random.key(0), steps=2, hook=hook)
     metrics = end.carry
     assert metrics.past_events.numerical_error.tolist() == [True, False] and metrics.steps.tolist() == [0, 2]
-    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.speed_sum.any()
+    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.sums["speed"].any()
     motion = replace(state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
     assert step_metrics.is_finite(motion).tolist() == [False, True]
 

@@ -63,7 +63,7 @@ def test_it_holds_its_speed_and_takes_any_batch_and_any_parameters(seeker):
 
 def test_what_it_cannot_drive_by_is_named(seeker):
     settings = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit"])["policy"]
-    with pytest.raises(ConfigError, match=r"a seeker needs the group `ego` of the observation; it has: turning"):
+    with pytest.raises(ConfigError, match=r"pure pursuit needs the observation group `ego`; the observation has: turning"):
         seeker.apply({}, {"turning": jnp.zeros(2)})
     for key in ("wheelbase_m", "speed_mps", "goal_scale_m"):
         with pytest.raises(ConfigError, match=rf"policy\.{key}"):

@@ -17,7 +17,7 @@ def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1
         groups: of worlds, each of which gives every minibatch an equal part.
 
     Raises:
-        ConfigError: the rollout (`sample_fraction` 1) does not divide into the minibatches, or a minibatch would be empty.
+        ConfigError: a rollout that does not divide into the minibatches, where all of it is used; or an empty minibatch.
     """
     worlds, agents = shape
     samples = config.horizon * worlds * agents
