@@ -43,7 +43,7 @@ def agree(one, other):
 @pytest.fixture(scope="module")
 def found():
     """(devices, shards) -> what was learnt."""
-    pairs = [(1, 4), (2, 4), (1, 2)]
+    pairs = [(1, 4), (2, 4)]
     return dict(zip(pairs, result(start(",".join(f"{devices}:{shards}" for devices, shards in pairs))), strict=True))
 
 
@@ -60,15 +60,11 @@ def test_scenes_pass_through_worlds_without_compiling_again(found):
         assert latest.max() < before.min() and before.max() < never.min()
 
 
-def test_other_groups_learn_something_else(found):
-    """Or the comparisons above could not fail."""
-    with pytest.raises(AssertionError):
-        agree(found[1, 2], found[1, 4])
-
-
 @pytest.mark.slow  # two devices of one process run the same code
 def test_four_devices_and_two_processes_learn_the_same(found):
     agree(result(start("4:4"))[0], found[1, 4])
+    with pytest.raises(AssertionError):  # other groups learn something else, or the comparisons could not fail
+        agree(result(start("1:2"))[0], found[1, 4])
     with socket.socket() as free:
         free.bind(("localhost", 0))
         place = f"localhost:{free.getsockname()[1]}"
