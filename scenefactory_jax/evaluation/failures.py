@@ -92,10 +92,10 @@ def classify(signals: Records, thresholds: TypeThresholds) -> dict[str, np.ndarr
             distance to the goal ("closest"), the start of the last rest ("last_rest"), the first stretch against the lanes
             ("first_wrong_way") and the "end".
     """
-    own, other = np.maximum(signals["approach_mps"], 0.0), np.maximum(signals["partner_approach_mps"], 0.0)
+    own_speed, other_speed = np.maximum(signals["approach_mps"], 0.0), np.maximum(signals["partner_approach_mps"], 0.0)
     fraction = thresholds.at_fault_speed_fraction
-    drove = (own >= thresholds.at_fault_min_mps) & (own >= fraction * (own + other))
-    head_on = drove & (other >= fraction * (own + other))
+    drove = (own_speed >= thresholds.at_fault_min_mps) & (own_speed >= fraction * (own_speed + other_speed))
+    head_on = drove & (other_speed >= fraction * (own_speed + other_speed))
     at_fault = signals["collision"] & drove & ~(head_on & signals["partner_wrong_way"] & ~signals["collision_wrong_way"])
     closing = np.maximum(signals["approach_mps"] + signals["partner_approach_mps"], 0.0)
     stuck = ~signals["goal_reached"] & (signals["rest_s"] >= thresholds.stuck_s)
@@ -141,10 +141,10 @@ def rank_failures(records: Records) -> dict[str, list[Failure]]:
     columns = ("failure", "failure_s", "failure_x_m", "failure_y_m", "severity", *FLAGS)
     if missing := [name for name in columns if name not in records]:
         raise RecordsError(f"records.{missing[0]}: column missing; failure types need {', '.join(columns)}, which `evaluate` writes")
-    kinds, found = np.asarray(records["failure"]), {}
+    kinds, ranked = np.asarray(records["failure"]), {}
     for row in np.argsort(-np.asarray(records["severity"], float), kind="stable"):  # ties as in the records
-        found.setdefault(str(kinds[row]), []).append(_make_failure(records, int(row)))
-    return {kind: found[kind] for kind in FAILURE_TYPES if kind in found}
+        ranked.setdefault(str(kinds[row]), []).append(_make_failure(records, int(row)))
+    return {kind: ranked[kind] for kind in FAILURE_TYPES if kind in ranked}
 
 
 def _make_failure(records: Records, row: int) -> Failure:

@@ -44,10 +44,10 @@ def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, 
     try:
         _write(file, arrays)
     except OSError as error:
-        kept, newest = "there is no complete checkpoint", latest(folder)
+        hint, newest = "there is no complete checkpoint", latest(folder)
         if newest is not None:
-            kept = f"checkpoint {newest} is complete: with resume=true training goes on from it"
-        raise OSError(error.errno, f"{error.strerror}; {kept}", str(file)) from None
+            hint = f"checkpoint {newest} is complete: with resume=true training goes on from it"
+        raise OSError(error.errno, f"{error.strerror}; {hint}", str(file)) from None
     for old in _list_iterations(folder)[:-keep]:
         _path(folder, old).unlink()
     return file

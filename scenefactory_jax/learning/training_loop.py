@@ -208,15 +208,14 @@ def step(
     trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
 ) -> tuple[TrainState, Scene, dict[str, float | int]]:
     """Makes one iteration, with the stream's next scenes in some worlds if there is a stream; gives its metrics on the host."""
-    if flow is None:
-        state, metrics = trainer.train_iteration(state, worlds)
-        return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
-    if not first:
+    if flow is not None and not first:
         state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
     state, metrics = trainer.train_iteration(state, worlds)
-    flow.draw()  # while the devices compute
-    metrics, record = jax.device_get((metrics, state.scene_stats))
-    return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
+    if flow is not None:
+        flow.draw()  # while the devices compute
+    metrics, stats = jax.device_get((metrics, state.scene_stats))
+    row = {name: float(value) for name, value in metrics.items()}
+    return state, worlds, row if flow is None else row | flow.note(stats.episodes, stats.successes)
 
 
 def describe(row: Mapping[str, float | int]) -> str:

@@ -1,4 +1,4 @@
-"""Checkpoints: going on from disk is going on, and what does not fit is named."""
+"""Checkpoints: resumed trainings are exact, and what does not fit is named."""
 
 import dataclasses
 import shutil
@@ -62,7 +62,7 @@ def test_the_newest_are_kept(saved):
     assert checkpoint.latest(folder) == 3
 
 
-def test_going_on_from_disk_is_going_on(saved):
+def test_a_resumed_training_equals_an_unbroken_one(saved):
     folder, third, unbroken = saved
     other = fresh()
     train_state = checkpoint.restore(folder, third, 2)
@@ -80,7 +80,7 @@ def test_restore_is_exact_in_every_array(saved, trainer):
     assert [leaf.committed for leaf in jax.tree.leaves(restored)] == [leaf.committed for leaf in jax.tree.leaves(like)]
 
 
-def test_parameters_alone_drive_a_policy(saved):
+def test_restored_parameters_fit_the_policy(saved):
     folder, third, _ = saved
     parameters = checkpoint.restore_parameters(folder)
     assert_same(parameters, third.ema_parameters)
@@ -88,7 +88,7 @@ def test_parameters_alone_drive_a_policy(saved):
     assert mean.shape == (STAGE, 3, 3)
 
 
-def test_what_is_judged_is_the_running_mean(saved, trainer):
+def test_the_running_mean_is_evaluated(saved, trainer):
     folder, third, fourth = saved
     second = checkpoint.restore(folder, begin(trainer), 2)
     for before, after in ((second, third), (third, fourth)):
@@ -110,7 +110,7 @@ def test_a_run_without_a_mean_is_saved_and_restored(saved, tmp_path):
         checkpoint.restore(folder, alone)
 
 
-def test_an_unfinished_checkpoint_is_not_there(saved):
+def test_an_incomplete_checkpoint_is_ignored(saved):
     folder, third, _ = saved
     (folder / ".9.npz.part").write_bytes(b"PK")
     assert checkpoint.latest(folder) == 3
@@ -143,7 +143,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize(("damage", "reason"), DAMAGE.values(), ids=DAMAGE)
-def test_damage_is_named_and_the_one_before_goes_on(saved, tmp_path, damage, reason):
+def test_damage_is_named_with_the_checkpoint_before(saved, tmp_path, damage, reason):
     folder, third, _ = saved
     for name in ("2.npz", "3.npz"):
         shutil.copy(folder / name, tmp_path)
@@ -225,7 +225,7 @@ def test_empty_arrays_and_half_precision_survive(saved, tmp_path):
     assert_same(checkpoint.restore(tmp_path, odd), odd)
 
 
-def test_a_stripped_checkpoint_drives_but_does_not_go_on(saved, trainer, tmp_path):
+def test_a_stripped_checkpoint_has_parameters_alone(saved, trainer, tmp_path):
     folder = shutil.copytree(saved[0], tmp_path / "run")
     parameters, size = checkpoint.restore_parameters(folder), (folder / "3.npz").stat().st_size
     checkpoint.drop_training_state(folder)

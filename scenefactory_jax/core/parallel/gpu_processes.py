@@ -75,10 +75,11 @@ def _choose_gpu(index: int, per_gpu: int) -> dict[str, str]:
 
     With `jax_cuda_visible_devices` of JAX 0.11.2 programs fail on any GPU but the first.
     """
-    given, place = [name for name in os.environ.get(VISIBLE, "").split(",") if name], index // per_gpu
-    if given and place >= len(given):
-        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(given)}; `processes` is at most {per_gpu * len(given)}")
-    variables = {VISIBLE: given[place] if given else str(place)}
+    visible, gpu = [name for name in os.environ.get(VISIBLE, "").split(",") if name], index // per_gpu
+    if visible and gpu >= len(visible):
+        most = per_gpu * len(visible)
+        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(visible)}; `processes` is at most {most}")
+    variables = {VISIBLE: visible[gpu] if visible else str(gpu)}
     return variables | ({MEMORY: f"{USED_FRACTION / per_gpu:.3f}"} if per_gpu > 1 else {})
 
 

@@ -207,9 +207,9 @@ def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x
     return pooled, (weights, x, winner, jnp.any(mask, axis=-1)[..., None])
 
 
-def _encode_backward(activation: str, dtype: str, kernels: bool, kept: tuple, cotangent: Array) -> tuple[list, Array, None]:
-    weights, x, winner, shown = kept
-    cotangent = jnp.where(shown, cotangent, 0.0)
+def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tuple, cotangent: Array) -> tuple[list, Array, None]:
+    weights, x, winner, has_rows = residuals
+    cotangent = jnp.where(has_rows, cotangent, 0.0)
 
     def at_winners(weights: list, x: Array) -> Array:
         rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the winner of each channel

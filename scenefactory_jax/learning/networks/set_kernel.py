@@ -81,17 +81,17 @@ def _encode(last, x, mask, first, second, second_bias, pooled, winner, *, activa
 
     def block(index, best):
         at = index * rows + lanes
-        seen = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
-        table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=seen[:, None] & (columns < features)[None, :], other=ones)
+        valid = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
+        table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=valid[:, None] & (columns < features)[None, :], other=ones)
         inner = [activate(_product(table, first[:, pl.ds(start, length)])).astype(second.dtype) for start, length in hidden]
-        found = []
+        results = []
         for (start, length), (value, where) in zip(out, best, strict=True):
             parts = [_product(part, second[pl.ds(k, w), pl.ds(start, length)]) for part, (k, w) in zip(inner, hidden, strict=True)]
-            here = jnp.where(seen[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
-            largest, half = jnp.max(here, axis=1), jnp.argmax(here, axis=1).astype(jnp.int32)
+            values = jnp.where(valid[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
+            largest, half = jnp.max(values, axis=1), jnp.argmax(values, axis=1).astype(jnp.int32)
             better = largest > value
-            found.append((jnp.where(better, largest, value), jnp.where(better, 2 * index + half, where)))
-        return found
+            results.append((jnp.where(better, largest, value), jnp.where(better, 2 * index + half, where)))
+        return results
 
     shape = (rows // 16, 8)
     begin = [(jnp.full((*shape, length), -jnp.inf, jnp.float32), jnp.zeros((*shape, length), jnp.int32)) for _, length in out]
@@ -159,21 +159,21 @@ def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activa
     mine = base + jnp.arange(CHANNELS)
     ones, known = _ones(CHANNELS, features), jnp.broadcast_to((columns < features)[None, :], (CHANNELS, INPUTS))
 
-    def one(index, sums):
+    def add(index, sums):
         at = program + index * programs  # the first sets may have rows where later ones are empty: each program gets some of both
         pull, row = cotangent[at, mine], winner[at, mine]
         table = plgpu.load(x.at[at, row[:, None], columns[None, :]], mask=known, other=ones)
-        found = []
+        results = []
         for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
             before = _product(table, first[:, pl.ds(start, length)])
             after = activate(before)
             steep = pull[:, None] * second[pl.ds(base, CHANNELS), pl.ds(start, length)] * slope(before, after)
             wide += pull[:, None] * after.astype(dtype).astype(jnp.float32)
-            found.append((wide, narrow + _product(table, steep, along=0)))
-        return found
+            results.append((wide, narrow + _product(table, steep, along=0)))
+        return results
 
     begin = [(jnp.zeros((CHANNELS, length), jnp.float32), jnp.zeros((INPUTS, length), jnp.float32)) for _, length in parts]
-    sums = jax.lax.fori_loop(0, pl.cdiv(last[0] - program, programs), one, begin)
+    sums = jax.lax.fori_loop(0, pl.cdiv(last[0] - program, programs), add, begin)
     for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
         outer[:, pl.ds(start, length)] = wide
         inner[:, pl.ds(start, length)] = narrow
@@ -181,12 +181,12 @@ def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activa
 
 def tiles(width: int, most: int) -> list[tuple[int, int]]:
     """Divides a width into starts and lengths, powers of two, the largest first: 96 -> (0, 64), (64, 32)."""
-    found, start = [], 0
+    results, start = [], 0
     while start < width:
         length = min(most, 1 << ((width - start).bit_length() - 1))
-        found.append((start, length))
+        results.append((start, length))
         start += length
-    return found
+    return results
 
 
 def _ones(rows: int, features: int) -> Array:

@@ -61,6 +61,6 @@ def split_minibatches(
 
 def count_left_out(weight: Float[Array, " N"], *, size: int, groups: int, axis: str | None) -> Float[Array, ""]:
     """Computes the fraction of the samples with weight that minibatches with `size` samples in all leave out."""
-    held = weight.reshape(groups, -1).sum(axis=1)
-    total, used = sharding.sum_over_devices((held.sum(), jnp.minimum(held, size // groups).sum()), axis)
+    active = weight.reshape(groups, -1).sum(axis=1)
+    total, used = sharding.sum_over_devices((active.sum(), jnp.minimum(active, size // groups).sum()), axis)
     return (total - used) / jnp.maximum(total, 1.0)
