@@ -108,10 +108,10 @@ MUTATIONS = (
              "list(map(slice, bounds[:-1], bounds[1:]))", "list(map(slice, [b + 1 for b in bounds[:-1]], bounds[1:]))",
              "data/test_banks.py"),
     Mutation("checkpoints", "the oldest is restored", "learning/checkpoint.py",
-             "found[-1] if iteration is None", "found[0] if iteration is None",
+             "iterations[-1] if iteration is None", "iterations[0] if iteration is None",
              "learning/test_checkpoint.py"),
     Mutation("checkpoints", "what is judged is the last step, not the running mean", "learning/checkpoint.py",
-             "AVERAGED if AVERAGED in held else LEARNT", "LEARNT", "learning/test_checkpoint.py"),
+             "(averaged or last)", "last", "learning/test_checkpoint.py"),
 )  # fmt: skip
 
 

@@ -18,15 +18,18 @@ functions, so nothing can be passed to them; hundreds of scenes are fine, for th
 """
 
 import contextlib
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State, Wrapper
-from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from jaxtyping import Array
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 from scenefactory_jax.adapters import episodes
 from scenefactory_jax.adapters.episodes import Episode

@@ -164,7 +164,7 @@ def measure(config: Mapping[str, Any], worlds: Scene, *, mesh: Mesh | None = Non
         spawned, active = metrics["steps/spawned"], metrics["active_fraction"]
     else:
         whole, roll, active = act(SCOPES[scope]), None, None
-        spawned = int(whole.left[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded
+        spawned = int(whole.result[0].agents.present.sum()) * horizon  # as drawn, which need not be as recorded
     nested = {}
     if config["phases"] and mesh is None:
         levels = phase_timing.ACTING[: phase_timing.ACTING.index(SCOPES[scope])] if roll is None else phase_timing.ACTING
@@ -201,7 +201,7 @@ def _learn(
     trainer = make_trainer(config, env, policy, mesh=mesh)
     state = trainer.init(jax.random.key(config["seed"]), worlds)
     whole = phase_timing.time_phase(trainer.train_iteration, state, lambda _: (worlds,), warmup=warmup, repeats=repeats)
-    state, metrics = whole.left
+    state, metrics = whole.result
 
     def collect(carry: Any, parameters: Any, scenes: Scene, key: Any) -> Any:
         return rollout.collect_rollout(env, policy, parameters, scenes, carry, key, horizon=config["ppo"]["horizon"])[:2]

@@ -40,8 +40,7 @@ def place(tmp_path_factory):
     (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
     (folder / "my_reward.py").write_text(OWN_REWARD)
     shutil.copytree(folder / "runs" / "mine", folder / "runs" / "damaged")
-    shutil.copytree(folder / "runs" / "mine" / "checkpoints" / "1", folder / "runs" / "damaged" / "checkpoints" / "2")
-    (folder / "runs" / "damaged" / "checkpoints" / "2" / "parameters" / "_METADATA").write_text("{")
+    (folder / "runs" / "damaged" / "checkpoints" / "2.npz").write_text("{")
     hydra_config.write(folder / "runs" / "theirs", smoke(None, "+reward.haste={_target_: my_reward.haste, weight: 1.0}"))
     return folder
 

@@ -18,6 +18,7 @@ from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
+from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.roadgraph import queries
 
 
@@ -372,11 +373,11 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     broken = lambda parameters, observation, key: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
     state = env.init_state(jax.random.key(0), two_cars)
     start = rollout.start_rollout(state, episodes.make_metrics(state))
-    hook = episodes.make_hook(env, ttc_limit_s=10.0, signals=signals)
+    hook = episodes.make_hook(env, ttc_limit_s=10.0, thresholds=SignalThresholds(**signals))
     end, _ = rollout.rollout(env, broken, None, two_cars, start, jax.random.key(0), steps=2, hook=hook)
     metrics = end.carry
     assert metrics.past_events.numerical_error.tolist() == [True, False] and metrics.steps.tolist() == [0, 2]
-    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.speed_sum.any()
+    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.sums["speed"].any()
     motion = replace(state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
     assert step_metrics.is_finite(motion).tolist() == [False, True]
 

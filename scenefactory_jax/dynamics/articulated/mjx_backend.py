@@ -6,6 +6,8 @@ Written into the model at each step: friction coefficient and slip damping of ea
 friction losses of the wheel joints. All other forces on a car are generalised forces.
 """
 
+import contextlib
+import io
 from typing import NamedTuple
 
 import jax
@@ -13,7 +15,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
+    from mujoco import mjx
 
 from scenefactory_jax.dynamics.articulated import equations_of_motion, tyres
 from scenefactory_jax.dynamics.articulated import state as states

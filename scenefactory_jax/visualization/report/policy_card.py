@@ -37,8 +37,8 @@ def format_card(
     parts = [f"# {name}", about or "", "## Training", markdown.format_table(["", ""], _training(config, versions, training))]
     if judged:
         parts += ["## Scores", *_scores(judged), _episodes(episodes)]
-    learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
-    parts += ["## Files", f"`config.yaml` has every setting of the training, {learnt}. {_code(outside)}"]
+    files = "`config.yaml` has every setting of the training, `checkpoints/policy.npz` the parameters."
+    parts += ["## Files", f"{files} {_code(outside)}"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
