@@ -30,16 +30,25 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Bounds:
-    """Range of a finite number, or of each number of a list: `min <= x <= max`, `above < x < below`."""
+    """Range of a finite number, or of each number of a list: `min <= x <= max`, `above < x < below`.
+
+    With `is_range` the list is itself a range, [min, max].
+    """
 
     min: float | int | None = None
     max: float | int | None = None
     above: float | int | None = None
     below: float | int | None = None
+    is_range: bool = False
 
     def __contains__(self, number: float | int) -> bool:
         inside = (self.min is None or number >= self.min) and (self.max is None or number <= self.max)
         return inside and (self.above is None or number > self.above) and (self.below is None or number < self.below)
+
+    def admit(self, numbers: list[Any]) -> bool:
+        """Whether all numbers are finite and inside the bounds and, of a range, two in ascending order."""
+        ordered = not self.is_range or (len(numbers) == 2 and numbers[0] <= numbers[1])
+        return ordered and all(math.isfinite(number) and number in self for number in numbers)
 
     def __str__(self) -> str:
         signs = {">=": self.min, ">": self.above, "<=": self.max, "<": self.below}
@@ -51,6 +60,8 @@ Seed = Annotated[int, Bounds(min=0)]
 NonNegative = Annotated[float, Bounds(min=0)]
 Positive = Annotated[float, Bounds(above=0)]
 Fraction = Annotated[float, Bounds(min=0, max=1)]
+Range = Annotated[list[float], Bounds(min=0, is_range=True)]  # [min, max]
+CountRange = Annotated[list[int], Bounds(min=0, is_range=True)]
 
 
 def check(config: Any, schema: type, *, where: str = "") -> None:
@@ -121,11 +132,13 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
     if not _fits(value, plain):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     numbers: list[Any] = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_number(number)]
-    if bounds is not None and not all(math.isfinite(number) and number in bounds for number in numbers):
+    if bounds is not None and value is not None and not bounds.admit(numbers):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     if isinstance(value, (list, tuple)) and (items := _item_hints(options)):
         hints = items if len(items) == len(value) and Ellipsis not in items else items[:1] * len(value)
-        return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
+        places = [f"{where}[{i}]" if isinstance(item, Mapping) else where for i, item in enumerate(value)]
+        items_read = [read_value(item, item_hint, where=place) for item, item_hint, place in zip(value, hints, places, strict=True)]
+        return items_read if any(list in (option, typing.get_origin(option)) for option in options) else tuple(items_read)
     as_float = isinstance(value, int) and not isinstance(value, bool) and float in options and int not in options
     return float(typing.cast(int, value)) if as_float else value
 
@@ -184,7 +197,8 @@ def describe(hint: Any) -> str:
     """Describes an annotation for an error message: "an integer >= 1", "a number or null", "one of a, b"."""
     if typing.get_origin(hint) is Annotated:
         plain, bounds = _split(hint)
-        return f"{describe(plain)} {bounds or ''}".strip()
+        kind = "[min, max]" if bounds is not None and bounds.is_range else describe(plain)
+        return f"{kind} {bounds or ''}".strip()
     origin, items = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(describe(item) for item in items)

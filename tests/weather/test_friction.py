@@ -12,7 +12,7 @@ from support.running import ROOT, SHARED
 
 from scenefactory_jax.cli import physics as command
 from scenefactory_jax.cli.hydra_config import load_config
-from scenefactory_jax.core import result_file
+from scenefactory_jax.core import result_file, schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import SURFACES
 from scenefactory_jax.weather import friction, road_condition
@@ -20,7 +20,7 @@ from scenefactory_jax.weather.friction import make_uniform
 
 CONF = ROOT / "conf" / "weather"
 BASE = yaml.safe_load((CONF / "base.yaml").read_text())
-TYRE = friction.Tyre(**BASE["friction"]["tyre"])
+TYRE = schema.read(BASE["friction"]["tyre"], friction.Tyre, where="tyre")
 SURFACE = BASE["friction"]["surfaces"]
 FILMS = (0.0, 0.3, 0.5, 1.0, 2.0)
 PUBLISHED = {"AC": (1.105, 0.959, 0.859, 0, 0), "SMA": (1.204, 1.046, 0.937, 0, 0), "OGFC": (1.337, 1.162, 1.041, 0, 0)}
@@ -33,6 +33,10 @@ def mu_of(speed, film, theta, texture, slip):
 
 def grip_of(**numbers):
     return instantiate({**BASE["friction"], **numbers}, builtins=friction, where="weather.friction")
+
+
+def sampler_of(cases):
+    return instantiate({**BASE["sampler"], "cases": cases}, builtins=road_condition, where="weather.sampler")
 
 
 @pytest.mark.parametrize(("column", "slip"), [("mu_static_ss", 0.15), ("mu_dynamic_ss", 0.80)])
@@ -116,7 +120,7 @@ def test_draw_follows_the_weights_and_keep_keeps():
         {"surface": "SMA", "film_mm": 9.0, "weight": 0.0},
     ]
     scene = scene_of([[0, 0]], [[1, 0]])
-    drawn = jax.vmap(lambda key: road_condition.sample_condition(key, scene, cases=cases))(jax.random.split(jax.random.key(0), 4000))
+    drawn = jax.jit(jax.vmap(lambda key: sampler_of(cases)(key, scene)))(jax.random.split(jax.random.key(0), 4000))
     assert set(np.unique(drawn.surface)) == {0, 2}
     assert float((drawn.surface == 0).mean()) == pytest.approx(0.75, abs=0.03)
     np.testing.assert_array_equal(drawn.film_mm == 0.5, drawn.surface == 2)
@@ -135,8 +139,8 @@ def test_draw_follows_the_weights_and_keep_keeps():
         ({"slip_static": -0.15}, "weather.friction.slip_static: expected a number >= 0, got -0.15"),
         ({"reference_speed": -1.0}, "weather.friction.reference_speed"),
         ({"tyre": {**BASE["friction"]["tyre"], "load": -3469.0}}, "weather.friction.tyre.load"),
-        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, r"friction.tyre.stribeck_velocity\[3\]"),
-        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, "stribeck_velocity: .*; expected .b1, b2, b3, b4"),
+        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9, 3.0, -3.4]}}, "velocity: expected a number > 0, got -3.4"),
+        ({"tyre": {**BASE["friction"]["tyre"], "stribeck_velocity": [4.9, -7.9]}}, r"stribeck_velocity: expected .* got \[4.9, -7.9\]"),
         ({"surfaces": {**SURFACE, "ICE": {"theta": 0.1, "texture_mm": 0.0}}}, "weather.friction.surfaces.ICE.texture_mm"),
     ],
 )
@@ -153,21 +157,20 @@ def test_grip_refuses_by_name(change, named):
         ({"surface": "AC", "film_mm": -1.0, "weight": 1.0}, "film_mm"),
         ({"surface": "AC", "film_mm": 0.0, "weight": 0.0}, "positive weight"),
         ({"surface": "AC", "weight": 1.0}, "film_mm"),
-        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: expected a finite number >= 0, got nan"),
+        ({"surface": "AC", "film_mm": float("nan"), "weight": 1.0}, "film_mm: expected a number >= 0, got nan"),
     ],
 )
 def test_draw_refuses_by_name(case, named):
     with pytest.raises(ConfigError, match=named):
-        road_condition.sample_condition(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]), cases=[case])
+        sampler_of([case])(jax.random.key(0), scene_of([[0, 0]], [[1, 0]]))
 
 
 @pytest.mark.parametrize("name", ["dry", "mixed", "wet"])
 def test_every_shipped_weather_draws_a_drivable_road(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    draw = instantiate({**BASE["sampler"], **config["sampler"]}, builtins=road_condition, where="weather.sampler")
-    scene = scene_of([[0, 0]], [[1, 0]])
-    drawn = jax.vmap(lambda key: draw(key, scene))(jax.random.split(jax.random.key(1), 200))
-    mu = jax.vmap(lambda w: grip_of()(w, jnp.zeros((1, 2)), jnp.zeros(1)))(drawn)
+    draw, scene = sampler_of(config["sampler"]["cases"]), scene_of([[0, 0]], [[1, 0]])
+    read = jax.jit(jax.vmap(lambda key: grip_of()(draw(key, scene), jnp.zeros((1, 2)), jnp.zeros(1))))
+    mu = read(jax.random.split(jax.random.key(1), 200))
     assert mu.min() > 0.5 and mu.max() < 1.4
 
 
@@ -176,10 +179,10 @@ def test_a_mix_spans_the_friction_that_its_first_line_says(name, least):
     text = (CONF / f"{name}.yaml").read_text()
     cases = yaml.safe_load(text)["sampler"]["cases"]
     roads = [make_uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"]))) for case in cases]
-    mu = [float(grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0]) for road in roads]
+    read = jax.jit(lambda road: grip_of()(road, jnp.zeros((1, 2)), jnp.zeros(1))[0])
+    mu = [float(read(road)) for road in roads]
     assert (min(mu), max(mu)) == pytest.approx((float(least), 1.10), abs=0.006)
     assert f"friction 1.10 down to {least}" in text.splitlines()[0]
-    assert "between 0.80 and 1.10" in (ROOT / "conf" / "study" / "friction.yaml").read_text()
 
 
 def test_the_command_tells_what_the_model_says(tmp_path):
