@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import Points, arc_length, cut, interpolate, join, right_normals, smoothstep
-from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.road_network import CHANGING, WALKING, Network
 
 STEP_M = 0.5  # between the points of a path
@@ -85,8 +84,7 @@ def draw_path(
         lane_change_m: range of the length of a lane change.
     """
     pieces: list[PathPiece] = []
-    left = length
-    control: int | None = None
+    left, control = length, None
     while True:
         current = network.lanes[lane]
         place = arc_length(current.points)
@@ -94,7 +92,7 @@ def draw_path(
         room = float(place[-1]) - begin - LANE_END_M
         if beside and room > lane_change_m[0] and rng.random() < lane_change_fraction:
             target = int(rng.choice(beside))
-            over = min(draw(rng, lane_change_m, "traffic.driving.lane_change_m"), room)
+            over = min(rng.uniform(*lane_change_m), room)
             start = begin + float(rng.uniform(0.0, room - over))
             change, begin = _change_lane(network, lane, target, begin, start, start + over, control)
             pieces += change

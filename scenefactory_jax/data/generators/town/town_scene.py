@@ -102,7 +102,7 @@ def generate(
         raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
     if not 0 <= log_current < log_steps - 1:
         raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
-    modules = {"network": "network_choice"}  # of other entries: of the same name
+    modules = {"network": "build_network"}
     entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
     parts = TownParts(
         *(instantiate(entry, builtins=f"{PACKAGE}.{modules.get(key, key)}", where=f"generate.{key}") for key, entry in entries.items())
@@ -126,7 +126,7 @@ def _draw_town(rng: np.random.Generator, kind: str | None, reach: float, parts: 
     outer, islands, surface = parts.kerbs(network, reach)
     pavements = [] if kind == "motorway" else outer
     driveways, spots = parts.driveways(rng, network, pavements, surface)
-    network = network._replace(spots=[*network.spots, *spots])
+    network.spots += spots
     times = add_warmup(log.times, log.warmup_s)
     gates = parts.gates(rng, network, times)
     for _ in range(MAX_TRAFFIC_REDRAWS):
@@ -159,7 +159,7 @@ def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[
 
 def _to_scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, line_spacing: float) -> RawScene:
     """Converts a town to a raw scene."""
-    kinds = town.network.kinds
+    kinds = town.network.blocks
     return RawScene(
         name=f"town-{town.kind}-{seed}-{index:06d}",
         source=f"generator, seed {seed}, index {index}",
@@ -177,10 +177,18 @@ def _to_scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, 
 def _to_polylines(town: Town, lane_spacing: float, line_spacing: float) -> tuple[Polyline, ...]:
     """Lists lanes (the id is the place in the list), then lines, edges, crosswalks, driveways and stop signs."""
     network = town.network
-    links = zip(network.lanes, network.entries, network.exits, network.left, network.right, strict=True)
     lanes = [
-        Polyline(lane.kind, _flat(resample(lane.points, lane_spacing)), i, *ids, speed_limit=lane.limit)
-        for i, (lane, *ids) in enumerate(links)
+        Polyline(
+            lane.kind,
+            _flat(resample(lane.points, lane_spacing)),
+            i,
+            entry=tuple(sorted(network.entries[i])),
+            exit=tuple(network.exits[i]),
+            left=tuple(network.left[i]),
+            right=tuple(network.right[i]),
+            speed_limit=lane.limit,
+        )
+        for i, lane in enumerate(network.lanes)
     ]
     features = [(line.kind, resample(line.points, line_spacing)) for line in network.lines]
     features += [(EDGE_BOUNDARY, points) for points in town.outer] + [(EDGE_MEDIAN, points) for points in town.islands]

@@ -1,20 +1,19 @@
 """Draws and simulates the traffic of a town, without collisions."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
+from scenefactory_jax.core.schema import CountRange, Range
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.generators.curves import Points, arc_length, heading, interpolate
-from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count, read_group
 from scenefactory_jax.data.generators.town import road_users
-from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
+from scenefactory_jax.data.generators.town.driver_model import DriverParameters, SimulatedUser, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
-from scenefactory_jax.data.generators.town.path_conflicts import find_conflicts
 from scenefactory_jax.data.generators.town.road_network import Network
+from scenefactory_jax.data.generators.town.road_users import CyclistNumbers, DrivingNumbers, PedestrianNumbers
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
@@ -51,13 +50,13 @@ def populate(
     times: Float[np.ndarray, " L"],
     gates: Gates,
     *,
-    cars: list[int],
-    travel_m: list[float],
-    parked_fraction: list[float],
-    driving: Mapping[str, Any],
-    driver: Mapping[str, Any],
-    cyclists: Mapping[str, Any],
-    pedestrians: Mapping[str, Any],
+    cars: CountRange,
+    travel_m: Range,
+    parked_fraction: Range,
+    driving: DrivingNumbers,
+    driver: DriverParameters,
+    cyclists: CyclistNumbers,
+    pedestrians: PedestrianNumbers,
 ) -> list[TownUser]:
     """Draws and simulates all road users over `times`, which include the warm-up.
 
@@ -67,51 +66,30 @@ def populate(
         cars: range of the number of driving cars.
         travel_m: minimum travel of a moving car; maximum travel since time 0, after which its log ends.
         parked_fraction: range of the fraction of parking spaces with a car.
-        driving: numbers of `road_users.DrivingNumbers`.
-        driver: numbers of `DriverParameters`.
-        cyclists, pedestrians: numbers of `road_users.CyclistNumbers` and `road_users.PedestrianNumbers`.
-
-    Raises:
-        ConfigError: a number out of range.
     """
-    for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_fraction, "parked_fraction")):
-        check_range(span, f"traffic.{name}")
-    parameters = read_group(driver, DriverParameters, "traffic.driver")
-    drive = read_group(driving, road_users.DrivingNumbers, "traffic.driving")
-    walk = read_group(pedestrians, road_users.PedestrianNumbers, "traffic.pedestrians")
-    cycle = read_group(cyclists, road_users.CyclistNumbers, "traffic.cyclists")
     simulated = [
-        *road_users.draw_cars(rng, network, draw_count(rng, cars), times, reach, drive),
-        *road_users.draw_cyclists(rng, network, times, reach, drive, cycle),
-        *road_users.draw_crossers(rng, network, times, walk),
+        *road_users.draw_cars(rng, network, int(rng.integers(*cars, endpoint=True)), times, reach, driving),
+        *road_users.draw_cyclists(rng, network, times, reach, driving, cyclists),
+        *road_users.draw_crossers(rng, network, times, pedestrians),
     ]
-    strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), walk)
-    parked = _park(rng, network, draw(rng, parked_fraction, "traffic.parked_fraction"), drive.size_m, times)
+    strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), pedestrians)
+    parked = _park(rng, network, rng.uniform(*parked_fraction), driving, times)
     users = [
-        *_simulate(simulated, gates, times, parameters),
-        *(_stroll(*stroll, road_users.to_size(walk.size_m), times) for stroll in strolls),
+        *(_simulate(simulated, gates, times, driver) if simulated else []),
+        *(_stroll(*stroll, pedestrians.size_m, times) for stroll in strolls),
         *parked,
     ]
     users = [_limit_travel(user, times, travel_m[1]) for user in users]
     return separate_users([user for user in users if user.kind != "vehicle" or _is_on_road(user, surface, reach)])
 
 
-def _simulate(
-    users: list[road_users.SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], parameters: DriverParameters
-) -> list[TownUser]:
+def _simulate(users: list[SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], driver: DriverParameters) -> list[TownUser]:
     """Simulates the road users along their paths."""
-    if not users:
-        return []
-    paths = [user.path for user in users]
-    columns = zip(*((user.size[0], user.size[1], 0.0, user.speed, user.enters) for user in users), strict=True)
-    states = Users(*(np.array(column, float) for column in columns))
-    table, zones = find_conflicts(paths, states.width)
-    motion = simulate(paths, states, table, zones, gates.state, times, parameters)
-    logs = []
-    for i, user in enumerate(users):
-        row, rows = motion.place[:, i] / STEP_M, np.arange(len(user.path.points), dtype=float)
+    logs, motion = [], simulate(users, gates.state, times, driver)
+    for user, place, speed, present in zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True):
+        row, rows = place / STEP_M, np.arange(len(user.path.points), dtype=float)
         position, yaw = interpolate(row, rows, user.path.points), np.interp(row, rows, user.path.yaw)
-        logs.append(TownUser(user.kind, user.size, position, yaw, motion.speed[:, i], motion.present[:, i]))
+        logs.append(TownUser(user.kind, user.size, position, yaw, speed, present))
     return logs
 
 
@@ -125,15 +103,15 @@ def _stroll(points: Points, speed: float, size: tuple[float, float, float], time
 
 
 def _park(
-    rng: np.random.Generator, network: Network, fraction: float, size_m: list[list[float]], times: Float[np.ndarray, " L"]
+    rng: np.random.Generator, network: Network, fraction: float, driving: DrivingNumbers, times: Float[np.ndarray, " L"]
 ) -> list[TownUser]:
     """Draws cars in a fraction of the parking spaces."""
     parked = []
     for spot in network.spots:
         if rng.random() < fraction:
-            size = road_users.draw_size(rng, size_m)
+            size, steps = driving.draw_size(rng), len(times)
             place = spot.place + rng.uniform(-0.2, 0.2) * heading(spot.yaw)
-            states = np.tile(place, (len(times), 1)), np.full(len(times), spot.yaw), np.zeros(len(times)), np.ones(len(times), bool)
+            states = np.tile(place, (steps, 1)), np.full(steps, spot.yaw), np.zeros(steps), np.ones(steps, bool)
             parked.append(TownUser("vehicle", size, *states))
     return parked
 
