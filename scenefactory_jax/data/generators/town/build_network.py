@@ -11,8 +11,8 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Fraction
 from scenefactory_jax.data.generators.curves import heading
 from scenefactory_jax.data.generators.town.intersections import OPPOSITE, Arm, Control, turn_angle
-from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, Network, Port, Street
-from scenefactory_jax.data.generators.town.road_segments import Pose, RoadDimensions, connect_ports
+from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, Network, Port, Pose, Street
+from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, connect_ports
 from scenefactory_jax.data.generators.town.street_plan import Edge, Plan, StreetClass
 
 PACKAGE = "scenefactory_jax.data.generators.town"
@@ -67,12 +67,9 @@ def draw_network(
 
     Args:
         kind: name of a plan, or "motorway"; None: drawn.
-        plans: entries of street plans, `(rng, reach, classes) -> Plan` or None, all equally likely.
+        plans: entries of `(rng, reach, classes) -> Plan`, or None.
         motorway: entry of `(rng) -> Network`.
-        motorway_fraction: of scenes that are a motorway.
-        streets: classes of streets, the least important first: at junctions the later class goes first.
-        driveway: lane width and speed limit.
-        lots: entry of the parking lots, `(rng, plan, reach, street) -> Plan`.
+        lots: entry of `(rng, plan, reach, street) -> Plan`.
     """
     names = [name for name, entry in plans.items() if entry is not None]
     classes = {rank: street_class for rank, street_class in enumerate(streets.values(), start=1) if street_class is not None}

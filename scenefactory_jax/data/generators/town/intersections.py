@@ -10,17 +10,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.schema import Bounds, ConfigError, Fraction, Positive
 from scenefactory_jax.core.types import LANE_BIKE
 from scenefactory_jax.data.generators.curves import FINE_M, Points, connect, curvature, heading, wrap_angle
-from scenefactory_jax.data.generators.town.road_network import (
-    SOLID_WHITE,
-    Crosswalk,
-    Lane,
-    Line,
-    Network,
-    Place,
-    Port,
-    Stop,
-    Street,
-)
+from scenefactory_jax.data.generators.town.road_network import SOLID_WHITE, Crosswalk, Lane, Network, Place, Port, Stop, Street
 
 Control = Literal["signal", "all_way_stop", "two_way_stop", "yield"]
 CrosswalkRange = Annotated[list[float], Bounds(min=1, is_range=True)]
@@ -120,14 +110,7 @@ def intersection(
     crosswalk_m: CrosswalkRange,
     crosswalk_fraction: Fraction,
 ) -> list[Port]:
-    """Builds an intersection, large enough for turns with a minimum radius, and returns the ports of its arms.
-
-    Args:
-        arms: counter-clockwise.
-        corner_radius_m: range of the radius of the corners.
-        turn_radius_m: minimum radius of the connecting lanes.
-        crosswalk_m: range of the depth of the crosswalks.
-        crosswalk_fraction: of the arms that have a crosswalk; at lights all have one.
+    """Builds an intersection of arms, counter-clockwise, large enough for turns with a minimum radius; returns the ports of the arms.
 
     Raises:
         ConfigError: no size is large enough.
@@ -148,7 +131,7 @@ def intersection(
     stops = _add_stops(network, mouths, junction, control)
     ports = [mouth.port(controlled=(a, False) in stops) for a, mouth in enumerate(mouths)]
     network.lines += [
-        Line(SOLID_WHITE, np.stack([mouth.slot(at, entering=True) for at in (-0.5, mouth.arm.entering - 0.5)]))
+        (SOLID_WHITE, np.stack([mouth.slot(at, entering=True) for at in (-0.5, mouth.arm.entering - 0.5)]))
         for mouth, port in zip(mouths, ports, strict=True)
         if port.controlled
     ]
@@ -289,12 +272,9 @@ def roundabout(
     crosswalk_m: CrosswalkRange,
     crosswalk_fraction: Fraction,
 ) -> list[Port]:
-    """Builds a ring with one lane, driven counter-clockwise, and returns the ports of its arms; traffic on the ring goes first.
+    """Builds a ring with one lane, driven counter-clockwise; traffic on the ring goes first. Returns the ports of the arms.
 
-    Args:
-        arms: counter-clockwise, with one slot in each direction.
-        ring_radius_m: range of the radius of the lane's centre.
-        split_deg: maximum angle between an arm and the points where its traffic leaves and joins the ring.
+    `arms` are counter-clockwise, with one slot in each direction.
     """
     radius, width, depth = rng.uniform(*ring_radius_m), rng.uniform(*ring_width_m), rng.uniform(*crosswalk_m)
     yaws = np.array([arm.yaw for arm in arms])

@@ -16,12 +16,6 @@ def boundary(
 ) -> tuple[list[Points], list[Points], shapely.Geometry]:
     """Computes road edges within the square of half side `reach`, with the paved surface on their left.
 
-    Args:
-        rounding_m: radius of the smallest corner; narrower gaps between areas are paved.
-        island_m2: minimum area of a gap that is not paved; the islands of the network are never paved.
-        block_m2: minimum area of a gap whose edge is an outer edge, as around a block of houses.
-        spacing_m: maximum length of an edge segment.
-
     Returns:
         Outer edges, edges of islands and medians, and the surface.
     """

@@ -37,18 +37,7 @@ def motorway(
     ramp_limit_mps: float,
     shoulder_m: float,
 ) -> Network:
-    """Builds two carriageways side by side; a joining ramp adds a lane that drops later, a leaving ramp takes an added lane.
-
-    Args:
-        length_m: of both carriageways.
-        lanes: range of the lanes of a carriageway.
-        bend_radius_m: minimum radius.
-        offset_m: maximum distance from the middle of the town, along each axis.
-        join_m, leave_m: ranges of the places of the ramps along a carriageway, from the middle of the town.
-        auxiliary_m: range of the length of an added lane.
-        ramp_fraction: of the possible ramps that exist.
-        ramp_turn_deg: range of the angle by which a ramp turns away.
-    """
+    """Builds two carriageways side by side; a joining ramp adds a lane that drops later, a leaving ramp takes an added lane."""
     count = int(rng.integers(*lanes, endpoint=True))
     limit, median = rng.uniform(*speed_limit_mps), rng.uniform(*median_m)
     street = Street(count, lane_width_m, median, limit, RANK, 0.0, 0.0, DOUBLE_YELLOW, LANE_FREEWAY)

@@ -9,7 +9,7 @@ import shapely
 from scenefactory_jax.core.schema import Bounds
 from scenefactory_jax.data.generators.curves import FINE_M, connect, heading
 from scenefactory_jax.data.generators.town.intersections import compute_paved_area
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network, ParkingSpace, Place, Port, Street
+from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network, Place, Port, Street
 
 AISLE_M = 6.0  # width that a car needs to turn into a space at a right angle
 SPACE_M = (5.2, 2.7)  # depth and width of a space
@@ -28,12 +28,10 @@ def parking_lot(
     depth_m: Annotated[list[float], Bounds(min=15, is_range=True)],
     limit_mps: float,
 ) -> list[Port]:
-    """Builds a lot with two aisles and parking spaces on both sides of each; its port lies at `place` and looks along `yaw`.
+    """Builds a lot with two aisles and parking spaces on both sides of each.
 
     Args:
-        street: the driveway.
-        depth_m: range of the depth behind the first space.
-        limit_mps: speed limit.
+        place, yaw: of its port, at the end of the driveway `street`.
     """
     ahead, left = heading(yaw + np.pi), heading(yaw + 3 * np.pi / 2)
     to_town = lambda points: place + points[..., :1] * ahead + points[..., 1:] * left  # noqa: E731
@@ -63,7 +61,7 @@ def parking_lot(
     rows = [(side * (half + toward * (AISLE_M + SPACE_M[0]) / 2), side * toward) for side in (-1, 1) for toward in (-1, 1)]
     turns = rng.integers(0, 2, (len(rows), len(along)))  # whether a car is parked forward or backward
     network.spots += [
-        ParkingSpace(to_town(np.array([x, y])), float(yaw + np.pi + sign * np.pi / 2 + turns[row, i] * np.pi))
+        (to_town(np.array([x, y])), float(yaw + np.pi + sign * np.pi / 2 + turns[row, i] * np.pi))
         for row, (y, sign) in enumerate(rows)
         for i, x in enumerate(along)
     ]

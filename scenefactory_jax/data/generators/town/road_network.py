@@ -16,6 +16,7 @@ from scenefactory_jax.core.types import LANE_STREET
 from scenefactory_jax.data.generators.curves import Points
 
 Place = Float[np.ndarray, " 2"]
+Pose = tuple[Place, float]  # place, yaw
 Slots = Sequence[Sequence[int]]  # lanes at each slot of a port; slots are counted from the middle of the road outward
 BROKEN_WHITE, SOLID_WHITE, BROKEN_YELLOW, SOLID_YELLOW, DOUBLE_YELLOW = 6, 7, 9, 11, 12  # WOMD map element ids
 WALKING, ON_ROAD, MERGING, CHANGING = 90, 60, 20, 5  # right of way outside of junctions: the higher rank goes first
@@ -46,13 +47,6 @@ class Lane(NamedTuple):
     control: int | None = None  # index into the stops: cars wait at the start of the lane
 
 
-class Line(NamedTuple):
-    """A painted line."""
-
-    kind: int
-    points: Points
-
-
 class Stop(NamedTuple):
     """A light or a sign at the start of the lanes whose `control` is its index."""
 
@@ -70,13 +64,6 @@ class Crosswalk(NamedTuple):
     ends: Float[np.ndarray, "2 2"]
     arm: int  # of its junction that it crosses
     junction: int
-
-
-class ParkingSpace(NamedTuple):
-    """Place of one parked car."""
-
-    place: Place
-    yaw: float
 
 
 class Port(NamedTuple):
@@ -102,12 +89,12 @@ class Network:
     exits: list[list[int]] = field(default_factory=list)
     left: list[list[int]] = field(default_factory=list)  # the lanes into which a car may change from each lane
     right: list[list[int]] = field(default_factory=list)
-    lines: list[Line] = field(default_factory=list)
+    lines: list[tuple[int, Points]] = field(default_factory=list)  # painted: kind, points
     areas: list[shapely.Geometry] = field(default_factory=list)  # paved
     islands: list[shapely.Polygon] = field(default_factory=list)  # not paved, within the areas
     stops: list[Stop] = field(default_factory=list)
     crosswalks: list[Crosswalk] = field(default_factory=list)
-    spots: list[ParkingSpace] = field(default_factory=list)
+    spots: list[Pose] = field(default_factory=list)  # of parked cars
     phases: dict[int, list[frozenset[int]]] = field(default_factory=dict)  # junction with lights -> arms that have green together
     blocks: list[str] = field(default_factory=list)  # kinds of all blocks
 

@@ -9,39 +9,14 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_BIKE, LANE_STREET
-from scenefactory_jax.data.generators.curves import (
-    FINE_M,
-    Curve,
-    Points,
-    arc_length,
-    connect,
-    interpolate,
-    join,
-    smoothstep,
-    tangents,
-    wrap_angle,
-)
-from scenefactory_jax.data.generators.town.road_network import (
-    BROKEN_WHITE,
-    MERGING,
-    ON_ROAD,
-    SOLID_WHITE,
-    SOLID_YELLOW,
-    Lane,
-    Line,
-    Network,
-    ParkingSpace,
-    Place,
-    Port,
-    Street,
-)
+from scenefactory_jax.data.generators import curves
+from scenefactory_jax.data.generators.curves import FINE_M, Curve, Points, smoothstep, wrap_angle
+from scenefactory_jax.data.generators.town import road_network
+from scenefactory_jax.data.generators.town.road_network import BROKEN_WHITE, SOLID_WHITE, SOLID_YELLOW, Lane, Network, Port, Pose, Street
 
 CURVE_RAD = np.radians(20.0)  # a road with a larger range of yaw is a curve
 MIN_LANE_M = 6.0  # length of a lane before and behind a taper
 MIN_PARKING_ROAD_M = 40.0  # length of a road with parking spaces
-
-Pose = tuple[Place, float]
-
 
 @dataclass(frozen=True)
 class RoadDimensions:
@@ -81,7 +56,7 @@ def connect_ports(network: Network, first: Port, second: Port, via: list[Pose], 
         network.link_slots([*a.leaving, a.cycles_leaving], [*([lane] for lane in way.start), way.cycles])
         network.link_slots([*([lane] for lane in way.end), way.cycles], [*b.entering, b.cycles_entering])
     if street.median == 0:
-        network.lines.append(Line(street.centre_line, points))
+        network.lines.append((street.centre_line, points))
     if street.median > 2 * dimensions.shoulder_m + 0.5:
         half = street.median / 2 - dimensions.shoulder_m
         trim = max(2, round((half + 1.0) / FINE_M))
@@ -91,8 +66,8 @@ def connect_ports(network: Network, first: Port, second: Port, via: list[Pose], 
 def _middle_line(first: Port, second: Port, via: list[Pose]) -> Curve:
     """Computes the middle line of the road and its yaw: smooth between the two ports and through every corner."""
     poses = [(first.place, first.yaw), *via, (second.place, second.yaw + np.pi)]
-    points = join([connect(a, a_yaw, b, b_yaw) for (a, a_yaw), (b, b_yaw) in itertools.pairwise(poses)])
-    yaw = tangents(points)
+    points = curves.join([curves.connect(a, a_yaw, b, b_yaw) for (a, a_yaw), (b, b_yaw) in itertools.pairwise(poses)])
+    yaw = curves.tangents(points)
     yaw[0] += wrap_angle(first.yaw - float(yaw[0]))
     yaw[-1] += wrap_angle(second.yaw + np.pi - float(yaw[-1]))
     return points, yaw
@@ -114,12 +89,12 @@ def build_carriageway(
         side: on which a lane is gained; lanes are dropped on the right.
         controlled: solid lines before the end.
     """
-    place = arc_length(curve[0])
+    place = curves.arc_length(curve[0])
     i, j = (int(np.searchsorted(place, at)) for at in _taper(before, behind, float(place[-1]), dimensions))
     ease = smoothstep((place - place[i]) / (place[j] - place[i]))
     offset = lambda slot: street.median / 2 + (slot + 0.5) * street.width  # noqa: E731
 
-    def add(rows: slice, right: np.ndarray | float, rank: int = ON_ROAD) -> int:
+    def add(rows: slice, right: np.ndarray | float, rank: int = road_network.ON_ROAD) -> int:
         points = shift_line((curve[0][rows], curve[1][rows]), np.broadcast_to(right, place.shape)[rows])
         return network.add_lane(Lane(points, street.width, street.limit, rank, street.kind))
 
@@ -130,7 +105,7 @@ def build_carriageway(
         sections = [(slice(0, i + 1), before), (slice(j, None), behind)]
         start, end = ([add(rows, offset(slot)) for slot in range(count)] for rows, count in sections)
         for a, b in _pair_slots(before, behind, side):
-            rank = MERGING if behind < before and a == before - 1 else ON_ROAD
+            rank = road_network.MERGING if behind < before and a == before - 1 else road_network.ON_ROAD
             lane = add(slice(i, j + 1), offset(a) + (offset(b) - offset(a)) * ease, rank)
             network.link(start[a], lane)
             network.link(lane, end[b])
@@ -140,7 +115,7 @@ def build_carriageway(
     cycles = []
     if street.bike:
         points = shift_line(curve, outer + street.bike / 2)
-        cycles.append(network.add_lane(Lane(points, street.bike, street.limit, ON_ROAD, LANE_BIKE)))
+        cycles.append(network.add_lane(Lane(points, street.bike, street.limit, road_network.ON_ROAD, LANE_BIKE)))
     parking = _parking_width(place, street, dimensions)
     network.areas.append(_paved_area(curve, outer + street.bike + parking + dimensions.shoulder_m))
     if parking.any():
@@ -151,11 +126,11 @@ def build_carriageway(
             points = shift_line((curve[0][rows], curve[1][rows]), street.median / 2 + slot * street.width)
             split = int(np.searchsorted(place[rows], solid))
             parts = ((BROKEN_WHITE, points[: split + 1]), (SOLID_WHITE, points[split:]))
-            network.lines += [Line(kind, part) for kind, part in parts if len(part) > 4]
+            network.lines += [(kind, part) for kind, part in parts if len(part) > 4]
     if street.median:
-        network.lines.append(Line(SOLID_YELLOW, shift_line(curve, street.median / 2)))
+        network.lines.append((SOLID_YELLOW, shift_line(curve, street.median / 2)))
     if street.bike or street.kind != LANE_STREET:
-        network.lines.append(Line(SOLID_WHITE, shift_line(curve, outer)))
+        network.lines.append((SOLID_WHITE, shift_line(curve, outer)))
     return Carriageway(start, end, cycles)
 
 
@@ -195,9 +170,9 @@ def _paved_area(curve: Curve, outer: Float[np.ndarray, " N"]) -> shapely.Polygon
 
 def _parking_spaces(
     curve: Curve, place: Float[np.ndarray, " N"], beside: Float[np.ndarray, " N"], dimensions: RoadDimensions
-) -> list[ParkingSpace]:
+) -> list[Pose]:
     """Lists kerbside parking spaces in a row."""
     margin = dimensions.spot_margin_m + dimensions.spot_m / 2
     at = np.arange(margin, place[-1] - dimensions.spot_margin_m - dimensions.spot_m / 2, dimensions.spot_m)
-    places = interpolate(at, place, shift_line(curve, beside))
-    return [ParkingSpace(spot, float(yaw)) for spot, yaw in zip(places, np.interp(at, place, curve[1]), strict=True)]
+    places = curves.interpolate(at, place, shift_line(curve, beside))
+    return [(spot, float(yaw)) for spot, yaw in zip(places, np.interp(at, place, curve[1]), strict=True)]

@@ -1,14 +1,15 @@
 """Draws the road users of a town and their paths: cars, cyclists, pedestrians."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.schema import CountRange, Fraction, Range
-from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET
-from scenefactory_jax.data.generators.curves import FINE_M, Points, arc_length, interpolate, right_normals
+from scenefactory_jax.core.types import LANE_BIKE, LANE_FREEWAY, LANE_STREET, RoadUser
+from scenefactory_jax.data.generators.curves import FINE_M, Points, arc_length, heading, interpolate, right_normals
 from scenefactory_jax.data.generators.town.driver_model import SimulatedUser
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path, draw_path, make_path, offset_path, walk
 from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Lane, Network, Place
@@ -18,6 +19,17 @@ MIN_PATH_M = 15.0
 BIKE_LANE_FRACTION = 0.7  # of the cyclists, where there are bicycle lanes
 KERB_GAP_M = 0.6  # between a cyclist on a street and the side of the lane
 LAST_CROSSING = 0.7  # fraction of the log after which no pedestrian starts to cross
+
+
+class TownUser(NamedTuple):
+    """States of one road user over time."""
+
+    kind: RoadUser
+    size: tuple[float, float, float]
+    position: Float[np.ndarray, "L 2"]
+    yaw: Float[np.ndarray, " L"]
+    speed: Float[np.ndarray, " L"]
+    valid: Bool[np.ndarray, " L"]
 
 
 @dataclass(frozen=True)
@@ -183,20 +195,41 @@ def draw_crossers(
 
 
 def draw_strollers(
-    rng: np.random.Generator, kerbs: list[Points], surface: shapely.Geometry, seconds: float, people: PedestrianNumbers
-) -> list[tuple[Points, float]]:
-    """Draws paths of pedestrians on pavements, and their speeds."""
+    rng: np.random.Generator, kerbs: list[Points], surface: shapely.Geometry, times: Float[np.ndarray, " L"], people: PedestrianNumbers
+) -> list[TownUser]:
+    """Draws pedestrians that walk along kerbs with a constant speed."""
     lengths = np.array([arc_length(kerb)[-1] for kerb in kerbs])
-    walks = []
+    users = []
     for _ in range(int(rng.integers(*people.strollers, endpoint=True)) if kerbs else 0):
         kerb = kerbs[int(rng.choice(len(kerbs), p=lengths / lengths.sum()))]
         speed, place = rng.uniform(*people.speed_mps), arc_length(kerb)
-        length = speed * seconds + 1.0
+        length = speed * float(times[-1] - times[0]) + 1.0
         if place[-1] < length + 2.0:
             continue
         points = interpolate(np.arange(0.0, length, STEP_M) + rng.uniform(0.0, place[-1] - length), place, kerb)
         # the paved surface is on the left of a kerb
         points = points + rng.uniform(*people.pavement_m) * right_normals(points)
-        if not shapely.contains_xy(surface, points[:, 0], points[:, 1]).any():
-            walks.append((points[:: int(rng.choice([-1, 1]))], speed))
-    return walks
+        if shapely.contains_xy(surface, points[:, 0], points[:, 1]).any():
+            continue
+        points = points[:: int(rng.choice([-1, 1]))]
+        place = arc_length(points)
+        at = np.minimum(speed * (times - times[0]), place[-1])
+        step = np.gradient(points, axis=0)
+        yaw = np.interp(at, place, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+        states = interpolate(at, place, points), yaw, np.full(len(times), speed), at < place[-1]
+        users.append(TownUser("pedestrian", people.size_m, *states))
+    return users
+
+
+def draw_parked_cars(
+    rng: np.random.Generator, network: Network, fraction: float, times: Float[np.ndarray, " L"], driving: DrivingNumbers
+) -> list[TownUser]:
+    """Draws cars in a fraction of the parking spaces."""
+    cars, steps = [], len(times)
+    for spot, yaw in network.spots:
+        if rng.random() < fraction:
+            size = driving.draw_size(rng)
+            place = spot + rng.uniform(-0.2, 0.2) * heading(yaw)
+            states = np.tile(place, (steps, 1)), np.full(steps, yaw), np.zeros(steps), np.ones(steps, bool)
+            cars.append(TownUser("vehicle", size, *states))
+    return cars

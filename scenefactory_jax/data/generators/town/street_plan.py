@@ -101,12 +101,7 @@ def draw_street(rng: np.random.Generator, classes: Classes) -> Street:
 
 
 def street(rng: np.random.Generator, reach: float, classes: Classes, *, offset_m: float, turn_deg: Range) -> Plan:
-    """Draws one street through the middle of the town, with one bend.
-
-    Args:
-        offset_m: maximum distance of the bend from the middle, along each axis.
-        turn_deg: range of the angle by which the street turns, to either side.
-    """
+    """Draws one street through the middle of the town, with one bend."""
     corner = rng.uniform(-offset_m, offset_m, 2)
     yaw, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]) * np.radians(rng.uniform(*turn_deg))
     nodes = [Node("outlet", _find_outlet(corner, angle, reach, MIN_STREET_M)) for angle in (yaw + np.pi, yaw + turn)]
@@ -124,15 +119,7 @@ def star(
     skew_deg: float,
     bend_m: float,
 ) -> Plan:
-    """Draws one junction with streets that lead out of the town.
-
-    Args:
-        roundabout: the junction is a roundabout; else its kind is drawn.
-        arms: range of the number of streets.
-        offset_m: maximum distance of the junction from the middle, along each axis.
-        skew_deg: maximum turn of an arm from its place in a regular star. Stars of three and four arms have a straight street.
-        bend_m: maximum distance of a bend from the straight way.
-    """
+    """Draws one junction with streets that lead out of the town; with three and four arms, one street goes straight on."""
     count = int(rng.integers(*arms, endpoint=True))
     centre = rng.uniform(-offset_m, offset_m, 2)
     first = rng.uniform(0, 2 * np.pi)
@@ -174,15 +161,7 @@ def grid(
     keep_fraction: Fraction,
     inset_m: float,
 ) -> Plan | None:
-    """Draws a grid of streets with gaps; None if the middle crossing lies outside of the square.
-
-    Args:
-        spacing_m: range of the distance between parallel streets.
-        offset_m: maximum distance of the middle crossing from the middle of the town, along each axis.
-        jitter_m: maximum distance of a crossing from its place in the regular grid, along each axis.
-        shear_deg: maximum difference of the two directions from a right angle.
-        keep_fraction: of the pieces of street that exist; the two streets that cross in the middle are complete.
-        inset_m: minimum distance of a crossing from the border of the square of half side `reach`.
+    """Draws a grid of streets with gaps; None if the middle crossing lies outside of the square of half side `reach`.
 
     Raises:
         ConfigError: the square holds no crossing.
@@ -264,14 +243,7 @@ def add_lots(
     fraction: Fraction,
     room_m: float,
 ) -> Plan:
-    """Adds parking lots behind driveways to the straight streets of a plan, where there is room.
-
-    Args:
-        max_count: of lots.
-        size_m: width and depth of the ground that a lot needs.
-        fraction: of the streets with enough room that get a lot.
-        room_m: minimum length of street on both sides of a driveway.
-    """
+    """Adds parking lots behind driveways to the straight streets of a plan, where there is room."""
     nodes, edges = list(plan.nodes), list(plan.edges)
     taken = [shapely.LineString(edge.places(nodes)).buffer(CLEARANCE_M) for edge in edges]
     added = 0

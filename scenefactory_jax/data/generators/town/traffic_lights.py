@@ -30,12 +30,7 @@ def draw_gates(
     clear_s: Range,
     walk_mps: Positive,
 ) -> Gates:
-    """Draws a cycle for every junction with lights, with a random start.
-
-    Args:
-        green_s, yellow_s, clear_s: durations of green, of yellow, and of red for all arms after each phase.
-        walk_mps: a crosswalk is open while pedestrians with this speed can cross before its road has green again.
-    """
+    """Draws a cycle for every junction with lights, with a random start."""
     state = np.full((len(network.stops) + len(network.crosswalks), len(times)), OPEN)
     light = np.full(state.shape, -1)
     state[[index for index, stop in enumerate(network.stops) if stop.kind == "stop"]] = SIGN
