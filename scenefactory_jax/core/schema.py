@@ -32,7 +32,7 @@ class ConfigError(ValueError):
 class Bounds:
     """Range of a finite number, or of each number of a list: `min <= x <= max`, `above < x < below`.
 
-    With `is_range` the list is itself a range, [min, max].
+    With `is_range` the list of two numbers is itself a range, [min, max].
     """
 
     min: float | int | None = None
@@ -46,9 +46,8 @@ class Bounds:
         return inside and (self.above is None or number > self.above) and (self.below is None or number < self.below)
 
     def admit(self, numbers: list[Any]) -> bool:
-        """Whether all numbers are finite and inside the bounds and, of a range, two in ascending order."""
-        ordered = not self.is_range or (len(numbers) == 2 and numbers[0] <= numbers[1])
-        return ordered and all(math.isfinite(number) and number in self for number in numbers)
+        """Whether all numbers are finite and inside the bounds and, of a range, in ascending order."""
+        return not (self.is_range and numbers[0] > numbers[1]) and all(math.isfinite(number) and number in self for number in numbers)
 
     def __str__(self) -> str:
         signs = {">=": self.min, ">": self.above, "<=": self.max, "<": self.below}
@@ -60,8 +59,8 @@ Seed = Annotated[int, Bounds(min=0)]
 NonNegative = Annotated[float, Bounds(min=0)]
 Positive = Annotated[float, Bounds(above=0)]
 Fraction = Annotated[float, Bounds(min=0, max=1)]
-Range = Annotated[list[float], Bounds(min=0, is_range=True)]  # [min, max]
-CountRange = Annotated[list[int], Bounds(min=0, is_range=True)]
+Range = Annotated[tuple[float, float], Bounds(min=0, is_range=True)]  # [min, max]
+CountRange = Annotated[tuple[int, int], Bounds(min=0, is_range=True)]
 
 
 def check(config: Any, schema: type, *, where: str = "") -> None:

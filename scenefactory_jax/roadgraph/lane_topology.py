@@ -133,7 +133,7 @@ def _find_left_branches(starts: Ends, stops: Ends, samples: Samples, **link: flo
 
 
 def _find_left_neighbours(
-    samples: Samples, lanes: int, distance_m: list[float], turn_deg: float, overlap_m: float, height_m: float
+    samples: Samples, lanes: int, distance_m: tuple[float, float], turn_deg: float, overlap_m: float, height_m: float
 ) -> Relation:
     """[i, j]: lane j is to the left of lane i in the same direction over the overlap, and they come nowhere closer than the range."""
     low, high = distance_m

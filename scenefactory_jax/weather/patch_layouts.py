@@ -90,7 +90,7 @@ def strips(
     chance: Fraction,
     length_m: Range,
     width_m: Range,
-    offset_m: Annotated[list[float], Bounds(is_range=True)],
+    offset_m: Annotated[tuple[float, float], Bounds(is_range=True)],
     points: Annotated[int, Bounds(min=2)],
     surface: SurfaceName | None,
     film_mm: Range,
@@ -175,7 +175,7 @@ def _sample_cover(
     has_lanes: Bool[Array, ""],
     chance: float,
     surface: SurfaceName | None,
-    film_mm: list[float],
+    film_mm: tuple[float, float],
     open_road_film_fraction: float,
 ) -> dict[str, Array]:
     """Samples existence and water film of patches."""

@@ -85,5 +85,5 @@ def _make_rain(time_s: Float[Array, " K"], film_mm: Float[Array, " K"]) -> Rain:
     return Rain(now_s=jnp.float32(0.0), time_s=time_s, film_mm=film_mm)
 
 
-def _sample(key: PRNGKeyArray, span: list[float]) -> Float[Array, ""]:
+def _sample(key: PRNGKeyArray, span: tuple[float, float]) -> Float[Array, ""]:
     return jax.random.uniform(key, (), jnp.float32, *span)

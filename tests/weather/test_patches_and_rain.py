@@ -32,11 +32,11 @@ OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml"
 DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
 inside, read_condition = jax.jit(patches.contains_points), jax.jit(patches.read_condition)
-COVER = {"chance": 1.0, "surface": "ICE", "film_mm": [0.1, 0.4], "open_road_film_fraction": 0.5}
+COVER = {"chance": 1.0, "surface": "ICE", "film_mm": (0.1, 0.4), "open_road_film_fraction": 0.5}
 LAYOUTS = {
-    "circles": {"count": 40, "radius_m": [0.5, 3.0], "scatter_m": 1.5, **COVER},
-    "polygons": {"count": 40, "corners": 7, "radius_m": [1.0, 4.0], "scatter_m": 1.5, **COVER},
-    "strips": {"count": 40, "length_m": [5.0, 30.0], "width_m": [1.0, 2.0], "offset_m": [0.8, 1.2], "points": 16, **COVER},
+    "circles": {"count": 40, "radius_m": (0.5, 3.0), "scatter_m": 1.5, **COVER},
+    "polygons": {"count": 40, "corners": 7, "radius_m": (1.0, 4.0), "scatter_m": 1.5, **COVER},
+    "strips": {"count": 40, "length_m": (5.0, 30.0), "width_m": (1.0, 2.0), "offset_m": (0.8, 1.2), "points": 16, **COVER},
 }
 
 
@@ -187,7 +187,7 @@ def integrated(film, balance, tau, times):
     return np.array(found)
 
 
-ONSET = {"start_s": [3.0, 3.0], "rain_mm_h": [8.0, 8.0], "film_per_rain": 0.05, "film_max_mm": 3.0, "tau_s": [6.0, 6.0], "knots": 16}
+ONSET = {"start_s": (3.0, 3.0), "rain_mm_h": (8.0, 8.0), "film_per_rain": 0.05, "film_max_mm": 3.0, "tau_s": (6.0, 6.0), "knots": 16}
 
 
 @pytest.mark.parametrize(("drawn", "change", "balance"), [(0.0, {}, 0.4), (0.2, {"film_max_mm": 0.3}, 0.3), (0.5, {"knots": 40}, 0.4)])
@@ -202,7 +202,7 @@ def test_onset_solves_its_equation(drawn, change, balance):
 
 
 def test_drying_solves_its_equation():
-    course = rain.drying(KEY, make_uniform(jnp.float32(0.8), jnp.int32(0)), tau_s=[20.0, 20.0], knots=16)
+    course = rain.drying(KEY, make_uniform(jnp.float32(0.8), jnp.int32(0)), tau_s=(20.0, 20.0), knots=16)
     times = np.linspace(0.0, 90.0, 30)
     got = np.interp(times, course.time_s, course.film_mm)
     np.testing.assert_allclose(got, integrated(0.8, 0.0, 20.0, times), atol=0.004 * 0.8)
@@ -210,7 +210,7 @@ def test_drying_solves_its_equation():
 
 
 def test_courses_stay_within_their_ranges():
-    numbers = ONSET | {"start_s": [2.0, 5.0], "rain_mm_h": [2.0, 10.0], "tau_s": [4.0, 8.0]}
+    numbers = ONSET | {"start_s": (2.0, 5.0), "rain_mm_h": (2.0, 10.0), "tau_s": (4.0, 8.0)}
     draw = jax.jit(jax.vmap(lambda key: rain.onset(key, DRY, **numbers)))
     course = draw(jax.random.split(KEY, 300))
     start, span, last = course.time_s[:, 0], course.time_s[:, -1] - course.time_s[:, 0], course.film_mm[:, -1]

@@ -13,7 +13,7 @@ from scenefactory_jax.data.generators.curves import FINE_M, Points, connect, cur
 from scenefactory_jax.data.generators.town.road_network import SOLID_WHITE, Crosswalk, Lane, Network, Place, Port, Stop, Street
 
 Control = Literal["signal", "all_way_stop", "two_way_stop", "yield"]
-CrosswalkRange = Annotated[list[float], Bounds(min=1, is_range=True)]
+CrosswalkRange = Annotated[tuple[float, float], Bounds(min=1, is_range=True)]
 STRAIGHT_RAD = np.radians(40.0)  # maximum angle of a turn that goes straight on
 OPPOSITE = np.radians(150.0)  # minimum angle between arms that have green together
 MAX_GROWTHS, GROWTH_M = 24, 1.5  # of an intersection, until its sharpest turn has the minimum radius
@@ -105,7 +105,7 @@ def intersection(
     arms: Sequence[Arm],
     control: Control,
     *,
-    corner_radius_m: Annotated[list[float], Bounds(min=0, is_range=True)],
+    corner_radius_m: Annotated[tuple[float, float], Bounds(min=0, is_range=True)],
     turn_radius_m: Positive,
     crosswalk_m: CrosswalkRange,
     crosswalk_fraction: Fraction,
@@ -266,8 +266,8 @@ def roundabout(
     arms: Sequence[Arm],
     control: Control,
     *,
-    ring_radius_m: Annotated[list[float], Bounds(min=8, is_range=True)],
-    ring_width_m: Annotated[list[float], Bounds(min=3, is_range=True)],
+    ring_radius_m: Annotated[tuple[float, float], Bounds(min=8, is_range=True)],
+    ring_width_m: Annotated[tuple[float, float], Bounds(min=3, is_range=True)],
     split_deg: float,
     crosswalk_m: CrosswalkRange,
     crosswalk_fraction: Fraction,

@@ -75,7 +75,7 @@ def draw_path(
     length: float,
     *,
     lane_change_fraction: float,
-    lane_change_m: list[float],
+    lane_change_m: tuple[float, float],
 ) -> list[PathPiece]:
     """Draws a path of a length from a place on a lane: an exit at every fork, and lane changes.
 

@@ -12,7 +12,7 @@ from scenefactory_jax.data.generators.curves import FINE_M, Curve, easing_bend, 
 from scenefactory_jax.data.generators.town.road_network import DOUBLE_YELLOW, ON_ROAD, Lane, Network, Place, Street
 from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, build_carriageway, shift_line
 
-PlaceRange = Annotated[list[float], Bounds(is_range=True)]
+PlaceRange = Annotated[tuple[float, float], Bounds(is_range=True)]
 RANK = 3  # of the motorway as a street
 RAMP_LEAD_M, RAMP_EASING_M = 5.0, 30.0  # of the bend of a ramp
 
@@ -21,10 +21,10 @@ def motorway(
     rng: np.random.Generator,
     *,
     length_m: Positive,
-    lanes: Annotated[list[int], Bounds(min=1, is_range=True)],
+    lanes: Annotated[tuple[int, int], Bounds(min=1, is_range=True)],
     lane_width_m: Positive,
     median_m: Range,
-    speed_limit_mps: Annotated[list[float], Bounds(min=5, is_range=True)],
+    speed_limit_mps: Annotated[tuple[float, float], Bounds(min=5, is_range=True)],
     bend_radius_m: Positive,
     offset_m: float,
     join_m: PlaceRange,

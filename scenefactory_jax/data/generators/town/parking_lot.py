@@ -25,7 +25,7 @@ def parking_lot(
     yaw: float,
     street: Street,
     *,
-    depth_m: Annotated[list[float], Bounds(min=15, is_range=True)],
+    depth_m: Annotated[tuple[float, float], Bounds(min=15, is_range=True)],
     limit_mps: float,
 ) -> list[Port]:
     """Builds a lot with two aisles and parking spaces on both sides of each.

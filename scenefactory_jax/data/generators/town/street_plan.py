@@ -21,9 +21,9 @@ MIN_STREET_M, MIN_ARM_M = 45.0, 60.0  # from a node to where its street leaves t
 class StreetClass:
     """Ranges and fractions from which the streets of a class are drawn."""
 
-    lanes: Annotated[list[int], Bounds(min=1, is_range=True)]  # per direction
-    lane_width_m: Annotated[list[float], Bounds(min=2.6, is_range=True)]
-    speed_limit_mps: Annotated[list[float], Bounds(min=1, is_range=True)]
+    lanes: Annotated[tuple[int, int], Bounds(min=1, is_range=True)]  # per direction
+    lane_width_m: Annotated[tuple[float, float], Bounds(min=2.6, is_range=True)]
+    speed_limit_mps: Annotated[tuple[float, float], Bounds(min=1, is_range=True)]
     median_m: Range
     median_fraction: Fraction
     bike_fraction: Fraction
@@ -114,7 +114,7 @@ def star(
     classes: Classes,
     *,
     roundabout: bool,
-    arms: Annotated[list[int], Bounds(min=3, is_range=True)],
+    arms: Annotated[tuple[int, int], Bounds(min=3, is_range=True)],
     offset_m: float,
     skew_deg: float,
     bend_m: float,
@@ -154,7 +154,7 @@ def grid(
     reach: float,
     classes: Classes,
     *,
-    spacing_m: Annotated[list[float], Bounds(min=40, is_range=True)],
+    spacing_m: Annotated[tuple[float, float], Bounds(min=40, is_range=True)],
     offset_m: float,
     jitter_m: float,
     shear_deg: float,
@@ -198,7 +198,7 @@ def grid(
     return _remove_dead_ends(Plan(nodes, edges), crossings[middle])
 
 
-def _draw_lines(rng: np.random.Generator, reach: float, spacing: list[float], offset: float) -> list[float]:
+def _draw_lines(rng: np.random.Generator, reach: float, spacing: tuple[float, float], offset: float) -> list[float]:
     """Draws the places of parallel streets: one near the middle and others on both sides."""
     places = [float(rng.uniform(-offset, offset))]
     for side in (-1.0, 1.0):
@@ -239,7 +239,7 @@ def add_lots(
     driveway: Street,
     *,
     max_count: int,
-    size_m: list[float],
+    size_m: tuple[float, float],
     fraction: Fraction,
     room_m: float,
 ) -> Plan:

@@ -25,7 +25,7 @@ def draw_gates(
     network: Network,
     times: Float[np.ndarray, " L"],
     *,
-    green_s: Annotated[list[float], Bounds(min=1, is_range=True)],
+    green_s: Annotated[tuple[float, float], Bounds(min=1, is_range=True)],
     yellow_s: Range,
     clear_s: Range,
     walk_mps: Positive,
