@@ -1,4 +1,4 @@
-"""Patches and rain: geometry against shapely, courses against their differential equation, draws, and what a world makes of them."""
+"""Patches and rain: geometry against shapely, films against their differential equation, sampling, and their use in a world."""
 
 import functools
 import types
@@ -109,8 +109,8 @@ def test_repeated_vertices_and_absent_patches_change_nothing():
     np.testing.assert_array_equal(inside(patches.join_patches(doubled), points), alone)
     hidden = patch([[0.0, 0.0]], radius=50.0, surface=SNOW, film=9.0, present=False)
     for with_hidden in (on(*shapes, hidden), on(hidden, *shapes)):
-        for got, wanted in zip(read_condition(with_hidden, points), read_condition(on(*shapes), points), strict=True):
-            np.testing.assert_array_equal(got, wanted)
+        for got, expected in zip(read_condition(with_hidden, points), read_condition(on(*shapes), points), strict=True):
+            np.testing.assert_array_equal(got, expected)
 
 
 def test_the_last_patch_counts_and_films_follow_the_open_road():
@@ -125,7 +125,7 @@ def test_the_last_patch_counts_and_films_follow_the_open_road():
     np.testing.assert_array_equal(surface, [ICE, ICE, SNOW, 1])
 
 
-def test_no_patches_cost_nothing():
+def test_a_road_without_patches_needs_no_geometry():
     operations = jax.make_jaxpr(functools.partial(patches.read_condition, DRY))(jnp.zeros((16, 4, 2))).jaxpr.eqns
     assert {operation.primitive.name for operation in operations} <= {"broadcast_in_dim", "jit", "pjit"}
     assert patches.join_patches([DRY.patches, patch([[0, 0]])]).vertices.shape == (1, 1, 2)
@@ -146,11 +146,11 @@ def test_drawn_areas_are_the_patches():
 
 def test_dry_surfaces_have_their_textbook_friction():
     entry = scenefactory_jax.load_config("task")["weather"]["friction"]
-    grip = instantiate.instantiate(entry, builtins=friction_model, where="weather.friction")
-    wanted = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
-    spots = [patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))]
+    compute_mu = jax.jit(instantiate.instantiate(entry, builtins=friction_model, where="weather.friction"))
+    expected = {"AC": 1.1048, "SMA": 1.2043, "OGFC": 1.3368, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}
+    spots = on(*(patch([[10.0 * i, 0.0]], radius=1.0, surface=i) for i in range(len(SURFACES))))
     places = jnp.array([[10.0 * i, 0.0] for i in range(len(SURFACES))])
-    np.testing.assert_allclose(jax.jit(grip)(on(*spots), places, jnp.zeros(len(SURFACES))), [wanted[name] for name in SURFACES], rtol=1e-3)
+    np.testing.assert_allclose(compute_mu(spots, places, jnp.zeros(len(SURFACES))), [expected[name] for name in SURFACES], rtol=1e-3)
 
 
 def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
@@ -158,8 +158,8 @@ def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
     condition = on(patch([[0, 5]], radius=5.0, surface=0, film=0.5), film=0.3)
     wheels = jnp.array([[[1.3, 1.0], [1.3, -1.0], [-1.3, 1.0], [-1.3, -1.0]]])
     for mode, wet, damp in (("static", 0.8595, 0.9594), ("dynamic", 0.6770, 0.8302), ("speed", 0.8595, 0.9594)):
-        grip = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.friction")
-        np.testing.assert_allclose(jax.jit(grip)(condition, wheels, jnp.full((1, 4), 13.89)), [[wet, damp, wet, damp]], atol=1e-4)
+        compute_mu = instantiate.instantiate({**entry, "mode": mode}, builtins=friction_model, where="weather.friction")
+        np.testing.assert_allclose(jax.jit(compute_mu)(condition, wheels, jnp.full((1, 4), 13.89)), [[wet, damp, wet, damp]], atol=1e-4)
 
 
 # ---- rain
@@ -194,9 +194,9 @@ ONSET = {"start_s": (3.0, 3.0), "rain_mm_h": (8.0, 8.0), "film_per_rain": 0.05, 
 def test_onset_solves_its_equation(drawn, change, balance):
     course = rain.onset(KEY, make_uniform(jnp.float32(drawn), jnp.int32(0)), **(ONSET | change))
     times = np.linspace(0.0, 28.0, 30)
-    wanted = integrated(drawn, balance, 6.0, times)
+    expected = integrated(drawn, balance, 6.0, times)
     got = np.interp(times + 3.0, course.time_s, course.film_mm)
-    np.testing.assert_allclose(got, wanted, atol=0.004 * abs(balance - drawn))
+    np.testing.assert_allclose(got, expected, atol=0.004 * abs(balance - drawn))
     np.testing.assert_allclose(np.interp([0.0, 2.9], course.time_s, course.film_mm), drawn)
     assert abs(float(course.film_mm[-1]) - balance) < 0.01 * abs(balance - drawn)
 
@@ -209,7 +209,7 @@ def test_drying_solves_its_equation():
     assert (np.diff(course.film_mm) < 0).all() and (course.film_mm >= 0).all()
 
 
-def test_courses_stay_within_their_ranges():
+def test_films_stay_within_their_ranges():
     numbers = ONSET | {"start_s": (2.0, 5.0), "rain_mm_h": (2.0, 10.0), "tau_s": (4.0, 8.0)}
     draw = jax.jit(jax.vmap(lambda key: rain.onset(key, DRY, **numbers)))
     course = draw(jax.random.split(KEY, 300))
@@ -316,27 +316,6 @@ def test_every_option_samples_the_weather_of_an_episode(option):
         assert 0 < first.patches.present.mean() < 1
 
 
-def test_a_world_with_patches_and_rain_traces_once():
-    env = scenefactory_jax.make(config_of("weather=storm"))
-    scenes = jax.tree.map(lambda leaf: jnp.stack([leaf] * 6), scene_of([[0, 0], [30, 0]], [[20, 0], [50, 0]], speeds=[5.0, 0.0]))
-    traces = []
-
-    @jax.jit
-    def step(scenes, states, action):
-        traces.append(1)
-        return jax.vmap(env.step)(scenes, states, action)
-
-    states, observation = jax.jit(jax.vmap(env.reset))(jax.random.split(KEY, 6), scenes)
-    patches = states.weather.patches
-    for _ in range(3):
-        states, outcome = step(scenes, states, jnp.zeros((6, 2, 3)))
-    assert len(traces) == 1 and observation["weather"].shape == (6, 2, 4)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.metrics.mu, outcome.observation, states.weather)))
-    np.testing.assert_allclose(states.weather.rain.now_s, 0.1, rtol=1e-5)
-    for name, leaf in vars(patches).items():
-        np.testing.assert_array_equal(getattr(states.weather.patches, name), leaf)
-
-
 PUDDLE = (
     "+weather.patches.here={_target_: fixed, shapes: [{circle: [0, 0], radius: 2.0, surface: SMA, film_mm: 0.2, "
     "open_road_film_fraction: 1.0}]}"
@@ -344,16 +323,19 @@ PUDDLE = (
 COURSE = "weather.rain={_target_: schedule, time_s: [0.0, 1.0], film_mm: [0.1, 0.4]}"
 
 
-def test_the_token_and_friction_follow_each_car_and_the_rain():
+def test_observation_and_friction_follow_each_car_and_the_rain():
     env = scenefactory_jax.make(config_of(PUDDLE, COURSE))
     scene = scene_of([[0, 0], [30, 0]], [[20, 0], [50, 0]], speeds=[4.0, 0.0])
-    state, seen = jax.jit(env.reset)(KEY, scene)
-    np.testing.assert_allclose(seen["weather"], [[0.3, 0, 1, 0], [0.1, 1, 0, 0]], atol=1e-6)
-    step, tokens, friction = jax.jit(env.step), [], []
+    state, observation = jax.jit(env.reset)(KEY, scene)
+    np.testing.assert_allclose(observation["weather"], [[0.3, 0, 1, 0], [0.1, 1, 0, 0]], atol=1e-6)
+    patches, step, tokens, friction = state.weather.patches, jax.jit(env.step), [], []
     for _ in range(30):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))
         tokens.append(outcome.observation["weather"])
         friction.append(outcome.metrics.mu)
+    assert step._cache_size() == 1
+    jax.tree.map(np.testing.assert_array_equal, state.weather.patches, patches)
+    np.testing.assert_allclose(state.weather.rain.now_s, 1.0, rtol=1e-5)
     tokens, film, friction = np.array(tokens), 0.1 + 0.3 * np.arange(1, 31) / 30, np.array(friction)
     wet = np.array([4.0 * step / 30 for step in range(1, 31)]) < 1.9  # the bearings' drag takes little of 4 m/s
     np.testing.assert_allclose(tokens[:, 1, 0], film, atol=1e-5)
@@ -362,8 +344,8 @@ def test_the_token_and_friction_follow_each_car_and_the_rain():
     assert tokens[-1, 0, 0] == pytest.approx(0.4, abs=1e-5)
     assert (np.diff(friction[:, 1]) < 0).all() and friction[0, 0] != friction[0, 1] and friction[-1, 0] == pytest.approx(friction[-1, 1])
     # the weather moves on before the dynamics read it: the step to 1 s drives on the film of 1 s
-    grip = instantiate.instantiate(config_of()["weather"]["friction"], builtins=friction_model, where="weather.friction")
-    assert friction[-1, 1] == pytest.approx(float(grip(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
+    compute_mu = instantiate.instantiate(config_of()["weather"]["friction"], builtins=friction_model, where="weather.friction")
+    assert friction[-1, 1] == pytest.approx(float(compute_mu(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
 
 
 def test_the_observation_lists_the_surfaces_of_its_config():
@@ -374,12 +356,14 @@ def test_the_observation_lists_the_surfaces_of_its_config():
     for surfaces, expected in observations.items():
         observe = jax.jit(lambda: state_vectors.weather.__wrapped__(None, state, film_scale_mm=1.0, surfaces=surfaces.split()))  # noqa: B023
         np.testing.assert_allclose(observe(), expected, atol=1e-6)
+    with pytest.raises(ConfigError, match=r"observations\.weather\.surfaces: expected names of AC, SMA"):
+        state_vectors.weather.__wrapped__(None, state, film_scale_mm=1.0, surfaces=["AC", "MUD"])
 
 
 def test_an_entry_of_null_is_left_out_and_others_may_be_added():
     overrides = ("weather=puddles", "+weather/patches@weather.patches.black=ice", "weather.patches.puddles=null")
     added = scenefactory_jax.load_config("train", *overrides)["weather"]
-    laid = road_condition.make(added)(KEY, lanes_scene())
+    laid = jax.jit(road_condition.make(added))(KEY, lanes_scene())
     assert laid.patches.present.shape == (6,) and (laid.patches.surface == ICE).all()
     old = {name: config_of()["weather"][name] for name in ("sampler", "friction")}  # without patches and rain
     assert road_condition.make(old)(KEY, lanes_scene()).patches.present.shape == (0,)
@@ -415,12 +399,11 @@ def test_the_report_says_how_the_film_changed():
         ("weather.rain={_target_: schedule, time_s: [1.0, 1.0], film_mm: [0.0, 0.0]}", r"weather\.rain\.time_s: .*ascending"),
         ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [0.0, 0.0]}", r"film_mm: expected a film for each of 1 times, got 2"),
         ("weather.rain={_target_: schedule, time_s: [1.0], film_mm: [-0.1]}", r"weather\.rain\.film_mm: expected .*>= 0"),
-        ("observations.weather.surfaces=[AC,MUD]", r"observations\.weather\.surfaces: expected names of AC, SMA"),
     ],
 )
 def test_refuses_by_name(override, message):
     with pytest.raises(ConfigError, match=message):
-        scenefactory_jax.make(config_of("weather=ice", override)).reset(KEY, lanes_scene())
+        jax.eval_shape(road_condition.make(config_of("weather=ice", override)["weather"]), KEY, lanes_scene())
 
 
 @pytest.mark.parametrize(

@@ -33,11 +33,44 @@ class Arm(NamedTuple):
     leaving: int  # lanes out of the junction
     entering: int
     bay: str = ""  # side of a lane that only turns: "left", "right" or none
+    centre: Place = np.zeros(2)  # of the junction
+    distance: float = 0.0  # of the end of the arm from the centre, m
 
     def half_width(self, side: Literal["left", "right"]) -> float:
         """Computes the distance from the middle of the arm to its kerb."""
         slots = self.entering if side == "left" else self.leaving
         return self.street.median / 2 + slots * self.street.width + self.street.bike + PAVED_M
+
+    def at(self, along: float, across: float) -> Place:
+        """Place at distances from the centre along the arm and to its left, looking away from the junction."""
+        return self.centre + along * heading(self.yaw) + across * heading(self.yaw + np.pi / 2)
+
+    def slot(self, slot: int | float, *, entering: bool) -> Place:
+        """Place where a slot meets the junction; slots at half numbers are lines between lanes."""
+        beside = self.street.median / 2 + (slot + 0.5) * self.street.width
+        return self.at(self.distance, beside if entering else -beside)
+
+    def cycle_lane(self, *, entering: bool) -> Place:
+        """Place where the bicycle lane meets the junction."""
+        aside = self.street.bike / 2 * heading(self.yaw + np.pi / 2)
+        slot = (self.entering if entering else self.leaving) - 0.5
+        return self.slot(slot, entering=entering) + (aside if entering else -aside)
+
+    def corners(self, near: float, far: float) -> list[Place]:
+        """Corners of the full width of the arm between two distances from the centre."""
+        left, right = self.half_width("left"), self.half_width("right")
+        return [self.at(x, y) for x, y in ((near, -right), (far, -right), (far, left), (near, left))]
+
+    def crosswalk(self, distance: float, depth: float, index: int, junction: int) -> Crosswalk:
+        """Crosswalk before a line at a distance from the centre."""
+        near, far = distance - CROSSWALK_GAP_M - depth, distance - CROSSWALK_GAP_M
+        ends = [self.at((near + far) / 2, across) for across in (-self.half_width("right"), self.half_width("left"))]
+        return Crosswalk(np.stack(self.corners(near, far)), np.stack(ends), index, junction)
+
+    def port(self, *, controlled: bool) -> Port:
+        """Port of the arm, without lanes."""
+        leaving, entering = ([[] for _ in range(count)] for count in (self.leaving, self.entering))
+        return Port(self.at(self.distance, 0.0), self.yaw, self.street, leaving, entering, [], [], self.bay or "right", controlled)
 
 
 def turn_angle(source: Arm, target: Arm) -> float:
@@ -48,46 +81,6 @@ def turn_angle(source: Arm, target: Arm) -> float:
 def is_straight(source: Arm, target: Arm) -> bool:
     """Checks whether the way from one arm to another goes straight on."""
     return bool(abs(turn_angle(source, target)) < STRAIGHT_RAD)
-
-
-class Mouth(NamedTuple):
-    """End of an arm at a junction."""
-
-    arm: Arm
-    centre: Place  # of the junction
-    distance: float  # from the centre, m
-
-    def at(self, along: float, across: float) -> Place:
-        """Place at distances from the centre along the arm and to its left, looking away from the junction."""
-        return self.centre + along * heading(self.arm.yaw) + across * heading(self.arm.yaw + np.pi / 2)
-
-    def slot(self, slot: int | float, *, entering: bool) -> Place:
-        """Place where a slot meets the junction; slots at half numbers are lines between lanes."""
-        beside = self.arm.street.median / 2 + (slot + 0.5) * self.arm.street.width
-        return self.at(self.distance, beside if entering else -beside)
-
-    def cycle_lane(self, *, entering: bool) -> Place:
-        """Place where the bicycle lane meets the junction."""
-        slots = self.arm.entering if entering else self.arm.leaving
-        aside = self.arm.street.bike / 2 * heading(self.arm.yaw + np.pi / 2)
-        return self.slot(slots - 0.5, entering=entering) + (aside if entering else -aside)
-
-    def corners(self, near: float, far: float) -> list[Place]:
-        """Corners of the full width of the arm between two distances from the centre."""
-        left, right = self.arm.half_width("left"), self.arm.half_width("right")
-        return [self.at(x, y) for x, y in ((near, -right), (far, -right), (far, left), (near, left))]
-
-    def crosswalk(self, distance: float, depth: float, arm: int, junction: int) -> Crosswalk:
-        """Crosswalk before a line at a distance from the centre."""
-        near, far = distance - CROSSWALK_GAP_M - depth, distance - CROSSWALK_GAP_M
-        ends = [self.at((near + far) / 2, across) for across in (-self.arm.half_width("right"), self.arm.half_width("left"))]
-        return Crosswalk(np.stack(self.corners(near, far)), np.stack(ends), arm, junction)
-
-    def port(self, *, controlled: bool) -> Port:
-        """Port of the arm, without lanes."""
-        arm = self.arm
-        leaving, entering = ([[] for _ in range(count)] for count in (arm.leaving, arm.entering))
-        return Port(self.at(self.distance, 0.0), arm.yaw, arm.street, leaving, entering, [], [], arm.bay or "right", controlled)
 
 
 class Turn(NamedTuple):
@@ -120,19 +113,19 @@ def intersection(
     distances = _compute_distances(arms, corner) + np.where(has_crosswalk, depth + 1.0, 0.0)
     turns = find_turns(arms)
     for _ in range(MAX_GROWTHS):
-        mouths = [Mouth(arm, centre, float(distances[a])) for a, arm in enumerate(arms)]
-        paths = [_turn_path(mouths, turn) for turn in turns]
+        arms = [arm._replace(centre=centre, distance=float(distance)) for arm, distance in zip(arms, distances, strict=True)]
+        paths = [_turn_path(arms, turn) for turn in turns]
         if max(np.abs(curvature(path)[2:-2]).max() for path in paths) <= 1 / turn_radius_m:
             break
         distances = distances + GROWTH_M
     else:
         raise ConfigError(f"intersection.turn_radius_m: expected a radius that fits {len(arms)} arms, got {turn_radius_m:g}")
     junction = network.add_block(f"{len(arms)}_arms")
-    stops = _add_stops(network, mouths, junction, control)
-    ports = [mouth.port(controlled=(a, False) in stops) for a, mouth in enumerate(mouths)]
+    stops = _add_stops(network, arms, junction, control)
+    ports = [arm.port(controlled=(a, False) in stops) for a, arm in enumerate(arms)]
     network.lines += [
-        (SOLID_WHITE, np.stack([mouth.slot(at, entering=True) for at in (-0.5, mouth.arm.entering - 0.5)]))
-        for mouth, port in zip(mouths, ports, strict=True)
+        (SOLID_WHITE, np.stack([arm.slot(at, entering=True) for at in (-0.5, arm.entering - 0.5)]))
+        for arm, port in zip(arms, ports, strict=True)
         if port.controlled
     ]
     for turn, path in zip(turns, paths, strict=True):
@@ -147,13 +140,13 @@ def intersection(
         for b, target in enumerate(arms):
             if is_straight(source, target) and min(source.street.bike, target.street.bike, source.entering, target.leaving) > 0:
                 street = source.street
-                path = connect(mouths[a].cycle_lane(entering=True), source.yaw + np.pi, mouths[b].cycle_lane(entering=False), target.yaw)
+                path = connect(source.cycle_lane(entering=True), source.yaw + np.pi, target.cycle_lane(entering=False), target.yaw)
                 rank = _rank(street, "right", control)
                 lane = network.add_lane(Lane(path, street.bike, street.limit, rank, LANE_BIKE, stops.get((a, False))))
                 ports[a].cycles_entering.append(lane)
                 ports[b].cycles_leaving.append(lane)
-    network.areas += _middle(mouths, depth + 1.0)
-    network.crosswalks += [mouth.crosswalk(mouth.distance, depth, a, junction) for a, mouth in enumerate(mouths) if has_crosswalk[a]]
+    network.areas += _middle(arms, depth + 1.0)
+    network.crosswalks += [arm.crosswalk(arm.distance, depth, a, junction) for a, arm in enumerate(arms) if has_crosswalk[a]]
     return ports
 
 
@@ -171,11 +164,11 @@ def _compute_distances(arms: Sequence[Arm], corner: float) -> Float[np.ndarray, 
     return distances
 
 
-def _turn_path(mouths: Sequence[Mouth], turn: Turn) -> Points:
+def _turn_path(arms: Sequence[Arm], turn: Turn) -> Points:
     """Computes the centre line of a connecting lane."""
-    source, target = mouths[turn.source[0]], mouths[turn.target[0]]
+    source, target = arms[turn.source[0]], arms[turn.target[0]]
     start, end = source.slot(turn.source[1], entering=True), target.slot(turn.target[1], entering=False)
-    return connect(start, source.arm.yaw + np.pi, end, target.arm.yaw)
+    return connect(start, source.yaw + np.pi, end, target.yaw)
 
 
 def find_turns(arms: Sequence[Arm]) -> list[Turn]:
@@ -222,41 +215,39 @@ def _rank(street: Street, kind: str, control: Control) -> int:
     return TURN_RANK[kind] + (0 if control in ("signal", "all_way_stop") else 5 * street.rank)
 
 
-def _add_stops(network: Network, mouths: Sequence[Mouth], junction: int, control: Control) -> dict[tuple[int, bool], int]:
+def _add_stops(network: Network, arms: Sequence[Arm], junction: int, control: Control) -> dict[tuple[int, bool], int]:
     """Adds the lights with their phases, or the signs; returns the stop of every arm that has one, and that of its protected left turn.
 
     Opposite arms have green together, the others alone; a left turn without oncoming traffic has an arrow.
     """
     phases: list[frozenset[int]] = []
     if control == "signal":
-        pending = list(range(len(mouths)))
+        pending = list(range(len(arms)))
         while pending:
             arm = pending.pop(0)
-            facing = [other for other in pending if abs(wrap_angle(mouths[other].arm.yaw - mouths[arm].arm.yaw)) > OPPOSITE][:1]
+            facing = [other for other in pending if abs(wrap_angle(arms[other].yaw - arms[arm].yaw)) > OPPOSITE][:1]
             pending = [other for other in pending if other not in facing]
             phases.append(frozenset([arm, *facing]))
         network.phases[junction] = phases
-    highest = max(mouth.arm.street.rank for mouth in mouths)
+    highest = max(arm.street.rank for arm in arms)
     stops = {}
-    for a, mouth in enumerate(mouths):
-        arm = mouth.arm
-        kind = "signal" if control == "signal" else "stop"
+    for a, arm in enumerate(arms):
         if not arm.entering or control == "yield" or (control == "two_way_stop" and arm.street.rank == highest):
             continue
-        post = mouth.slot(arm.entering - 0.5, entering=True) + (arm.street.bike + PAVED_M + POST_M) * heading(arm.yaw + np.pi / 2)
+        post = arm.slot(arm.entering - 0.5, entering=True) + (arm.street.bike + PAVED_M + POST_M) * heading(arm.yaw + np.pi / 2)
         for protected in (False, True) if frozenset([a]) in phases else (False,):
             stops[a, protected] = len(network.stops)
-            network.stops.append(Stop(kind, a, post, junction, protected))
+            network.stops.append(Stop("signal" if control == "signal" else "stop", a, post, junction, protected))
     return stops
 
 
-def _middle(mouths: Sequence[Mouth], depth: float) -> Sequence[shapely.Geometry]:
+def _middle(arms: Sequence[Arm], depth: float) -> Sequence[shapely.Geometry]:
     """Computes the paved surface between the arms: between two opposite arms, else from the centre to the port of the arm."""
-    surface = lambda mouth, near: shapely.Polygon(mouth.corners(near, mouth.distance + 0.05))  # noqa: E731
-    near = [surface(mouth, max(0.0, mouth.distance - depth)) for mouth in mouths]
-    pairs = [(a, b) for a in range(len(mouths)) for b in range(a) if is_straight(mouths[b].arm, mouths[a].arm)]
+    surface = lambda arm, near: shapely.Polygon(arm.corners(near, arm.distance + 0.05))  # noqa: E731
+    near = [surface(arm, max(0.0, arm.distance - depth)) for arm in arms]
+    pairs = [(a, b) for a in range(len(arms)) for b in range(a) if is_straight(arms[b], arms[a])]
     joined = [shapely.convex_hull(shapely.union(near[a], near[b])) for a, b in pairs]
-    return [*joined, *(surface(mouth, 0.0) for a, mouth in enumerate(mouths) if not any(a in pair for pair in pairs))]
+    return [*joined, *(surface(arm, 0.0) for a, arm in enumerate(arms) if not any(a in pair for pair in pairs))]
 
 
 def roundabout(
@@ -280,18 +271,18 @@ def roundabout(
     yaws = np.array([arm.yaw for arm in arms])
     split = min(np.radians(split_deg), 0.42 * float(np.min(np.mod(np.roll(yaws, -1) - yaws, 2 * np.pi))))
     beside = max(arm.street.median / 2 + arm.street.width / 2 for arm in arms)
-    # entry and exit are arcs where the mouth lies at this distance: the angle between chord and arm is half the turn
+    # entry and exit are arcs where the arm ends at this distance: the angle between chord and arm is half the turn
     distance = radius * np.cos(split) + max(radius * np.sin(split) - beside, 1.0) / np.tan((np.pi / 2 - split) / 2) + 2.0
+    arms = [arm._replace(centre=centre, distance=distance) for arm in arms]
     junction = network.add_block("roundabout")
     ports, ring = [], []
     for a, arm in enumerate(arms):
         leave, join = arm.yaw - split, arm.yaw + split
         next_leave = join + np.mod(arms[(a + 1) % len(arms)].yaw - split - join, 2 * np.pi)
         before, after = _arc(centre, radius, leave, join), _arc(centre, radius, join, next_leave)
-        mouth = Mouth(arm, centre, distance)
         limit = min(arm.street.limit, 10.0)
-        entry = connect(mouth.slot(0, entering=True), arm.yaw + np.pi, after[0], join + np.pi / 2)
-        leaving = connect(before[0], leave + np.pi / 2, mouth.slot(0, entering=False), arm.yaw)
+        entry = connect(arm.slot(0, entering=True), arm.yaw + np.pi, after[0], join + np.pi / 2)
+        leaving = connect(before[0], leave + np.pi / 2, arm.slot(0, entering=False), arm.yaw)
         lanes = [
             Lane(entry, arm.street.width, limit, TURN_RANK["right"]),
             Lane(leaving, arm.street.width, limit, RING_RANK),
@@ -300,11 +291,11 @@ def roundabout(
         ]
         network.areas += [compute_paved_area(lane, RING_PAVED_M) for lane in lanes]
         ring.append([network.add_lane(lane) for lane in lanes])
-        ports.append(mouth.port(controlled=True))
+        ports.append(arm.port(controlled=True))
         ports[-1].entering[0].append(ring[-1][0])
         ports[-1].leaving[0].append(ring[-1][1])
         if rng.random() < crosswalk_fraction:
-            network.crosswalks.append(mouth.crosswalk(distance + depth + CROSSWALK_GAP_M, depth, a, junction))
+            network.crosswalks.append(arm.crosswalk(distance + depth + CROSSWALK_GAP_M, depth, a, junction))
     for (entry, _, before, after), (_, next_leaving, next_before, _) in zip(ring, [*ring[1:], ring[0]], strict=True):
         for lane, follower in ((entry, after), (before, after), (after, next_leaving), (after, next_before)):
             network.link(lane, follower)

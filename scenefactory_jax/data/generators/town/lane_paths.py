@@ -21,7 +21,7 @@ class Path(NamedTuple):
     speed: Float[np.ndarray, " N"]  # maximum, m/s
     rank: Float[np.ndarray, " N"]  # right of way
     gates: tuple[tuple[float, int], ...]  # (place, gate): where a light, a sign or a crosswalk can stop the road user
-    lanes: tuple[int, ...]
+    lanes: tuple[int, ...]  # of the network, in driving order
 
     @property
     def length(self) -> float:
@@ -77,11 +77,9 @@ def draw_path(
     lane_change_fraction: float,
     lane_change_m: tuple[float, float],
 ) -> list[PathPiece]:
-    """Draws a path of a length from a place on a lane: an exit at every fork, and lane changes.
+    """Draws a path of a length from a place on a lane: an exit at every fork, and lane changes of a length within a range.
 
-    Args:
-        lane_change_fraction: probability of a lane change on a lane that is long enough.
-        lane_change_m: range of the length of a lane change.
+    `lane_change_fraction` is the probability of a lane change on a lane that is long enough.
     """
     pieces: list[PathPiece] = []
     left, control = length, None
@@ -128,11 +126,8 @@ def offset_path(pieces: list[PathPiece], right: float) -> list[PathPiece]:
     """Shifts a path to its right."""
     points = join([piece.points for piece in pieces])
     shifted = points + right * right_normals(points)
-    result, start = [], 0
-    for piece in pieces:
-        result.append(piece._replace(points=shifted[start : start + len(piece.points)]))
-        start += len(piece.points) - 1
-    return result
+    ends = np.cumsum([len(piece.points) - 1 for piece in pieces])
+    return [piece._replace(points=shifted[end + 1 - len(piece.points) : end + 1]) for piece, end in zip(pieces, ends, strict=True)]
 
 
 def walk(points: Points, speed: float, *, crosswalk: tuple[float, int] | None) -> Path:

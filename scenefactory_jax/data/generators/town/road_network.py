@@ -72,8 +72,8 @@ class Port(NamedTuple):
     place: Place  # middle of the road
     yaw: float  # out of the block
     street: Street
-    leaving: Slots  # lanes of the block that end at each slot
-    entering: Slots  # lanes of the block that begin at each slot
+    leaving: list[list[int]]  # lanes of the block that end at each slot
+    entering: list[list[int]]  # lanes of the block that begin at each slot
     cycles_leaving: list[int]
     cycles_entering: list[int]
     side: str = "right"  # on which a road to this port gains a lane
