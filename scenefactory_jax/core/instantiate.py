@@ -3,7 +3,8 @@
     reward.jerk: {_target_: my_terms.jerk, weight: -0.1, limit: 3.0}
 
 A target without a dot is a public function of a given module. A dotted target is imported; of a module of this package, only functions that
-it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`).
+it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`) and
+bound as `schema` reads them: a mapping that the annotation takes as a dataclass becomes its instance.
 """
 
 import functools
@@ -39,9 +40,8 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
 
     check_names(numbers, tunable, where=where, required=[name for name in tunable if parameters[name].default is inspect.Parameter.empty])
     hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
-    for key, value in numbers.items():
-        read_value(value, hints.get(key, Any), where=f"{where}.{key}")
-    return functools.partial(function, **numbers, **supplied)
+    values = {key: read_value(value, hints.get(key, Any), where=f"{where}.{key}") for key, value in numbers.items()}
+    return functools.partial(function, **values, **supplied)
 
 
 def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:

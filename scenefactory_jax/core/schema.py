@@ -30,16 +30,24 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Bounds:
-    """Range of a finite number, or of each number of a list: `min <= x <= max`, `above < x < below`."""
+    """Range of a finite number, or of each number of a list: `min <= x <= max`, `above < x < below`.
+
+    With `is_range` the list of two numbers is itself a range, [min, max].
+    """
 
     min: float | int | None = None
     max: float | int | None = None
     above: float | int | None = None
     below: float | int | None = None
+    is_range: bool = False
 
     def __contains__(self, number: float | int) -> bool:
         inside = (self.min is None or number >= self.min) and (self.max is None or number <= self.max)
         return inside and (self.above is None or number > self.above) and (self.below is None or number < self.below)
+
+    def admit(self, numbers: list[Any]) -> bool:
+        """Whether all numbers are finite and inside the bounds and, of a range, in ascending order."""
+        return not (self.is_range and (len(numbers) < 2 or numbers[0] > numbers[1])) and all(math.isfinite(number) and number in self for number in numbers)
 
     def __str__(self) -> str:
         signs = {">=": self.min, ">": self.above, "<=": self.max, "<": self.below}
@@ -51,6 +59,8 @@ Seed = Annotated[int, Bounds(min=0)]
 NonNegative = Annotated[float, Bounds(min=0)]
 Positive = Annotated[float, Bounds(above=0)]
 Fraction = Annotated[float, Bounds(min=0, max=1)]
+Range = Annotated[tuple[float, float], Bounds(min=0, is_range=True)]  # [min, max]
+CountRange = Annotated[tuple[int, int], Bounds(min=0, is_range=True)]
 
 
 def check(config: Any, schema: type, *, where: str = "") -> None:
@@ -107,7 +117,7 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
     kinds = [(kind, bounds) for kind, bounds in _list_kinds(hint) if _is_kind(value, kind)]
     kind, bounds = kinds[0] if kinds else (None, None)
     numbers = [number for number in (value if isinstance(value, (list, tuple)) else [value]) if _is_kind(number, float)]
-    if not kinds or (bounds is not None and not all(math.isfinite(number) and number in bounds for number in numbers)):
+    if not kinds or (bounds is not None and value is not None and not bounds.admit(numbers)):
         raise ConfigError(f"{where}: expected {describe(hint)}, got {value!r}")
     items = typing.get_args(kind)
     if isinstance(value, Mapping) and dataclasses.is_dataclass(kind):
@@ -116,7 +126,9 @@ def read_value(value: Any, hint: Any, *, where: str) -> Any:
         return {key: read_value(item, items[1], where=_join(where, key)) for key, item in value.items()}
     if isinstance(value, (list, tuple)) and items and typing.get_origin(kind) in (list, tuple):
         hints = items if _is_fixed(kind) else items[:1] * len(value)
-        return [read_value(item, item_hint, where=where) for item, item_hint in zip(value, hints, strict=True)]
+        places = [f"{where}[{i}]" if isinstance(item, Mapping) else where for i, item in enumerate(value)]
+        found = [read_value(item, item_hint, where=place) for item, item_hint, place in zip(value, hints, places, strict=True)]
+        return found if typing.get_origin(kind) is list else tuple(found)
     return float(typing.cast(float, value)) if kind is float else value
 
 
@@ -156,10 +168,12 @@ WORDS = {float: "a number", int: "an integer", bool: "true or false", str: "a te
 
 def describe(hint: Any) -> str:
     """Describes an annotation for an error message: "an integer >= 1", "a number or null", "one of a, b"."""
-    return " or ".join(_describe(kind) + (f" {bounds}" if bounds and kind is not type(None) else "") for kind, bounds in _list_kinds(hint))
+    return " or ".join(_describe(kind, bounds) for kind, bounds in _list_kinds(hint))
 
 
-def _describe(kind: Any) -> str:
+def _describe(kind: Any, bounds: Bounds | None) -> str:
+    if bounds is not None and kind is not type(None):
+        return f"{'[min, max]' if bounds.is_range else _describe(kind, None)} {bounds}".strip()
     origin, items = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return " or ".join(map(str, items)) if len(items) < 3 else f"one of {', '.join(map(str, items))}"

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass, static
 
-SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
+SurfaceName = Literal["AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE"]  # the first three are asphalts: concrete, stone mastic, open-graded
+SURFACES: tuple[SurfaceName, ...] = get_args(SurfaceName)
 
 RoadUser = Literal["vehicle", "pedestrian", "cyclist", "other"]
 ROAD_USERS: tuple[RoadUser, ...] = get_args(RoadUser)  # the order of `Tracks.kind`

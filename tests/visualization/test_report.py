@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from support.hand_scenes import road_of, scene_of
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
@@ -476,7 +477,8 @@ def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
         {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "open_road_film_fraction": 0.0},
     ]
     road = jax.tree.map(jnp.asarray, trajectory.scene.weather)
-    laid = patch_layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=spots)
+    shapes = [schema.read(spot, patch_layouts.Shape) for spot in spots]
+    laid = patch_layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=shapes)
     hidden = replace(laid, present=jnp.zeros(3, bool))
     shown, none = (replace(trajectory.scene, weather=jax.device_get(replace(road, patches=p))) for p in (laid, hidden))
     assert [area.label for area in patch_overlay.areas(shown.weather)] == ["water", "ice", "gravel"] and not patch_overlay.areas(

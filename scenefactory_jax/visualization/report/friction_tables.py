@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from scenefactory_jax.core import markdown
-from scenefactory_jax.core.instantiate import check_range, instantiate
+from scenefactory_jax.core import markdown, schema
+from scenefactory_jax.core.instantiate import check_range
 from scenefactory_jax.visualization.report import plots
 from scenefactory_jax.weather import friction as model
 
@@ -39,7 +39,7 @@ def compute_tables(
         ConfigError: a range that is not ascending.
     """
     speeds, slip = (np.linspace(*check_range(span, where=name), POINTS) for name, span in (("speeds_mps", speeds_mps), ("slips", slips)))
-    tyre = instantiate({**friction["tyre"], "_target_": "Tyre"}, builtins=model, where="weather.friction.tyre")()
+    tyre = schema.read(friction["tyre"], model.Tyre, where="weather.friction.tyre")
     kinds, speed = {"static": friction["slip_static"], "dynamic": friction["slip_dynamic"]}, friction["reference_speed"]
     films, first = np.linspace(0.0, max_film_mm, POINTS), next(iter(friction["surfaces"]))
 
