@@ -334,7 +334,7 @@ async function start() {
   } catch (error) {
     document
       .querySelector("main")
-      .replaceChildren(element("p", { className: "numerical_error", textContent: `This replay cannot be read: ${error.message}` }));
+      .replaceChildren(element("p", { className: "error", textContent: `This replay cannot be read: ${error.message}` }));
     throw error;
   }
   requestAnimationFrame(tick);
