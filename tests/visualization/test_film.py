@@ -58,10 +58,10 @@ def test_prisms_enclose_area_times_height(shape):
 
 def test_a_road_has_asphalt_kerbs_and_paint():
     found = {surface.name: surface for surface in ground_meshes.find_surfaces(scene_of(np.zeros((1, 2)), np.ones((1, 2))))}
-    assert set(found) == {"asphalt", "kerb"}
+    assert set(found) == {"asphalt", "edge"}
     low, high = found["asphalt"].vertices.min(axis=0), found["asphalt"].vertices.max(axis=0)
     assert high[1] == pytest.approx(ground_meshes.LANE_M, abs=0.05) and low[0] == pytest.approx(-60 - ground_meshes.LANE_M, abs=0.1)
-    assert found["kerb"].vertices[:, 2].max() == pytest.approx(ground_meshes.LAYERS["kerb"].height_m)
+    assert found["edge"].vertices[:, 2].max() == pytest.approx(ground_meshes.LOOKS["edge"].height_m)
 
 
 def test_cars_stand_and_steer_as_they_are_put():

@@ -84,7 +84,7 @@ def number(page, selector: str) -> float:
 
 
 def selected(page) -> str:
-    return page.text_content("#who").split(" ")[1][0]
+    return page.text_content("#car-title").split(" ")[1][0]
 
 
 def colours(page) -> int:
@@ -302,5 +302,5 @@ def test_a_notebook_shows_it_inline(browser, recording):
     page.set_content(replay_page.show(recording, goal_radius_m=3.0).data)
     frame = page.frame_locator("iframe")
     frame.locator("#cars button").first.wait_for()
-    assert frame.locator("#who").text_content().startswith("Car 0") and not errors
+    assert frame.locator("#car-title").text_content().startswith("Car 0") and not errors
     page.close()

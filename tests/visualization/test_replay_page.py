@@ -65,8 +65,9 @@ def test_the_page_reads_what_there_is(page):
     scripts = "\n".join(path.read_text() for path in (ROOT / "scenefactory_jax" / "visualization" / "web" / "page").glob("*.js"))
     derived = {"array", "bySlot", "end", "road"}
     assert set(re.findall(r"\bworld\.(\w+)", scripts)) <= set(unpacked(page)[0]) | derived
-    corners = re.search(r"const corners = \{([^}]+)\}\[name\]", scripts).group(1)
-    assert set(re.findall(r"(\w+):", corners)) <= {field.name for field in dataclasses.fields(Events)}
+    glyphs = re.search(r"const GLYPHS = \{(.+?)\n\};", scripts, re.DOTALL).group(1)
+    named = set(re.findall(r"^  (\w+):", glyphs, re.MULTILINE)) | set(re.findall(r'name === "(\w+_\w+)"', scripts))
+    assert len(named) == 5 and named <= {field.name for field in dataclasses.fields(Events)}
 
 
 @pytest.mark.parametrize("values", [
