@@ -42,11 +42,7 @@ class RerunError(ValueError):
 
 
 def check() -> None:
-    """Checks that rerun is installed.
-
-    Raises:
-        RerunError: rerun is not installed.
-    """
+    """Raises RerunError if rerun is not installed."""
     if importlib.util.find_spec("rerun") is None:
         raise RerunError("writing .rrd needs rerun; `pip install scenefactory_jax[rerun]`, or choose out=NAME.html")
 
@@ -57,9 +53,6 @@ def write(path: Path | str, recording: Recording, *, names: Sequence[str], title
     Args:
         recording: of one or several worlds, see `env.rollout.record`.
         names: of the worlds.
-
-    Raises:
-        RerunError: rerun is not installed.
     """
     check()
     import rerun as rr  # an optional dependency  # pyright: ignore[reportMissingImports]

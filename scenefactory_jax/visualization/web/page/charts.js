@@ -148,7 +148,7 @@ function lineKeys(caption, { lines, scale, digits, missing }, car) {
     output.dataset.array = array;
     const swatch = label ? [element("i", { className: dashed ? "dashed" : "" }), label, " "] : [];
     const key = element("span", { className: "key" }, ...swatch, output);
-    key.style.setProperty("--own", colour);
+    key.style.setProperty("--colour", colour);
     caption.append(key);
     return output;
   });

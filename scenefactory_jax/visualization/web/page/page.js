@@ -32,7 +32,7 @@ function carButton({ slot }) {
   const button = element("button", { type: "button", textContent: String(slot) });
   button.setAttribute("aria-label", `Car ${slot}`);
   button.dataset.car = String(slot);
-  button.style.setProperty("--own", rgb(carColour(slot)));
+  button.style.setProperty("--colour", rgb(carColour(slot)));
   button.addEventListener("click", () => select(app.selected === slot ? null : slot));
   return button;
 }
