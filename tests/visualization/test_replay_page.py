@@ -108,8 +108,8 @@ def test_cars_events_and_traffic(page, recording):
     first, second = unpacked(page)
     events, active = recording.shots.events, recording.shots.active
     for index, world in enumerate((first, second)):
-        told = {(event["name"], event["step"], event["car"]) for event in world["events"]}
-        assert told == {(n, t, a) for n, where in vars(events).items() for t, a in np.argwhere(where[index] & active[index])}
+        shown = {(event["name"], event["step"], event["car"]) for event in world["events"]}
+        assert shown == {(n, t, a) for n, where in vars(events).items() for t, a in np.argwhere(where[index] & active[index])}
         for car in world["cars"]:
             driven = np.zeros(STEPS, bool)
             for begin, end in car["spans"]:
