@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
@@ -93,6 +93,12 @@ def record_episodes(settings: Mapping[str, Any], scene: Scene, policy: tuple[Act
     steps = max(round(min(seconds, settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
     act, parameters = policy
     return jax.device_get(record(environment.make_env(settings), act, parameters, scene, jax.random.key(seed), steps=steps))
+
+
+def find_shown_steps(active: Bool[np.ndarray, "T A"]) -> Int[np.ndarray, "T A"]:
+    """Step whose values are shown at each step: the last active one; before the first active step, that one."""
+    last = np.maximum.accumulate(np.where(active, np.arange(len(active))[:, None], 0), axis=0)
+    return np.maximum(last, np.argmax(active, axis=0))
 
 
 def cut_world(recording: Recording, index: int) -> tuple[Scene, Any, Bool[np.ndarray, "T A"], float]:

@@ -52,6 +52,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, stack
 from scenefactory_jax.data.packing import summary as summary_text
 from scenefactory_jax.roadgraph import lane_topology
+from scenefactory_jax.visualization import road_lines
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
@@ -680,7 +681,7 @@ def test_others_stand_in_the_model_and_can_be_hit(street):
 
 def test_merged_segments_stay_within_the_tolerance(street):
     scene = prepared(replace(street, roads=(*street.roads, curve(2, 20, 50))), require_agents=False).scene
-    single, merged = (list(world_mjcf.join_segments(scene.road, tolerance)) for tolerance in (None, 0.05))
+    single, merged = (list(road_lines.join_segments(scene.road, tolerance)) for tolerance in (None, 0.05))
     assert [len(points) for points, _ in single] == [81, 50, 81] and [kind for _, kind in merged] == [2, 2, 15]
     assert sum(len(points) - 1 for points, _ in merged) < 20
     for (fine, _), (coarse, _) in zip(single, merged, strict=True):
