@@ -24,7 +24,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional 
 from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.data.loading import raw_scenes
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.loading.scene_source import load_training_scenes as load_scenes
 from scenefactory_jax.env.environment import EnvParts, assemble
 from scenefactory_jax.env.environment import make_env as make
@@ -53,7 +53,7 @@ def read(path: Path | str) -> Iterator[RawScene | str]:
     Raises:
         SceneError: no such path.
     """
-    return raw_scenes.scenes(load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
+    return scene_source.read_scenes(load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
 
 
 def __getattr__(name: str) -> Any:

@@ -123,7 +123,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     folder.mkdir()
     written(folder, document(name="../escaped"), "a.json")
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
-    loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
+    loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=check", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
@@ -195,7 +195,7 @@ def test_an_unknown_config_is_named():
         ("train", "scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
         ("benchmark", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("view", "skip=first", "skip: expected an integer >= 0, got 'first'"),
-        ("scenes", "limit=few", "limit: expected an integer >= 0, got 'few'"),
+        ("scenes", "check.max_pictures=few", "check.max_pictures: expected an integer >= 0, got 'few'"),
         ("convert", "source=3", "source: expected a text or null, got 3"),
         ("evaluate", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("evaluate", "overrides=weather", "overrides: expected a list, each a text, got 'weather'"),

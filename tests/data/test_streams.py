@@ -169,8 +169,8 @@ def test_failing_draws_new_scenes_of_an_endless_source():
     np.testing.assert_array_equal(known.successes[:4], [0, 0, 0, 4])  # never more than lives
     drawn = samplers.prioritize_failures(known, 6, seed=0, floor=0.5)
     assert set(drawn[:2]) == {2, 3} and list(drawn[2:]) == [10, 11, 12, 13]  # only two were driven in: new ones fill up
-    with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: 0\.0; .* scenes could starve"):
-        samplers.prioritize_failures(known, 6, seed=0, floor=0.0)
+    with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: expected a number > 0 and <= 1, got 0"):
+        instantiate({"_target_": "prioritize_failures", "floor": 0.0}, builtins=samplers, where="stream.sampler", seed=0)
 
 
 def test_what_was_learnt_earlier_fades():
@@ -300,10 +300,10 @@ def test_room_for_more_changes_no_look_up():
     [
         (["stream.capacity.road=8"], r"stream\.capacity\.road: 8; all 4 scenes of the sample need more: 177 to 213"),
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
-        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected 1 or more"),
+        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected an integer or null, got True"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
         (["stream.swap_fraction=1.5"], r"stream\.swap_fraction: expected a number >= 0 and <= 1, got 1\.5"),
-        (["stream.prefetch=0"], r"stream\.prefetch: expected a number >= 1, got 0"),
+        (["stream.prefetch=0"], r"stream\.prefetch: expected an integer >= 1, got 0"),
         (["stream.on_overflow=drop"], r"stream\.on_overflow: expected cut or skip, got 'drop'"),
         (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*; valid: .*prioritize_failures, .*shuffled"),
         (["+stream.speed=2"], r"stream\.speed: unknown key"),

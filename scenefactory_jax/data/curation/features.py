@@ -190,7 +190,7 @@ def _map(roads: Sequence[Polyline]) -> dict[str, Any]:
 
 def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> dict[str, float]:
     """How much driving lanes bend, from chord to chord; a lane's ends, where there is none before or after, count as the rest of it."""
-    samples = geographic_split.sample_along(lanes, spacing_m=chord_m, least=4)
+    samples = geographic_split.sample_along(lanes, spacing_m=chord_m, min_points=4)
     way = samples.xyz[1:, :2] - samples.xyz[:-1, :2]
     heading = np.arctan2(way[:, 1], way[:, 0])
     turn = np.abs(wrap_angles(heading[1:] - heading[:-1]))

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
-from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import COMPANION, RawScene, Reject, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
@@ -161,6 +161,33 @@ def make_packing(config: Mapping[str, Any]) -> dict[str, Any]:
         "check": instantiate(config["check"], builtins="scenefactory_jax.data.packing.validation", where="scenes.check"),
         "pack": instantiate(config["pack"], builtins="scenefactory_jax.data.packing.pack", where="scenes.pack"),
     }
+
+
+def read_scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[RawScene | str]:
+    """Reads the scenes of a `scenes` config, and in place of one that cannot be read the reason.
+
+    Args:
+        limit: most scenes and reasons; None: all, of a generator `count`.
+
+    Raises:
+        ConfigError: neither a path nor a generator.
+        SceneError: no such path, or a bank that is damaged.
+    """
+    source = open_source(config)
+    found = (one for one in source.read() if not (isinstance(one, Reject) and one.kind == COMPANION))
+    limit = config["count"] if limit is None and source.count is None else limit
+    for one in itertools.islice(found, limit):
+        yield ": ".join(filter(None, (one.source, one.scene, one.reason))) if isinstance(one, Reject) else one
+
+
+def read_checked_scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[RawScene | str]:
+    """As `read_scenes`, repaired by the config's check; in place of a scene that it refuses the reason."""
+    check = make_packing(config)["check"]
+    for raw in read_scenes(config, limit=limit):
+        try:
+            yield raw if isinstance(raw, str) else check(raw)[0]
+        except SceneError as error:
+            yield str(error)
 
 
 # ---- packing
