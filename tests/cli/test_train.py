@@ -453,7 +453,7 @@ def test_compiled_programs_are_kept_where_the_environment_says(monkeypatch, tmp_
 def test_scenes_lists_and_draws(tmp_path, capsys):
     loaded = scenes(hydra_config.load_config("scenes", "op=check", "scenes.count=3", "check.max_pictures=2", f"out={tmp_path}"))
     printed = capsys.readouterr().out
-    assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "3 generated scenes" in printed
+    assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "generated scenes of seed 0" in printed
     assert sorted(path.stem for path in tmp_path.glob("*.png")) == sorted([*loaded.names[:2], "sheet"])
     with pytest.raises(ConfigError, match="op: 'draw'; valid: check, quality"):
         scenes(hydra_config.load_config("scenes", "op=draw"))
