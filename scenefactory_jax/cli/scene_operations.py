@@ -15,9 +15,10 @@ from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.data.bank import bank_reader as banks
+from scenefactory_jax.data.bank import catalogue
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import operations
-from scenefactory_jax.data.curation.features import COLUMNS, EVERY_BANK
+from scenefactory_jax.data.curation.features import COLUMNS
 from scenefactory_jax.data.export import gpudrive, scenarionet
 from scenefactory_jax.data.loading import scene_source
 
@@ -46,7 +47,7 @@ def info(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _format_numbers(summary: Mapping[str, Any]) -> str:
-    meaning = {**EVERY_BANK, **COLUMNS}
+    meaning = {**{name: text for name, (_, text) in catalogue.COLUMNS.items()}, **COLUMNS}
     rows = []
     for name, numbers in summary["numbers"].items():
         cells = [f"{numbers[key]:.5g}" if key in numbers else "" for key in ("min", "median", "mean", "max", "sum")]

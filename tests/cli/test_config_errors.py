@@ -90,7 +90,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
     message = refused("train", "scenes=womd", f"scenes.path={path}", f"out={tmp_path / 'run'}")
     assert f"scenes.path={path}: no usable scene" in message and "1 too_short" in message and not (tmp_path / "run").exists()
     assert "scenes.path: null; give a bank, a scene file or a folder" in refused("train", "experiment=smoke", "scenes=womd")
-    with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: 7 is the training seed"):
+    with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: expected another seed than scenes.seed, got 7"):
         scene_source.load_heldout_scenes(hydra_config.load_config("train", "scenes.seed=7", "scenes.heldout.seed=7")["scenes"], path=None)
 
 

@@ -15,13 +15,6 @@ from jaxtyping import Float
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
 
-Point = tuple[float, float, float]
-
-
-def describe_point(place: Float[np.ndarray, "3"]) -> Point:
-    """A point as three floats."""
-    return float(place[0]), float(place[1]), float(place[2])
-
 
 class Finding(NamedTuple):
     """One defect: place, measured value and limit."""
@@ -29,7 +22,7 @@ class Finding(NamedTuple):
     message: str
     value: float  # in the unit of the limit
     limit: float
-    xyz: Point | None = None  # the place in the source's coordinates; None: of the whole scene
+    xyz: tuple[float, ...] | Float[np.ndarray, "3"] | None = None  # in the source's coordinates; None: the whole scene
     step: int | None = None
     objects: tuple[int, ...] = ()  # ids of tracks
     roads: tuple[int, ...] = ()  # ids of polylines
@@ -72,7 +65,11 @@ def make(config: Mapping[str, Any]) -> QualityRules:
 
 def find_defects(raw: RawScene, quality: QualityRules) -> Verdict:
     """The findings of all rules on a checked scene."""
-    findings = tuple(finding._replace(rule=name) for name, rule in quality.rules.items() for finding in rule(raw))
+    findings = tuple(
+        finding._replace(rule=name, xyz=None if finding.xyz is None else tuple(map(float, finding.xyz)))
+        for name, rule in quality.rules.items()
+        for finding in rule(raw)
+    )
     dropped = dict.fromkeys(identity for finding in findings if finding.rule in quality.drop for identity in finding.objects)
     return Verdict(findings, tuple(finding for finding in findings if finding.rule in quality.reject), tuple(dropped))
 
