@@ -255,7 +255,7 @@ def test_held_out_scenes_are_refused_before_anything_is_read(tmp_path):
     for overrides, message in {
         ("scenes.heldout.path=/nowhere",): r"scenes\.heldout\.path: /nowhere: no such file or folder",
         ("scenes.seed=7", "scenes.heldout.seed=7"): r"scenes\.heldout\.seed: expected another seed than scenes.seed, got 7",
-        ("scenes=womd", f"scenes.path={place}", f"scenes.heldout.path={place}/."): r"scenes\.heldout\.path: expected other scenes than scenes\.path",
+        ("scenes=womd", f"scenes.path={place}", f"scenes.heldout.path={place}/."): "expected other scenes than scenes.path",
     }.items():
         with pytest.raises(ConfigError, match=message):
             train(smoke(tmp_path / "run", *overrides))

@@ -180,7 +180,8 @@ def options(**changes):
     return {"tools": tools, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None} | changes
 
 
-@pytest.mark.parametrize("number", [1, 2, 5])  # before the first catalogue, the first index, and the second one take their places
+# before the first catalogue, the first index, and the second index take their places
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2, 5])
 def test_a_bank_whose_writing_was_killed_becomes_the_undisturbed_one(tmp_path, number):
     folder, out = tmp_path / "in", tmp_path / "bank"
     folder.mkdir()
