@@ -88,31 +88,19 @@ def split(config: Mapping[str, Any]) -> dict[str, Bank]:
     return {name: _save(part, Path(config["out"]) / name, config, account | {"op": "split", "part": name}) for name, part in parts.items()}
 
 
-EXPORTS: dict[str, Callable[[Iterable[RawScene], Path, list[str]], int]] = {
-    "gpudrive": gpudrive.write_all,
-    "scenarionet": scenarionet.write_all,
-}
-
-
 def export(config: Mapping[str, Any]) -> int:
     """Writes the bank's scenes, repaired by the checks, to the folder `out` in another simulator's format; returns their number.
 
     A scene that cannot be written is listed, and the rest goes on.
-
-    Raises:
-        ConfigError: no folder, or an unknown format.
-        SceneError: a damaged file of the bank, or a folder that cannot be written to.
     """
-    name = config["export"]["format"]
-    if name not in EXPORTS:
-        raise ConfigError(f"export.format: {name!r}; valid: {', '.join(EXPORTS)}")
-    out = require_out(config, "the files")
+    name, out = config["export"]["format"], require_out(config, "the files")
+    write_all = {"gpudrive": gpudrive, "scenarionet": scenarionet}[name].write_all
     bank, check = _open(_get_path(config)), scene_source.make_packing(config["scenes"])["check"]
     refused: list[str] = []
     repairs: Counter[str] = Counter()
     with Progress(disable=not config["progress"], transient=True) as bar:
         raws = bar.track(banks.read_raws(bank, range(len(bank))), total=len(bank), description="export")
-        written = EXPORTS[name](_repair(raws, check, refused, repairs), out, refused)
+        written = write_all(_repair(raws, check, refused, repairs), out, refused)
     lines = _shorten([f"not written: {reason}" for reason in refused[:SHOWN]], len(refused))
     lines += [f"in {number} scenes: {repair}" for repair, number in repairs.items()]
     lines.append(f"{out}: {written} of {len(bank)} scenes in the format of {name}")

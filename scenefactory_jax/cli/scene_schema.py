@@ -130,7 +130,7 @@ class CompareScenes:
 class ExportScenes:
     """`scenes op=export`."""
 
-    format: str
+    format: Literal["gpudrive", "scenarionet"]
 
 
 @dataclass(frozen=True)

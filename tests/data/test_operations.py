@@ -412,7 +412,7 @@ def test_banks_are_judged_and_compared(town, tmp_path):
     [
         (["op=compare", "out=x"], "compare.others: expected paths, or options of `scenes`: streets, town, womd; got"),
         (["op=quality"], "out: expected a folder for the report, got null"),
-        (["op=export", "export.format=bvh", "out=x"], "export.format: 'bvh'; valid: gpudrive, scenarionet"),
+        (["op=export", "export.format=bvh", "out=x"], "export.format: expected gpudrive or scenarionet, got 'bvh'"),
         (["op=export"], "out: expected a folder for the files, got null"),
         (["op=polish"], "op: 'polish'; valid: check, quality, compare, simulate, info, select, split, export$"),
         (["op=select", "select.filter='cars > 3'"], "select.filter: unknown column 'cars'"),
