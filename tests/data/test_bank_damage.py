@@ -136,7 +136,7 @@ def test_a_damaged_index_is_refused(tmp_path, scenes):
         told = bank_reader.is_bank(path)
         assert outcome(path, wanted, file) == "refused" and told, bytes(changed)
         with pytest.raises(SceneError, match=r"bank\.json: damaged"):
-            bank_writer.check_free_space(path)  # it may be a bank of which something can be saved: nothing takes its place
+            bank_writer.check_target(path)  # it may be a bank of which something can be saved: nothing takes its place
     for place in (0, 1, len(content) // 2, len(content) - 3):
         put(file, content[:place])
         assert outcome(path, wanted, file) == "refused"
