@@ -230,10 +230,10 @@ def _task(override: str) -> dict[str, Any]:
 
 def quote_override(override: str) -> str:
     """Quotes an override for Hydra's grammar: the entries of `overrides=[dynamics=bicycle,weather=wet]` and the condition of
-    `filter=vehicles >= 8`, which contain `=`."""
-    if condition := re.fullmatch(r"filter=(?!null$)([^'\"].*)", override, re.DOTALL):
+    `select.filter=vehicles >= 8`, which contain `=`."""
+    if condition := re.fullmatch(r"select\.filter=(?!null$)([^'\"].*)", override, re.DOTALL):
         escaped = condition.group(1).replace("'", "\\'")
-        return f"filter='{escaped}'"
+        return f"select.filter='{escaped}'"
     match = re.fullmatch(rf"({'|'.join(LISTS)})=\[([^\[\]{{}}()'\"\\]+)\]", override)
     if not match:
         return override

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.data.loading import raw_scenes
+from scenefactory_jax.data.loading import scene_source
 
 
 def read(path: Path | str) -> Iterator[RawScene | str]:
@@ -20,4 +20,4 @@ def read(path: Path | str) -> Iterator[RawScene | str]:
     Raises:
         SceneError: no such path.
     """
-    return raw_scenes.scenes(load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
+    return scene_source.read_scenes(load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})

@@ -47,7 +47,8 @@ class Bounds:
 
     def admit(self, numbers: list[Any]) -> bool:
         """Whether all numbers are finite and inside the bounds and, of a range, in ascending order."""
-        return not (self.is_range and (len(numbers) < 2 or numbers[0] > numbers[1])) and all(math.isfinite(number) and number in self for number in numbers)
+        ascending = not self.is_range or (len(numbers) == 2 and numbers[0] <= numbers[1])
+        return ascending and all(math.isfinite(number) and number in self for number in numbers)
 
     def __str__(self) -> str:
         signs = {">=": self.min, ">": self.above, "<=": self.max, "<": self.below}

@@ -61,7 +61,8 @@ def map_over_devices(run: Callable, trees: Sequence[Any], in_specs: Sequence[Spe
     """
     if mesh is None:
         return run(*trees)
-    parts = [_describe(tree, specs(tree), lambda rows: rows // mesh.size) for tree, specs in zip(trees, in_specs, strict=True)]
+    devices = mesh.size
+    parts = [_describe(tree, specs(tree), lambda rows: rows // devices) for tree, specs in zip(trees, in_specs, strict=True)]
     full = [jax.tree.map(lambda leaf: leaf if leaf.size else None, tree) for tree in trees]
     results = []
 

@@ -63,7 +63,7 @@ def convert(
     """
     root, out = Path(path).absolute(), Path(out).resolve()
     files = reader_selection.find(root)
-    bank_writer.check_free_space(out)
+    bank_writer.check_target(out)
     work = functools.partial(convert_file, root=root, out=out, tools=tools)
 
     def results(waiting: Sequence[Path]) -> Iterator[SourceFileResult]:

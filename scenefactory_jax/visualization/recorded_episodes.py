@@ -12,7 +12,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.loading import raw_scenes, scene_source
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.env import environment
@@ -46,7 +46,7 @@ def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> ShownS
     parts = scene_source.make_packing(config)
     packed: list[tuple[Packed, RoadPosts]] = []
     reasons: list[str] = []
-    for raw in raw_scenes.scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
+    for raw in scene_source.read_scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
         if isinstance(raw, str):
             reasons.append(raw)
             continue

@@ -90,18 +90,18 @@ def test_nothing_to_train_on_says_why(tmp_path):
     message = refused("train", "scenes=womd", f"scenes.path={path}", f"out={tmp_path / 'run'}")
     assert f"scenes.path={path}: no usable scene" in message and "1 too_short" in message and not (tmp_path / "run").exists()
     assert "scenes.path: null; give a bank, a scene file or a folder" in refused("train", "experiment=smoke", "scenes=womd")
-    with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: 7 is the training seed"):
+    with pytest.raises(ConfigError, match=r"scenes\.heldout\.seed: expected another seed than scenes.seed, got 7"):
         scene_source.load_heldout_scenes(hydra_config.load_config("train", "scenes.seed=7", "scenes.heldout.seed=7")["scenes"], path=None)
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("quality.reject=[level]", "quality.reject: 'level' is no rule; valid: missing_map, "),
+        ("quality.reject=[level]", "quality.reject: expected names of rules, got 'level'; valid: missing_map, "),
         ("lanes.topology.neighbour_distance_m=[5.0,2.0]", "lanes.topology.neighbour_distance_m: expected [min, max], got [5.0, 2.0]"),
         ("features.streets.one_in=0", "features.streets.one_in: expected a number > 0, got 0"),
         ("spread.timeout_s=0.0", "spread.timeout_s: expected a number > 0, got 0"),
-        ("scenes.workers=0", "spread.workers: expected a number >= 1, got 0"),
+        ("scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
     ],
 )
 def test_a_mistake_in_the_config_is_no_reject_of_every_file(tmp_path, override, message):
@@ -123,7 +123,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     folder.mkdir()
     written(folder, document(name="../escaped"), "a.json")
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
-    loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=sheet", f"out={tmp_path / 'out'}"))
+    loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=check", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
@@ -195,7 +195,7 @@ def test_an_unknown_config_is_named():
         ("train", "scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
         ("benchmark", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("view", "skip=first", "skip: expected an integer >= 0, got 'first'"),
-        ("scenes", "limit=few", "limit: expected an integer >= 0, got 'few'"),
+        ("scenes", "check.max_pictures=few", "check.max_pictures: expected an integer >= 0, got 'few'"),
         ("convert", "source=3", "source: expected a text or null, got 3"),
         ("evaluate", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("evaluate", "overrides=weather", "overrides: expected a list, each a text, got 'weather'"),

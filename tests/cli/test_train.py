@@ -254,8 +254,8 @@ def test_held_out_scenes_are_refused_before_anything_is_read(tmp_path):
     place.mkdir()
     for overrides, message in {
         ("scenes.heldout.path=/nowhere",): r"scenes\.heldout\.path: /nowhere: no such file or folder",
-        ("scenes.seed=7", "scenes.heldout.seed=7"): r"scenes\.heldout\.seed: 7 is the training seed",
-        ("scenes=womd", f"scenes.path={place}", f"scenes.heldout.path={place}/."): r"is what is trained on",
+        ("scenes.seed=7", "scenes.heldout.seed=7"): r"scenes\.heldout\.seed: expected another seed than scenes.seed, got 7",
+        ("scenes=womd", f"scenes.path={place}", f"scenes.heldout.path={place}/."): "expected other scenes than scenes.path",
     }.items():
         with pytest.raises(ConfigError, match=message):
             train(smoke(tmp_path / "run", *overrides))
@@ -451,11 +451,11 @@ def test_compiled_programs_are_kept_where_the_environment_says(monkeypatch, tmp_
 
 
 def test_scenes_lists_and_draws(tmp_path, capsys):
-    loaded = scenes(hydra_config.load_config("scenes", "op=sheet", "scenes.count=3", "limit=2", f"out={tmp_path}"))
+    loaded = scenes(hydra_config.load_config("scenes", "op=check", "scenes.count=3", "check.max_pictures=2", f"out={tmp_path}"))
     printed = capsys.readouterr().out
-    assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "3 generated scenes" in printed
+    assert len(loaded) == 3 and all(name in printed for name in loaded.names) and "generated scenes of seed 0" in printed
     assert sorted(path.stem for path in tmp_path.glob("*.png")) == sorted([*loaded.names[:2], "sheet"])
-    with pytest.raises(ConfigError, match="op: 'draw'; valid: check, sheet"):
+    with pytest.raises(ConfigError, match="op: 'draw'; valid: check, quality"):
         scenes(hydra_config.load_config("scenes", "op=draw"))
 
 

@@ -377,7 +377,7 @@ def test_a_folder_that_cannot_be_listed_is_named_and_read_later(tmp_path, monkey
     assert conversion.convert(folder, out, **options()).scenes == 2 and bank_reader.open(out).names == ("a", "b")
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_happens_to_a_reader_costs_its_file_alone(tmp_path, workers):
     folder = streets(tmp_path / "in", "a", "b_killed", "c_two", "d_endless", "e_map", "f_broken", "g")
     spread = functools.partial(spreads.local, workers=workers, timeout_s=2.0)
@@ -476,7 +476,7 @@ def test_a_file_that_gave_nothing_is_read_again(tmp_path):
     assert conversion.convert(folder, out, **options(formats={"whole": reader})) == again and len(read) == 2
 
 
-def test_a_mistake_in_the_config_is_no_file_s_fault(tmp_path):
+def test_a_mistake_in_the_config_is_an_error_of_no_file(tmp_path):
     folder = streets(tmp_path / "in", "a", "b", "c")
     wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"neighbour_distance_m": [5.0, 2.0]})
     for workers in (1, 2):

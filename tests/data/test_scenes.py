@@ -32,7 +32,7 @@ from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import EDGES, POLYGONS
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading import raw_scenes
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, pack
 
 
@@ -79,7 +79,7 @@ def test_anything_is_read_from_python(tmp_path):
 def test_a_reader_that_breaks_costs_its_file_alone(tmp_path):
     for name in ("a", "b_broken", "c_two", "d_map", "e"):
         written(tmp_path, document(name=name), f"{name}.json")
-    found = list(raw_scenes.scenes({"path": str(tmp_path), "formats": {"eventful": {"_target_": "support.eventful.read"}}}))
+    found = list(scene_source.read_scenes({"path": str(tmp_path), "formats": {"eventful": {"_target_": "support.eventful.read"}}}))
     assert [one if isinstance(one, str) else one.name for one in found] == [
         "a", f"{tmp_path / 'b_broken.json'}: KeyError: 'x'", "c_two",
         f"{tmp_path / 'c_two.json'}: second: record 2 at byte 77: its checksum is wrong", "c_two", "e",

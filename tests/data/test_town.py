@@ -346,7 +346,7 @@ def test_realism_separates_different_sets(scenes):
     assert distribution_distance.mean_distance(same) == 0.0 and all(one is None or one.wasserstein == 0.0 for one in same.values())
     slow = half | {"speed_mps": half["speed_mps"] + 100.0}
     apart = distribution_distance.compare(half, slow)["speed_mps"]
-    assert apart is not None and apart.ks == 1.0 and apart.medians[1] - apart.medians[0] == pytest.approx(100.0)
+    assert apart is not None and apart.ks == 1.0
     assert distribution_distance.mean_distance(distribution_distance.compare(half, other)) < 0.35
     assert distribution_distance.compare(half, other | {"lights": np.zeros(3)})["lights"] is None
 

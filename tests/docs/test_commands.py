@@ -24,7 +24,7 @@ SHORTER = {  # words of the pages, and what stands for them here
     "common=[minutes=2]": "common=[iterations=1]",
     "until_s=540": "until_s=5400",
     "out=train.bank": "out=again.bank",  # that one is there already
-    "filter=moving_vehicles >= 8 and intersections > 0": "filter=moving_vehicles >= 2",
+    "select.filter=moving_vehicles >= 8 and intersections > 0": "select.filter=moving_vehicles >= 2",
 }
 SMALL = {
     "train": ["progress=false", "iterations=1", "evaluation.video.enable=false", "evaluation.untrained=false"],
@@ -38,7 +38,7 @@ SMALL = {
         "sysid.every=40",
         "sysid.refine.rounds=1",
     ],
-    "scenes": ["progress=false", "limit=2"],
+    "scenes": ["progress=false", "check.max_pictures=2"],
     "convert": ["progress=false"],
 }
 
