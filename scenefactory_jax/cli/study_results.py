@@ -16,7 +16,7 @@ from scenefactory_jax.evaluation.records import read_records, write_records
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import study_report
 
-RESULT, TRAINED = "result.json", "trained.json"
+RESULT = "result.json"
 CURVES = ("events/goal_reached", "events/collision", "events/road_edge_contact", "reward")
 POINTS = 120  # of a learning curve
 DIGITS = 5
@@ -104,12 +104,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
         and protocol; differences; trainings: variant -> durations, versions and curves.
     """
     study, settings = config["study"], config["evaluation"]
-    missing = [f"training {one.variant}, seed {one.seed}" for one in plan.trainings if not (one.folder / TRAINED).is_file()]
-    missing += [
-        f"evaluation {one.row}, {one.condition}, {one.protocol}, seed {one.training.seed}"
-        for one in plan.evaluations
-        if one.training.seed not in records[one.row, one.condition, one.protocol]
-    ]
+    missing = [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()]
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
     return {
         "study": dict(study),
@@ -158,7 +153,7 @@ def _differences(pairs: Iterable[list[str]], records: RowRecords, resampling: Ma
 def _describe_trainings(variant: str, plan: Plan, target: float) -> dict[str, Any]:
     """Durations and curves of a variant's seeds."""
     trainings = [one for one in plan.trainings if one.variant == variant]
-    notes = {one.seed: result_file.read(one.folder / TRAINED) for one in trainings if (one.folder / TRAINED).is_file()}
+    notes = {one.seed: result_file.read(one.file) for one in trainings if one.file.is_file()}
     metrics = {one.seed: metrics_csv.read(one.folder) for one in trainings if one.seed in notes}
     return {
         "overrides": [override for override in trainings[0].overrides if "path=" not in override],  # without paths of this machine

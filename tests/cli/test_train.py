@@ -23,7 +23,7 @@ from scenefactory_jax import __main__ as command_line
 from scenefactory_jax.cli import hydra_config, schema
 from scenefactory_jax.cli.convert import convert
 from scenefactory_jax.cli.evaluate import evaluate, format_rerun_command
-from scenefactory_jax.cli.export import export, named
+from scenefactory_jax.cli.export import export, format_name
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.cli.view import replay
@@ -356,9 +356,9 @@ def test_scores_and_titles_name_other_scenes(whole, tmp_path):
     asked = {"run": "mine", "scenes": "/data/towns.bank", "overrides": ["dynamics=bicycle"], "protocol": "recorded", "trust": True}
     asked["protocols"] = ["goal_only", "strict"]
     begin_folder(tmp_path, asked)
-    assert named("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
-    assert named("unseen", whole.folder) == "unseen"
-    assert evaluation_files.title("mine", asked) == "mine: evaluation on towns.bank"
+    assert format_name("unseen", tmp_path) == "unseen (towns.bank, protocol=recorded, dynamics=bicycle)"
+    assert format_name("unseen", whole.folder) == "unseen"
+    assert evaluation_files.format_title("mine", asked) == "mine: evaluation on towns.bank"
     assert format_rerun_command(asked, hydra_config.load_config("evaluate", "run=mine", "protocol=recorded", "seed=7")) == (
         "python -m scenefactory_jax evaluate run=mine protocol=recorded trust=true scenes.path=/data/towns.bank"
         " 'overrides=[\"dynamics=bicycle\"]' seed=7"
