@@ -80,7 +80,7 @@ def make_training_callback(
         return None
     if evaluators is None:
         scenes = scene_source.load_heldout_scenes(config["scenes"], path=None)
-        tasks = {name: {**config, "termination": one} for name, one in load_terminations(settings["protocols"]).items()}
+        tasks = {name: {**config, "termination": entry} for name, entry in load_terminations(settings["protocols"]).items()}
         evaluators = {name: protocols.make_evaluator(task, scenes, settings={**settings, "repeats": 1}) for name, task in tasks.items()}
     evaluate = protocols.make_training_callback(folder, resume_at, evaluators=evaluators, settings=settings)
 

@@ -1,4 +1,4 @@
-"""`export`: writes the policy of a run as a small folder to hand on, with a card."""
+"""`export`: writes the policy of a run as a small folder, with a card."""
 
 import shutil
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ def export(config: Mapping[str, Any]) -> Path:
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
     scenes = trained.config["scenes"]
-    scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # paths of this machine are not handed on
+    scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # without paths of this machine
     exported = {**trained.config, "out": None, "resume": False, "scenes": scenes}
     configs.write(out, exported)
     shutil.copy(trained.folder / "versions.yaml", out)

@@ -158,7 +158,7 @@ def _run(part: str, plan: Plan, session: Session) -> bool:
     if part == "train":
         trainings = [training for training in plan.trainings if only is None or training.variant in only]
         return _run_tasks(trainings, functools.partial(_make_trainer, plan, session), session)
-    evaluations = [one for one in plan.evaluations if (only is None or one.training.variant in only) and _is_ready(one)]
+    evaluations = [task for task in plan.evaluations if (only is None or task.training.variant in only) and _is_ready(task)]
     return _run_tasks(evaluations, functools.partial(_make_evaluation, session), session)
 
 
@@ -201,7 +201,7 @@ def _make_trainer(plan: Plan, session: Session, first: Training) -> Callable[[Tr
                 evaluators[evaluation.program] = session.make_evaluator(evaluation, "curve points")
         scenes = session.training_scenes(training.config) if training.config["stream"] is None else None
         try:
-            note = _train(training, prepared._replace(scenes=scenes), {one.protocol: evaluators[one.program] for one in watched})
+            note = _train(training, prepared._replace(scenes=scenes), {task.protocol: evaluators[task.program] for task in watched})
         except folder_lock.Busy:
             print(f"{training.label}: left to the command that trains in {training.folder}", flush=True)
             return

@@ -89,8 +89,8 @@ def make(config: Mapping[str, Any]) -> Plan:
 
 def evaluations_while_training(plan: Plan, training: Training) -> list[Evaluation]:
     """Returns the evaluations that a training repeats while it runs: those under its first condition, in every protocol."""
-    evaluations = [one for one in plan.evaluations if one.row == training.variant and one.training.seed == training.seed]
-    return [one for one in evaluations if one.condition == evaluations[0].condition]
+    evaluations = [task for task in plan.evaluations if task.row == training.variant and task.training.seed == training.seed]
+    return [task for task in evaluations if task.condition == evaluations[0].condition]
 
 
 def digest_scenes(config: Mapping[str, Any], path: str | None) -> str:
@@ -123,8 +123,8 @@ def check(config: Mapping[str, Any]) -> None:
         raise ConfigError("study: expected one or more trainings and conditions, got none")
     names = {"only": (config["only"], variants), "study.evaluated": (study["evaluated"], variants)}
     names |= {f"study.evaluated.{name}": (chosen, conditions) for name, chosen in (study["evaluated"] or {}).items()}
-    names |= {f"study.baselines.{name}.of": ([one["of"]], variants) for name, one in baselines.items()}
-    names |= {f"study.baselines.{name}.conditions": (one["conditions"], conditions) for name, one in baselines.items()}
+    names |= {f"study.baselines.{name}.of": ([entry["of"]], variants) for name, entry in baselines.items()}
+    names |= {f"study.baselines.{name}.conditions": (entry["conditions"], conditions) for name, entry in baselines.items()}
     names |= {f"study.compare.{index}": (pair, [*variants, *baselines]) for index, pair in enumerate(study["compare"])}
     names["study.trend.values"] = ((study["trend"] or {"values": {}})["values"], variants)
     for where, (chosen, valid) in names.items():

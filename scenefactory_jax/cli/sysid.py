@@ -31,10 +31,10 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     schema.check(config, schema.Sysid)
     scene_source.use_compilation_cache()
     out, targets = Path(config["out"]), config["sysid"]["targets"]
-    found = identification.identify(config, out)
-    result = {"command": configs.format_command("sysid"), "versions": configs.versions(), **found}
+    fit = identification.identify(config, out)
+    result = {"command": configs.format_command("sysid"), "versions": configs.versions(), **fit}
     result_file.write(out / "result.json", result, digits=DIGITS)
-    values = dict(zip(found["space"]["names"], found["refined"].best.tolist(), strict=True))
+    values = dict(zip(fit["space"]["names"], fit["refined"].best.tolist(), strict=True))
     fitted = {
         "car": {name: value for name, value in values.items() if name not in FRICTION},
         "friction": {name: values[name] for name in FRICTION if name in values},

@@ -117,9 +117,9 @@ def fit_view(points: Num[np.ndarray, "n 2"], *, margin: float, smallest: float) 
 
 def shown_points(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
     """Points that a picture of the trajectory contains: positions of active agents, and their goals."""
-    shown = trajectory.active & trajectory.present
+    active = trajectory.active & trajectory.present
     goals = np.broadcast_to(trajectory.goal, trajectory.position.shape)
-    points = np.concatenate([trajectory.position[shown], goals[shown]])
+    points = np.concatenate([trajectory.position[active], goals[active]])
     return points if len(points) else np.zeros((1, 2), np.float32)
 
 

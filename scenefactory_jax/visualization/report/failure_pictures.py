@@ -29,12 +29,12 @@ def draw(
         return Case(failure, trajectory(failure.world), partner)
 
     paths = {}
-    for kind, found in ranked.items():
-        cases = [case(failure) for failure in failures.find_worst_failures(found, numbers["panels"])]
+    for kind, worst in ranked.items():
+        cases = [case(failure) for failure in failures.find_worst_failures(worst, numbers["panels"])]
         figure = failures_figure(cases, before_s=numbers["before_s"])
         paths[kind] = plots.save(figure, out / f"failures-{stem}-{kind}.png", dpi=120)
     if numbers["video"] and ranked:
-        films = [_clip(found[0], trajectory(found[0].world), before_s=numbers["before_s"]) for found in ranked.values()]
+        films = [_clip(worst[0], trajectory(worst[0].world), before_s=numbers["before_s"]) for worst in ranked.values()]
         path = out / f"failures-{stem}{settings['video']['suffix']}"
         paths["film"] = video.write(path, films, **{key: settings["video"][key] for key in video.SETTINGS})
     return paths

@@ -60,10 +60,10 @@ def compute_tables(
     }
 
 
-def write(folder: Path, found: Mapping[str, Any]) -> Path:
+def write(folder: Path, tables: Mapping[str, Any]) -> Path:
     """Writes `folder`/weather.md and its figure; returns the path of the text."""
-    picture = plots.save(figure(found), folder / "weather.png")
-    reference = found["reference"]
+    picture = plots.save(figure(tables), folder / "weather.png")
+    reference = tables["reference"]
     text = (
         f"Friction coefficient of a tyre at {reference['speed_mps']:g} m/s, before a contact's own floor: at slip "
         f"{reference['slips']['static']:g} (static, the default of `weather.friction.mode`) and, in brackets, "
@@ -76,47 +76,47 @@ def write(folder: Path, found: Mapping[str, Any]) -> Path:
     )
     return document.write(
         folder / "weather.md",
-        "# Friction on wet roads", f"`{found['command']}`", text, table(found),
-        document.section("Beside the published table", compare_with_published(found)),
+        "# Friction on wet roads", f"`{tables['command']}`", text, table(tables),
+        document.section("Beside the published table", compare_with_published(tables)),
         document.section("Over film, speed and slip", f"![Friction over film, speed and slip]({picture.name})", cliff),
     )  # fmt: skip
 
 
-def table(found: Mapping[str, Any]) -> str:
+def table(tables: Mapping[str, Any]) -> str:
     """Formats static and dynamic friction of every surface by film."""
     rows = [
         [name, *(f"{static:.3f} ({dynamic:.3f})" for static, dynamic in zip(row["static"], row["dynamic"], strict=True))]
-        for name, row in found["table"].items()
+        for name, row in tables["table"].items()
     ]
-    return markdown.format_table(["Surface", *(f"{film:g}" for film in found["reference"]["films_mm"])], rows)
+    return markdown.format_table(["Surface", *(f"{film:g}" for film in tables["reference"]["films_mm"])], rows)
 
 
-def compare_with_published(found: Mapping[str, Any]) -> str:
+def compare_with_published(tables: Mapping[str, Any]) -> str:
     """Formats static friction beside Table 5 of the paper, for surfaces and films in both; empty if there are none."""
-    films = [(i, film) for i, film in enumerate(found["reference"]["films_mm"]) if all(film in row for row in PUBLISHED.values())]
+    films = [(i, film) for i, film in enumerate(tables["reference"]["films_mm"]) if all(film in row for row in PUBLISHED.values())]
     rows = [
-        [name, *(f"{found['table'][name]['static'][i]:.3f} / {row[film]:.3f}" for i, film in films)]
-        for name, row in PUBLISHED.items() if name in found["table"]
+        [name, *(f"{tables['table'][name]['static'][i]:.3f} / {row[film]:.3f}" for i, film in films)]
+        for name, row in PUBLISHED.items() if name in tables["table"]
     ]  # fmt: skip
     return markdown.format_table(["Here / published", *(f"{film:g}" for _, film in films)], rows) if rows and films else ""
 
 
 @matplotlib.rc_context(plots.STYLE)
-def figure(found: Mapping[str, Any]) -> Figure:
+def figure(tables: Mapping[str, Any]) -> Figure:
     """Draws friction over the film for every surface, and over speed and slip for the first surface and every film of the table."""
-    reference, over_film = found["reference"], found["over_film"]
+    reference, over_film = tables["reference"], tables["over_film"]
     drawn = Figure(figsize=(12.0, 3.6), layout="constrained")
     film, speed, slip = drawn.subplots(1, 3, sharey=True)
-    for name in found["table"]:
+    for name in tables["table"]:
         [line] = film.plot(over_film["film_mm"], over_film[name]["static"], label=name)
         film.plot(over_film["film_mm"], over_film[name]["dynamic"], "--", color=line.get_color(), linewidth=1)
     film.set(title=f"Surfaces at {reference['speed_mps']:g} m/s", xlabel="water film, mm", ylabel="friction coefficient")
     film.legend(title="solid static, dashed dynamic", title_fontsize=8)
     colours = matplotlib.colormaps["viridis"]
     for axes, key, along, label in ((speed, "over_speed", "speed_mps", "speed, m/s"), (slip, "over_slip", "slip", "slip")):
-        curves = {name: values for name, values in found[key].items() if name != along}
+        curves = {name: values for name, values in tables[key].items() if name != along}
         for place, (name, values) in enumerate(curves.items()):
-            axes.plot(found[key][along], values, color=colours(0.9 * place / max(len(curves) - 1, 1)), label=f"{name} mm")
+            axes.plot(tables[key][along], values, color=colours(0.9 * place / max(len(curves) - 1, 1)), label=f"{name} mm")
         axes.set_xlabel(label)
     speed.set_title(f"{reference['surface']}, slip {reference['slips']['static']:g}")
     slip.set_title(f"{reference['surface']} at {reference['speed_mps']:g} m/s")

@@ -68,7 +68,7 @@ _EVENTS = {f"events/{name}": (mark.label, rgb(mark.colour)) for name, mark in MA
 
 
 class PlotError(ValueError):
-    """Data that no figure can be made of; the message names what is missing."""
+    """Data without the values of a figure; the message names the missing columns."""
 
 
 def save(figure: Figure, path: Path, *, dpi: int = 160) -> Path:
@@ -247,8 +247,8 @@ def _find_keys(panel: Panel, table: Mapping[str, np.ndarray]) -> list[str]:
     def fits(column: str, key: str) -> bool:
         return column == key or (column.startswith(key) if key.endswith("/") else column.rsplit("/", 1)[-1] == key)
 
-    found = dict.fromkeys(column for key in panel.keys for column in table if fits(column, key))
-    return [key for key in found if np.isfinite(table[key]).any()]
+    keys = dict.fromkeys(column for key in panel.keys for column in table if fits(column, key))
+    return [key for key in keys if np.isfinite(table[key]).any()]
 
 
 def _draw_panel(axes: Axes, panel: Panel, steps: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:

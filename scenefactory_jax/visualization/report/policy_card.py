@@ -30,7 +30,7 @@ def format_card(
         episodes: evaluation -> what decided its episodes, "Starts" -> "as recorded, from rest".
         outside: functions that the config names and the package does not have.
     """
-    described = {what: "; ".join(f"{label.lower()}: {text}" for label, text in found.items()) for what, found in episodes.items() if found}
+    described = {what: "; ".join(f"{label.lower()}: {text}" for label, text in rows.items()) for what, rows in episodes.items() if rows}
     text = document.join(
         f"# {name}",
         about or "",

@@ -35,9 +35,9 @@ def table(reference: str, sets: Mapping[str, Samples]) -> str:
     rows = []
     for name, quantity in QUANTITIES.items():
         medians = [f"{np.median(samples[name]):.3g}" if len(samples[name]) else "none" for samples in sets.values()]
-        pairs = [(f"{one.ks:.2f}", f"{one.wasserstein:.2f}") if (one := found[name]) else ("", "") for found in distances.values()]
+        pairs = [(f"{gap.ks:.2f}", f"{gap.wasserstein:.2f}") if (gap := entry[name]) else ("", "") for entry in distances.values()]
         rows.append([quantity.label, *medians, *itertools.chain(*pairs)])
-    means = [cell for found in distances.values() for cell in (f"{distribution_distance.mean_distance(found):.2f}", "")]
+    means = [cell for entry in distances.values() for cell in (f"{distribution_distance.mean_distance(entry):.2f}", "")]
     header = ["quantity", *(f"median {name}" for name in sets), *(f"{kind} {name}" for name in distances for kind in ("KS", "W"))]
     return markdown.format_table(header, [*rows, ["mean", *("" for _ in sets), *means]])
 

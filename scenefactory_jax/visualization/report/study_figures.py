@@ -134,7 +134,7 @@ def _draw_differences(result: Result, protocol: str) -> Figure | None:
                 axes.plot(100 * estimate.value, place, "o", color=colour, markersize=5)
         axes.axvline(0, color="#222222", linewidth=1)
         axes.set(title=METRICS[name].label, xlabel="points")
-    pairs = [f"{one['before']} → {one['after']}" + (f": {one['condition']}" if several else "") for one in changes]
+    pairs = [f"{change['before']} → {change['after']}" + (f": {change['condition']}" if several else "") for change in changes]
     panels[0].set_yticks(range(len(changes)), pairs)
     panels[0].invert_yaxis()
     return figure

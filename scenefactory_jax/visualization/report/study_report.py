@@ -18,7 +18,7 @@ SAFETY = ("mean_max_drac", "high_drac_rate", "mean_min_ttc_s", "min_ttc_s", "nea
 CHANGES = ("success_rate", "clean_success_rate", "collision_rate", "road_edge_rate", "crash_rate", "mean_max_drac")
 GROUPS = {"spawning": "Starts", "weather": "Weather", "traffic": "Background traffic", "dynamics": "Dynamics"}  # of an episode
 AS_TRAINED = "as trained"
-INTERPRETATION = "interpretation.md"  # what the result shows and what it does not, written by hand
+INTERPRETATION = "interpretation.md"  # of the result; written by a person
 
 
 def write(folder: Path, result: Result) -> Path:
@@ -103,7 +103,7 @@ def _episodes(study: Mapping[str, Any]) -> str:
 def _differences(changes: Sequence[Mapping[str, Any]]) -> list[str]:
     if not changes:
         return []
-    cells = [([one[key] for key in ("before", "after", "condition", "protocol")], read_estimates(one["change"])) for one in changes]
+    cells = [([entry[key] for key in ("before", "after", "condition", "protocol")], read_estimates(entry["change"])) for entry in changes]
     intervals, without_zero = count_intervals(changes)
     text = (
         "The second less the first, on the same scenes, cars and seeds. If all true differences were zero, about one 95 % interval in "
@@ -115,7 +115,7 @@ def _differences(changes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def count_intervals(changes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
     """Counts the intervals in the table of differences, and those of them that exclude zero."""
-    ends = [(one["change"][name]["low"], one["change"][name]["high"]) for one in changes for name in CHANGES]
+    ends = [(entry["change"][name]["low"], entry["change"][name]["high"]) for entry in changes for name in CHANGES]
     ends = [(low, high) for low, high in ends if low is not None and high is not None]
     return len(ends), sum(low > 0 or high < 0 for low, high in ends)
 
@@ -205,7 +205,7 @@ def _settings(result: Result) -> list[str]:
     code = lambda overrides: " ".join(f"`{override}`" for override in overrides)  # noqa: E731
     variants = [[name, code(trained["overrides"])] for name, trained in result["trainings"].items()]
     conditions = [[name, code([*study["evaluation_overrides"], *overrides])] for name, overrides in study["conditions"].items()]
-    baselines = [[name, f"untrained, {one['of']} {code(one['overrides'])}".strip()] for name, one in study["baselines"].items()]
+    baselines = [[name, f"untrained, {entry['of']} {code(entry['overrides'])}".strip()] for name, entry in study["baselines"].items()]
     seeds = sorted({int(seed) for trained in result["trainings"].values() for seed in trained["runs"]})
     settings = ", ".join(f"{name} {value}" for name, value in result["settings"]["evaluation"].items())
     return [

@@ -71,8 +71,8 @@ def format_rows(
 
 def find_metrics(summaries: Iterable[Summary]) -> list[str]:
     """Returns the metrics that any of the summaries has, in the order of `METRICS`."""
-    found = set().union(*summaries)
-    return [name for name in METRICS if name in found]
+    names = set().union(*summaries)
+    return [name for name in METRICS if name in names]
 
 
 def define_metrics(names: Iterable[str]) -> str:

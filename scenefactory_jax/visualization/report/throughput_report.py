@@ -90,7 +90,7 @@ def format_phases(row: Row) -> str:
 
 
 def compare_with_published(result: Mapping[str, Any]) -> str:
-    """Formats rows of the whole configuration at the sizes of the paper beside its figures; empty without any. README has this table."""
+    """Formats rows of the complete configuration at the sizes of the paper beside its figures; empty without any. README has this table."""
     pairs = [(row, PUBLISHED[row["worlds"], row["slots"]]) for row in _sizes(result) if (row["worlds"], row["slots"]) in PUBLISHED]
     cells = [[_size(row), _steps_per_s(row), f"{published:,}", f"{row['per_s'] / published:.1f}"] for row, published in pairs]
     device = f"1 x {result['versions']['device'].split(' x ')[-1]}"  # of several, one was used
@@ -137,7 +137,7 @@ def streaming_table(result: Mapping[str, Any]) -> str:
     for row in _fitting(result):
         if (stream := row.get("stream")) is None:
             continue
-        full = next((one for one in _fitting(result) if one.get("stream") is None and _comparable(one, row)), None)
+        full = next((other for other in _fitting(result) if other.get("stream") is None and _comparable(other, row)), None)
         lost = f"{100 * (1 - row['slots_per_s'] / full['slots_per_s']):.1f} % of `{full['name']}`" if full else ""
         seconds = 1e-3 * row["ms_a_control_step"] * row["horizon"]
         cells.append([row["name"], f"{stream['swapped']} of {row['worlds']}", f"{stream['swapped'] / seconds:,.1f}",
@@ -199,7 +199,7 @@ def _fitting(result: Mapping[str, Any]) -> list[Row]:
 
 
 def _sizes(result: Mapping[str, Any]) -> list[Row]:
-    """Training on one device, the whole configuration at several sizes."""
+    """Training on one device, the complete configuration at several sizes."""
     rows = [row for row in _fitting(result) if row.get("stream") is None and row["devices"] == 1 and row["scope"] == "training"]
     return [row for row in rows if set(flatten(row["changes"])) <= SIZES]
 
