@@ -227,15 +227,12 @@ def sample_traces(suites: Suites, samples: Sequence[str], traces: Mapping[str, M
     recorded = {recording.manoeuvre.name: recording for recordings in suites.values() for recording in recordings}
     names = [name for name in samples if name in recorded] or [recordings[0].manoeuvre.name for recordings in suites.values()]
 
-    def every(frames: int, **columns: Any) -> dict[str, Any]:
-        columns = {"time_s": np.arange(1, frames + 1) / manoeuvres.RATE_HZ, **columns}
-        return {name: np.round(np.asarray(column, float)[:frames:stride], 4) for name, column in columns.items()}
+    def sample(teacher: ManoeuvreRecording) -> dict[str, Any]:
+        paths = {car: paths[teacher.manoeuvre.name] for car, paths in traces.items()}
+        columns = {"teacher": (teacher.position, teacher.speed, teacher.yaw_rate)}
+        columns |= {car: (path.position, path.pace, path.yaw_rate) for car, path in paths.items()}
+        time_s, keys = np.arange(1, len(teacher.yaw) + 1) / manoeuvres.RATE_HZ, ("time_s", "position", "speed", "yaw_rate")
+        thin = lambda column: np.round(np.asarray(column, float)[: len(time_s) : stride], 4)  # noqa: E731
+        return {car: dict(zip(keys, map(thin, (time_s, *values)), strict=True)) for car, values in columns.items()}
 
-    def sample(name: str) -> dict[str, Any]:
-        teacher = recorded[name]
-        paths = {car: paths[name] for car, paths in traces.items()}
-        frames = len(teacher.yaw)
-        cars = {car: every(frames, position=path.position, speed=path.pace, yaw_rate=path.yaw_rate) for car, path in paths.items()}
-        return {"teacher": every(frames, position=teacher.position, speed=teacher.speed, yaw_rate=teacher.yaw_rate), **cars}
-
-    return {name: sample(name) for name in names}
+    return {name: sample(recorded[name]) for name in names}
