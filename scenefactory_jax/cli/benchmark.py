@@ -42,8 +42,8 @@ def benchmark(
     Raises:
         ConfigError: a key that does not fit, also one of a variant, by name.
     """
-    variants, tasks = config["variants"] or {config["name"]: {}}, {}
     schema.check(config, schema.Benchmark)
+    variants, tasks = config["variants"] or {config["name"]: {}}, {}
     for name, changes in variants.items():
         tasks[name] = change(config, changes, where=f"variants.{name}")
         schema.check(tasks[name], schema.Benchmark)

@@ -353,7 +353,12 @@ def steps_of(config):
     return math.prod([config["iterations"], config["worlds"], config["ppo"]["horizon"], config["actions"]["action_repeat"]])
 
 
-TWINS = {"rewards_laptop"}  # the same variants as another study, for a CPU
+TWINS = {"rewards_laptop", "network_laptop"}  # nearly the same variants as another study, for a CPU
+
+
+@pytest.mark.parametrize("name", sorted(TWINS))
+def test_names_of_a_study_fit_each_other(name):
+    study_plan.check(hydra_config.load_config("study", f"study={name}"))
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in TWINS else []) for n in STUDIES])
@@ -404,7 +409,7 @@ def test_other_scenes_of_the_same_path_are_another_study(tmp_path):
     ("name", "base"),
     [
         ("network", "experiment=smoke"),
-        ("recipe", "experiment=quick,worlds=2"),
+        pytest.param("recipe", "experiment=quick,worlds=2", marks=pytest.mark.slow),  # scenes of the recipe's size
         pytest.param("network_laptop", "experiment=laptop,scenes.take.count=1", marks=pytest.mark.slow),  # observations as in network
     ],
 )
