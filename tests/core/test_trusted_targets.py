@@ -89,7 +89,7 @@ def test_trusted_targets_are_named_and_run(folder, tmp_path, capsys):
 
 def test_a_policy_of_the_package_needs_no_trust(capsys):
     assert trusted_targets.find_outside_targets(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
-    assert policy_card._code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
+    assert policy_card._describe_code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
 
 
 def test_all_targets_of_the_configs_are_inside():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
-from scenefactory_jax.cli import sysid as command
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.cli.sysid import sysid
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.sysid import candidate_simulation, error_metrics, optimization, parameter_space
+from scenefactory_jax.sysid import candidate_simulation, error_metrics, identification, optimization, parameter_space
 from scenefactory_jax.sysid.candidate_simulation import TERMS
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, ManoeuvreRecording
 
@@ -217,7 +217,7 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
         return terms
 
     (tmp_path / "stages").mkdir()
-    found = command.stages(config, tmp_path, stand_ins(), where, score)
+    found = identification.search_stages(config, tmp_path, stand_ins(), where, score)
     assert [outcome.name for outcome in found] == list(config["sysid"]["stages"])
     losses = [loss for outcome in found[:4] for loss in (outcome.start_loss, outcome.loss)]
     assert (np.diff(losses) <= 1e-12).all() and losses[-1] < losses[0]
@@ -230,10 +230,10 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
     assert found[4].start_loss == pytest.approx(((parameter_space.unit(where, again) - parameter_space.unit(where, target)) ** 2).sum())
 
     asked.clear()
-    kept = command.stages(config, tmp_path, stand_ins(), where, score)
+    kept = identification.search_stages(config, tmp_path, stand_ins(), where, score)
     assert not asked and all(np.array_equal(a.best, b.best) and a.loss == b.loss for a, b in zip(found, kept, strict=True))
     other = {**config, "sysid": {**config["sysid"], "budget": {**budget, "surface": [4, 3]}}}
-    command.stages(other, tmp_path, stand_ins(), where, score)
+    identification.search_stages(other, tmp_path, stand_ins(), where, score)
     assert asked[0] == (1, (2, 3)), "the first two stages stay, the third is searched anew"
     assert len(list((tmp_path / "stages").iterdir())) == 5
 
@@ -250,14 +250,14 @@ def test_stages_that_cannot_be_are_refused(tmp_path, override, message):
     where = parameter_space.make(config["sysid"]["space"])
     (tmp_path / "stages").mkdir()
     with pytest.raises(ConfigError, match=message):
-        command.stages(config, tmp_path, stand_ins(), where, lambda rows, manoeuvres: np.ones((len(rows), len(manoeuvres), len(TERMS))))
+        identification.search_stages(config, tmp_path, stand_ins(), where, lambda rows, _: np.ones((len(rows), 1, len(TERMS))))
 
 
 @pytest.mark.slow
 def test_the_whole_command(tmp_path):
     budget = "{longitudinal: [2,1], steering: [2,1], surface: [2,1], refinement: [2,1], brake_preservation: [2,1]}"
     config = load_config("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
-    found = command.sysid(config)
+    found = sysid(config)
     written = {path.name for path in tmp_path.iterdir()}
     figures = {"search.png", "slices.png", "heldout.png", "paths.png"}
     assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
