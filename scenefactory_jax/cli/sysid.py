@@ -31,7 +31,7 @@ from scenefactory_jax.sysid import (
     parameter_space,
     reference_recordings,
 )
-from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Replay
+from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Simulator
 from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
 from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
 from scenefactory_jax.sysid.parameter_space import Space
@@ -58,13 +58,14 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     known = recorded(config, out)
     lessons = [*known["training"], *known["extra"]]
     where = parameter_space.make(settings["space"])
-    replay = candidate_simulation.make(config["dynamics"], where, settings["friction"], physics_hz=float(config["physics_hz"]))
-    plan = candidate_simulation.suite(lessons)
-    score = candidate_simulation.make_scorer(replay, plan, width=settings["width"])
+    simulator = candidate_simulation.make_simulator(config["dynamics"], where, settings["friction"], physics_hz=float(config["physics_hz"]))
+    plan = candidate_simulation.stack_recordings(lessons)
+    score = candidate_simulation.make_scorer(simulator, plan, width=settings["width"])
     outcomes = stages(config, out, lessons, where, score)
-    refined = refinement(config, out, where, replay, plan, outcomes[-1].best)
-    places, along = optimization.slices(score, where, refined.best, range(len(lessons)), weights=settings["weights"], **settings["slices"])
-    drivers = {"fitted": (replay, refined.best), "default": (replay, where.start), "published": published(config)}
+    refined = refinement(config, out, where, simulator, plan, outcomes[-1].best)
+    options = {"weights": settings["weights"], **settings["slices"]}
+    places, along = optimization.compute_slices(score, where, refined.best, range(len(lessons)), **options)
+    drivers = {"fitted": (simulator, refined.best), "default": (simulator, where.start), "published": published(config)}
     samples = drawn(known, settings["samples"])
     judged = {name: judge(known, *car, weights=settings["weights"], samples=samples) for name, car in drivers.items()}
     result = {
@@ -89,7 +90,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def judge(
     known: Mapping[str, Sequence[ManoeuvreRecording]],
-    replay: Replay,
+    simulator: Simulator,
     row: np.ndarray,
     *,
     weights: Mapping[str, float],
@@ -98,9 +99,9 @@ def judge(
     """How one car drives the manoeuvres of the fit and those kept out of it: measures of every manoeuvre, and traces of the samples."""
     row_of_weights, found, traces = optimization.weight_row(weights), {}, {}
     for name, recordings in known.items():
-        plan, index = candidate_simulation.suite(recordings), np.arange(len(recordings))
+        plan, index = candidate_simulation.stack_recordings(recordings), np.arange(len(recordings))
         rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
-        path = jax.tree.map(np.asarray, replay.trace(rows, jnp.asarray(index), plan))
+        path = jax.tree.map(np.asarray, simulator.trace(rows, jnp.asarray(index), plan))
         one = lambda i, path=path: jax.tree.map(lambda leaf: leaf[i : i + 1], path)  # noqa: E731
         squares = [candidate_simulation.residuals(one(i), plan, index[i : i + 1], row_of_weights) for i in index]
         found[name] = {
@@ -141,10 +142,10 @@ def shown(
     return {name: sample(name) for name in samples}
 
 
-def published(config: Mapping[str, Any]) -> tuple[Replay, np.ndarray]:
+def published(config: Mapping[str, Any]) -> tuple[Simulator, np.ndarray]:
     """The published car, with its own friction of the surfaces and nothing left open."""
     friction = config["sysid"]["published_friction"]
-    return candidate_simulation.make(
+    return candidate_simulation.make_simulator(
         config["others"]["published"], parameter_space.make({}), friction, physics_hz=float(config["physics_hz"])
     ), np.zeros(0)
 
@@ -161,16 +162,13 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
 
     Of each suite every `sysid.every`-th manoeuvre.
     """
-    instructor = instantiate(config["teacher"], builtins=multibody_model, where="teacher")(cars.read_parameters(config["dynamics"])[0])
-    suites = {
-        "training": manoeuvres.training,
-        "extra": manoeuvres.extra,
-        "heldout": functools.partial(heldout_manoeuvres.heldout, teacher=instructor),
-    }
+    car, _ = cars.read_parameters(config["dynamics"])
+    reference = instantiate(config["teacher"], builtins=multibody_model, where="teacher", car=car)()
+    modules = {"training": manoeuvres, "extra": manoeuvres, "heldout": heldout_manoeuvres}
     masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
     every, found = config["sysid"]["every"], {}
     with open_pool(config["workers"] if config["workers"] > 1 else 0) as task_map:
-        for name, suite in suites.items():
+        for name, module in modules.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
             made = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
             if path.is_file():
@@ -180,8 +178,9 @@ def recorded(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRe
                 except ConfigError:
                     print(f"{path}: of other settings, recorded anew", flush=True)
             begun = time.perf_counter()
-            record = functools.partial(reference_recordings.record, teacher=instructor)
-            found[name] = list(require_results(task_map(record, suite(entries)[::every])))
+            suite = manoeuvres.make_suite(entries, builtins=module, where=f"manoeuvres.{name}", reference=reference)
+            record = functools.partial(reference_recordings.record, reference=reference)
+            found[name] = list(require_results(task_map(record, suite[::every])))
             reference_recordings.save(path, found[name], digest=made)
             print(f"{path}: {len(found[name])} manoeuvres driven by the teacher in {time.perf_counter() - begun:.0f} s", flush=True)
     return found
@@ -206,7 +205,7 @@ def stages(config: Mapping[str, Any], out: Path, lessons: Sequence[ManoeuvreReco
         if outcome is None:
             outcome = optimization.search(
                 score, where, start, stage, rows, seed=settings["seed"] + place + 1, weights=settings["weights"], **settings["search"],
-                clock=time.perf_counter, tell=lambda line: print(line, flush=True),
+                clock=time.perf_counter, report=lambda line: print(line, flush=True),
             )  # fmt: skip
             result_file.write(path, {"made": made, **outcome._asdict()}, digits=None)
         print(f"{name}: {outcome.start_loss:.4f} -> {outcome.loss:.4f}, {outcome.evaluations} candidates on {len(rows)} manoeuvres, "
@@ -230,7 +229,7 @@ def _stage(
 
 
 def refinement(
-    config: Mapping[str, Any], out: Path, where: Space, replay: Replay, plan: ManoeuvreBatch, begin: np.ndarray
+    config: Mapping[str, Any], out: Path, where: Space, simulator: Simulator, plan: ManoeuvreBatch, begin: np.ndarray
 ) -> RefinementResult:
     """Least squares on all manoeuvres."""
     settings = config["sysid"]
@@ -243,7 +242,7 @@ def refinement(
 
         def piece(some: np.ndarray) -> list[np.ndarray]:
             pairs = jnp.asarray(np.repeat(some, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(some)))
-            path = jax.tree.map(np.asarray, replay.trace(*pairs, plan))
+            path = jax.tree.map(np.asarray, simulator.trace(*pairs, plan))
             each = [slice(i * len(index), (i + 1) * len(index)) for i in range(len(some))]
             return [
                 candidate_simulation.residuals(jax.tree.map(lambda leaf, own=own: leaf[own], path), plan, index, weights) for own in each
