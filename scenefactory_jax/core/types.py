@@ -8,7 +8,7 @@ world x; anything else carries a suffix (`film_mm`). What is missing is masked b
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass, static
 
@@ -306,5 +306,3 @@ class Policy(NamedTuple):
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
 
-
-Pytree = Shaped[Array, "..."] | Any

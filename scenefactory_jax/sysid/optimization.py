@@ -167,9 +167,8 @@ def refine(
 
     start = np.clip(to_unit_box(space, begin), 1e-4, 1.0 - 1e-4)
     start_loss = float((evaluate(start[None])[0] ** 2).sum())
-    solution = least_squares(  # pyright: ignore
-        lambda point: evaluate(point[None])[0], start, jac=jacobian, bounds=(0.0, 1.0), max_nfev=rounds, method="dogbox"
-    )
+    options: dict[str, Any] = {"jac": jacobian, "bounds": (0.0, 1.0), "max_nfev": rounds, "method": "dogbox"}
+    solution = least_squares(lambda point: evaluate(point[None])[0], start, **options)
     slope = jacobian(solution.x)
     loss = float((solution.fun**2).sum())
     inverse = np.linalg.pinv(slope.T @ slope)

@@ -13,6 +13,8 @@ from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics import collision
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 NUMBERS = yaml.safe_load((ROOT / "conf" / "dynamics" / "base.yaml").read_text())["contact"]
 MASS = NUMBERS["mass"]
 touch = jax.jit(jax.vmap(collision.find_box_contact))

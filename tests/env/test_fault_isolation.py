@@ -15,6 +15,8 @@ from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 NUMBERS = dict(seed=3, steps=12, fault_step=5, world=0, agent=1, iterations=2)
 
 

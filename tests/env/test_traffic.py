@@ -23,6 +23,8 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, stack, validation
 from scenefactory_jax.env import environment, spawning, traffic
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CONTROL = 1 / 30
 KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 

@@ -13,6 +13,8 @@ from scenefactory_jax.sysid import candidate_simulation, error_metrics, optimiza
 from scenefactory_jax.sysid.candidate_simulation import TERMS
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, ManoeuvreRecording
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WEIGHTS = {name: 1.0 for name in TERMS}
 SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, report=lambda line: None)
 
