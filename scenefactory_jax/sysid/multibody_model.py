@@ -4,19 +4,19 @@ Source: M. Althoff, G. Wuersching, "CommonRoad: Vehicle Models" (2020), package 
 of the US DOT (R. W. Allen et al. 1992): sprung mass and two axles with compliant joints, Pacejka tyres with combined slip, 29 states.
 Vehicle 2 is a BMW 320i. Its parameters here:
 
-    mass, inertia, axles,              ours. p.m is the whole car, m_s the chassis, m_uf and m_ur an axle's wheels, carriers, knuckles;
-    wheel radius and inertia           I_z is the whole car's: the chassis' and the wheels' share
+    mass, inertia, axles,              ours. p.m is the car, m_s the chassis, m_uf and m_ur an axle's wheels, carriers, knuckles;
+    wheel radius and inertia           I_z is the car's: chassis and wheels
     K_sf, K_sdf, K_sr, K_sdr           x sprung mass on the axle: ride frequencies and damping ratios stay
     K_tsf, K_tsr                       x the same x track^2: so does the share of roll stiffness
     K_ras, K_rad                       x sprung mass
-    K_zt                               x whole mass: the tyres' static deflection stays
-    K_lt                               / whole mass
+    K_zt                               x mass of the car: the tyres' static deflection stays
+    K_lt                               / mass of the car
     I_uf, I_ur                         x unsprung mass x track^2
     D_f, D_r                           / track: camber per roll angle stays
     E_f, E_r, I_xz_s, h_raf, h_rar     as they are (0)
     Pacejka's coefficients             as they are, but the shifts (ply steer, conicity) p_hx1, p_vx1, p_hy1, p_vy1, r_hx1, r_hy1, r_by3,
                                        r_vy1 are 0: mirrored commands give the mirrored path, and a wheel that rolls freely pulls nowhere
-    limits of steering, acceleration   out of reach: `rates` has its own
+    limits of steering, acceleration   out of reach: those of `rates` apply
 
 Signs: the model is written for y to the right (SAE). Mirrored, its positive yaw, steer and y are left, its "left" wheels are our right
 ones, and its roll angle is minus ours.
@@ -47,8 +47,8 @@ CREEP = 0.1  # m/s; the model's limit between rolling and tyres; up to twice thi
 SLIDE = 0.3  # m/s sideways; a car that slides faster than this does not roll, however slowly it goes forward
 FLOOR = 0.05  # m/s, least forward speed of a wheel on which the model may divide
 SHIFTS = ("p_hx1", "p_vx1", "p_hy1", "p_vy1", "r_hx1", "r_hy1", "r_by3", "r_vy1")
-OURS = (1, 0, 3, 2)  # place of the model's left front, right front, left rear, right rear wheel among `car.WHEELS`
-# places in the state
+OUR_WHEELS = (1, 0, 3, 2)  # index of the model's left front, right front, left rear, right rear wheel in `parameters.WHEELS`
+# rows of the state
 X, Y, STEER, FORWARD, YAW, YAW_RATE, ROLL, PITCH, SIDEWAYS, HEIGHT = 0, 1, 2, 3, 4, 5, 6, 8, 10, 11
 SIDEWAYS_FRONT, HEIGHT_FRONT, SIDEWAYS_REAR, HEIGHT_REAR, SPIN = 15, 16, 20, 21, slice(23, 27)
 PLANAR = (FORWARD, YAW_RATE, SIDEWAYS, *range(23, 27))
@@ -130,20 +130,20 @@ def make_body(car: CarParameters, bmw: Any, *, sprung_height: float) -> Body:
     """Computes the parameters of the model: see the table above."""
     front, rear = (2 * (car.wheel_mass + car.carrier_mass) + extra for extra in (2 * car.knuckle_mass, 0.0))
     a, b = car.wheelbase / 2 - car.mass_forward, car.wheelbase / 2 + car.mass_forward
-    whole = car.mass + front + rear
+    mass = car.mass + front + rear
     across = 2 * (2 * (car.wheel_inertia[1] + car.carrier_inertia) + car.knuckle_inertia)
     wheels_yaw = across + front * (a**2 + (car.track / 2) ** 2) + rear * (b**2 + (car.track / 2) ** 2)
     span = bmw.a + bmw.b
     on_front = (car.mass * b / car.wheelbase) / (bmw.m_s * bmw.b / span)
     on_rear = (car.mass * a / car.wheelbase) / (bmw.m_s * bmw.a / span)
-    sprung, total = car.mass / bmw.m_s, whole / bmw.m
+    sprung, total = car.mass / bmw.m_s, mass / bmw.m
     wider_f, wider_r = car.track / bmw.T_f, car.track / bmw.T_r
     far = types.SimpleNamespace(min=-10.0, max=10.0, v_min=-100.0, v_max=100.0)
     free = types.SimpleNamespace(a_max=1e3, v_max=1e3, v_min=-1e3, v_switch=1e3)
     pacejka = {name: value for name, value in vars(bmw.tire).items()} | dict.fromkeys(SHIFTS, 0.0)
     tyres = [types.SimpleNamespace(**pacejka) for _ in range(4)]
     return Body(
-        m=whole, m_s=car.mass, m_uf=front, m_ur=rear, a=a, b=b,
+        m=mass, m_s=car.mass, m_uf=front, m_ur=rear, a=a, b=b,
         I_Phi_s=car.inertia[0], I_y_s=car.inertia[1], I_z=car.inertia[2] + wheels_yaw, I_xz_s=bmw.I_xz_s,
         h_s=sprung_height, R_w=car.wheel_radius, I_y_w=car.wheel_inertia[0],
         T_f=car.track, T_r=car.track,
@@ -180,7 +180,7 @@ def rates(state: Float[np.ndarray, "29"], time: float, vehicle: Vehicle, command
     rate = (reference.steering_lock * command[1] - angle) / reference.steering_lag_s
     steering = min(max(rate, -reference.steering_rate_max), reference.steering_rate_max)
     if road is not None:
-        vehicle.set_grip([road(*place) for place in _wheel_positions(p, x)])
+        vehicle.set_grip([road(*position) for position in _wheel_positions(p, x)])
     spins = x[SPIN]
     rolling = 0.0 if abs(sideways) > SLIDE else min(max(2.0 - forward / CREEP, 0.0), 1.0)
     if rolling < 1.0:
@@ -189,24 +189,24 @@ def rates(state: Float[np.ndarray, "29"], time: float, vehicle: Vehicle, command
     else:
         extra, x[FORWARD] = 0.0, max(-0.9 * CREEP, min(forward, 0.9 * CREEP))
     turned = extra * math.cos(angle) / p.R_w
-    for place, shift in enumerate((turned, turned, extra / p.R_w, extra / p.R_w), start=SPIN.start):
-        x[place] = max(x[place], 0.0) + shift
+    for row, shift in enumerate((turned, turned, extra / p.R_w, extra / p.R_w), start=SPIN.start):
+        x[row] = max(x[row], 0.0) + shift
     p.turn = itertools.cycle(p.tyres)
     f = vehicle.model(x, (steering, 0.0), p)
 
     f[X] = forward * math.cos(yaw) - sideways * math.sin(yaw)
     f[Y] = forward * math.sin(yaw) + sideways * math.cos(yaw)
     f[STEER], f[YAW] = steering, yaw_rate
-    for place in (SIDEWAYS, SIDEWAYS_FRONT, SIDEWAYS_REAR):  # turning couples with the true forward speed
-        f[place] += yaw_rate * extra
+    for row in (SIDEWAYS, SIDEWAYS_FRONT, SIDEWAYS_REAR):  # turning couples with the true forward speed
+        f[row] += yaw_rate * extra
     f[FORWARD] -= 0.5 * reference.air_density * reference.drag_area * forward * abs(forward) / p.m
     drive, hold = _torques(vehicle, command)
     for wheel, spin in enumerate(spins):
         f[SPIN.start + wheel] += (drive[wheel] - hold[wheel] * math.tanh(spin / reference.lock_spin)) / p.I_y_w
     if rolling > 0.0:
         slow = _roll(vehicle, (sum(drive), sum(hold)), spins, angle, steering, forward, yaw_rate, sideways)
-        for place, rate in zip(PLANAR, slow, strict=True):
-            f[place] += rolling * (rate - f[place])
+        for row, rate in zip(PLANAR, slow, strict=True):
+            f[row] += rolling * (rate - f[row])
     return f
 
 

@@ -127,7 +127,7 @@ class RefinementResult(NamedTuple):
     loss: float
     start_loss: float
     evaluations: int
-    deviation: Float[np.ndarray, " P"]  # standard deviation of each parameter, in its own unit; see `refine`
+    deviation: Float[np.ndarray, " P"]  # standard deviation of each parameter, in its unit; see `refine`
     correlation: Float[np.ndarray, "P P"]
     at_bound: Bool[np.ndarray, " P"]
     seconds: float

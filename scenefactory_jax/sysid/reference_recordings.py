@@ -106,7 +106,7 @@ def _read_states(manoeuvre: Manoeuvre, states: Float[np.ndarray, "T 29"], *, veh
         yaw=yaw,
         speed=np.hypot(forward, sideways - ahead * yaw_rate),
         yaw_rate=yaw_rate,
-        wheel_spin=states[:, multibody_model.SPIN][:, multibody_model.OURS],
+        wheel_spin=states[:, multibody_model.SPIN][:, multibody_model.OUR_WHEELS],
         steer=states[:, multibody_model.STEER],
         lateral=np.array(sideways_rates) + yaw_rate * forward,
         roll=-states[:, multibody_model.ROLL],

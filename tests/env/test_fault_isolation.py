@@ -61,6 +61,7 @@ def test_the_same_seed_drives_the_same(report):
     assert len(report.driving) > 80 and all(report.driving.values())
 
 
+@pytest.mark.slow  # tests/learning/test_ppo.py compares one iteration
 def test_the_same_seed_learns_the_same():
     """Two PPO iterations at toy size, twice."""
     settings = load_config("train", "experiment=smoke")

@@ -13,6 +13,7 @@ from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
 SETTINGS = load_config("validate")["validation"]  # what `validate` runs, at toy size
 DRIVES = {**SETTINGS["drives"]["draw"], "control_hz": 30.0, "seconds": 2.0}
 MEETINGS = {**SETTINGS["encounters"]["draw"], "control_hz": 30.0}
