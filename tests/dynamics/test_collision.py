@@ -21,7 +21,7 @@ touch = jax.jit(jax.vmap(collision.find_box_contact))
 
 
 def with_numbers(**changes):
-    model = collision.make(**{**NUMBERS, "height": 1.0, **changes})
+    model = collision.make_contact(NUMBERS | changes, height=1.0)
     return lambda cars, others: model.forces(cars, model.neighbours(cars, others))
 
 

@@ -82,7 +82,7 @@ def make(
     Args:
         car: values of `CarParameters`.
         solver: values of `Solver`.
-        contact: values of `collision.make`; its height is the car's.
+        contact: values of `ContactLaw`.
         brakes: `friction`: locking and standstill by the solver. `latched`: the published torque against a remembered spin direction,
             which flips every substep when a wheel is locked.
         randomization: null: all cars are the reference car. An entry whose target, such as `car_parameter_sampler`, returns a function
