@@ -43,5 +43,6 @@ def make_open_ground(
         weather = make_uniform(friction, pattern)
         return Scene(road=road, lanes=road, edges=road, agents=agents, log=log, weather=weather, **traffic)
 
-    numbers = (jnp.asarray(column, jnp.float32) for column in (position, yaw, speed, friction))
-    return jax.vmap(make_world)(*numbers, jnp.asarray(pattern, jnp.int32))
+    columns = [jnp.asarray(column, jnp.float32) for column in (position, yaw, speed, friction)]
+    columns.append(jnp.asarray(pattern, jnp.int32))
+    return jax.vmap(make_world)(*columns)
