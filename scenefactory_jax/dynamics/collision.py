@@ -5,6 +5,7 @@ momentum are conserved to rounding. Depth and normal come from the separating-ax
 other box's nearest face, which leaves two contact points, each with half the stiffness.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
@@ -14,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace
-from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
+from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
@@ -38,40 +39,38 @@ class Contact(NamedTuple):
     forces: Callable[[Boxes, Boxes], tuple[Array, Array, Array]]  # (cars, neighbours) -> see `compute_forces`
 
 
+@dataclasses.dataclass(frozen=True)
+class ContactLaw:
+    """The config `dynamics.contact`: a spring-damper with friction between two boxes."""
+
+    stiffness: Positive  # along a whole face of two cars, N/m
+    damping: NonNegative  # along the same face, N s/m; a contact never pulls
+    friction: NonNegative  # Coulomb coefficient; below the limit `damping` resists sliding, which is as stable as the normal force
+    mass: Positive  # of the two cars that `stiffness` and `damping` are meant for, kg
+    momentum_transfer_s: Positive  # time in which a box of finite mass may get the car's speed
+    max_neighbours: Annotated[int, Bounds(min=0)]  # objects that a car may touch, beside other cars
+
+
 def make_contact(entry: Mapping[str, Any], *, height: float, physics_dt: float | None = None) -> Contact:
-    """Makes the contact model of a config's `dynamics.contact`: see `make`."""
-    target = {**entry, "_target_": "make"}
-    return instantiate(target, builtins=__name__, where="dynamics.contact", height=height, physics_dt=physics_dt)()
-
-
-def make(
-    *,
-    stiffness: Positive,
-    damping: NonNegative,
-    friction: NonNegative,
-    mass: Positive,
-    momentum_transfer_s: Positive,
-    max_neighbours: Annotated[int, Bounds(min=0)],
-    height: float,
-    physics_dt: float | None = None,
-) -> Contact:
-    """Binds `find_neighbours` and `compute_forces` to their parameters.
+    """Makes the contact model of a config's `dynamics.contact`.
 
     Args:
-        max_neighbours: objects that a car may touch, beside other cars; 0: none.
+        height: of the boxes, m; two whose elevations differ by more do not touch.
         physics_dt: s, if the forces move cars; None: they are only reported.
 
     Raises:
         ConfigError: a number out of range, or a contact too stiff for `physics_dt`, by name.
     """
-    load = OFF_CENTRE * (stiffness * (physics_dt or 0.0) + 2 * damping) * (physics_dt or 0.0) / (mass / 2)
+    law = schema.read(entry, ContactLaw, where="dynamics.contact")
+    dt = physics_dt or 0.0
+    load = OFF_CENTRE * (law.stiffness * dt + 2 * law.damping) * dt / (law.mass / 2)
     if load >= 4.0:  # see `compute_forces`
         raise ConfigError(
-            f"dynamics.contact: stiffness {stiffness:g} and damping {damping:g} cannot be integrated: {OFF_CENTRE} (k dt + 2 c) dt / m, m "
-            f"half the mass: expected below 4, got {load:.2f} at physics_dt {physics_dt:.5f}"
+            f"dynamics.contact: stiffness {law.stiffness:g} and damping {law.damping:g} cannot be integrated: {OFF_CENTRE} (k dt + 2 c) dt "
+            f"/ m, m half the mass: expected below 4, got {load:.2f} at physics_dt {dt:.5f}"
         )
-    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, momentum_transfer_s=momentum_transfer_s, height=height)
-    return Contact(functools.partial(find_neighbours, max_neighbours=max_neighbours), functools.partial(compute_forces, **law))
+    neighbours = functools.partial(find_neighbours, max_neighbours=law.max_neighbours)
+    return Contact(neighbours, functools.partial(compute_forces, law=law, height=height))
 
 
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
@@ -107,15 +106,7 @@ def advance_boxes(boxes: Boxes, seconds: float | Float[Array, ""]) -> Boxes:
 
 
 def compute_forces(
-    cars: Boxes,
-    neighbours: Boxes,
-    *,
-    stiffness: float,
-    damping: float,
-    friction: float,
-    mass: float,
-    momentum_transfer_s: float,
-    height: float,
+    cars: Boxes, neighbours: Boxes, *, law: ContactLaw, height: float
 ) -> tuple[Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
@@ -129,27 +120,20 @@ def compute_forces(
             more than `height` do not touch.
         neighbours: of each car, leaves `[A, K, ...]`: see `find_neighbours`. They follow their path and feel no force. If their mass is
             finite, the force is limited to what gives them the car's speed within `momentum_transfer_s`.
-        stiffness: of a contact along a whole face of two cars, N/m.
-        damping: along the same face, N s/m. A contact never pulls.
-        friction: Coulomb coefficient of the bodies. Below the limit `damping` resists sliding, which is as stable as the normal force.
-        mass: of the two cars that `stiffness` and `damping` are meant for, kg.
-        momentum_transfer_s: s.
-        height: of the boxes, m.
     """
     count, beside = neighbours.mass.shape
-    law = dict(stiffness=stiffness, damping=damping, friction=friction, mass=mass, height=height)
-    cars = _sanitize(cars, mass)
+    cars = _sanitize(cars, law.mass)
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if beside:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
-        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours), mass)
-        pair_force, pair_torque, _ = _compute_pair_forces(first, second, momentum_transfer_s, **law)
+        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours), law.mass)
+        pair_force, pair_torque, _ = _compute_pair_forces(first, second, law, height=height, limited=True)
         pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        force, torque_first, torque_second = _compute_pair_forces(first, second, None, **law)
+        force, torque_first, torque_second = _compute_pair_forces(first, second, law, height=height, limited=False)
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
         scale = _scale_of_many(jnp.maximum(contacts[rows_first], contacts[rows_second]))
@@ -175,17 +159,12 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _compute_pair_forces(
-    first: Boxes,
-    second: Boxes,
-    momentum_transfer_s: float | None,
-    *,
-    stiffness: float,
-    damping: float,
-    friction: float,
-    mass: float,
-    height: float,
+    first: Boxes, second: Boxes, law: ContactLaw, *, height: float, limited: bool
 ) -> tuple[Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
-    """Computes the force on the second box of each pair (the first has the opposite), and the torques on both."""
+    """Computes the force on the second box of each pair (the first has the opposite), and the torques on both.
+
+    `limited`: the second box may have a finite mass and follows its path, see `compute_forces`.
+    """
     normal, points, depths = jax.vmap(find_box_contact)(
         first.position, first.yaw, first.size / 2.0, second.position, second.yaw, second.size / 2.0
     )
@@ -197,13 +176,13 @@ def _compute_pair_forces(
     tangent = _rotate_90(normal)
     closing = -dot(speed, normal[:, None])
     sliding = dot(speed, tangent[:, None])
-    scale = (2.0 / (mass / first.mass + mass / second.mass))[:, None]
-    push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * stiffness * depths + 0.5 * damping * closing), 0.0), 0.0)
-    if momentum_transfer_s is not None:
-        reduced = 0.5 * mass * scale
-        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # per contact point
+    scale = (2.0 / (law.mass / first.mass + law.mass / second.mass))[:, None]
+    push = jnp.where(depths > 0.0, jnp.maximum(scale * (0.5 * law.stiffness * depths + 0.5 * law.damping * closing), 0.0), 0.0)
+    if limited:
+        reduced = 0.5 * law.mass * scale
+        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / law.momentum_transfer_s  # per contact point
         push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
-    drag = jnp.clip(scale * (0.5 * damping * sliding), -friction * push, friction * push)
+    drag = jnp.clip(scale * (0.5 * law.damping * sliding), -law.friction * push, law.friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
     return force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
 

@@ -28,7 +28,7 @@ from scenefactory_jax.sysid import (
     parameter_space,
     reference_recordings,
 )
-from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Replay
+from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Simulator
 from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
 from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
 from scenefactory_jax.sysid.parameter_space import Space
@@ -50,18 +50,18 @@ def identify(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
     settings, physics_hz = config["sysid"], float(config["physics_hz"])
     suites = record_suites(config, out)
     recordings, space = [*suites["training"], *suites["extra"]], parameter_space.make(settings["space"])
-    replay = candidate_simulation.make(config["dynamics"], space, settings["friction"], physics_hz=physics_hz)
-    batch = candidate_simulation.suite(recordings)
-    score = candidate_simulation.make_scorer(replay, batch, width=settings["width"])
+    simulator = candidate_simulation.make_simulator(config["dynamics"], space, settings["friction"], physics_hz=physics_hz)
+    batch = candidate_simulation.stack_recordings(recordings)
+    score = candidate_simulation.make_scorer(simulator, batch, width=settings["width"])
     stages = search_stages(config, out, recordings, space, score)
-    refined = refine(config, out, space, replay, batch, stages[-1].best)
+    refined = refine(config, out, space, simulator, batch, stages[-1].best)
     indices = range(len(recordings))
-    place, loss = optimization.slices(score, space, refined.best, indices, weights=settings["weights"], **settings["slices"])
+    place, loss = optimization.compute_slices(score, space, refined.best, indices, weights=settings["weights"], **settings["slices"])
     published = config["others"]["published"], parameter_space.make({}), settings["published_friction"]
     drivers = {
-        "fitted": (replay, refined.best),
-        "default": (replay, space.start),
-        "published": (candidate_simulation.make(*published, physics_hz=physics_hz), np.zeros(0)),
+        "fitted": (simulator, refined.best),
+        "default": (simulator, space.start),
+        "published": (candidate_simulation.make_simulator(*published, physics_hz=physics_hz), np.zeros(0)),
     }
     errors, traces = {}, {}
     for name, (car, values) in drivers.items():
@@ -83,16 +83,13 @@ def record_suites(config: Mapping[str, Any], out: Path) -> dict[str, list[Manoeu
 
     Of each suite every `sysid.every`-th manoeuvre.
     """
-    teacher = instantiate(config["teacher"], builtins=multibody_model, where="teacher")(cars.read_parameters(config["dynamics"])[0])
-    makers = {
-        "training": manoeuvres.training,
-        "extra": manoeuvres.extra,
-        "heldout": functools.partial(heldout_manoeuvres.heldout, teacher=teacher),
-    }
+    car, _ = cars.read_parameters(config["dynamics"])
+    reference = instantiate(config["teacher"], builtins=multibody_model, where="teacher", car=car)()
+    modules = {"training": manoeuvres, "extra": manoeuvres, "heldout": heldout_manoeuvres}
     masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
     every, suites = config["sysid"]["every"], {}
     with open_pool(config["workers"] if config["workers"] > 1 else 0) as task_map:
-        for name, make in makers.items():
+        for name, module in modules.items():
             path, entries = out / f"{name}.npz", config["manoeuvres"][name]
             digest = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
             if path.is_file():
@@ -102,8 +99,9 @@ def record_suites(config: Mapping[str, Any], out: Path) -> dict[str, list[Manoeu
                 except ConfigError:
                     LOG.info("%s: of other settings, recorded anew", path)
             start = time.perf_counter()
-            record = functools.partial(reference_recordings.record, teacher=teacher)
-            suites[name] = list(require_results(task_map(record, make(entries)[::every])))
+            record = functools.partial(reference_recordings.record, reference=reference)
+            suite = manoeuvres.make_suite(entries, builtins=module, where=f"manoeuvres.{name}", reference=reference)
+            suites[name] = list(require_results(task_map(record, suite[::every])))
             reference_recordings.save(path, suites[name], digest=digest)
             LOG.info("%s: %d manoeuvres driven by the teacher in %.0f s", path, len(suites[name]), time.perf_counter() - start)
     return suites
@@ -128,7 +126,7 @@ def search_stages(
         if outcome is None:
             outcome = optimization.search(
                 score, space, start, stage, rows, seed=settings["seed"] + place, weights=settings["weights"], **settings["search"],
-                clock=time.perf_counter, tell=LOG.info,
+                clock=time.perf_counter, report=LOG.info,
             )  # fmt: skip
             result_file.write(path, {"made": digest, **outcome._asdict()}, digits=None)
         LOG.info(
@@ -154,7 +152,7 @@ def _make_stage(
 
 
 def refine(
-    config: Mapping[str, Any], out: Path, space: Space, replay: Replay, batch: ManoeuvreBatch, start: np.ndarray
+    config: Mapping[str, Any], out: Path, space: Space, simulator: Simulator, batch: ManoeuvreBatch, start: np.ndarray
 ) -> RefinementResult:
     """Fits by least squares on all manoeuvres."""
     settings, path = config["sysid"], out / "stages" / "refine.json"
@@ -167,7 +165,7 @@ def refine(
         def residuals_of(candidates: np.ndarray) -> list[np.ndarray]:
             pairs = jnp.asarray(np.repeat(candidates, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(candidates)))
             traces = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(len(candidates), len(index), *leaf.shape[1:]),
-                                  replay.trace(*pairs, batch))  # fmt: skip
+                                  simulator.trace(*pairs, batch))  # fmt: skip
             each = [jax.tree.map(lambda leaf, i=i: leaf[i], traces) for i in range(len(candidates))]
             return [candidate_simulation.residuals(trace, batch, index, weights) for trace in each]
 
@@ -198,12 +196,12 @@ def _read(path: Path, digest: str, kind: type) -> Any:
 
 
 def evaluate_car(
-    suites: Suites, car: Replay, values: np.ndarray, *, weights: Mapping[str, float]
+    suites: Suites, car: Simulator, values: np.ndarray, *, weights: Mapping[str, float]
 ) -> tuple[dict[str, Any], dict[str, candidate_simulation.CandidatePath]]:
     """Computes the errors of a car on every manoeuvre by suite, and its traces by manoeuvre."""
     row, errors, traces = optimization.weight_row(weights), {}, {}
     for suite, recordings in suites.items():
-        batch, index = candidate_simulation.suite(recordings), np.arange(len(recordings))
+        batch, index = candidate_simulation.stack_recordings(recordings), np.arange(len(recordings))
         path = jax.tree.map(np.asarray, car.trace(jnp.asarray(np.tile(values, (len(index), 1)), jnp.float32), jnp.asarray(index), batch))
         names = [recording.manoeuvre.name for recording in recordings]
         single = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], path) for i in index]

@@ -22,6 +22,7 @@ from scenefactory_jax.dynamics.articulated import actuators, closed_form_step, e
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
+from scenefactory_jax.dynamics.articulated.closed_form_step import StepInput
 from scenefactory_jax.dynamics.articulated.constants import CarConstants, compute_rest_pose, derive_constants
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, Solver, check_stability, read_parameters
 from scenefactory_jax.dynamics.articulated.tyres import TyreInput, Tyres, compute_slip_damping
@@ -81,7 +82,7 @@ def make(
     Args:
         car: values of `CarParameters`.
         solver: values of `Solver`.
-        contact: values of `collision.make`; its height is the car's.
+        contact: values of `ContactLaw`.
         brakes: `friction`: locking and standstill by the solver. `latched`: the published torque against a remembered spin direction,
             which flips every substep when a wheel is locked.
         randomization: null: all cars are the reference car. An entry whose target, such as `car_parameter_sampler`, returns a function
@@ -233,7 +234,7 @@ def physics_step(
         wheel_torque, friction_loss = actuators.compute_wheel_torques(car, command, state.spin)
     forces = actuators.compute_applied_forces(car, state, command.steer, wheel_torque, push)
     tyre = TyreInput(mu, compute_slip_damping(car, state))
-    inputs = constants, state, forces, friction_loss, tyre, carry.qpos, carry.qvel, carry.qacc_warmstart
+    inputs = StepInput(constants, state, forces, friction_loss, tyre), carry.qpos, carry.qvel, carry.qacc_warmstart
     if compiled.mjx_car is None:
         qpos, qvel, acceleration, tyres = closed_form_step.step(*inputs, solver=compiled.solver, physics_dt=compiled.physics_dt)
     else:

@@ -4,6 +4,8 @@ MJX computes the same in stages for any tree of bodies (`mjx_backend`), with gat
 scalars that XLA fuses into few loops.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,12 +19,18 @@ from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.tyres import Patch, TyreInput, Tyres
 
 
+class StepInput(NamedTuple):
+    """Inputs of one car in one physics step, for both solvers."""
+
+    constants: CarConstants
+    state: CarState  # `from_mujoco` of position and velocity
+    forces: Forces  # that MuJoCo's model lacks (`actuators.compute_applied_forces`)
+    friction_loss: Float[Array, "4"] | None  # of each wheel joint, N m; None with latched brakes
+    tyre: TyreInput
+
+
 def step(
-    constants: CarConstants,
-    state: CarState,
-    forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
+    inputs: StepInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
@@ -33,37 +41,22 @@ def step(
     """Computes position, velocity and acceleration after the step, and the tyres' outputs.
 
     Args:
-        constants: of this car.
-        state: `from_mujoco` of position and velocity.
-        forces: that MuJoCo's model lacks (`actuators.compute_applied_forces`).
-        friction_loss: of each wheel joint, N m; None with latched brakes.
-        tyre: inputs of the tyres.
         qpos, qvel: in MuJoCo's order.
         start: initial acceleration of the solver: that of the previous step.
     """
-    patch = tyres.find_contact_patches(constants.car, state)
-    problem = make_contact_problem(
-        constants, state, patch, forces, friction_loss, tyre, friction_ratio=solver.friction_ratio, physics_dt=physics_dt
-    )
+    state = inputs.state
+    patch = tyres.find_contact_patches(inputs.constants.car, state)
+    problem = make_contact_problem(inputs, patch, friction_ratio=solver.friction_ratio, physics_dt=physics_dt)
     initial = contact_solver.Acceleration(*states.unflatten(start, state))
     solution, force = contact_solver.solve_contacts(problem, initial, iterations=solver.iterations, line_search=solver.line_search)
     acceleration = states.flatten(solution.base, solution.wheel, state)
     moved = states.integrate(qpos, qvel, acceleration, physics_dt=physics_dt)
-    return *moved, acceleration, tyres.compute_tyre_outputs(state, patch, force, tyre)
+    return *moved, acceleration, tyres.compute_tyre_outputs(state, patch, force, inputs.tyre)
 
 
-def make_contact_problem(
-    constants: CarConstants,
-    state: CarState,
-    patch: Patch,
-    forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
-    *,
-    friction_ratio: float,
-    physics_dt: float,
-) -> contact_solver.Problem:
+def make_contact_problem(inputs: StepInput, patch: Patch, *, friction_ratio: float, physics_dt: float) -> contact_solver.Problem:
     """Computes MuJoCo's convex problem of this step, in the car's axes."""
+    constants, state, forces, friction_loss, tyre = inputs
     drift = equations_of_motion.compute_bias_acceleration(state)
     base, across, wheel = equations_of_motion.compute_mass_matrix(constants.car, state)
     springs = actuators.compute_suspension_forces(constants.car, state)

@@ -21,12 +21,11 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional 
 
 from scenefactory_jax.dynamics.articulated import equations_of_motion, tyres
 from scenefactory_jax.dynamics.articulated import state as states
+from scenefactory_jax.dynamics.articulated.closed_form_step import StepInput
 from scenefactory_jax.dynamics.articulated.constants import CarConstants
-from scenefactory_jax.dynamics.articulated.equations_of_motion import Forces
 from scenefactory_jax.dynamics.articulated.model import ModelAddresses, find_addresses
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, MIN_FRICTION_LOSS, Solver
-from scenefactory_jax.dynamics.articulated.state import CarState
-from scenefactory_jax.dynamics.articulated.tyres import TyreInput, Tyres
+from scenefactory_jax.dynamics.articulated.tyres import Tyres
 from scenefactory_jax.dynamics.articulated.vector import dot
 
 
@@ -78,20 +77,14 @@ def fit_model(mjx_car: MjxCar, constants: CarConstants) -> dict[str, Array]:
 
 
 def compute_smooth_dynamics(
-    mjx_car: MjxCar,
-    fields: dict[str, Array],
-    state: CarState,
-    forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
-    qpos: Float[Array, "17"],
-    qvel: Float[Array, "16"],
+    mjx_car: MjxCar, fields: dict[str, Array], inputs: StepInput, qpos: Float[Array, "17"], qvel: Float[Array, "16"]
 ) -> tuple[mjx.Model, mjx.Data]:
     """Computes the model of this car and step, and everything before the solver: inertia, forces, constraint rows.
 
     Args:
         fields: `fit_model` of a car that differs from the compiled one, else empty.
     """
+    _, state, forces, friction_loss, tyre = inputs
     at, model = mjx_car.addresses, mjx_car.model.replace(**fields)
     slip_damping = model.pair_solreffriction.at[:, 1].set(-tyre.slip_damping)
     model = model.replace(pair_friction=model.pair_friction.at[:, :2].set(tyre.mu[:, None]), pair_solreffriction=slip_damping)
@@ -107,11 +100,7 @@ def compute_smooth_dynamics(
 def step(
     mjx_car: MjxCar,
     fields: dict[str, Array],
-    constants: CarConstants,
-    state: CarState,
-    forces: Forces,
-    friction_loss: Float[Array, "4"] | None,
-    tyre: TyreInput,
+    inputs: StepInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
@@ -119,8 +108,9 @@ def step(
     solver: Solver,
 ) -> tuple[Float[Array, "17"], Float[Array, "16"], Float[Array, "16"], Tyres]:
     """Computes `mjx.step` with dJ/dt qvel in the tyres' reference. Arguments and results as those of `closed_form_step.step`."""
-    model, data = compute_smooth_dynamics(mjx_car, fields, state, forces, friction_loss, tyre, qpos, qvel)
-    patch = tyres.find_contact_patches(constants.car, state)
+    model, data = compute_smooth_dynamics(mjx_car, fields, inputs, qpos, qvel)
+    state = inputs.state
+    patch = tyres.find_contact_patches(inputs.constants.car, state)
     drift = tyres.compute_jdot_qvel(patch, equations_of_motion.compute_bias_acceleration(state))
     slip_drift = jnp.stack([dot(axis, drift) for axis in (state.north, -state.east)], axis=-1)
     slip_drift = jnp.where(patch.depth[:, None] > 0.0, slip_drift, 0.0)
@@ -128,4 +118,4 @@ def step(
     data = mjx.solve(model, data.replace(qacc_warmstart=start))
     data = (mjx.euler if solver.integrator == "Euler" else mjx.implicit)(model, data)
     force = data._impl.efc_force[mjx_car.rows]
-    return data.qpos, data.qvel, data.qacc_warmstart, tyres.compute_tyre_outputs(state, patch, [force[:, r] for r in range(3)], tyre)
+    return data.qpos, data.qvel, data.qacc_warmstart, tyres.compute_tyre_outputs(state, patch, [force[:, r] for r in range(3)], inputs.tyre)
