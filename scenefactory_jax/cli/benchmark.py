@@ -11,8 +11,8 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file, sharding
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.loading import scene_source
@@ -52,10 +52,10 @@ def benchmark(
     if config["baseline"] is not None and measure_baseline is None:
         raise ConfigError(f"baseline: expected null; the baseline is measured by {PROGRAM}")
     scene_source.use_compilation_cache()
-    meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, configs.versions()
+    meshes, loaded, versions = {name: sharding.make_mesh(task["devices"]) for name, task in tasks.items()}, {}, run_config.versions()
     out = None if config["out"] is None else Path(config["out"])
     before = _read(out) if config["resume"] else {"rows": [], "baseline": None}
-    result = {"command": configs.format_command("benchmark"), "versions": versions, "rows": [], "baseline": None}
+    result = {"command": run_config.format_command("benchmark"), "versions": versions, "rows": [], "baseline": None}
 
     def load(task: Mapping[str, Any]) -> scene_source.Scenes:
         source = result_file.digest(task["scenes"])

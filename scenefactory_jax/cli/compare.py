@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
@@ -57,7 +57,7 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
             same = f"{other.folder} and {run.folder} have one setting and one seed, {run.config['seed']}"
             raise ConfigError(f"runs: {same}: they are no two samples; leave one out")
     result = {
-        "command": configs.format_command("compare"),
+        "command": run_config.format_command("compare"),
         "settings": {key: config[key] for key in ("metrics", "window", "last")},
         "groups": {label: _summarise(seeds, config) for label, seeds in groups.items()},
     }
@@ -85,7 +85,7 @@ def _find(patterns: Iterable[str]) -> list[Path]:
 
 
 def _read(folder: Path, metrics: Iterable[str]) -> ReadRun:
-    config, rows = configs.read_values(folder), metrics_csv.read(folder)
+    config, rows = run_config.read_values(folder), metrics_csv.read(folder)
     if not rows:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
     if missing := [name for name in (STEPS, *metrics) if name not in rows[0]]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.data.loading import scene_source
@@ -55,7 +56,7 @@ def _evaluate(config: Mapping[str, Any], run: Path, out: Path, *, request: Mappi
     terminations = load_terminations(request["protocols"])
     evaluated = protocols.evaluate_protocols(config, scenes, policies, terminations, settings=settings, recorded_worlds=recorded_worlds)
     result = evaluation_files.write(
-        out, evaluated, config=config, run=run, request=request, settings=settings, versions=configs.versions(),
+        out, evaluated, config=config, run=run, request=request, settings=settings, versions=run_config.versions(),
         command=format_rerun_command(request, settings),
     )  # fmt: skip
     print(tables.format_summaries(result.summary), f"\nreport {result.report}", sep="\n", flush=True)

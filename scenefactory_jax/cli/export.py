@@ -9,6 +9,7 @@ import yaml
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import statistics
@@ -40,7 +41,7 @@ def export(config: Mapping[str, Any]) -> Path:
     scenes = trained.config["scenes"]
     scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # without paths of this machine
     exported = {**trained.config, "out": None, "resume": False, "scenes": scenes}
-    configs.write(out, exported)
+    run_config.write(out, exported)
     shutil.copy(trained.folder / "versions.yaml", out)
     text = policy_card.format_card(
         out.name,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.loading import scene_source
@@ -29,7 +29,7 @@ def physics(config: Mapping[str, Any]) -> dict[str, Any]:
     schema.check(config, schema.Physics)
     numbers = {name: config[name] for name in ("films_mm", "speeds_mps", "slips", "max_film_mm")}
     tables = friction_tables.compute_tables(config["weather"]["friction"], **numbers)
-    result = result_file.plain({"command": configs.format_command("physics"), **tables}, digits=DIGITS)
+    result = result_file.plain({"command": run_config.format_command("physics"), **tables}, digits=DIGITS)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
     result_file.write(out / "weather.json", result, digits=None)

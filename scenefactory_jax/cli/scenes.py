@@ -9,6 +9,7 @@ import numpy as np
 
 from scenefactory_jax.cli import hydra_config, scene_operations
 from scenefactory_jax.cli.scene_schema import SceneOperations
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import markdown, schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import RawScene, SceneError
@@ -75,7 +76,7 @@ def quality(config: Mapping[str, Any]) -> dict[str, quality_gate.Count]:
     )
     if not found.scenes:
         raise SceneError("\n".join(["scenes.path: no scene that can be read", *found.unread]))
-    command = hydra_config.format_command("scenes")
+    command = run_config.format_command("scenes")
     path = scene_quality.write(out, found, rules, entries=settings["rules"], window_m=numbers["window_m"], command=command)
     print(markdown.format_table(["rule", "findings", "scenes", "objects"], [[name, *count] for name, count in found.counts.items()]))
     summary = f"{found.scenes} scenes checked, {found.refused} refused, {found.dropped} objects left out, {len(found.unread)} not read"
@@ -100,7 +101,7 @@ def compare(config: Mapping[str, Any]) -> Path:
         if not len(sets[name]["vehicles"]):
             raise SceneError(f"{entry['path']}: no usable scene to compare as {name!r}")
     first = next(iter(sets))
-    path = scene_comparison.write(out, first, sets, scene_size_m=size_m, command=hydra_config.format_command("scenes"))
+    path = scene_comparison.write(out, first, sets, scene_size_m=size_m, command=run_config.format_command("scenes"))
     print(f"{scene_comparison.table(first, sets)}\n{path}", flush=True)
     return path
 

@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import study_plan, study_results
 from scenefactory_jax.cli.evaluate import make_training_callback
 from scenefactory_jax.cli.study_plan import Evaluation, Plan, Training
 from scenefactory_jax.core import atomic_file, folder_lock, result_file
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.parallel import gpu_processes
 from scenefactory_jax.core.parallel.gpu_processes import TaskClaims
 from scenefactory_jax.data.loading import scene_source
@@ -165,7 +165,7 @@ def _run(part: str, plan: Plan, session: Session) -> bool:
 def _is_ready(evaluation: Evaluation) -> bool:
     """Whether the weights exist; records of an untrained policy need the folder of a run that has begun."""
     training = evaluation.training
-    return (training.folder / configs.FILE if evaluation.weights == study_plan.UNTRAINED else training.file).is_file()
+    return (training.folder / run_config.FILE if evaluation.weights == study_plan.UNTRAINED else training.file).is_file()
 
 
 def _run_tasks(tasks: Iterable[Task], make_work: Callable[[Task], Callable[[Task], None]], session: Session) -> bool:
@@ -216,13 +216,13 @@ def _make_trainer(plan: Plan, session: Session, first: Training) -> Callable[[Tr
 
 def _train(training: Training, prepared: training_loop.Prepared, evaluators: Mapping[str, Evaluator]) -> dict[str, Any]:
     """Runs a training and returns what it was: settings, duration, scenes and versions."""
-    resume = (training.folder / configs.FILE).is_file()
+    resume = (training.folder / run_config.FILE).is_file()
     print(training.label + (" (resumed)" if resume else ""), flush=True)
     config = {**training.config, "out": str(training.folder), "resume": resume}
     callback = functools.partial(make_training_callback, config, evaluators=evaluators)
     last = training_loop.train(config, prepared=prepared, make_callback=callback).metrics[-1]
     note = {"digest": training.digest, "seed": training.seed, "iterations": int(last["iteration"]), "steps": last["steps/total"]}
-    note |= {"minutes": last["minutes"], "commit": configs.find_commit(), "versions": configs.versions()}
+    note |= {"minutes": last["minutes"], "commit": run_config.find_commit(), "versions": run_config.versions()}
     if prepared.scenes is not None:
         scenes = scene_source.take_scenes(prepared.scenes, config["scenes"])
         note |= {"scenes": len(scenes), "agents": int(np.asarray(scenes.scene.agents.present).sum())}
@@ -250,7 +250,7 @@ def _make_evaluation(session: Session, first: Evaluation) -> Callable[[Evaluatio
 
 def _format_command(config: Mapping[str, Any]) -> str:
     """Formats the command without the paths of this machine."""
-    command = configs.format_command("study")
+    command = run_config.format_command("study")
     for name in ("train_scenes", "test_scenes", "runs"):
         if config[name] is not None:
             command = command.replace(str(config[name]), Path(config[name]).name)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import study_plan
 from scenefactory_jax.cli.study_plan import Plan
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import statistics
@@ -114,7 +114,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
         "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
         "differences": _compare(study["compare"], records, resampling),
         "trainings": {variant: _describe_trainings(variant, plan, config["target"]) for variant in study["trainings"]},
-        "made_with": {"commit": configs.find_commit(), **configs.versions()},
+        "made_with": {"commit": run_config.find_commit(), **run_config.versions()},
     }
 
 

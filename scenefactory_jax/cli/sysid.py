@@ -6,8 +6,8 @@ from typing import Any
 
 import yaml
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.sysid import identification
@@ -32,7 +32,7 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     scene_source.use_compilation_cache()
     out, targets = Path(config["out"]), config["sysid"]["targets"]
     fit = identification.identify(config, out)
-    result = {"command": configs.format_command("sysid"), "versions": configs.versions(), **fit}
+    result = {"command": run_config.format_command("sysid"), "versions": run_config.versions(), **fit}
     result_file.write(out / "result.json", result, digits=DIGITS)
     values = dict(zip(fit["space"]["names"], fit["refined"].best.tolist(), strict=True))
     fitted = {

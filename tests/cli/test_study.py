@@ -13,6 +13,7 @@ from support import study_parts
 from scenefactory_jax.cli import hydra_config, study_plan
 from scenefactory_jax.cli import study as command
 from scenefactory_jax.cli.study import study
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
@@ -79,7 +80,7 @@ def stub_training(monkeypatch, request):
     def train(config, **_):
         with run_folder.open_run_folder(config) as (folder, _):
             begun.append((config["seed"], config["resume"]))
-            hydra_config.write(folder, config)
+            run_config.write(folder, config)
             row = {"iteration": 1, "steps/total": 10, "minutes": 0.1, "casps": 100.0}
             (folder / "metrics.csv").write_text(",".join(row) + "\n" + ",".join(map(str, row.values())) + "\n")
             if len(begun) == 2 and stops:

@@ -27,6 +27,7 @@ from scenefactory_jax.cli.export import export, format_name
 from scenefactory_jax.cli.scenes import scenes
 from scenefactory_jax.cli.train import train
 from scenefactory_jax.cli.view import replay
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.data.bank import bank_reader
@@ -491,7 +492,7 @@ def test_only_our_own_command_line_counts_as_a_command(monkeypatch):
     called = {"/lib/scenefactory_jax/__main__.py train": "python -m scenefactory_jax train a=1", "/home/me/train.py": "train(config)"}
     for program, command in called.items():
         monkeypatch.setattr(sys, "argv", [program, "a=1", "out=x"])
-        assert hydra_config.format_command("train") == command
+        assert run_config.format_command("train") == command
 
 
 def test_a_wrong_key_ends_as_one_line():

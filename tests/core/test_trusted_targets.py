@@ -11,6 +11,7 @@ from scenefactory_jax.cli.compare import _read
 from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.export import export
 from scenefactory_jax.cli.view import load_run_config, replay
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import policy_io, run_folder
@@ -111,7 +112,7 @@ def test_yaml_that_names_itself_is_read_once(tmp_path):
 def test_a_run_resumes_with_the_parts_of_the_command(tmp_path, capsys):
     mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
     before = hydra_config.load_config("train", mine, f"out={tmp_path}")
-    hydra_config.write(tmp_path, before)
+    run_config.write(tmp_path, before)
     with run_folder.open_run_folder(before | {"resume": True}) as (
         folder,
         resume,
@@ -124,6 +125,6 @@ def test_a_run_resumes_with_the_parts_of_the_command(tmp_path, capsys):
 
 
 def test_runs_are_compared_without_trust(tmp_path):
-    hydra_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
+    run_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
     (tmp_path / "metrics.csv").write_text("iteration\n1\n")
     assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"
