@@ -14,7 +14,7 @@ from scenefactory_jax.core import atomic_file, trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 
 FILE = "config.yaml"  # of a run's folder
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy", "hydra-core")
 
 
 def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
