@@ -11,28 +11,19 @@
 Every function of `scenefactory_jax.cli` that is named like a command takes such a config.
 """
 
-import contextlib
 import importlib
-import io
-from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
-    from mujoco import mjx as _mjx  # noqa: F401
-
-from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
-from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.core.raw_scene import RawScene
-from scenefactory_jax.data.loading import raw_scenes
-from scenefactory_jax.data.loading.scene_source import load_training_scenes as load_scenes
-from scenefactory_jax.env.environment import EnvParts, assemble
-from scenefactory_jax.env.environment import make_env as make
 
 if TYPE_CHECKING:
     from scenefactory_jax.cli.evaluate import evaluate
+    from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
+    from scenefactory_jax.cli.read import read
     from scenefactory_jax.cli.train import train
     from scenefactory_jax.cli.view import replay
+    from scenefactory_jax.core.schema import ConfigError
+    from scenefactory_jax.data.loading.scene_source import load_training_scenes as load_scenes
+    from scenefactory_jax.env.environment import EnvParts, assemble
+    from scenefactory_jax.env.environment import make_env as make
     from scenefactory_jax.learning.policy_io import load_policy
     from scenefactory_jax.visualization.birds_eye.video import draw_frame
 
@@ -40,34 +31,30 @@ __version__ = "0.1.0"
 __all__ = ["ConfigError", "EnvParts", "__version__", "apply_overrides", "assemble", "draw_frame", "evaluate", "load_config"]
 __all__ += ["load_policy", "load_scenes", "make", "read", "replay", "train"]
 
-
-def read(path: Path | str) -> Iterator[RawScene | str]:
-    """Reads every scene of a bank, a file or a folder in float64, before checks and packing, in any of the known formats.
-
-        for raw in scenefactory_jax.read("scenes.tfrecord"):
-            print(raw if isinstance(raw, str) else raw.name)
-
-    Returns:
-        The scenes one after another; in place of a scene that cannot be read, the reason.
-
-    Raises:
-        SceneError: no such path.
-    """
-    return raw_scenes.scenes(load_config("scenes", "scenes=womd")["scenes"] | {"path": str(path)})
+PLACES = {  # module of each public name, and its name there
+    "ConfigError": ("core.schema", "ConfigError"),
+    "EnvParts": ("env.environment", "EnvParts"),
+    "apply_overrides": ("cli.hydra_config", "apply_overrides"),
+    "assemble": ("env.environment", "assemble"),
+    "draw_frame": ("visualization.birds_eye.video", "draw_frame"),
+    "evaluate": ("cli.evaluate", "evaluate"),
+    "load_config": ("cli.hydra_config", "load_config"),
+    "load_policy": ("learning.policy_io", "load_policy"),
+    "load_scenes": ("data.loading.scene_source", "load_training_scenes"),
+    "make": ("env.environment", "make_env"),
+    "read": ("cli.read", "read"),
+    "replay": ("cli.view", "replay"),
+    "train": ("cli.train", "train"),
+}
 
 
 def __getattr__(name: str) -> Any:
-    """What loads checkpoints and reports is imported when it is first used: that takes a second."""
-    places = {
-        "train": "cli.train",
-        "evaluate": "cli.evaluate",
-        "replay": "cli.view",
-        "load_policy": "learning.policy_io",
-        "draw_frame": "visualization.birds_eye.video",
-    }
-    if name not in places:
+    """Imports a public name when it is first used: JAX, MuJoCo and Hydra take seconds, which worker processes and `--help` do not need."""
+    if name not in PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"scenefactory_jax.{places[name]}"), name)
+    module, attribute = PLACES[name]
+    globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+    return value
 
 
 def __dir__() -> list[str]:

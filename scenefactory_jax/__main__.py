@@ -17,7 +17,7 @@ COMMANDS = {  # name -> purpose, and the keys to begin with
     "compare": ("Compare training runs.", "runs='[runs/A-*,runs/B]' out=FOLDER"),
     "export": ("Export a policy to one small folder.", "run=RUN out=FOLDER"),
     "convert": ("Convert scene files to a bank.", "source=FILE_OR_FOLDER out=BANK"),
-    "scenes": ("Inspect, filter, split and merge scenes.", "op=info|filter|split|merge|... scenes.path=BANK out=BANK"),
+    "scenes": ("Check, select, split and export scenes.", "op=info|select|split|... scenes.path=BANK out=BANK"),
     "view": ("Watch episodes, or drive a car.", "run=RUN scenes.path=FOLDER out=view.html|.gif|.mp4|.png|.rrd|.xml window=true"),
     "benchmark": ("Measure steps per second.", "experiment=paper suite=throughput scenes.path=FOLDER out=FOLDER"),
     "study": ("Train, evaluate and report an experiment.", "study=navigation|transfer|... train_scenes=BANK test_scenes=BANK"),

@@ -34,3 +34,15 @@ def quickly():
     """XLA without its costly passes for all of a module; `pytestmark = pytest.mark.usefixtures("quickly")`."""
     with quick_compilation():
         yield
+
+
+@pytest.fixture
+def undrawn_figures(monkeypatch):
+    """Reports write empty files in place of their figures: drawing takes most of their time."""
+    from scenefactory_jax.visualization.report import plots
+
+    def save(figure, path, *, dpi=160):
+        path.touch()
+        return path
+
+    monkeypatch.setattr(plots, "save", save)

@@ -74,5 +74,5 @@ def _measure(worlds: Scene, overrides: list[str], *, steps: int, repeats: int, s
         "per_s_range": [done / max(found.seconds), done / min(found.seconds)],
         "ms_a_control_step": 1e3 * found.median / steps,
         "compile_s": found.compile_s,
-        "finite": bool(jnp.isfinite(jax.vmap(parts.dynamics.read)(found.left[0].body).position)[worlds.agents.present].all()),
+        "finite": bool(jnp.isfinite(jax.vmap(parts.dynamics.read)(found.result[0].body).position)[worlds.agents.present].all()),
     }

@@ -103,15 +103,15 @@ MUTATIONS = (
     Mutation("readers", "speed limits of WOMD are km/h", "data/formats/womd_scenario.py",
              "MPH = 0.44704", "MPH = 1 / 3.6", "data/test_womd.py"),
     Mutation("packing", "segments are twice as long", "data/packing/pack.py",
-             '"half_length": own / 2', '"half_length": own', "data/test_scenes.py"),
+             '"road.half_length": length[rows] / 2', '"road.half_length": length[rows]', "data/test_scenes.py"),
     Mutation("banks", "a track's steps begin one row late", "data/bank/arrow_codec.py",
              "list(map(slice, bounds[:-1], bounds[1:]))", "list(map(slice, [b + 1 for b in bounds[:-1]], bounds[1:]))",
              "data/test_banks.py"),
     Mutation("checkpoints", "the oldest is restored", "learning/checkpoint.py",
-             "found[-1] if iteration is None", "found[0] if iteration is None",
+             "iterations[-1] if iteration is None", "iterations[0] if iteration is None",
              "learning/test_checkpoint.py"),
     Mutation("checkpoints", "what is judged is the last step, not the running mean", "learning/checkpoint.py",
-             "AVERAGED if AVERAGED in held else LEARNT", "LEARNT", "learning/test_checkpoint.py"),
+             "(averaged or last)", "last", "learning/test_checkpoint.py"),
 )  # fmt: skip
 
 

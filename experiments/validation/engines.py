@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from experiments.validation import c_engine_encounters
 from experiments.validation.encounters import Encounters
 from experiments.validation.random_drives import PATTERNS, Sequences
 from scenefactory_jax.core.instantiate import instantiate
@@ -152,20 +153,20 @@ def meet_c(
     car, solver = cars.read_parameters(entry)
     settings = {"physics_dt": 1.0 / physics_hz, "iterations": iterations, "line_search": line_search}
     newton = dataclasses.replace(solver, algorithm="newton")
-    rig = mujoco_c.make_encounter(car, newton, touch(entry, impedance=impedance), **settings)
+    rig = c_engine_encounters.make_encounter(car, newton, touch(entry, impedance=impedance), **settings)
     still, substeps = models.find_rest_pose(mujoco_c.make_one(car, newton, **settings).model, car), round(physics_hz / control_hz)
     paths, first = [], []
     for index in range(len(cases.kind)):
         position, yaw, speed = (x[index].astype(float) for x in (cases.position, cases.yaw, cases.speed))
         mujoco_c.place(rig, still, position, yaw, speed + nudge)
         mu = np.full((2, 4), float(cases.friction[index]))
-        story = mujoco_c.simulate_encounter(rig, cases.controls[index].astype(float), mu, substeps=substeps)
+        story = c_engine_encounters.simulate_encounter(rig, cases.controls[index].astype(float), mu, substeps=substeps)
         paths.append([*story.trajectory, story.contact_force])
         first.append(story.first_contact_s)
     return Run(*(np.array(column) for column in zip(*paths, strict=True))), np.array(first)
 
 
-def touch(entry: Mapping[str, Any], *, impedance: float) -> mujoco_c.ContactParameters:
+def touch(entry: Mapping[str, Any], *, impedance: float) -> c_engine_encounters.ContactParameters:
     """The contact between cars that a config's dynamics has, for the C engine."""
     contact = entry["contact"]
-    return mujoco_c.ContactParameters(contact["stiffness"], contact["damping"], contact["friction"], impedance)
+    return c_engine_encounters.ContactParameters(contact["stiffness"], contact["damping"], contact["friction"], impedance)

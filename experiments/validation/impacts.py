@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from experiments.validation import engines
+from experiments.validation import c_engine_encounters, engines
 from experiments.validation.engines import Run
 from experiments.validation.equivalence import errors
-from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 
@@ -151,11 +150,11 @@ def balance(
     """Momentum and energy that the two cars together gained or lost between two control steps."""
     car, solver = cars.read_parameters(entry)
     touch = engines.touch(entry, impedance=0.5)  # no contact force enters here
-    rig = mujoco_c.make_encounter(car, solver, touch, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
+    rig = c_engine_encounters.make_encounter(car, solver, touch, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
     mass = float(rig.model.body_subtreemass[0])
     momentum, angular, lost = [], [], []
     for case, (start, end) in enumerate(zip(before, after, strict=True)):
-        first, last = (mujoco_c.compute_mechanics(rig, run.qpos[case, step], run.qvel[case, step]) for step in (start, end))
+        first, last = (c_engine_encounters.compute_mechanics(rig, run.qpos[case, step], run.qvel[case, step]) for step in (start, end))
         momentum.append((last.momentum - first.momentum)[:2])
         angular.append((last.angular_momentum - first.angular_momentum)[2])
         lost.append(first.kinetic_energy - last.kinetic_energy)

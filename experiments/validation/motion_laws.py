@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.validation import engines
+from experiments.validation import c_engine_encounters, engines
 from experiments.validation.random_drives import PATTERN_NAMES, Sequences
 from scenefactory_jax.core.types import Dynamics, Scene
 from scenefactory_jax.dynamics import mujoco_c, open_ground
@@ -262,7 +262,7 @@ def rolling(
     trace = drive(cases)
     assert trace.qpos is not None and trace.qvel is not None
     energy = np.array([
-        [sum(mujoco_c.compute_mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
+        [sum(c_engine_encounters.compute_mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
         for path in zip(trace.qpos, trace.qvel, strict=True)
     ])  # fmt: skip
     scale = 0.5 * total_mass(car) * speed**2

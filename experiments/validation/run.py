@@ -13,7 +13,7 @@ from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
 from experiments.validation.measurements import Spread, spread_cases
 from scenefactory_jax.cli import entry, schema
-from scenefactory_jax.cli import hydra_config as configs
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.loading import scene_source
@@ -69,7 +69,7 @@ def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) ->
     """One part, unless its result is there already."""
     path, part = out / "results" / f"{name}.json", PARTS[name]
     read = subset(config, part.reads)
-    made = {"settings": result_file.digest(read), "versions": configs.versions()}
+    made = {"settings": result_file.digest(read), "versions": run_config.versions()}
     if config["resume"] and path.is_file():
         before = result_file.read(path)
         if all(before[key] == value for key, value in made.items()):
@@ -79,7 +79,7 @@ def _measure(name: str, config: Mapping[str, Any], out: Path, spread: Spread) ->
     print(f"{name} ...", flush=True)
     result = part.run(read, spread)
     seconds = time.perf_counter() - begun
-    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": configs.format_command("validate"), "result": result}
+    whole = {**made, "seconds": seconds, "workers": config["workers"], "command": run_config.format_command("validate"), "result": result}
     result_file.write(path, whole, digits=DIGITS)
     print(f"{name}: {seconds:.0f} s", flush=True)
 

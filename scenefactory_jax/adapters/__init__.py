@@ -1,6 +1,6 @@
-"""The environment as Gymnasium, Stable-Baselines3, PettingZoo, JaxMARL and Brax know one.
+"""Adapts the environment to the interfaces of Gymnasium, Stable-Baselines3, PettingZoo, JaxMARL and Brax.
 
-Each is a thin file over `episodes`, and an extra of the package.
+Each adapter is a thin file over `episodes`, and an extra of the package.
 
     import gymnasium, scenefactory_jax.adapters.gymnasium                      # pip install 'scenefactory_jax[gymnasium]'
     env = gymnasium.make("scenefactory_jax/Drive-v0", overrides=["dynamics=bicycle"])
@@ -9,18 +9,18 @@ Each is a thin file over `episodes`, and an extra of the package.
     from scenefactory_jax.adapters.pettingzoo import Drive                     # ParallelEnv; also .sb3, .jaxmarl and .brax
     env = Drive(overrides=["experiment=demo"])
 
-All take `config` (what `scenefactory_jax.load_config("train", ...)` gives; by default that), `overrides` of it as on the command line, and
-`scenes` (what `load_scenes` gives; by default the config's). Every episode begins in a scene drawn at random from these. Gymnasium, SB3
-and Brax know one agent: the config must say `scenes.pack.agents=1`, and does by default.
+All take `config` (from `scenefactory_jax.load_config("train", ...)`, the default), `overrides` of it as on the command line, and
+`scenes` (from `load_scenes`; by default the config's). Every episode begins in a scene sampled from these. Gymnasium, SB3 and Brax have
+one agent: `scenes.pack.agents=1`, the default here.
 
-What they share:
+Common to all:
 
-- An observation is one vector of float32 (`flat`); `layout` says which columns are what, and all are within finite bounds (`bounds`).
+- An observation is one vector of float32 (`flatten_observation`) with columns as in `layout`, all within finite bounds (`bounds`).
   An action is throttle, steer, brake in [-1, 1].
-- A step is an action: with `actions.action_repeat=3` it is three control steps, and its reward what they paid together.
-- *Terminated* is a car that an event has ended (`config["termination"]`); it observes zeros from then on. *Truncated* is a car that was
-  still driving when the time of its world was up (`timing.episode_s`); its last observation is a real one, to bootstrap from.
-- `terms` are the weighted reward terms, which sum to the reward; `events` what happened to the car in this step, for the first time.
+- A step is an action: with `actions.action_repeat=3` it is three control steps, and its reward is their sum.
+- *Terminated*: an event ended the car (`config["termination"]`); it observes zeros from then on. *Truncated*: the car was active at the
+  time limit of its world (`timing.episode_s`); its last observation is a real one, to bootstrap from.
+- `terms` are the weighted reward terms, which sum to the reward; `events` are the new events of the car in this step.
 - The same seed gives the same bits, and nothing is compiled again while an environment runs.
 
 Code in the style of purejaxrl, with one `jit` around everything, needs no adapter: docs/library.md has the rollout.
@@ -49,8 +49,8 @@ def flatten_observation(observation: Observation) -> Float[Array, "..."]:
 
 
 def layout(observation: Observation) -> dict[str, slice]:
-    """Which columns of `flat` hold what: `road` and `road.mask` of a set. Works on shapes, too (`jax.eval_shape`)."""
-    found, at = {}, 0
+    """Columns of each group in `flatten_observation`, as `road` and `road.mask` for a set; also of shapes (`jax.eval_shape`)."""
+    columns, at = {}, 0
     for name in sorted(observation):
         group = observation[name]
         if isinstance(group, SetObservation):
@@ -59,5 +59,5 @@ def layout(observation: Observation) -> dict[str, slice]:
         else:
             widths = {name: group.shape[-1]}
         for key, width in widths.items():
-            found[key], at = slice(at, at + width), at + width
-    return found
+            columns[key], at = slice(at, at + width), at + width
+    return columns

@@ -1,8 +1,8 @@
-"""Finite bounds of observations, for interfaces whose spaces have some.
+"""Finite bounds of observations, for interfaces with bounded spaces.
 
-Columns of an observation are quantities divided by a scale of the config. Most are bounded by what they are (a sine, a share, a squashed
-length), and their group says so (`observations.bounded`). The others (positions, velocities, yaw rates) are clipped to LIMIT of their
-scales; with the scales of the package that is 1 km to the goal, 100 m/s and 10 rad/s, which no car of its own reaches.
+Columns of an observation are quantities divided by a scale of the config. Most are bounded by definition (a sine, a fraction, a squashed
+length), which their group declares (`observations.bound_observation`). The others (positions, velocities, yaw
+rates) are clipped to LIMIT of their scales: with the package's scales 1 km to the goal, 100 m/s and 10 rad/s, which no car reaches.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,23 +16,24 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Observation, SetObservation
 from scenefactory_jax.env.observations import ANY, Group
 
-LIMIT = 10.0  # of its scale, at which a column without a bound of its own is clipped
+LIMIT = 10.0  # of its scale, at which a column without a declared bound is clipped
 
 
 def clip(group: Group) -> Group:
     """The group with every column clipped to its bounds; without effect on columns that declare them."""
 
     def clipped(scene: Any, state: Any) -> Array | SetObservation:
-        seen = group(scene, state)
-        if isinstance(seen, SetObservation):
-            return replace(seen, features=jnp.clip(seen.features, *_columns(group, seen.features.shape[-1])))
-        return jnp.clip(seen, *_columns(group, seen.shape[-1]))
+        observation = group(scene, state)
+        if isinstance(observation, SetObservation):
+            features = observation.features
+            return replace(observation, features=jnp.clip(features, *_columns(group, features.shape[-1])))
+        return jnp.clip(observation, *_columns(group, observation.shape[-1]))
 
     return clipped
 
 
 def flat_bounds(groups: Mapping[str, Callable], observation: Observation) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"]]:
-    """Lowest and highest value of each column of `adapters.flat`.
+    """Lowest and highest value of each column of `adapters.flatten_observation`.
 
     Args:
         groups: of the environment (`Parts.groups`), by name.
@@ -40,18 +41,18 @@ def flat_bounds(groups: Mapping[str, Callable], observation: Observation) -> tup
     """
     low, high = [], []
     for name in sorted(observation):
-        seen = observation[name]
-        features = seen.features if isinstance(seen, SetObservation) else seen
-        rows = features.shape[-2] if isinstance(seen, SetObservation) else 1
-        bounds = _columns(groups[name], features.shape[-1])
-        for found, bound, mask in zip((low, high), bounds, (0.0, 1.0), strict=True):
-            found += [*np.tile(bound, rows), *([mask] * rows if isinstance(seen, SetObservation) else [])]
+        values = observation[name]
+        is_set = isinstance(values, SetObservation)
+        features = values.features if is_set else values
+        rows = features.shape[-2] if is_set else 1
+        for bounds, bound, mask in zip((low, high), _columns(groups[name], features.shape[-1]), (0.0, 1.0), strict=True):
+            bounds += [*np.tile(bound, rows), *([mask] * rows if is_set else [])]
     return np.array(low, np.float32), np.array(high, np.float32)
 
 
 def _columns(group: Callable, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest value of each column of a group; zero, which finished and absent agents read, is always within."""
-    declared = getattr(getattr(group, "func", group), "columns", (ANY,))  # `build` binds numbers by functools.partial
+    """Lowest and highest value of each column of a group; zero, the value of finished and absent agents, is always within."""
+    declared = getattr(getattr(group, "func", group), "columns", (ANY,))  # `instantiate` binds numbers by functools.partial
     columns = [*declared, *[declared[-1]] * (count - len(declared))][:count]
     low, high = np.clip(np.array(columns, np.float32), -LIMIT, LIMIT).T
     return np.minimum(low, 0.0), np.maximum(high, 0.0)

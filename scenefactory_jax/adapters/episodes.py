@@ -58,9 +58,8 @@ class Episode:
 
 @pytree_dataclass
 class WorldStep:
-    """Results of one step for the cars of one world; the observation is from before a new episode."""
+    """Results of one step for the cars of one world."""
 
-    observation: Float[Array, "A F"]
     reward: Float[Array, " A"]
     terms: dict[str, Float[Array, " A"]]
     events: dict[str, Bool[Array, " A"]]
@@ -71,25 +70,25 @@ class WorldStep:
 
 
 def make_pool(
-    config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: scene_source.Scenes | None, *, alone: bool, lives: bool = False
+    config: Mapping[str, Any] | None, overrides: Sequence[str], scenes: scene_source.Scenes | None, *, alone: bool, respawns: bool = False
 ) -> Pool:
-    """The pool of a config.
+    """Makes the pool of a config.
 
     Args:
-        config: as `load("train", ...)` gives it; None: that, with one agent if `alone`.
-        overrides: of the config.
-        scenes: to draw from; None: the config's.
-        alone: one car per world is required.
-        lives: cars may respawn.
+        config: as `load_config("train", ...)` returns it; None: that, with one agent if `alone`.
+        overrides: of the config, as on the command line.
+        scenes: to sample episodes from; None: the config's.
+        alone: one slot per scene is required.
+        respawns: cars may respawn.
 
     Raises:
-        ConfigError: more slots than one where one is wanted, cars that begin anew where they may not, or a key that does not fit.
+        ConfigError: several slots in place of one, respawning cars where they may not, or what `make` and `load_scenes` raise.
     """
     if config is None:
         config = scenefactory_jax.load_config("train", *([ALONE] if alone else []), *overrides)
     elif overrides:
         config = scenefactory_jax.apply_overrides(config, overrides)
-    if not lives and config["spawning"]["respawn_clearance_m"] is not None:
+    if not respawns and config["spawning"]["respawn_clearance_m"] is not None:
         clearance = config["spawning"]["respawn_clearance_m"]
         raise ConfigError(f"spawning.respawn_clearance_m: expected null, for cars of this interface do not respawn, got {clearance}")
     if alone and scenes is None and config["scenes"]["pack"]["agents"] != 1:
@@ -97,8 +96,8 @@ def make_pool(
     scene_source.use_compilation_cache()
     parts = environment.make_parts(config)
     env = environment.assemble(parts._replace(groups={name: bounds.clip(group) for name, group in parts.groups.items()}))
-    found = scene_source.load_training_scenes(config["scenes"]) if scenes is None else scenes
-    on_device = jax.device_put(found.scene)
+    loaded = scene_source.load_training_scenes(config["scenes"]) if scenes is None else scenes
+    on_device = jax.device_put(loaded.scene)
     slots = on_device.agents.present.shape[1]
     if alone and slots != 1:
         where = "the scenes given" if scenes is not None else f"scenes.capacity.agents={config['scenes']['capacity']['agents']}"
@@ -106,10 +105,10 @@ def make_pool(
     episode = jax.eval_shape(functools.partial(start_episodes, env), on_device, jax.random.key(0))
     observation = jax.eval_shape(lambda scenes, at: env.observe(_select(scenes, at.scene), at.state), on_device, episode)
     low, high = bounds.flat_bounds(parts.groups, observation)
-    result = jax.eval_shape(functools.partial(step_worlds, env), on_device, episode, jnp.zeros((slots, 3)))[1]
+    result = jax.eval_shape(functools.partial(step_world, env), on_device, episode, jnp.zeros((slots, 3)))[1]
     timing, terms = config["timing"], tuple(sorted(result.terms))
     steps, step_hz = environment.episode_steps(timing) // env.action_repeat, timing["control_hz"] / env.action_repeat
-    return Pool(env, on_device, found.names, slots, low, high, terms, steps, step_hz, config["step_metrics"]["goal_radius_m"])
+    return Pool(env, on_device, loaded.names, slots, low, high, terms, steps, step_hz, config["step_metrics"]["goal_radius_m"])
 
 
 def begin_episode(env: Env, scenes: Scene, key: PRNGKeyArray, scene: Int[Array, ""] | int = ANY) -> tuple[Episode, Float[Array, "A F"]]:
@@ -131,19 +130,12 @@ def observe(env: Env, scenes: Scene, episode: Episode) -> Float[Array, "A F"]:
     return flatten_observation(env.observe(_select(scenes, episode.scene), episode.state))
 
 
-def step_worlds(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
+def step_world(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
     """Applies one action in one world; no new episode starts."""
-    episode, result = transition(env, scenes, episode, action)
-    return episode, _with_observation(result, observe(env, scenes, episode))
-
-
-def transition(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, WorldStep]:
-    """`step_worlds` with an empty observation, [A, 0]."""
     scene = _select(scenes, episode.scene)
     control = lambda state: env.control_step(scene, state, action)  # noqa: E731
     state, _, outcome, _ = environment.repeat_action(control, episode.state, action_repeat=env.action_repeat)
     result = WorldStep(
-        observation=jnp.zeros((len(state.active), 0), jnp.float32),
         reward=outcome.reward,
         terms=outcome.terms,
         events=vars(outcome.events),
@@ -167,12 +159,13 @@ class CarStep(NamedTuple):
 
 
 def pack_observation(env: Env, scenes: Scene, episode: Episode, action: Float[Array, "A 3"]) -> tuple[Episode, Float[Array, "A N"]]:
-    """`step_worlds` with all results in one array, which a host fetches faster than thirty; `unpack_car_step` splits a row."""
-    after, result = step_worlds(env, scenes, episode, action)
+    """`step_world` and `observe` with all results in one array, which is fetched faster than thirty; see `unpack_car_step`."""
+    after, result = step_world(env, scenes, episode, action)
     same_for_all = [jnp.full_like(result.reward, result.over), jnp.full_like(result.reward, after.scene)]
     columns = [result.reward, result.terminated, result.truncated, *same_for_all]
     columns += [*(result.terms[name] for name in sorted(result.terms)), *(result.events[name] for name in EVENTS)]
-    return after, jnp.concatenate([result.observation, jnp.stack([one.astype(jnp.float32) for one in columns], axis=1)], axis=1)
+    values = jnp.stack([column.astype(jnp.float32) for column in columns], axis=1)
+    return after, jnp.concatenate([observe(env, scenes, after), values], axis=1)
 
 
 def unpack_car_step(pool: Pool, row: np.ndarray) -> CarStep:
@@ -181,10 +174,6 @@ def unpack_car_step(pool: Pool, row: np.ndarray) -> CarStep:
     terms, events = dict(zip(pool.terms, rest, strict=False)), rest[len(pool.terms) :]
     info = {"scene": int(scene), "terms": terms, "events": {name: bool(new) for name, new in zip(EVENTS, events, strict=True)}}
     return CarStep(row[: pool.columns], reward, bool(terminated), bool(truncated), bool(over), info)
-
-
-def _with_observation(result: WorldStep, observation: Float[Array, "A F"]) -> WorldStep:
-    return WorldStep(**{**vars(result), "observation": observation})
 
 
 def _select(scenes: Scene, index: Int[Array, ""]) -> Scene:
@@ -196,17 +185,24 @@ def make_key(seed: int) -> np.uint32:
     return np.uint32(seed % 2**32)
 
 
+def choose_key(episode: Episode | None, seed: int | None, generator: np.random.Generator) -> PRNGKeyArray:
+    """Key of the next episode: from the seed; without a seed the previous episode's, or a random one."""
+    if seed is None and episode is not None:
+        return episode.key
+    return jax.random.key(make_key(int(generator.integers(2**32)) if seed is None else seed))
+
+
 def choose_scene(options: Mapping[str, Any] | None, count: int, worlds: int | None = None) -> np.ndarray:
-    """The scene that `options["scene"]` of a `reset` names, or ANY; of several worlds, [worlds].
+    """The scene index `options["scene"]` of a `reset`, or ANY; of several worlds, [worlds].
 
     Raises:
-        ConfigError: an index of no scene, or another number of them than worlds.
+        ConfigError: an unknown index, or another number of indices than worlds.
     """
-    given = (options or {}).get("scene", ANY)
-    shape, index = () if worlds is None else (worlds,), np.asarray(given)
+    value = (options or {}).get("scene", ANY)
+    shape, index = () if worlds is None else (worlds,), np.asarray(value)
     if not np.issubdtype(index.dtype, np.integer) or index.shape not in ((), shape) or index.min() < ANY or index.max() >= count:
         each = "" if worlds is None else f", or a list of {worlds} of these"
-        raise ConfigError(f"options['scene']: {given!r}; valid: 0 to {count - 1}, or {ANY} for any{each}")
+        raise ConfigError(f"options['scene']: {value!r}; valid: 0 to {count - 1}, or {ANY} for any{each}")
     return np.broadcast_to(index, shape).astype(np.int32)
 
 

@@ -38,13 +38,8 @@ class Drive(gymnasium.Env):
     """One car in one world.
 
     Args:
-        config: as `load("train", ...)` gives it, with `scenes.pack.agents=1`; None: that with its defaults.
-        overrides: of the config, as on the command line.
-        scenes: to draw episodes from; None: the config's.
+        config, overrides, scenes: as of `episodes.make_pool`; one slot per scene.
         render_mode: None, or rgb_array.
-
-    Raises:
-        ConfigError: another render mode, scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
     """
 
     metadata = METADATA
@@ -68,28 +63,16 @@ class Drive(gymnasium.Env):
         self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """A fresh episode: of the seed, or the next one of the seed before.
-
-        Raises:
-            ConfigError: `options["scene"]` is no scene's index.
-        """
+        """Starts an episode from the seed, or the next one of the previous seed, in `options["scene"]` or a sampled scene."""
         super().reset(seed=seed)
         scene = episodes.choose_scene(options, len(self.names))
-        if seed is None and self._episode is not None:
-            key = self._episode.key
-        else:
-            key = jax.random.key(episodes.make_key(seed if seed is not None else int(self.np_random.integers(2**32))))
+        key = episodes.choose_key(self._episode, seed, self.np_random)
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
         return np.array(observation)[0], {"scene": int(episode.scene)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One action.
-
-        Raises:
-            ResetNeeded: nothing has begun.
-            ConfigError: an action of another shape.
-        """
+        """Applies one action."""
         if self._episode is None:
             raise ResetNeeded("step: no episode has begun; call reset first")
         episodes.check_action(action, self.action_space.shape)
@@ -98,11 +81,7 @@ class Drive(gymnasium.Env):
         return result.observation, result.reward, result.over and not result.truncated, result.truncated, result.info
 
     def render(self) -> np.ndarray | None:
-        """The world from above around its car, [H, W, 3] from 0 to 255; None without a render mode.
-
-        Raises:
-            ResetNeeded: nothing has begun.
-        """
+        """A bird's-eye picture around the car, [H, W, 3] from 0 to 255; None without a render mode."""
         if self.render_mode is None:
             return None
         if self._episode is None:
@@ -110,10 +89,5 @@ class Drive(gymnasium.Env):
         return self._painter.draw(jax.tree.map(lambda leaf: leaf[None], self._episode))[0]
 
 
-def register() -> None:
-    """Make `gymnasium.make` and `make_vec` know the environment; once is enough."""
-    if ID not in gymnasium.registry:
-        gymnasium.register(ID, entry_point=f"{__name__}:Drive", vector_entry_point=f"{DriveVector.__module__}:DriveVector")
-
-
-register()
+if ID not in gymnasium.registry:
+    gymnasium.register(ID, entry_point=f"{__name__}:Drive", vector_entry_point=f"{DriveVector.__module__}:DriveVector")

@@ -70,38 +70,31 @@ class DriveVector(VectorEnv):
         self._ended: Any = (jnp if arrays == "jax" else np).zeros(num_envs, bool)
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict]:
-        """Fresh episodes everywhere, or where `options["reset_mask"]` says: of the seeds, or the next ones of those before.
+        """Starts episodes in all worlds, or in those of `options["reset_mask"]`, from the seeds or the next of the previous seeds.
 
         Args:
-            seed: world `i` takes `seed + i`, or its own of a sequence.
-
-        Raises:
-            ConfigError: `options["scene"]` is no scene's index, or not one seed for each world.
+            seed: world `i` takes `seed + i`, or element `i` of a sequence.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
-        if seed is None or isinstance(seed, int):
-            given = [None if seed is None else seed + world for world in range(self.num_envs)]
+        if seed is None:
+            seeds = [None] * self.num_envs
         else:
-            given = list(seed)
-        if len(given) != self.num_envs:
-            raise ConfigError(f"seed: {len(given)} seeds for {self.num_envs} worlds")
+            seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"seed: {len(seeds)} seeds for {self.num_envs} worlds")
         everywhere, first = np.ones(self.num_envs, bool), self._worlds is None
-        if first:  # nothing to go on from: what has no seed takes a random one
-            given = [int(self.np_random.integers(2**32)) if one is None else one for one in given]
-        anew = np.array([one is not None for one in given])
-        known = np.array([episodes.make_key(one or 0) for one in given], np.uint32)
+        if first:  # no previous seed
+            seeds = [int(self.np_random.integers(2**32)) if number is None else number for number in seeds]
+        seeded = np.array([number is not None for number in seeds])
+        numbers = np.array([episodes.make_key(number or 0) for number in seeds], np.uint32)
         mask = everywhere if first else np.asarray((options or {}).get("reset_mask", everywhere), bool)
         scene = episodes.choose_scene(options, len(self.names), self.num_envs)
-        worlds, observation = self._begin(self.pool.scenes, self._worlds, known, anew, mask, scene)
+        worlds, observation = self._begin(self.pool.scenes, self._worlds, numbers, seeded, mask, scene)
         self._worlds, self._ended = worlds, self._ended & ~mask
         return self._out((observation, _paired({"scene": worlds.scene}, mask)))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One action of every world.
-
-        Raises:
-            See `advance`.
-        """
+        """Applies one action in every world."""
         step = self.advance(actions)
         return step.observation, step.reward, step.terminated, step.truncated, self._info(step)
 
@@ -109,26 +102,19 @@ class DriveVector(VectorEnv):
         """`step` without Gymnasium's layout of `info`, for other interfaces.
 
         Raises:
-            ResetNeeded: nothing has begun.
-            ConfigError: actions of another shape.
-            RuntimeError: an episode that ended was not begun anew, in mode DISABLED with numpy arrays.
+            RuntimeError: no new episode was started after an end, in mode DISABLED with numpy arrays.
         """
         if self._worlds is None:
             raise ResetNeeded("step: no episode has begun; call reset first")
         episodes.check_action(actions, self.action_space.shape)
         if self.mode is AutoresetMode.DISABLED and self.arrays == "numpy" and self._ended.any():
             raise RuntimeError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset(options={{'reset_mask': ...}}) first")
-        given = jnp.asarray(actions, jnp.float32)
-        self._worlds, step = self._step(self.pool.scenes, self._worlds, self._ended, given)
+        self._worlds, step = self._step(self.pool.scenes, self._worlds, self._ended, jnp.asarray(actions, jnp.float32))
         self._ended = step.ended if self.arrays == "jax" else np.asarray(step.ended)  # not what a caller may write to
         return self._out(step)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Every world from above around its car, [H, W, 3] from 0 to 255 each; None without a render mode.
-
-        Raises:
-            ResetNeeded: nothing has begun.
-        """
+        """A bird's-eye picture of every world, [H, W, 3] from 0 to 255; None without a render mode."""
         if self.render_mode is None:
             return None
         if self._worlds is None:
@@ -158,13 +144,13 @@ def _begin(
     scenes: Scene,
     worlds: Episode | None,
     seeds: UInt32[Any, " W"],
-    anew: Bool[Any, " W"],
+    seeded: Bool[Any, " W"],
     mask: Bool[Any, " W"],
     scene: Int[Any, " W"],
 ) -> tuple[Episode, Float[Array, "W F"]]:
-    """Starts episodes in worlds of `mask`: from the seeds where `anew` is true, else the next episode of the world."""
+    """Starts episodes in worlds of `mask`: from the seeds where `seeded` is true, else the next episode of the world."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-    keys = keys if worlds is None else jnp.where(anew, keys, worlds.key)
+    keys = keys if worlds is None else jnp.where(seeded, keys, worlds.key)
     fresh = jax.vmap(functools.partial(episodes.start_episodes, env, scenes))(keys, jnp.asarray(scene))
     worlds = fresh if worlds is None else tree_where(jnp.asarray(mask), fresh, worlds)
     return worlds, _observe(env, scenes, worlds)
@@ -190,7 +176,7 @@ def _step(
     env: Env, mode: AutoresetMode, scenes: Scene, worlds: Episode, ended: Bool[Any, " W"], actions: Float[Array, "W 3"]
 ) -> tuple[Episode, StepArrays]:
     """Applies one action and starts new episodes."""
-    after, result = jax.vmap(lambda world, action: episodes.transition(env, scenes, world, action[None]))(worlds, actions)
+    after, result = jax.vmap(lambda world, action: episodes.step_world(env, scenes, world, action[None]))(worlds, actions)
     ended, late, every = jnp.asarray(ended), result.truncated[:, 0], jnp.ones(len(actions), bool)
     anew = {AutoresetMode.SAME_STEP: result.over, AutoresetMode.NEXT_STEP: ended, AutoresetMode.DISABLED: ~every}[mode]
     now = after
@@ -223,7 +209,7 @@ def _observe(env: Env, scenes: Scene, worlds: Episode) -> Float[Array, "W F"]:
 
 def _paired(info: Mapping[str, Any], mask: Bool[Any, " W"]) -> dict[str, Any]:
     """Gymnasium's layout: beside every key one with an underscore that says for which worlds it counts."""
-    found = {}
+    paired = {}
     for key, value in info.items():
-        found |= {key: _paired(value, mask) if isinstance(value, Mapping) else value, f"_{key}": mask}
-    return found
+        paired |= {key: _paired(value, mask) if isinstance(value, Mapping) else value, f"_{key}": mask}
+    return paired

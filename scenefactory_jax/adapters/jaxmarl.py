@@ -4,13 +4,13 @@
     env = LogWrapper(Drive(overrides=["experiment=demo"]))          # jaxmarl.wrappers.baselines
     observations, state = jax.vmap(env.reset)(keys)
 
-JaxMARL knows no truncation: a car is done once an event has ended it or its world's time is up. It stays done, observes zeros and earns
-nothing until its world begins anew; so does a slot without a car. `info` holds `terms`, `events`, `truncated` and `acted`, [A] each, the
-latter true of a slot whose car drove in this step: the weight of its sample. The observation after a step that ends an episode is the
-first of the next one; the last of the old one is what `step_env` gives.
+JaxMARL has no truncation: a car is done after an event that ends it or at the time limit of its world. It stays done, with observation
+and reward zero, until its world starts a new episode; so does a slot without a car. `info` holds `terms`, `events`, `truncated` and
+`acted`, [A] each; `acted`, true of cars that were active before the step, is the weight of the sample. The observation after a step that
+ends an episode is the first of the next one; `step_env` returns the last of the old one.
 
-Scenes are closed over, so a `jit` around `reset` or `step` makes constants of its program of them (150 to 250 kB each). Where that is
-too much, make them an argument: `jax.jit(lambda scenes, key: make_train(env.holding(scenes))(key))(env.scenes, key)`.
+Scenes are constants of a compiled `reset` or `step` (150 to 250 kB each). To make them an argument:
+`jax.jit(lambda scenes, key: make_train(env.holding(scenes))(key))(env.scenes, key)`.
 """
 
 import contextlib
@@ -44,23 +44,18 @@ class Drive(MultiAgentEnv):
     """All cars of one world.
 
     Args:
-        config: as `load("train", ...)` gives it; None: that with its defaults.
-        overrides: of the config, as on the command line.
-        scenes: to draw episodes from; None: the config's.
-
-    Raises:
-        ConfigError: what `scenefactory_jax.make` and `load_scenes` raise.
+        config, overrides, scenes: as of `episodes.make_pool`.
     """
 
     def __init__(
         self, config: Mapping[str, Any] | None = None, overrides: Sequence[str] = (), scenes: scene_source.Scenes | None = None
     ):
-        self.pool = episodes.make_pool(config, overrides, scenes, alone=False, lives=True)
+        self.pool = episodes.make_pool(config, overrides, scenes, alone=False, respawns=True)
         super().__init__(num_agents=self.pool.agents)
         self.agents = self.pool.cars
         self.scenes = self.pool.scenes
-        seen = Box(jnp.asarray(self.pool.low), jnp.asarray(self.pool.high), (self.pool.columns,))
-        self.observation_spaces = dict.fromkeys(self.agents, seen)
+        space = Box(jnp.asarray(self.pool.low), jnp.asarray(self.pool.high), (self.pool.columns,))
+        self.observation_spaces = dict.fromkeys(self.agents, space)
         self.action_spaces = {name: Box(-1.0, 1.0, (3,)) for name in self.agents}
 
     def holding(self, scenes: Scene) -> "Drive":
@@ -71,7 +66,7 @@ class Drive(MultiAgentEnv):
 
     @functools.partial(jax.jit, static_argnums=(0,))
     def reset(self, key: Array) -> tuple[Named, Episode]:
-        """A fresh episode."""
+        """Starts an episode."""
         episode, observation = episodes.begin_episode(self.pool.env, self.scenes, key)
         return self._named(observation), episode
 
@@ -79,21 +74,20 @@ class Drive(MultiAgentEnv):
     def step(
         self, key: Array, state: Episode, actions: Named, reset_state: Episode | None = None
     ) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
-        """One action; a world that is over begins anew, by the key or in `reset_state`. What JaxMARL's own does, with one look in
-        place of two."""
-        after, result = episodes.transition(self.pool.env, self.scenes, state, self._stacked(actions))
+        """Applies one action; a finished world starts a new episode, from the key or `reset_state`. Observes once, JaxMARL's twice."""
+        after, result = episodes.step_world(self.pool.env, self.scenes, state, self._stacked(actions))
         fresh = episodes.start_episodes(self.pool.env, self.scenes, key) if reset_state is None else reset_state
         now = jax.tree.map(lambda new, old: jnp.where(result.over, new, old), fresh, after)
         return self.get_obs(now), now, *self._outputs(state, result)
 
     def step_env(self, key: Array, state: Episode, actions: Named) -> tuple[Named, Episode, Named, Named, dict[str, Any]]:
-        """One action, without beginning anew."""
+        """Applies one action; no new episode starts."""
         del key  # the environment draws nothing in a step
-        after, result = episodes.step_worlds(self.pool.env, self.scenes, state, self._stacked(actions))
-        return self._named(result.observation), after, *self._outputs(state, result)
+        after, result = episodes.step_world(self.pool.env, self.scenes, state, self._stacked(actions))
+        return self.get_obs(after), after, *self._outputs(state, result)
 
     def get_obs(self, state: Episode) -> Named:
-        """What the cars see."""
+        """Observations of all cars."""
         return self._named(episodes.observe(self.pool.env, self.scenes, state))
 
     @property

@@ -6,8 +6,8 @@
     while env.agents:
         observations, rewards, terminations, truncations, infos = env.step({name: env.action_space(name).sample() for name in env.agents})
 
-Agents are the slots, "car_0" and so on; those that hold a car in this episode's scene are in `agents` until they end. What `step` returns
-is about those that were driving before it. `infos[name]` holds `scene`, an index into `names`, and of a step `terms` and `events`.
+Agents are the slots, "car_0" and so on; those with a car in this episode's scene are in `agents` until they end. `step` returns results
+of those that were active before it. `infos[name]` holds `scene`, an index into `names`, and of a step `terms` and `events`.
 """
 
 import functools
@@ -34,12 +34,7 @@ class Drive(ParallelEnv):
     """All cars of one world.
 
     Args:
-        config: as `load("train", ...)` gives it; None: that with its defaults.
-        overrides: of the config, as on the command line.
-        scenes: to draw episodes from; None: the config's.
-
-    Raises:
-        ConfigError: cars that begin anew (`spawning.respawn_clearance_m`), or what `scenefactory_jax.make` and `load_scenes` raise.
+        config, overrides, scenes: as of `episodes.make_pool`.
     """
 
     def __init__(
@@ -66,16 +61,9 @@ class Drive(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """A fresh episode: of the seed, or the next one of the seed before.
-
-        Raises:
-            ConfigError: `options["scene"]` is no scene's index.
-        """
+        """Starts an episode from the seed, or the next one of the previous seed, in `options["scene"]` or a sampled scene."""
         scene = episodes.choose_scene(options, len(self.names))
-        if seed is None and self._episode is not None:
-            key = self._episode.key
-        else:
-            key = jax.random.key(episodes.make_key(seed if seed is not None else int(seeding.np_random()[0].integers(2**32))))
+        key = episodes.choose_key(self._episode, seed, seeding.np_random()[0])
         episode, observation = self._begin(self.pool.scenes, key, scene)
         self._episode = episode
         active, scene = jax.device_get((episode.state.active, episode.scene))
@@ -84,10 +72,10 @@ class Drive(ParallelEnv):
         return {name: observation[self._slot[name]] for name in self.agents}, {name: {"scene": int(scene)} for name in self.agents}
 
     def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        """One action. Actions of cars that have ended count for nothing.
+        """Applies one action. Actions of cars that have ended are ignored.
 
         Raises:
-            ConfigError: nothing has begun, a driving car without an action, one of another shape, or an action of a car that there is not.
+            ConfigError: no episode has begun, an active car has no action, an action has another shape, or names an unknown car.
         """
         if self._episode is None:
             raise ConfigError("step: no episode has begun; call reset first")
@@ -95,11 +83,11 @@ class Drive(ParallelEnv):
             return {}, {}, {}, {}, {}
         if wrong := [name for name in self.agents if name not in actions] + [name for name in actions if name not in self._slot]:
             raise ConfigError(f"actions: {wrong[0]!r}: expected one for each of {', '.join(self.agents)}")
-        given = np.zeros((self.pool.agents, 3), np.float32)
+        stacked = np.zeros((self.pool.agents, 3), np.float32)
         for name in self.agents:
             episodes.check_action(actions[name], (3,), where=f"actions: {name!r}")
-            given[self._slot[name]] = actions[name]
-        self._episode, rows = self._advance(self.pool.scenes, self._episode, given)
+            stacked[self._slot[name]] = actions[name]
+        self._episode, rows = self._advance(self.pool.scenes, self._episode, stacked)
         rows = np.array(rows)  # a copy: what a caller gets may be written to
         results = {name: episodes.unpack_car_step(self.pool, rows[self._slot[name]]) for name in self.agents}
         self.agents = [name for name, result in results.items() if not result.terminated and not result.truncated]

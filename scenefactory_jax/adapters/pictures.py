@@ -36,21 +36,21 @@ class Painter:
     def __init__(self, pool: Pool):
         self._pool = pool
         self._shown = jax.jit(jax.vmap(functools.partial(_shown, pool.env), in_axes=(None, 0)))
-        self._scenes: dict[int, Scene] = {}
+        self._scene = functools.cache(lambda index: jax.device_get(jax.tree.map(lambda leaf: leaf[index], pool.scenes)))
 
     def draw(self, worlds: Episode) -> list[UInt8[np.ndarray, "H W 3"]]:
         """A picture of each world, [W, ...] along the first axis, as RGB from 0 to 255."""
         shown = jax.device_get(self._shown(self._pool.scenes, worlds))
         return [self._picture(jax.tree.map(lambda leaf, world=world: leaf[world], shown)) for world in range(len(shown.scene))]
 
-    def _picture(self, shown: Any) -> UInt8[np.ndarray, "H W 3"]:  # one world of `Shown`, in numpy arrays
+    def _picture(self, shown: Any) -> UInt8[np.ndarray, "H W 3"]:  # a `ShownWorld` of numpy arrays
         place = shown.motion.position[:, :2]
         trajectory = Trajectory(
             scene=replace(self._scene(int(shown.scene)), weather=shown.weather),
             position=place[None],
             yaw=shown.motion.yaw[None],
             speed=np.linalg.norm(shown.motion.velocity[:, :2], axis=-1)[None],
-            active=shown.agents.present[None],  # a car that has ended still stands there
+            active=shown.agents.present[None],  # an ended car is still drawn
             events={name: (past_events & ~shown.active)[None] for name, past_events in vars(shown.past_events).items()},
             size=shown.agents.size,
             goal=shown.agents.goal,
@@ -64,18 +64,9 @@ class Painter:
         left, bottom = place[0] - _SIDE_M / 2
         return scenefactory_jax.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
 
-    def _scene(self, index: int) -> Scene:
-        if index not in self._scenes:
-            self._scenes[index] = jax.device_get(jax.tree.map(lambda leaf: leaf[index], self._pool.scenes))
-        return self._scenes[index]
-
 
 def check_mode(mode: Any) -> None:
-    """Refuse a way to draw that there is not.
-
-    Raises:
-        ConfigError: any but None and those of `MODES`.
-    """
+    """Raises ConfigError for a render mode other than None and `MODES`."""
     if mode is not None and mode not in MODES:
         raise ConfigError(f"render_mode: {mode!r}; valid: None, {', '.join(MODES)}")
 

@@ -5,8 +5,8 @@
     from scenefactory_jax.adapters.sb3 import Drive
     PPO("MlpPolicy", VecMonitor(Drive(64, overrides=["dynamics=bicycle"]))).learn(100_000)
 
-The observation after an episode's end is the first of the next one; `infos[world]["terminal_observation"]` is the last of the one that
-ended, and `infos[world]["TimeLimit.truncated"]` says that its time was up. `infos[world]` also holds `scene`, an index into `names`,
+The observation after an episode's end is the first of the next one; `infos[world]["terminal_observation"]` is the last of the old one,
+and `infos[world]["TimeLimit.truncated"]` is true at the time limit. `infos[world]` also holds `scene`, an index into `names`,
 `terms` and `events` of the step. `set_options({"scene": 3})` (or a list, one for each world) before a `reset` names its scene.
 """
 
@@ -35,13 +35,7 @@ class Drive(VecEnv):
 
     Args:
         num_envs: worlds.
-        config: as `load("train", ...)` gives it, with `scenes.pack.agents=1`; None: that with its defaults.
-        overrides: of the config, as on the command line.
-        scenes: to draw episodes from; None: the config's.
-        render_mode: None, or rgb_array.
-
-    Raises:
-        ConfigError: another render mode, scenes with other than one slot, or what `scenefactory_jax.make` and `load_scenes` raise.
+        config, overrides, scenes, render_mode: as of `adapters.gymnasium.Drive`.
     """
 
     def __init__(
@@ -59,11 +53,7 @@ class Drive(VecEnv):
         self.metadata = {**self.metadata, "render_fps": self.worlds.metadata["render_fps"]}
 
     def reset(self) -> np.ndarray:
-        """Fresh episodes everywhere, [W, F]: of the seeds that `seed` set, or the next ones of those before.
-
-        Raises:
-            ConfigError: `set_options` names a scene that does not exist.
-        """
+        """Starts an episode in every world from the seeds that `seed` set, or the next one of the previous seeds; [W, F]."""
         scene = [options.get("scene", episodes.ANY) for options in self._options]
         observation, info = self.worlds.reset(seed=self._seeds, options={"scene": scene})
         self.reset_infos = [{"scene": index} for index in info["scene"].tolist()]
@@ -72,15 +62,11 @@ class Drive(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of all worlds, [W, 3]; `step_wait` steps."""
+        """Keeps the actions of all worlds, [W, 3], for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, whether the episodes ended, and infos.
-
-        Raises:
-            See `DriveVector.advance`.
-        """
+        """Applies the actions; returns observations, rewards, whether the episodes ended, and infos."""
         step: Any = self.worlds.advance(self._actions)  # of numpy arrays, with all that mode SAME_STEP gives
         columns = {place: {name: column.tolist() for name, column in step.terms_and_events[place].items()} for place in ("terms", "events")}
         scenes, before, late = (column.tolist() for column in (step.scene, step.scene_before, step.truncated))
@@ -97,7 +83,7 @@ class Drive(VecEnv):
         """Nothing to release."""
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Every world from above around its car; None for each without a render mode."""
+        """A bird's-eye picture of every world; None for each without a render mode."""
         return self.worlds.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -105,19 +91,11 @@ class Drive(VecEnv):
         return [getattr(self.worlds, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Refused.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Raises ConfigError: worlds have no attributes."""
         raise ConfigError(f"set_attr({attr_name!r}): the worlds are one program and have no attributes of their own; set the config")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list[Any]:
-        """Refused.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Raises ConfigError: worlds have no methods."""
         raise ConfigError(f"env_method({method_name!r}): the worlds are one program and have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:

@@ -23,7 +23,7 @@ def annotate(command: str, *overrides: str) -> str:
         ConfigError: see `config.load`.
     """
     composed, choices = configs.load_with_choices(command, *overrides)
-    options = {findfind_place(group): (group.partition("@")[0], chosen) for group, chosen in choices.items()}
+    options = {find_place(group): (group.partition("@")[0], chosen) for group, chosen in choices.items()}
     return "\n".join(_lines(composed, (), collect_comments(command, choices), options))
 
 

@@ -1,13 +1,14 @@
 """`compare`: learning curves and evaluations of several runs side by side, seeds of one setting together."""
 
+import glob
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.config import flatten
 from scenefactory_jax.core.instantiate import ConfigError
@@ -17,24 +18,23 @@ from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import run_comparison as report
 
 STEPS = "steps/total"
-# settings that make no other group
-ASIDE = ("seed", "name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept")
-ASIDE += ("scenes.take.seed",)  # follows the seed
+# settings that make no other group; `scenes.take.seed` follows the seed
+IGNORED = ("seed", "name", "out", "resume", "progress", "loggers", "checkpoint_every", "checkpoints_kept", "scenes.take.seed")
 DIGITS = 6
 
 
 class ReadRun(NamedTuple):
-    """One run, as its folder holds it."""
+    """Contents of a run's folder."""
 
     folder: Path
     config: dict[str, Any]
-    settings: dict[str, Any]  # dotted key -> value, without those of ASIDE
+    settings: dict[str, Any]  # dotted key -> value, without those of IGNORED
     metrics: list[dict[str, float]]
     records: dict[str, dict[str, np.ndarray]]  # protocol -> agents of the evaluation at the end
 
 
 def compare(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Compare runs as a config says (`load("compare", "runs=[...]")`) and write the report in `out`.
+    """Compares runs as a config says (`load_config("compare", "runs=[...]")`) and writes the report to `out`.
 
     Returns:
         Group -> what differs, seeds, curves over agent steps and evaluations, as they were written.
@@ -46,22 +46,22 @@ def compare(config: Mapping[str, Any]) -> dict[str, Any]:
     schema.check(config, schema.Compare)
     if not config["metrics"]:
         raise ConfigError(f"metrics: none; give columns of {metrics_csv.FILE}, as events/goal_reached")
-    runs = [_read(folder) for folder in _find(config["runs"])]
+    runs = [_read(folder, config["metrics"]) for folder in _find(config["runs"])]
+    names = dict.fromkeys(name for run in runs for name in run.settings)
+    varied = [name for name in names if any(run.settings.get(name) != runs[0].settings.get(name) for run in runs)]
+    groups: dict[str, dict[int, ReadRun]] = {}
     for run in runs:
-        if missing := [name for name in (STEPS, *config["metrics"]) if name not in run.metrics[0]]:
-            raise ConfigError(
-                f"metrics: {run.folder / metrics_csv.FILE} has no column {missing[0]!r}; there are: {', '.join(run.metrics[0])}"
-            )
-    differing = _differing(run.settings for run in runs)
-    groups: dict[str, list[ReadRun]] = {}
-    for run in runs:
-        label = ", ".join(f"{key}={_shown(run.settings.get(key))}" for key in differing) or str(run.config["name"])
-        groups.setdefault(label, []).append(run)
-    found = {label: _group(members, config) for label, members in groups.items()}
-    shown = {key: config[key] for key in ("metrics", "window", "last")}
-    result = {"command": configs.format_command("compare"), "settings": shown, "groups": found}
-    result = result_file.plain(result, digits=DIGITS)
-    out = Path(config["out"])
+        label = ", ".join(f"{name}={_format(run.settings.get(name))}" for name in varied) or str(run.config["name"])
+        other = groups.setdefault(label, {}).setdefault(run.config["seed"], run)
+        if other is not run:
+            same = f"{other.folder} and {run.folder} have one setting and one seed, {run.config['seed']}"
+            raise ConfigError(f"runs: {same}: they are no two samples; leave one out")
+    result = {
+        "command": run_config.format_command("compare"),
+        "settings": {key: config[key] for key in ("metrics", "window", "last")},
+        "groups": {label: _summarise(seeds, config) for label, seeds in groups.items()},
+    }
+    result, out = result_file.plain(result, digits=DIGITS), Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
     result_file.write(out / "compare.json", result, digits=DIGITS)
     print(f"{report.table(result)}\n{report.write(out, result)}", flush=True)
@@ -72,12 +72,10 @@ def _find(patterns: Iterable[str]) -> list[Path]:
     """Run folders in the order in which they are named."""
     found: dict[Path, Path] = {}
     for pattern in patterns:
-        path = Path(pattern)
-        base = Path(path.anchor) if path.is_absolute() else Path()
-        matches = sorted(base.glob(str(path.relative_to(base)))) if any(sign in pattern for sign in "*?[") else [path]
+        matches = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
         if not matches:
             raise ConfigError(f"runs: nothing matches {pattern!r}; give folders that `train` wrote")
-        for match in matches:
+        for match in map(Path, matches):
             if match.resolve() in found:
                 raise ConfigError(f"runs: {pattern!r} names {match} once more; every run counts once")
             found[match.resolve()] = match
@@ -86,58 +84,47 @@ def _find(patterns: Iterable[str]) -> list[Path]:
     return list(found.values())
 
 
-def _read(folder: Path) -> ReadRun:
-    config, metrics = configs.read_values(folder), metrics_csv.read(folder)
-    if not metrics:
+def _read(folder: Path, metrics: Iterable[str]) -> ReadRun:
+    config, rows = run_config.read_values(folder), metrics_csv.read(folder)
+    if not rows:
         raise ConfigError(f"runs: {folder / metrics_csv.FILE}: no row; the run has not finished an iteration")
-    settings = {key: value for key, value in flatten(config).items() if key not in ASIDE and not key.startswith("loggers.")}
-    return ReadRun(folder, config, settings, metrics, read_folder(folder))
+    if missing := [name for name in (STEPS, *metrics) if name not in rows[0]]:
+        raise ConfigError(f"metrics: {folder / metrics_csv.FILE} has no column {missing[0]!r}; there are: {', '.join(rows[0])}")
+    settings = {key: value for key, value in flatten(config).items() if key not in IGNORED and not key.startswith("loggers.")}
+    return ReadRun(folder, config, settings, rows, read_folder(folder))
 
 
-def _differing(settings: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Keys whose values are not the same in all runs."""
-    first, *others = settings
-    names = dict.fromkeys(name for one in (first, *others) for name in one)
-    return [name for name in names if any(one.get(name) != first.get(name) for one in others)]
-
-
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
+    """Formats a value as in a config."""
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _group(runs: list[ReadRun], config: Mapping[str, Any]) -> dict[str, Any]:
+def _summarise(seeds: Mapping[int, ReadRun], config: Mapping[str, Any]) -> dict[str, Any]:
     """Curves of each seed up to the length of the shortest, and the evaluations of all seeds, resampled by seed, scene and agent."""
-    seeds: dict[int, ReadRun] = {}
-    for run in runs:
-        other = seeds.setdefault(run.config["seed"], run)
-        if other is not run:
-            same = f"{other.folder} and {run.folder} have one setting and one seed, {run.config['seed']}"
-            raise ConfigError(f"runs: {same}: they are no two samples; leave one out")
+    runs = list(seeds.values())
     length = min(len(run.metrics) for run in runs)
     tail = max(1, round(config["last"] * length))
-
-    def column(run: ReadRun, name: str) -> np.ndarray:
-        return np.array([row[name] for row in run.metrics[:length]])
-
-    curves = {name: [_running(column(run, name), config["window"]) for run in runs] for name in config["metrics"]}
-    evaluated = {}
-    for name in runs[0].records:
-        if all(name in run.records for run in runs):
-            each = {seed: run.records[name] for seed, run in seeds.items()}
-            evaluated[name] = statistics.summarise_runs(each, bootstrap=config["bootstrap"], seed=config["seed"])
+    column = lambda run, name: np.array([row[name] for row in run.metrics[:length]])  # noqa: E731
+    evaluated = {
+        name: statistics.summarise_runs(
+            {seed: run.records[name] for seed, run in seeds.items()}, bootstrap=config["bootstrap"], seed=config["seed"]
+        )
+        for name in runs[0].records
+        if all(name in run.records for run in runs)
+    }
     return {
         "runs": [run.folder.name for run in runs],
-        "seeds": [run.config["seed"] for run in runs],
+        "seeds": list(seeds),
         "iterations": length,
         "steps": np.mean([column(run, STEPS) for run in runs], axis=0),
         "minutes": [run.metrics[length - 1]["minutes"] for run in runs],
         "casps": [float(np.median(column(run, "casps"))) for run in runs],
-        "curves": curves,
+        "curves": {name: [_running_mean(column(run, name), config["window"]) for run in runs] for name in config["metrics"]},
         "last": {name: [float(np.nanmean(column(run, name)[-tail:])) for run in runs] for name in config["metrics"]},
         "evaluated": evaluated,
     }
 
 
-def _running(values: np.ndarray, window: int) -> np.ndarray:
-    """Mean of the values up to each one, `window` of them where there are so many."""
+def _running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Means over the last `window` values up to each one, over fewer at the start."""
     return np.array([np.nanmean(values[max(0, i + 1 - window) : i + 1]) for i in range(len(values))])

@@ -31,15 +31,14 @@ def convert(config: Mapping[str, Any]) -> Summary:
     for key in ("source", "out"):
         if config[key] is None:
             raise ConfigError(f"{key}: missing; `convert source=FILE_OR_FOLDER out=BANK`")
-    scenes, quality = config["scenes"], config["quality"]
+    scenes = config["scenes"]
     settings = {key: scenes[key] for key in ("formats", "check", "pack")}
     settings |= {key: config[key] for key in ("features", "bank", "quality", "lanes")}
-    rules = {"rules": quality_gate.make(quality["rules"]), "reject": quality["reject"], "drop": quality["drop"]}
-    quality_gate.check_names(**rules)
+    rules = quality_gate.make(config["quality"])
     rebuild = instantiate(config["lanes"]["topology"], builtins="scenefactory_jax.roadgraph.lane_topology", where="lanes.topology")
     rebuild(EMPTY)  # refuses numbers out of range before a file is read
     packing, features = scene_source.make_packing(scenes), config["features"]
-    gate = functools.partial(quality_gate.gate, check=packing["check"], **rules)
+    gate = functools.partial(quality_gate.gate, quality=rules, check=packing["check"])
     tools = conversion.SceneTools(
         reader_selection.make(scenes["formats"]),
         **packing,

@@ -1,4 +1,4 @@
-"""`export`: what a run's policy learnt, as a small folder to hand on, with a card."""
+"""`export`: writes the policy of a run as a small folder, with a card."""
 
 import shutil
 from collections.abc import Mapping
@@ -9,6 +9,7 @@ import yaml
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import statistics
@@ -19,54 +20,56 @@ from scenefactory_jax.visualization.report import policy_card
 
 
 def export(config: Mapping[str, Any]) -> Path:
-    """Write the policy's numbers, the run's config, the versions it was made with, and a card (`load("export", "run=...", "out=...")`).
+    """Writes a policy's numbers, its config and versions, and a card (`load_config("export", "run=...", "out=...")`).
 
-    The folder stands for the run wherever a policy is wanted (`evaluate`, `view`, `sf.load_policy`); training cannot go on from
-    it.
+    `evaluate`, `view` and `sf.load_policy` take the folder in place of a run; training cannot go on from it.
 
     Raises:
-        ConfigError: no such run, no checkpoint in it, code of others in its config without `trust`, a folder that holds something, or
+        ConfigError: no such run, no checkpoint in it, code of others in its config without `trust`, a folder that is not empty, or
             one of `card.judged` that `evaluate` did not write.
     """
     schema.check(config, schema.Export)
-    out = Path(config["out"])
+    out, card = Path(config["out"]), config["card"]
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"out: {out} holds something already; give a new folder")
-    folders = {what: Path(folder) for what, folder in (config["card"]["judged"] or {}).items()}
-    judged = {named(what, folder): _summaries(what, folder, config["card"]) for what, folder in folders.items()}
-    episodes = {named(what, folder): read_settings(folder).get("episodes", {}) for what, folder in folders.items()}
+    folders = {format_name(what, Path(folder)): Path(folder) for what, folder in (card["judged"] or {}).items()}
+    scores = {name: _summarise(name, folder, card) for name, folder in folders.items()}
     trained = policy_io.load_policy(config["run"], trust=config["trust"])
     configs.print_outside_targets(trained.config, trained.folder)
     (out / "checkpoints").mkdir(parents=True)
     file = checkpoint.write_parameters(out / "checkpoints", trained.parameters)
-    own = trained.config
-    # where scenes lay is of no use elsewhere, and nobody else's business
-    scenes = {**own["scenes"], "path": None, "heldout": {**own["scenes"]["heldout"], "path": None}}
-    own = {**own, "out": None, "resume": False, "scenes": scenes}
-    configs.write(out, own)
+    scenes = trained.config["scenes"]
+    scenes = {**scenes, "path": None, "heldout": {**scenes["heldout"], "path": None}}  # without paths of this machine
+    exported = {**trained.config, "out": None, "resume": False, "scenes": scenes}
+    run_config.write(out, exported)
     shutil.copy(trained.folder / "versions.yaml", out)
-    versions = yaml.safe_load((out / "versions.yaml").read_text())
     text = policy_card.format_card(
-        out.name, config["card"]["about"], config=own, versions=versions, training=metrics_csv.read(trained.folder), judged=judged,
-        episodes=episodes, outside=sorted(set(trusted_targets.find_outside_targets(own).values())),
-    )  # fmt: skip
+        out.name,
+        card["about"],
+        config=exported,
+        versions=yaml.safe_load((out / "versions.yaml").read_text()),
+        training=metrics_csv.read(trained.folder),
+        scores=scores,
+        episodes={name: read_settings(folder).get("episodes", {}) for name, folder in folders.items()},
+        outside=sorted(set(trusted_targets.find_outside_targets(exported).values())),
+    )
     (out / "README.md").write_text(text)
     print(f"{out}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     return out
 
 
-def named(what: str, folder: Path) -> str:
-    """What was driven, and with what it differed from the run's own held-out scenes and settings; of paths the names alone."""
-    noted = read_settings(folder)
-    told = [] if noted["scenes"] is None else [Path(noted["scenes"]).name]
-    told += [] if (protocol := noted.get("protocol", "trained")) == "trained" else [f"protocol={protocol}"]
-    told += [override for override in noted["overrides"] if "path=" not in override]
-    return f"{what} ({', '.join(told)})" if told else what
+def format_name(what: str, folder: Path) -> str:
+    """Formats what was evaluated, and its differences from the run's own held-out scenes and settings; of paths the names alone."""
+    settings = read_settings(folder)
+    differences = [] if settings["scenes"] is None else [Path(settings["scenes"]).name]
+    differences += [] if (protocol := settings.get("protocol", "trained")) == "trained" else [f"protocol={protocol}"]
+    differences += [override for override in settings["overrides"] if "path=" not in override]
+    return f"{what} ({', '.join(differences)})" if differences else what
 
 
-def _summaries(what: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, statistics.Estimate]]:
+def _summarise(name: str, folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, statistics.Estimate]]:
     """Protocol -> estimates of an evaluation's trained policy."""
     records = read_folder(folder)
     if not records:
-        raise ConfigError(f"card.judged.{what}: {folder} holds no records of agents; give a folder that `evaluate` wrote")
+        raise ConfigError(f"card.judged.{name}: {folder} holds no records of agents; give a folder that `evaluate` wrote")
     return {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}

@@ -25,7 +25,6 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
-from scenefactory_jax.core.config import FILE, find_commit, format_command, read_values, versions, write  # noqa: F401
 from scenefactory_jax.core.instantiate import ConfigError
 
 # Keys whose values are lists of overrides
@@ -186,7 +185,8 @@ def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
 def print_outside_targets(config: Mapping[str, Any], folder: Path) -> None:
     """Prints the functions outside of the package that a trusted config names."""
     if found := trusted_targets.find_outside_targets(config):
-        print(f"{Path(folder) / FILE}: trusted, and runs {', '.join(f'{target} ({key})' for key, target in found.items())}", flush=True)
+        functions = ", ".join(f"{target} ({key})" for key, target in found.items())
+        print(f"{Path(folder) / run_config.FILE}: trusted, and runs {functions}", flush=True)
 
 
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -230,10 +230,10 @@ def _task(override: str) -> dict[str, Any]:
 
 def quote_override(override: str) -> str:
     """Quotes an override for Hydra's grammar: the entries of `overrides=[dynamics=bicycle,weather=wet]` and the condition of
-    `filter=vehicles >= 8`, which contain `=`."""
-    if condition := re.fullmatch(r"filter=(?!null$)([^'\"].*)", override, re.DOTALL):
+    `select.filter=vehicles >= 8`, which contain `=`."""
+    if condition := re.fullmatch(r"select\.filter=(?!null$)([^'\"].*)", override, re.DOTALL):
         escaped = condition.group(1).replace("'", "\\'")
-        return f"filter='{escaped}'"
+        return f"select.filter='{escaped}'"
     match = re.fullmatch(rf"({'|'.join(LISTS)})=\[([^\[\]{{}}()'\"\\]+)\]", override)
     if not match:
         return override

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from scenefactory_jax.cli.schema import Group, Task
-from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Seed
+from scenefactory_jax.core.schema import Bounds, Count, Fraction, Seed
+from scenefactory_jax.data.loading.scenes_config import ScenesConfig
 
 
 @dataclass(frozen=True)
@@ -13,6 +14,25 @@ class Bank:
 
     shard_scenes: Count
     compression: Literal["zstd", "lz4"] | None
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """The report of `scenes op=quality`."""
+
+    examples: Seed
+    seed: Seed
+    window_m: Annotated[float, Bounds(min=1)]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The group `quality`; its rules are checked by the functions that they select."""
+
+    rules: dict[str, Group | None]
+    reject: list[str]
+    drop: list[str]
+    report: QualityReport
 
 
 @dataclass(frozen=True)
@@ -25,9 +45,21 @@ class Convert:
     bank: Bank
     features: Group | None
     spread: Group
-    scenes: Group
-    quality: Group | None
+    scenes: ScenesConfig
+    quality: Quality
     lanes: Group
+
+
+# ---- scenes
+
+
+@dataclass(frozen=True)
+class Check:
+    """`scenes op=check`."""
+
+    max_pictures: Seed
+    columns: Count
+    inches: Annotated[float, Bounds(min=0.5)]
 
 
 @dataclass(frozen=True)
@@ -36,49 +68,46 @@ class Info:
 
     by: str | None
     json: bool
+    verify: bool
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """`scenes op=sheet`."""
+class Duplicates:
+    """Thresholds for copies of one recording."""
 
-    columns: Count
-    inches: Annotated[float, Bounds(min=0.5)]
+    tolerance_m: Annotated[float, Bounds(min=0.001)]
+    min_matched_fraction: Fraction
+    max_relative_difference: Annotated[float, Bounds(min=1e-6)]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """`scenes op=sample`."""
+    """A random sample of scenes."""
 
     count: Count | None
-    share: NonNegative | None
+    fraction: Annotated[float, Bounds(above=0, max=1)] | None
     stratify: str | None
+
+
+@dataclass(frozen=True)
+class Select:
+    """`scenes op=select`."""
+
+    banks: list[str]
+    on_same_name: Literal["refuse", "first"]
+    dedupe: bool
+    duplicates: Duplicates
+    filter: str | None
+    sample: Sample
 
 
 @dataclass(frozen=True)
 class Split:
     """`scenes op=split`."""
 
-    shares: dict[str, float] | None
+    fractions: dict[str, float] | None
     by: Literal["scene", "streets"]
-    least_shared: Count
-
-
-@dataclass(frozen=True)
-class Merge:
-    """`scenes op=merge`."""
-
-    banks: list[str]
-    duplicates: Literal["refuse", "first"]
-
-
-@dataclass(frozen=True)
-class Dedupe:
-    """`scenes op=dedupe`."""
-
-    tolerance_m: Annotated[float, Bounds(min=0.001)]
-    share: NonNegative
-    slack: Annotated[float, Bounds(min=1e-6)]
+    min_shared_places: Count
 
 
 @dataclass(frozen=True)
@@ -94,14 +123,14 @@ class CompareScenes:
     """`scenes op=compare`."""
 
     others: list[str]
-    limit: Count
+    max_scenes: Count
 
 
 @dataclass(frozen=True)
 class ExportScenes:
     """`scenes op=export`."""
 
-    format: str
+    format: Literal["gpudrive", "scenarionet"]
 
 
 @dataclass(frozen=True)
@@ -111,20 +140,16 @@ class SceneOperations(Task):
     op: str
     out: str | None
     copy: bool
-    limit: Seed
     seed: Seed
     progress: bool
-    filter: str | None
-    info: Info
-    sheet: Sheet
-    sample: Sample
-    split: Split
-    merge: Merge
-    dedupe: Dedupe
-    simulate: Simulate
+    check: Check
     compare: CompareScenes
+    simulate: Simulate
+    info: Info
+    select: Select
+    split: Split
     export: ExportScenes
-    scenes: Group
+    scenes: ScenesConfig
     features: Group | None
-    quality: Group
+    quality: Quality
     lanes: Group

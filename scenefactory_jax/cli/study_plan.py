@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +31,14 @@ class Training(NamedTuple):
     overrides: list[str]
     config: dict[str, Any]
     folder: Path
+    file: Path  # written when the training has ended
     digest: str
     program: str  # digest of what its compiled program depends on
+
+    @property
+    def label(self) -> str:
+        """Name in messages."""
+        return f"training {self.variant}, seed {self.seed}"
 
 
 class Evaluation(NamedTuple):
@@ -47,11 +53,15 @@ class Evaluation(NamedTuple):
     program: str  # digest of all but the weights
     file: Path  # of its records
 
+    @property
+    def label(self) -> str:
+        """Name in messages."""
+        return f"evaluation {self.row}, {self.condition}, {self.protocol}, seed {self.training.seed}"
+
 
 class Plan(NamedTuple):
     """All trainings and evaluations of a study, in the order of its config."""
 
-    name: str
     trainings: list[Training]
     evaluations: list[Evaluation]
 
@@ -64,23 +74,23 @@ def make(config: Mapping[str, Any]) -> Plan:
     """
     check(config)
     digest_files.cache_clear()  # the files may have changed since this process planned last
-    study = config["study"]
+    study, terminations = config["study"], load_terminations(config["study"]["protocols"])
     seeds = study["seeds"] if config["seeds"] is None else config["seeds"]
-    trainings = [training for variant in study["trainings"] for training in _trainings(config, variant, seeds)]
-    terminations = load_terminations(study["protocols"])
+    trainings = [training for variant in study["trainings"] for training in _plan_trainings(config, variant, seeds)]
     evaluations = [
-        one for training in trainings for one in _evaluations(config, training, terminations, is_first=training.seed == seeds[0])
+        evaluation
+        for training in trainings
+        for evaluation in _plan_evaluations(config, training, terminations, is_first=training.seed == seeds[0])
     ]
-    rows = [*study["trainings"], *study["baselines"]]
-    conditions = list(study["conditions"])
-    evaluations.sort(key=lambda one: (conditions.index(one.condition), rows.index(one.row)))
-    return Plan(study["name"], trainings, evaluations)
+    rows, conditions = [*study["trainings"], *study["baselines"]], list(study["conditions"])
+    evaluations.sort(key=lambda evaluation: (conditions.index(evaluation.condition), rows.index(evaluation.row)))
+    return Plan(trainings, evaluations)
 
 
 def evaluations_while_training(plan: Plan, training: Training) -> list[Evaluation]:
     """Returns the evaluations that a training repeats while it runs: those under its first condition, in every protocol."""
-    found = [one for one in plan.evaluations if one.row == training.variant and one.training.seed == training.seed]
-    return [one for one in found if one.condition == found[0].condition]
+    evaluations = [task for task in plan.evaluations if task.row == training.variant and task.training.seed == training.seed]
+    return [task for task in evaluations if task.condition == evaluations[0].condition]
 
 
 def digest_scenes(config: Mapping[str, Any], path: str | None) -> str:
@@ -101,30 +111,29 @@ def digest_files(path: str | None) -> str | None:
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Checks every key of the command and of the study, and every name that one part of it uses of another.
+    """Checks every key of the command and of the study, and the names that its parts use of each other.
 
     Raises:
         ConfigError: naming the key, the value and what would be valid.
     """
     schema.check_study(config)
-    study = config["study"]
-    variants, conditions, baselines = list(study["trainings"]), list(study["conditions"]), study["baselines"]
+    study, baselines = config["study"], config["study"]["baselines"]
+    variants, conditions = list(study["trainings"]), list(study["conditions"])
+    if not variants or not conditions:
+        raise ConfigError("study: expected one or more trainings and conditions, got none")
     names = {"only": (config["only"], variants), "study.evaluated": (study["evaluated"], variants)}
     names |= {f"study.evaluated.{name}": (chosen, conditions) for name, chosen in (study["evaluated"] or {}).items()}
-    names |= {f"study.baselines.{name}.of": ([one["of"]], variants) for name, one in baselines.items()}
-    names |= {f"study.baselines.{name}.conditions": (one["conditions"], conditions) for name, one in baselines.items()}
+    names |= {f"study.baselines.{name}.of": ([entry["of"]], variants) for name, entry in baselines.items()}
+    names |= {f"study.baselines.{name}.conditions": (entry["conditions"], conditions) for name, entry in baselines.items()}
     names |= {f"study.compare.{index}": (pair, [*variants, *baselines]) for index, pair in enumerate(study["compare"])}
     names["study.trend.values"] = ((study["trend"] or {"values": {}})["values"], variants)
     for where, (chosen, valid) in names.items():
-        for name in chosen or []:
-            if name not in valid:
-                raise ConfigError(f"{where}: expected one of {', '.join(valid)}, got {name!r}")
+        if unknown := [name for name in chosen or [] if name not in valid]:
+            raise ConfigError(f"{where}: expected one of {', '.join(valid)}, got {unknown[0]!r}")
     if "draw" in config["parts"] and len(config["parts"]) > 1:
         raise ConfigError(f"parts: expected `draw` alone, got {config['parts']}; `report` draws, too")
     if doubled := set(variants) & set(baselines):
         raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
-    if not variants or not conditions:
-        raise ConfigError("study: expected one or more trainings and conditions, got none")
 
 
 def merge_overrides(overrides: Sequence[str]) -> list[str]:
@@ -133,7 +142,7 @@ def merge_overrides(overrides: Sequence[str]) -> list[str]:
     return [override for index, override in enumerate(overrides) if last[override.partition("=")[0].lstrip("+")] == index]
 
 
-def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int]) -> list[Training]:
+def _plan_trainings(config: Mapping[str, Any], variant: str, seeds: list[int]) -> list[Training]:
     """A variant's training with each seed."""
     study = config["study"]
     scenes = [] if config["train_scenes"] is None else ["scenes=womd", f"scenes.path={_quoted(config['train_scenes'])}"]
@@ -144,63 +153,60 @@ def _trainings(config: Mapping[str, Any], variant: str, seeds: list[int]) -> lis
         each = configs.load_each("train", *merge_overrides([*overrides, *fixed]), key="seed", values=seeds)
     except ConfigError as error:
         raise ConfigError(f"study.trainings.{variant}: {error}") from None
-    return [_training({**one, "name": f"{study['name']}, {variant}"}, variant, overrides, Path(config["runs"])) for one in each]
+    name, runs = f"{study['name']}, {variant}", Path(config["runs"])
+    return [_plan_training({**settings, "name": name}, variant, overrides, runs) for settings in each]
 
 
-def _training(settings: dict[str, Any], variant: str, overrides: list[str], runs: Path) -> Training:
+def _plan_training(settings: dict[str, Any], variant: str, overrides: list[str], runs: Path) -> Training:
     entry = {name: value for name, value in settings.items() if name not in IGNORED}
     entry["scenes"] = {name: value for name, value in settings["scenes"].items() if name not in ("heldout", "workers")}
-    entry |= _files_entry(settings["scenes"]["path"])
+    entry |= _digest_entry(settings["scenes"]["path"])
     if settings["scenes"]["take"]["count"] is None:
         entry["scenes"].pop("take")  # its seed follows that of the run
     digest, seed = result_file.digest(entry), settings["seed"]
-    known = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it under another name
-    folder = known[0] if known else runs / f"{slug(variant)}-{seed}-{digest}"
+    existing = sorted(runs.glob(f"*-{digest}/"))  # another study may have trained it under another name
+    folder = existing[0] if existing else runs / f"{slug(variant)}-{seed}-{digest}"
     program = result_file.digest({name: settings[name] for name in LEARNER})
-    return Training(variant, seed, overrides, settings, folder, digest, program)
+    return Training(variant, seed, overrides, settings, folder, folder / "trained.json", digest, program)
 
 
-def _evaluations(
+def _plan_evaluations(
     config: Mapping[str, Any], training: Training, terminations: Mapping[str, Mapping[str, Any]], *, is_first: bool
-) -> list[Evaluation]:
+) -> Iterator[Evaluation]:
     """The evaluations of a training's policy, and of the baselines that begin with it."""
     study, variant = config["study"], training.variant
     conditions = list(study["conditions"])
-    evaluated = conditions if study["evaluated"] is None else study["evaluated"].get(variant, [])
-    rows = [(variant, TRAINED, evaluated, [])]
+    rows = [(variant, TRAINED, conditions if study["evaluated"] is None else study["evaluated"].get(variant, []), [])]
     for name, baseline in study["baselines"].items():
         if baseline["of"] == variant and (is_first or baseline["seeds"] != 1):
             chosen = conditions if baseline["conditions"] is None else baseline["conditions"]
             rows.append((name, UNTRAINED, chosen, list(baseline["overrides"])))
-    found = []
     for row, weights, chosen, overrides in rows:
         for condition in chosen:
             try:
                 merged = [*study["evaluation_overrides"], *study["conditions"][condition], *overrides]
-                environment_config = configs.apply_overrides(training.config, merged)
+                settings = configs.apply_overrides(training.config, merged)
             except ConfigError as error:
                 raise ConfigError(f"study.conditions.{condition}: {error}") from None
             for protocol, termination in terminations.items():
-                program = _digest_program(config, environment_config, protocol)
+                program = _digest_program(config, settings, protocol)
                 file = training.folder / f"evaluated-{weights}-{program}.csv"
-                one = {**environment_config, "termination": termination}
-                found.append(Evaluation(row, training, weights, condition, protocol, one, program, file))
-    return found
+                yield Evaluation(row, training, weights, condition, protocol, {**settings, "termination": termination}, program, file)
 
 
-def _digest_program(config: Mapping[str, Any], environment_config: Mapping[str, Any], protocol: str) -> str:
-    settings = {name: value for name, value in config["evaluation"].items() if name != "bootstrap"}
-    parts = {name: environment_config[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": settings}
-    path, scenes = config["test_scenes"], environment_config["scenes"]
+def _digest_program(config: Mapping[str, Any], settings: Mapping[str, Any], protocol: str) -> str:
+    evaluation = {name: value for name, value in config["evaluation"].items() if name != "bootstrap"}
+    path, scenes = config["test_scenes"], settings["scenes"]
     heldout = scenes["heldout"] if path is None else None  # without a path: the recipe's own held-out scenes
+    parts = {name: settings[name] for name in (*TASK, "policy")} | {"protocol": protocol, "settings": evaluation}
     parts |= {"scenes": digest_scenes(scenes, path), "heldout": heldout}
-    return result_file.digest(parts | _files_entry(path if heldout is None else heldout["path"]))
+    return result_file.digest(parts | _digest_entry(path if heldout is None else heldout["path"]))
 
 
-def _files_entry(path: str | None) -> dict[str, str]:
-    """What a digest holds of scenes that no generator makes."""
-    found = digest_files(path)
-    return {} if found is None else {"scenes_print": found}
+def _digest_entry(path: str | None) -> dict[str, str]:
+    """The part of a digest for scenes that no generator makes."""
+    digest = digest_files(path)
+    return {} if digest is None else {"scenes_print": digest}
 
 
 def _quoted(path: str) -> str:

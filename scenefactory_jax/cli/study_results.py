@@ -1,4 +1,4 @@
-"""Results of a study, read from the folders of its runs: estimates with intervals, durations, and what made them."""
+"""Results of a study, read from the folders of its runs: estimates with intervals, durations and versions."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import study_plan
-from scenefactory_jax.cli.study_plan import Plan, Training
+from scenefactory_jax.cli.study_plan import Plan
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.records import read_records, write_records
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.report import study_report
+from scenefactory_jax.visualization.report.study_figures import CURVES
 
-RESULT, TRAINED = "result.json", "trained.json"
-CURVES = ("events/goal_reached", "events/collision", "events/road_edge_contact", "reward")
+RESULT = "result.json"
 POINTS = 120  # of a learning curve
 DIGITS = 5
 AGENTS = "agents"  # folder of the tables of agents
@@ -68,18 +68,18 @@ def draw(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_rows(plan: Plan) -> RowRecords:
     """The records of every evaluation that is done; a row without any has no seeds."""
-    found: RowRecords = {}
-    for one in plan.evaluations:
-        runs = found.setdefault((one.row, one.condition, one.protocol), {})
-        if one.file.is_file():
-            runs[one.training.seed] = read_records(one.file)
-    return found
+    rows: RowRecords = {}
+    for evaluation in plan.evaluations:
+        runs = rows.setdefault((evaluation.row, evaluation.condition, evaluation.protocol), {})
+        if evaluation.file.is_file():
+            runs[evaluation.training.seed] = read_records(evaluation.file)
+    return rows
 
 
 def _write_agents(out: Path, records: RowRecords) -> None:
     """Writes a table of all agents for each row, condition and protocol, with all seeds of training; earlier tables are removed."""
-    for old in (out / AGENTS).glob("*.csv.xz"):
-        old.unlink()
+    for file in (out / AGENTS).glob("*.csv.xz"):
+        file.unlink()
     for key, runs in records.items():
         if runs:
             (out / AGENTS).mkdir(exist_ok=True)
@@ -97,59 +97,49 @@ def _round(column: np.ndarray) -> np.ndarray:
 
 
 def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[str, Any]:
-    """Collects what the report says, as plain values.
+    """Collects the content of the report, as plain values.
 
     Returns:
         study: its config; scenes: names of the sources; missing: what is not trained or evaluated yet; rows: one for each row, condition
         and protocol; differences; trainings: variant -> durations, versions and curves.
     """
     study, settings = config["study"], config["evaluation"]
-    missing = [f"training {one.variant}, seed {one.seed}" for one in plan.trainings if not (one.folder / TRAINED).is_file()]
-    missing += [
-        f"evaluation {one.row}, {one.condition}, {one.protocol}, seed {one.training.seed}"
-        for one in plan.evaluations
-        if one.training.seed not in records[one.row, one.condition, one.protocol]
-    ]
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
+    scenes = {name: config[name] and Path(config[name]).name for name in ("train_scenes", "test_scenes")}
     return {
         "study": dict(study),
         "settings": {name: config[name] for name in ("seeds", "common", "cut", "target", "evaluation")},
-        "scenes": {name: _name_scenes(config[name]) for name in ("train_scenes", "test_scenes")},
-        "missing": missing,
-        "rows": [_row(key, runs, resampling) for key, runs in records.items() if runs],
-        "differences": _differences(study["compare"], records, resampling),
+        "scenes": {name: scene or "the recipe's own" for name, scene in scenes.items()},
+        "missing": [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()],
+        "rows": [_summarise(key, runs, resampling) for key, runs in records.items() if runs],
+        "differences": _compare(study["compare"], records, resampling),
         "trainings": {variant: _describe_trainings(variant, plan, config["target"]) for variant in study["trainings"]},
-        "made_with": {"commit": configs.find_commit(), **configs.versions()},
+        "made_with": {"commit": run_config.find_commit(), **run_config.versions()},
     }
 
 
-def _name_scenes(path: str | None) -> str:
-    return "the recipe's own" if path is None else Path(path).name
-
-
-def _row(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
-    row, condition, protocol = key
+def _summarise(key: RowKey, runs: statistics.Runs, resampling: Mapping[str, int]) -> dict[str, Any]:
     first = next(iter(runs.values()))
     return {
-        "row": row, "condition": condition, "protocol": protocol, "seeds": list(runs), "agents": len(first["scene"]),
+        **dict(zip(("row", "condition", "protocol"), key, strict=True)), "seeds": list(runs), "agents": len(first["scene"]),
         "scenes": len(np.unique(first["scene"])), "agents_file": _agents_file(key),
         "pooled": statistics.summarise_runs(runs, **resampling), "each": statistics.summarise_each_run(runs),
     }  # fmt: skip
 
 
-def _differences(pairs: Iterable[list[str]], records: RowRecords, resampling: Mapping[str, int]) -> list[dict[str, Any]]:
-    """The differences of every pair wherever both were evaluated, on the seeds that both have."""
-    found = []
+def _compare(pairs: Iterable[list[str]], records: RowRecords, resampling: Mapping[str, int]) -> list[dict[str, Any]]:
+    """The differences of every pair under each condition and protocol in which both were evaluated, on the seeds that both have."""
+    differences = []
     for before, after in pairs:
-        for (row, condition, protocol), runs in records.items():
-            others = records.get((after, condition, protocol), {})
-            if row != before or not runs or not others:
+        for (row, condition, protocol), old in records.items():
+            new = records.get((after, condition, protocol), {})
+            if row != before or not old or not new:
                 continue
-            shared = [seed for seed in runs if seed in others]
-            old, new = ({seed: one[seed] for seed in shared} if shared else one for one in (runs, others))
+            if shared := [seed for seed in old if seed in new]:
+                old, new = ({seed: runs[seed] for seed in shared} for runs in (old, new))
             key = {"before": before, "after": after, "condition": condition, "protocol": protocol, "seeds": [len(old), len(new)]}
-            found.append({**key, "change": statistics.difference_of_runs(old, new, **resampling)})
-    return found
+            differences.append({**key, "change": statistics.difference_of_runs(old, new, **resampling)})
+    return differences
 
 
 # ---- trainings
@@ -157,23 +147,30 @@ def _differences(pairs: Iterable[list[str]], records: RowRecords, resampling: Ma
 
 def _describe_trainings(variant: str, plan: Plan, target: float) -> dict[str, Any]:
     """Durations and curves of a variant's seeds."""
-    trainings = [one for one in plan.trainings if one.variant == variant]
-    notes = {one.seed: result_file.read(one.folder / TRAINED) for one in trainings if (one.folder / TRAINED).is_file()}
-    metrics = {one.seed: metrics_csv.read(one.folder) for one in trainings if one.seed in notes}
+    trainings = [training for training in plan.trainings if training.variant == variant]
+    ended = {training.seed: training for training in trainings if training.file.is_file()}
+    notes = {seed: result_file.read(training.file) for seed, training in ended.items()}
+    metrics = {seed: metrics_csv.read(training.folder) for seed, training in ended.items()}
+    held_out: dict[str, dict[int, dict[str, Any]]] = {}
+    for seed, training in ended.items():
+        rows, programs = metrics_csv.read(training.folder, metrics_csv.EVALUATIONS), notes[seed].get("watched", {})
+        for evaluation in study_plan.evaluations_while_training(plan, training):
+            if rows and programs.get(evaluation.protocol) == evaluation.program:  # another study may have evaluated another condition
+                held_out.setdefault(evaluation.protocol, {})[seed] = _held_out_curve(rows, evaluation.protocol, target)
     return {
         "overrides": [override for override in trainings[0].overrides if "path=" not in override],  # without paths of this machine
-        "digests": {one.seed: one.digest for one in trainings},
+        "digests": {training.seed: training.digest for training in trainings},
         "runs": {seed: _describe_run(note, metrics[seed]) for seed, note in notes.items()},
         "curves": _curves(metrics),
-        "held_out": _held_out_curves([one for one in trainings if one.seed in notes], plan, notes, target),
+        "held_out": held_out,
     }
 
 
 def _describe_run(note: Mapping[str, Any], rows: list[dict[str, float]]) -> dict[str, Any]:
     """Duration of one training; casps: control steps of spawned slots a second, median over iterations."""
-    kept = {name: note.get(name) for name in ("iterations", "steps", "minutes", "commit", "scenes", "agents")}
     device = note["versions"]["device"] + (f", shared by {note['per_gpu']}" if note.get("per_gpu", 1) > 1 else "")
-    return kept | {"casps": float(np.median([row["casps"] for row in rows])), "device": device}
+    values = {name: note.get(name) for name in ("iterations", "steps", "minutes", "commit", "scenes", "agents")}
+    return values | {"casps": float(np.median([row["casps"] for row in rows])), "device": device}
 
 
 def _curves(metrics: Mapping[int, list[dict[str, float]]]) -> dict[str, Any]:
@@ -192,24 +189,15 @@ def _curves(metrics: Mapping[int, list[dict[str, float]]]) -> dict[str, Any]:
     return {"steps": steps, "curves": {name: [average(column(rows, name)) for rows in metrics.values()] for name in CURVES}}
 
 
-def _held_out_curves(
-    trainings: Iterable[Training], plan: Plan, notes: Mapping[int, Mapping[str, Any]], target: float
-) -> dict[str, dict[int, dict[str, Any]]]:
-    """Protocol -> seed -> held-out rates while training; without runs that another study evaluated under another condition."""
-    found: dict[str, dict[int, dict[str, Any]]] = {}
-    for one in trainings:
-        rows = metrics_csv.read(one.folder, metrics_csv.EVALUATIONS)
-        for evaluation in study_plan.evaluations_while_training(plan, one):
-            if rows and notes[one.seed].get("watched", {}).get(evaluation.protocol) == evaluation.program:
-                found.setdefault(evaluation.protocol, {})[one.seed] = _held_out_curve(rows, evaluation.protocol, target)
-    return found
-
-
 def _held_out_curve(rows: list[dict[str, float]], protocol: str, target: float) -> dict[str, Any]:
-    """Success and collisions against agent steps, and when success first reached the target, and its last value."""
-    success = [row[f"{protocol}/success_rate/value"] for row in rows]
-    points = [{"minutes": row["minutes"], "steps": row["steps/total"], "success": value} for row, value in zip(rows, success, strict=True)]
+    """Success and collisions against agent steps, the first points at which success reached the target and its last value, and the last."""
+    points = [{"minutes": row["minutes"], "steps": row["steps/total"], "success": row[f"{protocol}/success_rate/value"]} for row in rows]
     first = lambda minimum: next((point for point in points if point["success"] >= minimum), None)  # noqa: E731
-    collisions = [row[f"{protocol}/collision_rate/value"] for row in rows]
-    curve = {"steps": [row["steps/total"] for row in rows], "success": success, "collisions": collisions}
-    return {**curve, "to_target": first(target), "to_final": first(success[-1]), "last": points[-1]}
+    return {
+        "steps": [point["steps"] for point in points],
+        "success": [point["success"] for point in points],
+        "collisions": [row[f"{protocol}/collision_rate/value"] for row in rows],
+        "to_target": first(target),
+        "to_final": first(points[-1]["success"]),
+        "last": points[-1],
+    }

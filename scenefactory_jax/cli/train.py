@@ -1,4 +1,4 @@
-"""`train`: scenes, an environment and a policy -> a run folder with checkpoints, metrics and a report."""
+"""`train`: trains a policy and writes a run folder with checkpoints, metrics and a report."""
 
 import functools
 from typing import Any
@@ -8,6 +8,8 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.learning import training_loop
 from scenefactory_jax.learning.training_loop import OnIteration, Prepared, Run
+
+NO_REPORT = "no report: scenes.heldout.path is null; evaluate the run with `evaluate run=... scenes.path=...`"
 
 
 def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, prepared: Prepared | None = None) -> Run:
@@ -31,6 +33,3 @@ def train(config: dict[str, Any], *, on_iteration: OnIteration | None = None, pr
             finish = lambda folder: print(NO_REPORT, flush=True)  # noqa: E731
     callback = functools.partial(evaluation.make_training_callback, config)
     return training_loop.train(config, on_iteration=on_iteration, prepared=prepared, make_callback=callback, finish=finish)
-
-
-NO_REPORT = "no report: scenes.heldout.path is null; evaluate the run with `evaluate run=... scenes.path=...`"

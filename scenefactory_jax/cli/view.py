@@ -56,11 +56,7 @@ class View(Task):
 
 
 def view(config: Mapping[str, Any]) -> Path | Drive:
-    """Writes `out`, or opens the window.
-
-    Raises:
-        ConfigError, SceneError, VideoError, OpenGLError, RerunError: see `replay`.
-    """
+    """Writes `out`, or opens the window; errors as of `replay` and `drive`."""
     if config["window"]:
         return drive(config)
     out = replay(config)
@@ -76,19 +72,19 @@ def replay(config: Mapping[str, Any]) -> Path:
         SceneError: no usable scene.
         VideoError, OpenGLError, RerunError: a library for this kind of file is missing.
     """
-    asked = _check(config)
-    settings, out = _load_settings(config), Path(asked.out)
-    shown = _choose_scenes(asked, settings, single=out.suffix in (*film.SUFFIXES, ".xml"))
+    command = _check(config)
+    settings, out = _load_settings(config), Path(command.out)
+    shown = _choose_scenes(command, settings, single=out.suffix in (*film.SUFFIXES, ".xml"))
     goal_radius_m, dynamics = settings["step_metrics"]["goal_radius_m"], _choose_car(settings)
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".xml":
         return _write_mjcf(out, settings, shown, dynamics)
-    policy = recorded_episodes.select_policy(settings, run=asked.run, act=asked.act, slots=shown.scene.agents.yaw.shape[1])
-    recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=asked.seconds, seed=asked.seed)
+    policy = recorded_episodes.select_policy(settings, run=command.run, act=command.act, slots=shown.scene.agents.yaw.shape[1])
+    recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=command.seconds, seed=command.seed)
     if out.suffix in film.SUFFIXES:
-        look = {"settings": asked.film, "camera": asked.camera, "slot": asked.car, "goal_radius_m": goal_radius_m}
+        look = {"settings": command.film, "camera": command.camera, "slot": command.car, "goal_radius_m": goal_radius_m}
         return film.write(out, recording, car=cars.read_parameters(dynamics)[0], **look)
-    title = asked.title or (Path(asked.run).name if asked.run else "replay")
+    title = command.title or (Path(command.run).name if command.run else "replay")
     if out.suffix == ".rrd":
         return rerun_file.write(out, recording, names=shown.names, title=title, goal_radius_m=goal_radius_m)
     return replay_page.write(out, recording, names=shown.names, posts=shown.posts, title=title, goal_radius_m=goal_radius_m)
@@ -103,45 +99,45 @@ def drive(config: Mapping[str, Any]) -> Drive:
     """
     from scenefactory_jax.visualization.mujoco import viewer  # loads the windowing library
 
-    asked = _check({**config, "window": True})
-    codes = viewer.read_keys(asked.keys)
+    command = _check({**config, "window": True})
+    codes = viewer.read_keys(command.keys)
     viewer.check_display()
     settings = _load_settings({**config, "window": True})
-    scene = jax.tree.map(lambda leaf: leaf[0], _choose_scenes(asked, settings, single=True).scene)
+    scene = jax.tree.map(lambda leaf: leaf[0], _choose_scenes(command, settings, single=True).scene)
     slots = np.flatnonzero(np.asarray(scene.agents.present)).tolist()
-    car = slots[0] if asked.car is None else asked.car
+    car = slots[0] if command.car is None else command.car
     if car not in slots:
         raise ConfigError(f"car: expected one of {', '.join(map(str, slots))}, got {car}")
-    act, parameters = recorded_episodes.select_policy(settings, run=asked.run, act="policy", slots=scene.agents.yaw.shape[0])
+    act, parameters = recorded_episodes.select_policy(settings, run=command.run, act="policy", slots=scene.agents.yaw.shape[0])
     env, dt = environment.make_env(settings), 1.0 / settings["timing"]["control_hz"]
-    world = keyboard_control.make_world(env, scene, act, parameters, car=car, dt=dt, off_map_m=asked.off_map_m)
-    print("; ".join(f"{command}: {key}" for command, key in vars(asked.keys).items()), flush=True)
-    response, start = asked.keyboard_response, keyboard_control.start(world, seed=asked.seed)
+    world = keyboard_control.make_world(env, scene, act, parameters, car=car, dt=dt, off_map_m=command.off_map_m)
+    print("; ".join(f"{name}: {key}" for name, key in vars(command.keys).items()), flush=True)
+    response, start = command.keyboard_response, keyboard_control.start(world, seed=command.seed)
     begun = keyboard_control.advance(world, start, set(), set(), response=response)
     drawn = cars.read_parameters(_choose_car(settings))[0]
-    return viewer.drive(world, begun, scene, drawn, response=response, camera=asked.camera, codes=codes)
+    return viewer.drive(world, begun, scene, drawn, response=response, camera=command.camera, codes=codes)
 
 
 def _check(config: Mapping[str, Any]) -> View:
     """Checks everything that would otherwise fail after the recording."""
-    asked = schema.read(config, View)
-    if asked.run is None and asked.overrides:
-        raise ConfigError(f"overrides: {asked.overrides} without a run; write them as settings of the command")
+    command = schema.read(config, View)
+    if command.run is None and command.overrides:
+        raise ConfigError(f"overrides: {command.overrides} without a run; write them as settings of the command")
     scene_source.use_compilation_cache()
-    if asked.window:
-        return asked
-    out = Path(asked.out)
+    if command.window:
+        return command
+    out = Path(command.out)
     if out.is_dir():
         raise ConfigError(f"out: expected a file, got the folder {out}; for example {out / 'view.html'}")
     if out.suffix not in SUFFIXES:
         raise ConfigError(f"out: expected a file {', '.join(SUFFIXES)}, got {out}")
     if out.suffix in video_file.SUFFIXES:
-        video_file.check(out, fps=asked.film.fps)
+        video_file.check(out, fps=command.film.fps)
     if out.suffix in film.SUFFIXES:
         offscreen_renderer.check()
     if out.suffix == ".rrd":
         rerun_file.check()
-    return asked
+    return command
 
 
 def _load_settings(config: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -166,19 +162,19 @@ def load_run_config(config: Mapping[str, Any]) -> dict[str, Any]:
         if config[group] != plain[group]:
             raise ConfigError(f"{group}: decided by the run {config['run']}; to change it: overrides='[{group}=...]'")
     trained = configs.apply_overrides(configs.read(policy_io.find(config["run"]), trust=config["trust"]), config["overrides"])
-    scenes, asked, default = trained["scenes"], config["scenes"], plain["scenes"]
-    if asked["path"] is not None:
-        return trained | {"scenes": scenes | {"path": asked["path"]}}
-    if any(asked[key] != default[key] for key in ("generate", "seed")):
-        return trained | {"scenes": scenes | {"path": None, "generate": asked["generate"], "seed": asked["seed"]}}
+    scenes, requested, default = trained["scenes"], config["scenes"], plain["scenes"]
+    if requested["path"] is not None:
+        return trained | {"scenes": scenes | {"path": requested["path"]}}
+    if any(requested[key] != default[key] for key in ("generate", "seed")):
+        return trained | {"scenes": scenes | {"path": None, "generate": requested["generate"], "seed": requested["seed"]}}
     if not scene_source.has_heldout(scenes):
         raise ConfigError("scenes.path: null, and the run names no held-out scenes; give scenes.path=..., or scenes=town")
     heldout = scenes["heldout"]
     return trained | {"scenes": scenes | {"path": heldout["path"], "seed": heldout["seed"]}}
 
 
-def _choose_scenes(asked: View, settings: Mapping[str, Any], *, single: bool) -> ShownScenes:
-    shown = recorded_episodes.choose_scenes(settings["scenes"], count=1 if single else asked.worlds, skip=asked.skip)
+def _choose_scenes(command: View, settings: Mapping[str, Any], *, single: bool) -> ShownScenes:
+    shown = recorded_episodes.choose_scenes(settings["scenes"], count=1 if single else command.worlds, skip=command.skip)
     print(f"scenes: {', '.join(shown.names)}", flush=True)
     return shown
 

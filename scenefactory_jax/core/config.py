@@ -14,17 +14,14 @@ from scenefactory_jax.core import atomic_file, trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 
 FILE = "config.yaml"  # of a run's folder
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy", "hydra-core")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy", "hydra-core")
 
 
 def read(path: Path, *, trust: bool = False) -> dict[str, Any]:
     """Reads the config of a run's folder, to build from.
 
     Args:
-        trust: whether it may name functions outside of the package (`core/trusted_targets.py`).
-
-    Raises:
-        ConfigError: no config there, a damaged one, or one that names such functions without `trust`.
+        trust: whether it may name functions outside of the package (`core/trusted_targets.py`); without, they are a ConfigError.
     """
     config = read_values(path)
     if not trust:
@@ -65,8 +62,8 @@ def versions() -> dict[str, str]:
     import scenefactory_jax
 
     device = jax.devices()[0]
-    found = {"scenefactory_jax": scenefactory_jax.__version__} | {name: _version(name) for name in PACKAGES}
-    return found | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
+    numbers = {"scenefactory_jax": scenefactory_jax.__version__} | {name: _version(name) for name in PACKAGES}
+    return numbers | {"device": f"{len(jax.devices())} x {device.device_kind}", "platform": device.platform}
 
 
 def find_commit() -> str:
@@ -110,11 +107,11 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def find_differences(before: Mapping[str, Any], after: Mapping[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
     """Returns dotted key -> both values, for keys in which two configs differ; None stands for a key that one of them lacks."""
-    found = {}
+    differences = {}
     for key in {**before, **after}:
         first, second = before.get(key), after.get(key)
         if isinstance(first, Mapping) and isinstance(second, Mapping):
-            found |= find_differences(first, second, f"{prefix}{key}.")
+            differences |= find_differences(first, second, f"{prefix}{key}.")
         elif first != second:
-            found[f"{prefix}{key}"] = first, second
-    return found
+            differences[f"{prefix}{key}"] = first, second
+    return differences

@@ -1,4 +1,4 @@
-"""Folders that one command at a time writes: a run that is trained, a bank that grows or is replaced."""
+"""Locks folders that one command at a time may write: the run of a training, a bank that grows or is replaced."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 
 try:
     import fcntl
-except ImportError:  # not on Windows: two commands in one folder are the user's own care there
+except ImportError:  # Windows: folders are not locked
     fcntl = None
 
 LOCK = ".lock"
@@ -21,18 +21,18 @@ class Busy(ConfigError):
 
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if it is not there, against other commands. The system takes the lock back however the process ends.
+    """Makes a folder and locks it against other commands; the system releases the lock when the process ends, in whatever way.
 
-    At the end the lock is removed, and what had to be made of the folder and its parents and is still empty.
+    At the end the lock file is removed, and those of the new folders that are empty.
 
     Raises:
-        Busy: another command holds it.
+        Busy: another command has the lock.
         ConfigError: the folder cannot be written.
     """
     new = find_missing_parents(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = None if fcntl is None else _locked(folder / LOCK)
+        file = None if fcntl is None else _open_locked(folder / LOCK)
     except BlockingIOError:
         raise Busy(f"{folder}: another command writes there now; wait for its end, or choose another folder") from None
     except OSError as error:
@@ -42,28 +42,26 @@ def lock_folder(folder: Path) -> Iterator[None]:
         yield
     finally:
         if file is not None:
-            _release(file, folder / LOCK)
+            if _is_at(file, folder / LOCK):
+                (folder / LOCK).unlink()
+            os.close(file)
         remove_empty(new)
 
 
 def find_missing_parents(folder: Path) -> list[Path]:
-    """The folder and those of its parents that do not exist, the innermost first."""
+    """Lists the folder and those of its parents that do not exist, the innermost first."""
     return [place for place in (folder, *folder.parents) if not place.exists()]
 
 
 def remove_empty(places: Sequence[Path]) -> None:
-    """Remove folders, the innermost first, up to one that is gone or holds something."""
+    """Removes folders, the innermost first, up to one that is missing or not empty."""
     with contextlib.suppress(OSError):
         for place in places:
             place.rmdir()
 
 
-def _locked(path: Path) -> int:
-    """The open descriptor of a lock that no other process holds.
-
-    Raises:
-        BlockingIOError: a process holds it.
-    """
+def _open_locked(path: Path) -> int:
+    """Opens and locks a file; raises BlockingIOError if another process has the lock."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -73,19 +71,12 @@ def _locked(path: Path) -> int:
             raise
         except OSError:  # a file system without locks
             return file
-        if _lies_at(file, path):
+        if _is_at(file, path):
             return file
-        os.close(file)  # removed by the one that held it, between opening and locking
+        os.close(file)  # the process before removed it between opening and locking
 
 
-def _release(file: int, path: Path) -> None:
-    """Remove a lock, if it is still in the folder that it was made in, and let go of it."""
-    if _lies_at(file, path):
-        path.unlink()
-    os.close(file)
-
-
-def _lies_at(file: int, path: Path) -> bool:
+def _is_at(file: int, path: Path) -> bool:
     """Whether an open file is the one at a path: its folder may have been replaced."""
     try:
         return os.path.samestat(os.fstat(file), path.stat())

@@ -3,7 +3,8 @@
     reward.jerk: {_target_: my_terms.jerk, weight: -0.1, limit: 3.0}
 
 A target without a dot is a public function of a given module. A dotted target is imported; of a module of this package, only functions that
-it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`).
+it defines itself are found. The numbers are the keyword-only parameters of the function, checked against their annotations (`schema`) and
+bound as `schema` reads them: a mapping that the annotation takes as a dataclass becomes its instance.
 """
 
 import functools
@@ -22,7 +23,6 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
     """Returns the function that `_target_` names with the numbers of `entry` bound.
 
     Args:
-        entry: mapping with `_target_`, and a value for every keyword-only parameter of the target.
         builtins: module of targets without a dot.
         where: key of the entry, for messages ("reward.progress").
         context: values that the program supplies to targets that declare them (time steps, friction): they need no key.
@@ -40,9 +40,8 @@ def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, w
 
     check_names(numbers, tunable, where=where, required=[name for name in tunable if parameters[name].default is inspect.Parameter.empty])
     hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
-    for key, value in numbers.items():
-        read_value(value, hints.get(key, Any), where=f"{where}.{key}")
-    return functools.partial(function, **numbers, **supplied)
+    values = {key: read_value(value, hints.get(key, Any), where=f"{where}.{key}") for key, value in numbers.items()}
+    return functools.partial(function, **values, **supplied)
 
 
 def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str) -> Callable[..., Any]:
@@ -63,21 +62,12 @@ def resolve_target(target: str, *, builtins: types.ModuleType | str, where: str)
     else:
         name = target
     function = getattr(module, name, None)
-    if not callable(function) or name.startswith("_") or not _is_own(function, module):
-        valid = ", ".join(list_functions(module))
+    foreign = module.__name__.partition(".")[0] != __name__.partition(".")[0]
+    if not callable(function) or name.startswith("_") or not (foreign or _is_defined_in(function, module)):
+        functions = [name for name, value in vars(module).items() if inspect.isfunction(value) and _is_defined_in(value, module)]
+        valid = ", ".join(sorted(name for name in functions if not name.startswith("_")))
         raise ConfigError(f"{where}._target_: {target!r} is not in {module.__name__}; valid: {valid}, or a dotted path")
     return function
-
-
-def list_functions(module: types.ModuleType) -> list[str]:
-    """Lists the public functions that a module defines itself."""
-    own = [n for n, f in vars(module).items() if inspect.isfunction(f) and _is_defined_in(f, module)]
-    return sorted(n for n in own if not n.startswith("_"))
-
-
-def _is_own(function: Callable[..., Any], module: types.ModuleType) -> bool:
-    """Whether the module defines the function itself; true for modules outside of this package."""
-    return module.__name__.partition(".")[0] != __name__.partition(".")[0] or _is_defined_in(function, module)
 
 
 def _is_defined_in(function: Callable[..., Any], module: types.ModuleType) -> bool:
@@ -86,19 +76,13 @@ def _is_defined_in(function: Callable[..., Any], module: types.ModuleType) -> bo
     return place == module.__name__ or (hasattr(module, "__path__") and place.startswith(f"{module.__name__}."))
 
 
-def check_type(value: Any, hint: Any, *, where: str) -> None:
-    """Checks a value of a config against an annotation, as `schema` does."""
-    read_value(value, hint, where=where)
+check_type = read_value
 
 
 def check_number(
     value: float | int, *, where: str, above: float | int | None = None, least: float | int | None = None, below: float | int | None = None
 ) -> None:
-    """Checks that a number of a config is finite and within its bounds.
-
-    Raises:
-        ConfigError: naming `where`, the bounds and the value.
-    """
+    """Checks that a number of a config is finite and within its bounds; raises a ConfigError that names `where`."""
     bounds = Bounds(min=least, above=above, below=below)
     if not math.isfinite(value) or value not in bounds:
         kind = "number" if math.isfinite(value) else "finite number"
@@ -112,20 +96,12 @@ def check_numbers(values: Mapping[str, float], *, where: str, **bounds: float) -
 
 
 def check_fraction(value: float | int, *, where: str) -> None:
-    """Checks that a number of a config is in [0, 1].
-
-    Raises:
-        ConfigError: naming `where` and the value.
-    """
+    """Checks that a number of a config is in [0, 1]; raises a ConfigError that names `where`."""
     read_value(value, Fraction, where=where)
 
 
 def check_range(span: Sequence[float | int], *, where: str, least: float | None = 0.0) -> tuple[float | int, float | int]:
-    """Returns the ends of a range of a config, [min, max].
-
-    Raises:
-        ConfigError: other than two ascending numbers, or one below `least`.
-    """
+    """Returns the ends of a range of a config, [min, max]; raises a ConfigError that names `where`."""
     if len(span) != 2 or span[0] > span[1]:
         raise ConfigError(f"{where}: expected [min, max], got {list(span)}")
     if least is not None and span[0] < least:

@@ -1,4 +1,4 @@
-"""What the Triton kernels share: where they run, what a program sees of its operands, and where it may stop."""
+"""Shared parts of the Triton kernels: the choice of the platform, blocks of operands, and the length of masks."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,6 +26,6 @@ def whole(operand: Any) -> pl.BlockSpec:
 
 
 def block_of(mask: Bool[Array, "*n K"]) -> Int[Array, "*n"]:
-    """How many entries of the last axis there are up to the last true one."""
+    """Number of entries of the last axis up to the last true one."""
     count = jnp.arange(1, mask.shape[-1] + 1, dtype=jnp.int32)
     return jnp.max(jnp.where(mask, count, 0), axis=-1, initial=0)

@@ -51,16 +51,13 @@ def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -
     """Checks shape and kind of number of a struct's fields against their annotations. Only shapes and dtypes are read.
 
     Args:
-        where: name of the value, for messages.
-        sizes: axis -> size, None if it is not known yet; sizes that are found are filled in. These axes have one size in all parts of the
-            value, other axes have their own in each part.
-
-    Raises:
-        ValueError: naming the field, what it is, and what was expected.
+        where: name of the value, for the ValueError.
+        sizes: axis -> size, None if it is not known yet; unknown sizes are filled in. These axes have one size in all parts of the value,
+            other axes have their own in each part.
     """
     if not isinstance(value, kind):
         raise ValueError(f"{where}: expected a {kind.__name__}, got {type(value).__name__}")
-    own: dict[str, int | None] = {}
+    local_sizes: dict[str, int | None] = {}
     for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
         leaf, expected = getattr(value, entry.name, None), entry.type
         if isinstance(expected, types.UnionType):  # a part that may be missing
@@ -68,34 +65,30 @@ def check(value: Any, kind: type, *, where: str, sizes: dict[str, int | None]) -
         if dataclasses.is_dataclass(expected):
             check(leaf, expected, where=f"{where}.{entry.name}", sizes=sizes)  # pyright: ignore[reportArgumentType]
         elif hasattr(expected, "dim_str"):
-            check_array(leaf, expected, where=f"{where}.{entry.name}", sizes=sizes, own=own)
+            check_array(leaf, expected, where=f"{where}.{entry.name}", sizes=sizes, local_sizes=local_sizes)
 
 
 def check_array(
-    leaf: Any, expected: Any, *, where: str, sizes: dict[str, int | None], own: dict[str, int | None] | None = None
+    leaf: Any, expected: Any, *, where: str, sizes: dict[str, int | None], local_sizes: dict[str, int | None] | None = None
 ) -> None:  # fmt: skip
-    """Checks shape and kind of number of an array against a jaxtyping annotation; `own`: sizes of the axes that `sizes` does not name.
-
-    Raises:
-        ValueError: naming the array, what it is, and what was expected.
-    """
-    own, axes = {} if own is None else own, expected.dim_str.split()
+    """Checks one array, as `check`; `local_sizes`: sizes of the axes that `sizes` does not name."""
+    local_sizes, axes = {} if local_sizes is None else local_sizes, expected.dim_str.split()
     kind = next(kind for kind in KINDS if expected.dtypes[0].startswith(kind))
     if leaf is None:
-        raise ValueError(f"{where}: missing; expected {kind} of shape {_shown(axes)}")
+        raise ValueError(f"{where}: missing; expected {kind} of shape {_format_shape(axes)}")
     shape, dtype = jnp.shape(leaf), jnp.result_type(leaf)
-    known = [int(axis) if axis.isdigit() else (sizes if axis in sizes else own).get(axis) for axis in axes]
-    if len(shape) != len(axes) or any(size not in (None, given) for size, given in zip(known, shape, strict=True)):
+    known = [int(axis) if axis.isdigit() else (sizes if axis in sizes else local_sizes).get(axis) for axis in axes]
+    if len(shape) != len(axes) or any(size not in (None, actual) for size, actual in zip(known, shape, strict=True)):
         worlds = "; for many worlds map over them with jax.vmap" if len(shape) == len(axes) + 1 else ""
-        wanted = [axis if size is None else size for axis, size in zip(axes, known, strict=True)]
-        raise ValueError(f"{where}: expected shape {_shown(wanted)}, got {_shown(shape)}{worlds}")
+        expected_shape = [axis if size is None else size for axis, size in zip(axes, known, strict=True)]
+        raise ValueError(f"{where}: expected shape {_format_shape(expected_shape)}, got {_format_shape(shape)}{worlds}")
     if not jnp.issubdtype(dtype, KINDS[kind]):
         raise ValueError(f"{where}: expected {kind}, got {dtype}")
     for axis, size in zip(axes, shape, strict=True):
-        (sizes if axis in sizes else own)[axis] = size
+        (sizes if axis in sizes else local_sizes)[axis] = size
 
 
-def _shown(shape: Iterable[Any]) -> str:
+def _format_shape(shape: Iterable[Any]) -> str:
     return f"({', '.join(map(str, shape))})"
 
 

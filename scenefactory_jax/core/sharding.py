@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 
 AXIS = "worlds"
 Tree = TypeVar("Tree")
+Specs = Callable[[Any], Any]
 
 
 def sum_over_devices(tree: Tree, axis: str | None) -> Tree:
@@ -50,57 +51,51 @@ def make_replicated_specs(tree: Any) -> Any:
     return jax.tree.map(lambda _: PartitionSpec(), tree)
 
 
-def map_over_devices(run: Callable, arguments: Sequence[tuple[Any, Any]], make_specs: Callable[[Any], Any], mesh: Mesh) -> Any:
-    """Runs a function on every device with its part of the arguments, by `jax.shard_map`.
+def map_over_devices(run: Callable, trees: Sequence[Any], in_specs: Sequence[Specs], out_specs: Specs, mesh: Mesh | None) -> Any:
+    """Runs a function on every device with its part of the trees, by `jax.shard_map`; without a mesh it is called as it is.
 
     Arrays without elements are left out: the partitioner of JAX 0.11 crashes on them.
 
     Args:
-        arguments: trees with their partition specs.
-        make_specs: computes the specs of the result.
+        in_specs, out_specs: functions that compute the partition specs of each tree and of the result.
     """
-    given = [_filled(tree, specs) for tree, specs in arguments]
-    returned = []
+    if mesh is None:
+        return run(*trees)
+    devices = mesh.size
+    parts = [_describe(tree, specs(tree), lambda rows: rows // devices) for tree, specs in zip(trees, in_specs, strict=True)]
+    full = [jax.tree.map(lambda leaf: leaf if leaf.size else None, tree) for tree in trees]
+    results = []
 
-    def each(*leaves: list[Array]) -> tuple[list[Array], list[Array]]:
-        parts = (one.refill(own, lambda rows: rows // mesh.size) for one, own in zip(given, leaves, strict=True))
-        found = run(*parts)
-        returned.append(_filled(found, make_specs(found)))
-        pairs = list(zip(returned[-1].leaves, returned[-1].specs, strict=True))
-        return [leaf for leaf, spot in pairs if AXIS in spot], [leaf for leaf, spot in pairs if AXIS not in spot]
+    def each(*leaves: Any) -> tuple[Any, Any]:
+        result = run(*map(_fill, leaves, parts))
+        specs = out_specs(result)
+        results.append(_describe(result, specs, lambda rows: rows * mesh.size))
+        keep = lambda sharded: lambda leaf, spec: leaf if leaf.size and (AXIS in spec) == sharded else None  # noqa: E731
+        return jax.tree.map(keep(True), result, specs), jax.tree.map(keep(False), result, specs)
 
-    out_specs = (PartitionSpec(AXIS), PartitionSpec())
-    mapped = jax.shard_map(each, mesh=mesh, in_specs=tuple(one.specs for one in given), out_specs=out_specs, check_vma=False)
-    shared, whole = map(iter, mapped(*(one.leaves for one in given)))
-    leaves = [next(shared if AXIS in spot else whole) for spot in returned[-1].specs]
-    return returned[-1].refill(leaves, lambda rows: rows * mesh.size)
-
-
-class _Filled(NamedTuple):
-    """The leaves of a tree that have elements, with their specs, and the function that rebuilds the tree."""
-
-    leaves: list[Array]
-    specs: list[PartitionSpec]
-    refill: Callable[[list[Array], Callable[[int], int]], Any]  # (leaves, map of the number of sharded rows)
+    specs_of_parts = tuple(specs(tree) for specs, tree in zip(in_specs, full, strict=True))
+    mapped = jax.shard_map(each, mesh=mesh, in_specs=specs_of_parts, out_specs=(PartitionSpec(AXIS), PartitionSpec()), check_vma=False)
+    sharded, replicated = mapped(*full)
+    return _fill(jax.tree.map(lambda one, other: other if one is None else one, sharded, replicated, is_leaf=_is_none), results[-1])
 
 
-def _filled(tree: Any, specs: Any) -> _Filled:
-    leaves, form = jax.tree.flatten(tree)
-    spots = form.flatten_up_to(specs)
-    full = [bool(leaf.size) for leaf in leaves]
-    shapes = [(leaf.shape, leaf.dtype) for leaf in leaves]
+def _describe(tree: Any, specs: Any, count: Callable[[int], int]) -> Any:
+    """Shapes and types of a tree whose sharded arrays have `count(rows)` rows."""
 
-    def refill(values: list[Array], rows: Callable[[int], int]) -> Any:
-        remaining = iter(values)
+    def describe(leaf: Array, spec: PartitionSpec) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((count(leaf.shape[0]), *leaf.shape[1:]) if AXIS in spec else leaf.shape, leaf.dtype)
 
-        def empty(shape: tuple[int, ...], dtype: Any, spot: PartitionSpec) -> Array:
-            return jnp.zeros((rows(shape[0]), *shape[1:]) if AXIS in spot else shape, dtype)
+    return jax.tree.map(describe, tree, specs)
 
-        known = zip(full, shapes, spots, strict=True)
-        return form.unflatten([next(remaining) if holds else empty(*kind, spot) for holds, kind, spot in known])
 
-    kept = [index for index, holds in enumerate(full) if holds]
-    return _Filled([leaves[index] for index in kept], [spots[index] for index in kept], refill)
+def _fill(tree: Any, shapes: Any) -> Any:
+    """Puts arrays without elements where a tree has None instead."""
+    fill = lambda leaf, shape: jnp.zeros(shape.shape, shape.dtype) if leaf is None and shape is not None else leaf  # noqa: E731
+    return jax.tree.map(fill, tree, shapes, is_leaf=_is_none)
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
 
 
 def make_mesh(count: int | None = None) -> Mesh | None:

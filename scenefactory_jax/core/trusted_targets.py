@@ -23,12 +23,12 @@ def check_targets(config: Mapping[str, Any], file: Path) -> None:
     Raises:
         ConfigError: naming the file, the key and the target.
     """
-    if not (found := find_outside_targets(config)):
+    if not (outside := find_outside_targets(config)):
         return
-    shown = "; ".join(f"{place}: {target!r}" for place, target in list(found.items())[:SHOWN])
-    more = f"; and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    listed = "; ".join(f"{place}: {target!r}" for place, target in list(outside.items())[:SHOWN])
+    more = f"; and {len(outside) - SHOWN} more" if len(outside) > SHOWN else ""
     raise ConfigError(
-        f"{file}: {shown}{more}: outside of {PACKAGE}, so loading it would run other code;"
+        f"{file}: {listed}{more}: outside of {PACKAGE}, so loading it would run other code;"
         " read that code first, then allow it: trust=true (in Python trust=True)"
     )
 
@@ -38,7 +38,7 @@ def find_outside_targets(config: Mapping[str, Any]) -> dict[str, Any]:
 
     A name without a dot is inside: it is looked up in a module of this package.
     """
-    found: dict[str, Any] = {}
+    outside: dict[str, Any] = {}
     todo: list[tuple[str, Any]] = [("", config)]
     visited: set[int] = set()  # YAML may hold one mapping in several places, or within itself
     for place, node in todo:
@@ -49,9 +49,9 @@ def find_outside_targets(config: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in pairs:
             where = f"{place}.{_shown(key)}" if place else _shown(key)
             if key == "_target_" and not _is_part(value):
-                found[where] = value
+                outside[where] = value
             todo.append((where, value))
-    return found
+    return outside
 
 
 def _is_part(target: Any) -> bool:

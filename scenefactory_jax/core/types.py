@@ -8,11 +8,12 @@ world x; anything else carries a suffix (`film_mm`). What is missing is masked b
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass, static
 
-SURFACES = ("AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE")  # the first three are asphalts: concrete, stone mastic, open-graded
+SurfaceName = Literal["AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE"]  # the first three are asphalts: concrete, stone mastic, open-graded
+SURFACES: tuple[SurfaceName, ...] = get_args(SurfaceName)
 
 RoadUser = Literal["vehicle", "pedestrian", "cyclist", "other"]
 ROAD_USERS: tuple[RoadUser, ...] = get_args(RoadUser)  # the order of `Tracks.kind`
@@ -305,6 +306,3 @@ class Policy(NamedTuple):
 
     init: Callable[[PRNGKeyArray, Observation], Any]
     apply: Callable[[Any, Observation], tuple[Array, Array, Array]]
-
-
-Pytree = Shaped[Array, "..."] | Any

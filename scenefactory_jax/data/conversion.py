@@ -1,7 +1,7 @@
-"""Files in any known format -> a bank. What cannot be used is listed with its reason, and the rest goes on.
+"""Files in any known format -> a bank. Files and scenes that cannot be used are listed with their reasons.
 
 Scenes go into the bank uncut. They are also packed on trial: the counts of what packing keeps and drops are stored, and a scene that it
-refuses stays in the bank with the reason in its row, because other numbers may take it. Scenes that the checks refuse are left out.
+refuses stays in the bank with the reason in its row, because other numbers may accept it. Scenes that the checks refuse are left out.
 """
 
 import functools
@@ -13,19 +13,19 @@ from typing import Any
 from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.parallel.task_map import FailedTask, TaskMap
-from scenefactory_jax.core.raw_scene import COMPANION, RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError, Unpackable
 from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, bank_writer, catalogue
 from scenefactory_jax.data.bank.bank_index import Index
 from scenefactory_jax.data.bank.bank_writer import Compression, SourceFileResult
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading.scene_source import Check, Pack, explain, read_file
-from scenefactory_jax.data.packing.pack import PackReport
-from scenefactory_jax.data.packing.summary import Summary, as_entry, count_results, summarise
+from scenefactory_jax.data.packing.pack import PackReport, prepare
+from scenefactory_jax.data.packing.summary import Summary, count_results, list_entries, summarise
 
 
 @dataclass(frozen=True)
 class SceneTools:
-    """What is done to each scene of a file; all of it can be sent to another process."""
+    """Functions for the scenes of a file; all of them can be sent to another process."""
 
     formats: Mapping[str, reader_selection.Reader]  # tried in order
     check: Check
@@ -45,34 +45,33 @@ def convert(
     compression: Compression,
     on_file: Callable[[int, int], None] | None = None,
 ) -> Summary:
-    """Reads every file below `path` into the bank `out`. A stopped conversion goes on where it stopped; a complete one takes up new files.
+    """Reads every file below `path` into the bank `out`. A stopped conversion continues; a complete one adds new files.
 
-    Files that could not be read are read again: they may have been repaired.
+    Files that could not be read are read again.
 
     Args:
-        path: a file, or a folder with its subfolders.
-        out: the bank's folder.
-        settings: the config behind `tools`, stored in the bank; a bank made with others is not continued.
+        path, out: a file or a folder with its subfolders; the bank's folder.
+        settings: the config behind `tools`, stored in the bank; a bank with other settings is refused.
         spread: task map over the files; order and result do not depend on it.
         shard_scenes, compression: of the bank's files, see `bank_writer.append_files`.
         on_file: called with (files done, files in all) after each file.
 
     Raises:
-        SceneError: no files, `out` is no bank or one made with other settings, or not one usable scene, with the first reasons.
+        SceneError: no files, `out` is not a bank or has other settings, or no usable scene, with the first reasons.
         ConfigError: a number that a part refuses.
         folder_lock.Busy: another command writes to `out`.
     """
     root, out = Path(path).absolute(), Path(out).resolve()
     files = reader_selection.find(root)
-    bank_writer.check_free_space(out)
+    bank_writer.check_target(out)
     work = functools.partial(convert_file, root=root, out=out, tools=tools)
 
-    def pieces(waiting: Sequence[Path]) -> Iterator[SourceFileResult]:
+    def results(waiting: Sequence[Path]) -> Iterator[SourceFileResult]:
         done = len(files) - len(waiting)
-        for number, (file, piece) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
-            if isinstance(piece, FailedTask):
-                piece = SourceFileResult(_name(file, root), rejects=(as_entry(Reject(None, piece.reason, None, str(file))),))
-            yield piece
+        for number, (file, result) in enumerate(zip(waiting, spread(work, list(enumerate(waiting))), strict=True), start=done + 1):
+            if isinstance(result, FailedTask):
+                result = SourceFileResult(_name(file, root), **list_entries([Reject(None, result.reason, None, str(file))]))
+            yield result
             if on_file is not None:
                 on_file(number, len(files))
 
@@ -81,25 +80,24 @@ def convert(
         known = set(index.files)
         waiting = [file for file in files if _name(file, root) not in known]
         try:
-            index = bank_writer.append_files(out, pieces(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
+            index = bank_writer.append_files(out, results(waiting), index=index, shard_scenes=shard_scenes, compression=compression)
         finally:
             bank_writer.remove_parts(out)
     return summarise(index.account, files=len(index.files), rejects=index.rejects, companions=index.companions)
 
 
 def _begin(root: Path, out: Path, settings: dict[str, Any]) -> Index:
-    """The index of the bank in `out`, if these settings made it, without the files that gave nothing; else that of a new bank."""
+    """The index of the bank in `out`, if it has these settings, without the files that gave no scene; else that of a new bank."""
     if not bank_index.is_bank(out):
         return Index(settings)
     index = bank_index.read(out)
-    if found := bank_index.differences(settings, index.settings):
-        raise SceneError(f"{out}: a bank made with other settings ({'; '.join(found)}); give another out, or remove it")
+    if differences := bank_index.differences(settings, index.settings):
+        raise SceneError(f"{out}: a bank made with other settings ({'; '.join(differences)}); give another out, or remove it")
     bank_writer.remove_parts(out)
-    lost = {reject["source"] for reject in index.rejects if reject["scene"] is None}
-    lost -= set(bank_reader.open(out).metadata["source"].to_pylist())
-    path = lambda name: str(root / name if root.is_dir() else root)  # noqa: E731
-    files = tuple(file for file in index.files if path(file) not in lost)
-    rejects = tuple(reject for reject in index.rejects if reject["source"] not in lost)
+    failed = {reject["source"] for reject in index.rejects if reject["scene"] is None}
+    failed -= set(bank_reader.open(out).metadata["source"].to_pylist())
+    files = tuple(file for file in index.files if str(root / file if root.is_dir() else root) not in failed)
+    rejects = tuple(reject for reject in index.rejects if reject["source"] not in failed)
     return replace(index, files=files, rejects=rejects, complete=False)
 
 
@@ -109,7 +107,7 @@ def _name(file: Path, root: Path) -> str:
 
 
 def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneTools) -> SourceFileResult:
-    """Writes the scenes of one file to a part of the bank's folder; it raises only `ConfigError`, whatever the file or a reader does."""
+    """Writes the scenes of one file to a part of the bank's folder. Any error is a reject, but for `ConfigError`."""
     number, path = item
     rows: list[dict[str, Any]] = []
     trials: list[PackReport | str] = []
@@ -122,7 +120,10 @@ def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneT
                 continue
             try:
                 raw = raw if tools.refine is None else tools.refine(raw)
-                trial = try_packing(raw, check=tools.check, pack=tools.pack)
+                try:
+                    trial = prepare(raw, check=tools.check, pack=tools.pack).report
+                except Unpackable as refusal:
+                    trial = str(refusal.kind)
                 row, batch = catalogue.extend_table(raw, tools.features), arrow_codec.encode(raw)
             except ConfigError:
                 raise
@@ -134,28 +135,7 @@ def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneT
             yield batch
 
     part = bank_writer.write_part(out, number, batches())
-    return SourceFileResult(
-        file=_name(path, root),
-        part=part,
-        rows=tuple(rows),
-        rejects=tuple(as_entry(reject) for reject in rejects if reject.kind != COMPANION),
-        companions=tuple(as_entry(reject) for reject in rejects if reject.kind == COMPANION),
-        account=count_results(trials),
-    )
-
-
-def try_packing(raw: RawScene, *, check: Check, pack: Pack) -> PackReport | str:
-    """The report of packing; of a scene that packing refuses, the kind of the refusal, such as those of `pack.REFUSALS`.
-
-    Raises:
-        SceneError: the check refuses the scene: no packing can use it.
-    """
-    checked, repairs = check(raw)
-    try:
-        report = pack(checked)[1]
-    except SceneError as refusal:
-        return refusal.kind or "other"
-    return replace(report, repairs=(*report.repairs, *repairs))
+    return SourceFileResult(_name(path, root), part=part, rows=tuple(rows), **list_entries(rejects), account=count_results(trials))
 
 
 def complete(

@@ -65,7 +65,7 @@ def make(
         rolling: deceleration of rolling resistance, m/s^2.
         drag: deceleration per speed, 1/s; `air_drag` per speed squared, 1/m.
         speed_limit: m/s.
-        contact: values of `collision.make`.
+        contact: values of `ContactLaw`.
         friction: (weather, position, speed) -> friction coefficient. It does not limit the motion: `friction_utilization` is the
             acceleration over mu g, above 1 where a real car would slide.
 

@@ -15,6 +15,7 @@ and high speed (R. P. Howard, J. Bomar and C. Bare, SAE 931842, 1993; K. L. Mons
 implicit in the closing speed: it is stable at any stiffness of the dissipation, and stops two boxes at any speed.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
@@ -24,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace
-from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
+from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import Boxes, Motion
 
 OFF_CENTRE = 3.7  # effective mass of a contact at the middle of two cars' faces over that at their corners
@@ -74,40 +75,37 @@ class Contact(NamedTuple):
     forces: Callable[[ContactState, Boxes, Neighbours], tuple[ContactState, Array, Array, Array]]  # see `compute_forces`
 
 
+@dataclasses.dataclass(frozen=True)
+class ContactLaw:
+    """The config `dynamics.contact`."""
+
+    stiffness: Positive  # along a whole face of two cars, N/m
+    dissipation: NonNegative  # s/m
+    friction: NonNegative  # Coulomb coefficient of the bodies; below the limit, what ends the sliding within eight steps
+    mass: Positive  # of the two cars that `stiffness` is meant for, kg
+    momentum_transfer_s: Positive  # time in which a box of finite mass may get the car's speed
+    max_neighbours: Annotated[int, Bounds(min=0)]  # objects that a car may touch, beside other cars
+
+
 def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> Contact:
-    """Makes the contact model of a config's `dynamics.contact`: see `make`."""
-    return instantiate({**entry, "_target_": "make"}, builtins=__name__, where="dynamics.contact", height=height, step_s=step_s)()
-
-
-def make(
-    *,
-    stiffness: Positive,
-    dissipation: NonNegative,
-    friction: NonNegative,
-    mass: Positive,
-    momentum_transfer_s: Positive,
-    max_neighbours: Annotated[int, Bounds(min=0)],
-    height: float,
-    step_s: float,
-) -> Contact:
-    """Binds `find_neighbours` and `compute_forces` to their parameters.
+    """Makes the contact model of a config's `dynamics.contact`.
 
     Args:
-        max_neighbours: objects that a car may touch, beside other cars; 0: none.
+        height: of the boxes, m; two whose elevations differ by more do not touch.
         step_s: time step of the forces, s.
 
     Raises:
         ConfigError: a number out of range, or a contact too stiff for `step_s`, by name.
     """
-    load = OFF_CENTRE * stiffness * step_s**2 / (mass / 2)
+    law = schema.read(entry, ContactLaw, where="dynamics.contact")
+    load = OFF_CENTRE * law.stiffness * step_s**2 / (law.mass / 2)
     if load >= 4.0:  # see `compute_forces`
         raise ConfigError(
-            f"dynamics.contact.stiffness: {stiffness:g} cannot be integrated: {OFF_CENTRE} k dt^2 / m, m half the mass: expected below 4, "
+            f"dynamics.contact.stiffness: {law.stiffness:g} cannot be integrated: {OFF_CENTRE} k dt^2 / m, m half the mass: expected below 4, "
             f"got {load:.2f} at a time step of {step_s:.5f} s"
         )
-    law = dict(stiffness=stiffness, dissipation=dissipation, friction=friction, mass=mass, height=height, step_s=step_s)
-    forces = functools.partial(compute_forces, momentum_transfer_s=momentum_transfer_s, **law)
-    return Contact(init, functools.partial(find_neighbours, max_neighbours=max_neighbours), forces)
+    neighbours = functools.partial(find_neighbours, max_neighbours=law.max_neighbours)
+    return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s))
 
 
 def init(cars: int, objects: int) -> ContactState:
@@ -155,17 +153,7 @@ def report_forces(contact: Contact, cars: Boxes, traffic: Boxes, seconds: float)
 
 
 def compute_forces(
-    state: ContactState,
-    cars: Boxes,
-    neighbours: Neighbours,
-    *,
-    stiffness: float,
-    dissipation: float,
-    friction: float,
-    mass: float,
-    momentum_transfer_s: float,
-    height: float,
-    step_s: float,
+    state: ContactState, cars: Boxes, neighbours: Neighbours, *, law: ContactLaw, height: float, step_s: float
 ) -> tuple[ContactState, Float[Array, "A 2"], Float[Array, " A"], Float[Array, " A"]]:
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
@@ -178,30 +166,23 @@ def compute_forces(
             more than `height` do not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
             speed within `momentum_transfer_s`.
-        stiffness: of a contact along a whole face of two cars, N/m.
-        dissipation: s/m.
-        friction: Coulomb coefficient of the bodies; below the limit, what ends the sliding within four steps.
-        mass: of the two cars that `stiffness` is meant for, kg.
-        momentum_transfer_s: s.
-        height: of the boxes, m.
-        step_s: s.
     """
     count, beside = neighbours.rows.shape
-    law = dict(stiffness=stiffness, dissipation=dissipation, friction=friction, mass=mass, height=height, step_s=step_s)
-    cars = _sanitize(cars, mass)
+    shared: dict[str, Any] = {"law": law, "height": height, "step_s": step_s}
+    cars = _sanitize(cars, law.mass)
     total, torque, largest, contacts = jnp.zeros((count, 2)), jnp.zeros(count), jnp.zeros(count), jnp.zeros(count)
     if beside:
         first = jax.tree.map(lambda leaf: jnp.repeat(leaf, beside, axis=0), cars)
-        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), mass)
+        second = _sanitize(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), neighbours.boxes), law.mass)
         places = jnp.arange(count)[:, None], neighbours.rows
-        axis, pair_force, pair_torque, _ = _compute_pair_forces(state.traffic[places].ravel(), first, second, momentum_transfer_s, **law)
+        axis, pair_force, pair_torque, _ = _compute_pair_forces(state.traffic[places].ravel(), first, second, limited=True, **shared)
         state = state._replace(traffic=jnp.full_like(state.traffic, NO_AXIS).at[places].set(axis.reshape(count, beside)))
         pair_force, pair_torque = pair_force.reshape(count, beside, 2), pair_torque.reshape(count, beside)
         contacts = (safe_norm(pair_force) > 0.0).sum(1, dtype=jnp.float32)
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        axis, force, torque_first, torque_second = _compute_pair_forces(state.cars[rows_first, rows_second], first, second, None, **law)
+        axis, force, torque_first, torque_second = _compute_pair_forces(state.cars[rows_first, rows_second], first, second, limited=False, **shared)
         state = state._replace(cars=state.cars.at[rows_first, rows_second].set(axis))
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
@@ -228,17 +209,7 @@ def _scale_of_many(contacts: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _compute_pair_forces(
-    axis: Int[Array, " N"],
-    first: Boxes,
-    second: Boxes,
-    momentum_transfer_s: float | None,
-    *,
-    stiffness: float,
-    dissipation: float,
-    friction: float,
-    mass: float,
-    height: float,
-    step_s: float,
+    axis: Int[Array, " N"], first: Boxes, second: Boxes, *, limited: bool, law: ContactLaw, height: float, step_s: float
 ) -> tuple[Int[Array, " N"], Float[Array, "N 2"], Float[Array, " N"], Float[Array, " N"]]:
     """Computes the axis of each pair, the force on its second box (the first has the opposite), and the torques on both."""
     separation = jax.vmap(compute_separation)(first, second)
@@ -255,17 +226,17 @@ def _compute_pair_forces(
     sliding = dot(speed, tangent[:, None])
     left = step_s - begin[:, None]  # of the step
     depth = _average_depth(depths, closing, left) * jnp.where(near[:, None], left / step_s, 0.0)
-    scale = (2.0 / (mass / first.mass + mass / second.mass))[:, None]
-    spring = 0.5 * stiffness * scale * depth
+    scale = (2.0 / (law.mass / first.mass + law.mass / second.mass))[:, None]
+    spring = 0.5 * law.stiffness * scale * depth
     levers = 1.0 / first.mass[:, None] + 1.0 / second.mass[:, None]
     levers = levers + _lever(arm_first, normal, first) + _lever(arm_second, normal, second)
-    implicit = 1.0 + step_s * dissipation * spring.sum(1, keepdims=True) * levers
-    push = spring * jnp.maximum(1.0 + dissipation * closing, 0.0) / implicit
-    reduced = 0.5 * mass * scale
-    if momentum_transfer_s is not None:
-        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / momentum_transfer_s  # per contact point
+    implicit = 1.0 + step_s * law.dissipation * spring.sum(1, keepdims=True) * levers
+    push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
+    reduced = 0.5 * law.mass * scale
+    if limited:
+        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / law.momentum_transfer_s  # per contact point
         push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
-    drag = jnp.clip(0.125 * reduced / step_s * sliding, -friction * push, friction * push)
+    drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
     return axis, force.sum(1), -cross(arm_first, force).sum(1), cross(arm_second, force).sum(1)
 

@@ -32,7 +32,7 @@ def make(
         start_row: row of the log at which episodes begin.
         centre_height: of the boxes' centres above the ground, m.
         mass: kg; for the contact force only.
-        contact: values of `collision.make`.
+        contact: values of `ContactLaw`.
         friction: (weather, position, speed) -> friction coefficient, for the report.
 
     Raises:

@@ -1,7 +1,5 @@
 """Worlds without roads and traffic, for single cars in validation and system identification."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,28 +23,26 @@ def make_open_ground(
 
     Their weather holds `friction` as its film and `pattern` as its surface: a friction function of the caller reads them.
     """
-    worlds, count = yaw.shape
+    count = yaw.shape[1]
 
-    def road() -> Road:
-        empty = {f.name: jnp.zeros((worlds, 0), jnp.float32) for f in dataclasses.fields(Road)}
-        two, whole = jnp.zeros((worlds, 0, 2), jnp.float32), jnp.zeros((worlds, 0), jnp.int32)
-        kinds = {"midpoint": two, "direction": two, "kind": whole, "polyline": whole, "valid": whole.astype(bool)}
-        return jax.vmap(lambda columns: Road(**columns))({**empty, **kinds})
-
-    def world(place: Array, heading: Array, pace: Array, mu: Array, row: Array, lines: Road) -> Scene:
+    def make_world(position: Array, yaw: Array, speed: Array, friction: Array, pattern: Array) -> Scene:
+        number, index, vector = jnp.zeros(0, jnp.float32), jnp.zeros(0, jnp.int32), jnp.zeros((0, 2), jnp.float32)
+        road = Road(vector, vector, half_length=number, kind=index, polyline=index, arc=number, valid=index.astype(bool))
         agents = Agents(
-            position=place,
-            yaw=heading,
-            speed=pace,
+            position=position,
+            yaw=yaw,
+            speed=speed,
             size=jnp.tile(jnp.array(size, jnp.float32), (count, 1)),
-            goal=place,
-            route_length=jnp.zeros_like(heading),
+            goal=position,
+            route_length=jnp.zeros_like(yaw),
             present=jnp.ones(count, bool),
         )
-        none = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
-        log = AgentLog(position=place[:, None], yaw=heading[:, None], **none)
-        alone = {"traffic_log": make_empty_log(1), "traffic": make_empty_boxes()}
-        return Scene(road=lines, lanes=lines, edges=lines, agents=agents, log=log, weather=make_uniform(mu, row), **alone)
+        standing = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
+        log = AgentLog(position=position[:, None], yaw=yaw[:, None], **standing)
+        traffic = {"traffic_log": make_empty_log(1), "traffic": make_empty_boxes()}
+        weather = make_uniform(friction, pattern)
+        return Scene(road=road, lanes=road, edges=road, agents=agents, log=log, weather=weather, **traffic)
 
-    place, heading, pace, mu = (jnp.asarray(x, jnp.float32) for x in (position, yaw, speed, friction))
-    return jax.vmap(world)(place, heading, pace, mu, jnp.asarray(pattern, jnp.int32), road())
+    columns = [jnp.asarray(column, jnp.float32) for column in (position, yaw, speed, friction)]
+    columns.append(jnp.asarray(pattern, jnp.int32))
+    return jax.vmap(make_world)(*columns)

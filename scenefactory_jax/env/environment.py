@@ -53,7 +53,7 @@ class Actions:
     """The config group `actions`."""
 
     command: dict[str, Any]  # an entry of `env.actions`
-    action_repeat: Count  # control steps for which an action is held
+    action_repeat: Count  # control steps per action
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +99,7 @@ class EnvParts(NamedTuple):
 
     dynamics: Dynamics
     map_action: Callable[[Float[Array, "A 3"]], Float[Array, "A 3"]]  # an agent's action in [-1, 1] -> throttle, steer, brake
-    action_repeat: int  # control steps for which an action is held
+    action_repeat: int  # control steps per action
     sample_agents: Callable[[PRNGKeyArray, Scene], Agents]
     sample_weather: Callable[[PRNGKeyArray, Scene], Weather]
     traffic: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> background traffic
@@ -246,7 +246,7 @@ def find_truncated_agents(result: StepResult, active: Bool[Array, "*W A"]) -> Bo
 
 
 def _scene_at(parts: EnvParts, scene: Scene, state: State) -> Scene:
-    """The scene at the time of a state: this episode's agents and weather, and the traffic where it is then."""
+    """Computes the scene at the time of a state: agents and weather of this episode, and the traffic at that time."""
     return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic(scene, state.step))
 
 
@@ -300,7 +300,7 @@ def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
 
 
 def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
-    """Throttle, steer and brake in this control step: of the given action where one is read, else of the last one that was."""
+    """Computes throttle, steer and brake of this control step: of the new action if one is read, else of the previous one."""
     new = jnp.clip(parts.map_action(jnp.clip(action, -1.0, 1.0)), -1.0, 1.0)
     return new if parts.action_repeat == 1 else jnp.where(state.step % parts.action_repeat == 0, new, state.previous_action)
 
@@ -319,8 +319,7 @@ def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array
 
 
 def _restore_non_finite(metrics: StepMetrics, before: State, after: State) -> tuple[StepMetrics, State]:
-    """Puts a car whose motion is not finite back where it was before the step, with a zero action: its NaN values do not propagate to
-    rewards, observations or other agents."""
+    """Restores a car whose motion is not finite to its state before the step, with a zero action: its NaN values do not propagate."""
     error = metrics.events.numerical_error
     clean = StepMetrics(**{name: _without_nan(value) for name, value in vars(metrics).items() if name != "events"}, events=metrics.events)
     body, motion = tree_where(error, (before.body, before.motion), (after.body, after.motion))
@@ -329,7 +328,7 @@ def _restore_non_finite(metrics: StepMetrics, before: State, after: State) -> tu
 
 
 def _without_nan(value: Array) -> Array:
-    """NaN becomes zero; infinities keep their meaning (no TTC)."""
+    """Replaces NaN by zero; infinities keep their meaning (no TTC)."""
     return value if value.dtype == bool else jnp.where(jnp.isnan(value), 0.0, value)
 
 

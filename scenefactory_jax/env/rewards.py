@@ -1,7 +1,7 @@
 """Reward terms: functions of a `RewardInput` that give a number for each agent; `sum_terms` adds them up.
 
 A term is a config entry `{_target_: progress, weight: 2.0, limit_m: 2.0}`: `weight` multiplies the term, the other keys are its parameters.
-A term of one's own has a dotted target: `{_target_: my_terms.jerk, weight: -0.1}`.
+A term from another module has a dotted target: `{_target_: my_terms.jerk, weight: -0.1}`.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """Rolls a policy out: a scan of policy and environment over control steps, with a hook that measures or records each of them.
 
-Evaluation, recordings for replay and scene simulation use it. Training has a scan of its own, which restarts worlds
+Evaluation, recordings for replay and scene simulation use it. Training has another scan, which restarts worlds
 (`learning/ppo/rollout.py`).
 """
 
@@ -97,7 +97,7 @@ class StepRecord:
     friction_utilization: Float[Array, " A"]
     slip: Float[Array, " A"]
     contact_force: Float[Array, " A"]
-    wheels: Tyres | None  # None: the dynamics has no wheels of its own
+    wheels: Tyres | None  # None: the dynamics has no wheels
     joints: Float[Array, "A 17"] | None  # chassis and wheels in MuJoCo's order; None: the dynamics has no joints
     traffic: Boxes
     film_mm: Float[Array, ""]  # of water on the open road

@@ -31,7 +31,7 @@ class MixturePart:
 
     sampler: dict[str, Any]
     weight: Positive
-    respawn_clearance_m: None = None  # only the whole group's counts
+    respawn_clearance_m: None = None  # that of the group `spawning` applies
 
 
 def make(entry: Mapping[str, Any], *, where: str = "spawning.sampler") -> Sampler:
@@ -102,7 +102,7 @@ def along_log(
 ) -> Agents:
     """Random starts along each agent's log, independent of each other: logged roads, goals and speeds, but other encounters.
 
-    Starts are valid rows of `scene.log`, `travel_min` or more before the goal along the log; a shorter log is driven from its beginning.
+    Starts are valid rows of `scene.log`, `travel_min` or more before the goal along the log; on a shorter log they are at its beginning.
     They keep `start_gap` from each other and half of it from the outlines of boxes; an agent without a valid candidate is absent. In a
     fraction of the episodes all agents start from rest, in the others at their logged speeds.
     """
@@ -188,7 +188,7 @@ def _choose(
     """Chooses for each slot in turn the first usable candidate that keeps its distance from the slots before it."""
     slots = start.shape[0]
 
-    def place(slot, carry):
+    def fill_slot(slot, carry):
         starts, goals, chosen, present = carry
         near_start = jnp.any((safe_norm(start[slot][:, None] - starts) < start_gap_m) & present, axis=1)
         near_goal = jnp.any((safe_norm(goal[slot][:, None] - goals) < goal_gap_m) & present, axis=1)
@@ -202,15 +202,15 @@ def _choose(
         )
 
     empty = (jnp.zeros((slots, 2)), jnp.zeros((slots, 2)), jnp.zeros(slots, jnp.int32), jnp.zeros(slots, bool))
-    _, _, chosen, present = jax.lax.fori_loop(0, slots, place, empty)
+    _, _, chosen, present = jax.lax.fori_loop(0, slots, fill_slot, empty)
     return chosen, present
 
 
 def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], present: Bool[Array, " A"]) -> Float[Array, "A *d"]:
     """Gathers each slot's chosen candidate; zeros where it is absent."""
     pad = (1,) * (candidates.ndim - 2)
-    found = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
-    return jnp.where(present.reshape((-1, *pad)), found, 0.0).astype(jnp.float32)
+    picked = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
+    return jnp.where(present.reshape((-1, *pad)), picked, 0.0).astype(jnp.float32)
 
 
 def is_clear(

@@ -13,6 +13,7 @@ from scenefactory_jax.core.geometry import cover_with_circles, cross, dot, headi
 from scenefactory_jax.core.pytree import is_finite
 from scenefactory_jax.core.schema import NonNegative, Positive
 from scenefactory_jax.core.types import Agents, Events, Motion, Scene, State, StepMetrics
+from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
 from scenefactory_jax.env import spawning, surrogate_safety
 from scenefactory_jax.roadgraph import queries
 
@@ -46,7 +47,6 @@ class StepMetricsConfig:
     off_lane_distance_m: Positive
     idle_speed_mps: NonNegative
     drac_gap_floor_m: Positive
-    gravity_mps2: Positive
     kernels: bool  # Triton kernels for the road on NVIDIA GPUs; False: plain JAX
 
 
@@ -73,7 +73,7 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
         out_of_bounds=_is_out_of_bounds(motion, after.agents, start_distance, config),
         road_edge_contact=edge_clearance <= 0,
     )
-    stopping_distance = speed**2 / (2 * config.gravity_mps2 * jnp.maximum(motion.mu, 1e-3))
+    stopping_distance = speed**2 / (2 * GRAVITY * jnp.maximum(motion.mu, 1e-3))
     return StepMetrics(
         speed=speed,
         goal_distance=safe_norm(to_goal),

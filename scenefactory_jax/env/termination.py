@@ -44,5 +44,5 @@ def evaluate(
 
 
 def make_empty_events(agents: int) -> Events:
-    """No event, for that many agents."""
+    """Makes events that are all false."""
     return Events(**{name: jnp.zeros(agents, bool) for name in EVENTS})

@@ -18,52 +18,52 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
     Args:
         config: of an environment with its scenes, resolved.
     """
-    found = {}
+    labels = {}
     if "spawning" in config:
-        found["Starts"] = _starts(config["spawning"]["sampler"])
+        labels["Starts"] = _starts(config["spawning"]["sampler"])
     if "weather" in config:
-        found["Weather"] = _weather(config["weather"])
+        labels["Weather"] = _weather(config["weather"])
     if "traffic" in config:
         name = config["traffic"]["_target_"]
-        found["Background traffic"] = TRAFFIC.get(name, f"`{name}`")
+        labels["Background traffic"] = TRAFFIC.get(name, f"`{name}`")
     if "dynamics" in config:
-        found["Dynamics"] = _dynamics(config["dynamics"])
+        labels["Dynamics"] = _dynamics(config["dynamics"])
     if "timing" in config:
-        found["Longest episode"] = f"{config['timing']['episode_s']:g} s"
+        labels["Longest episode"] = f"{config['timing']['episode_s']:g} s"
     if "pack" in config.get("scenes", {}):
         pack = config["scenes"]["pack"]
         if {"agents", "centre", "scene_size_m"} <= set(pack):
-            found["Scenes"] = (
+            labels["Scenes"] = (
                 f"up to {pack['agents']} agents in {pack['scene_size_m']:g} m x {pack['scene_size_m']:g} m, centre {pack['centre']}"
             )
-    return found
+    return labels
 
 
-def _starts(draw: Mapping[str, Any]) -> str:
-    name = draw["_target_"]
+def _starts(sampler: Mapping[str, Any]) -> str:
+    name = sampler["_target_"]
     if name != "mixed":
         return STARTS.get(name, f"`{name}`")
-    total = sum(part["weight"] for part in draw["parts"].values())
-    return "; ".join(f"{part['weight'] / total:.0%} {_starts(part['sampler'])}" for part in draw["parts"].values())
+    total = sum(part["weight"] for part in sampler["parts"].values())
+    return "; ".join(f"{part['weight'] / total:.0%} {_starts(part['sampler'])}" for part in sampler["parts"].values())
 
 
 def _weather(weather: Mapping[str, Any]) -> str:
-    """Surfaces and films with their shares, then patches and rain."""
+    """Surfaces and films with their fractions, then patches and rain."""
     cases = weather["sampler"].get("cases")
     if cases is None:
-        told = f"`{weather['sampler']['_target_']}`"
+        text = f"`{weather['sampler']['_target_']}`"
     else:
-        whole = sum(case["weight"] for case in cases)
-        shares = [f"{case['weight'] / whole:.0%} " if len(cases) > 1 else "" for case in cases]
-        told = ", ".join(f"{share}{case['surface']} {case['film_mm']:g} mm" for share, case in zip(shares, cases, strict=True))
+        total = sum(case["weight"] for case in cases)
+        fractions = [f"{case['weight'] / total:.0%} " if len(cases) > 1 else "" for case in cases]
+        text = ", ".join(f"{fraction}{case['surface']} {case['film_mm']:g} mm" for fraction, case in zip(fractions, cases, strict=True))
     patches = [name for name, entry in weather["patches"].items() if entry is not None]
-    told += f"; patches: {', '.join(patches)}" if patches else ""
-    return told + (f"; rain: `{weather['rain']['_target_']}`" if weather["rain"] else "")
+    text += f"; patches: {', '.join(patches)}" if patches else ""
+    return text + (f"; rain: `{weather['rain']['_target_']}`" if weather["rain"] else "")
 
 
 def _dynamics(dynamics: Mapping[str, Any]) -> str:
     """The module of one of the package's own, with what varies between its cars."""
     target = dynamics["_target_"]
     name = target.removeprefix("scenefactory_jax.dynamics.").removesuffix(".make")
-    told = f"`{name}`" + (f", brakes {dynamics['brakes']}" if "brakes" in dynamics else "")
-    return told + (", every car another" if dynamics.get("randomization") else "")
+    text = f"`{name}`" + (f", brakes {dynamics['brakes']}" if "brakes" in dynamics else "")
+    return text + (", every car another" if dynamics.get("randomization") else "")

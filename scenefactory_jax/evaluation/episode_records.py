@@ -14,7 +14,7 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
 from scenefactory_jax.evaluation import episodes, failures
-from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment
+from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.learning.training_loop import make_policy
 
@@ -53,7 +53,7 @@ def make_episode_runner(
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
-    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], signals=thresholds["signals"])
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], thresholds=SignalThresholds(**thresholds["signals"]))
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -90,7 +90,7 @@ def make_episode_runner(
         state, metrics = jax.device_get((episode.state, episode.carry))
         records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
         signals = _make_signals(metrics, state, first.agents.present, control_hz)
-        records |= failures.classify({**records, **signals}, **thresholds["types"])
+        records |= failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
@@ -105,8 +105,8 @@ def _make_records(
 ) -> dict[str, np.ndarray]:
     """Returns one row for every spawned agent of every world; film and surface are those of the open road at the start."""
     world, agent = np.nonzero(first.agents.present)
-    of = lambda leaf: np.asarray(leaf)[world, agent]  # noqa: E731
-    events = {name: of(value) for name, value in vars(metrics.past_events).items()}
+    of = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf)[world, agent], tree)  # noqa: E731
+    events, sums, largest, smallest = vars(of(metrics.past_events)), of(metrics.sums), of(metrics.largest), of(metrics.smallest)
     steps, ttc_steps = np.maximum(of(metrics.steps), 1), of(metrics.ttc_steps)
     return {
         "scene": np.array(names)[world],
@@ -119,18 +119,18 @@ def _make_records(
         "route_m": of(first.agents.route_length),
         "start_distance_m": of(distance),
         "end_distance_m": of(metrics.goal_distance),
-        "max_drac": of(metrics.max_drac),
-        "min_ttc_s": of(metrics.min_ttc),
-        "mean_ttc_s": of(metrics.ttc_sum) / np.maximum(ttc_steps, 1),
+        "max_drac": largest["drac"],
+        "min_ttc_s": smallest["ttc"],
+        "mean_ttc_s": sums["ttc"] / np.maximum(ttc_steps, 1),
         "has_ttc": ttc_steps > 0,
-        "mean_speed": of(metrics.speed_sum) / steps,
-        "yaw_acceleration": of(metrics.yaw_rate_change_sum) / steps * control_hz,
-        "max_contact_force_n": of(metrics.max_contact_force),
+        "mean_speed": sums["speed"] / steps,
+        "yaw_acceleration": sums["yaw_rate_change"] / steps * control_hz,
+        "max_contact_force_n": largest["contact_force"],
         "film_mm": np.asarray(first.weather.film_mm)[world],
         "surface": np.array(SURFACES)[np.asarray(first.weather.surface)[world]],
-        "friction": of(metrics.mu_sum) / steps,
-        "friction_utilization": of(metrics.friction_utilization_sum) / steps,
-        "stopping_margin_m": of(metrics.min_stopping_margin),
+        "friction": sums["mu"] / steps,
+        "friction_utilization": sums["friction_utilization"] / steps,
+        "stopping_margin_m": smallest["stopping_margin"],
     }
 
 

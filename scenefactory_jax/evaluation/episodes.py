@@ -4,8 +4,6 @@ Events are counted from the step metrics, not from the exclusive events that rew
 one step has both events. Nothing is counted after an agent or its world has ended.
 """
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -14,8 +12,11 @@ from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Events, State
 from scenefactory_jax.env import termination
 from scenefactory_jax.env.rollout import ControlStep, Hook
-from scenefactory_jax.evaluation import failure_signals
-from scenefactory_jax.evaluation.failure_signals import FailureSignals
+from scenefactory_jax.evaluation.failure_signals import FailureSignals, SignalThresholds, begin_signals, update_signals
+
+SUMS = ("ttc", "speed", "yaw_rate_change", "mu", "friction_utilization")
+LARGEST = ("drac", "contact_force")  # names of step metrics, as `SMALLEST`
+SMALLEST = ("ttc", "stopping_margin")
 
 
 @pytree_dataclass
@@ -24,17 +25,11 @@ class EpisodeMetrics:
 
     past_events: Events
     steps: Int[Array, " A"]
-    goal_distance: Float[Array, " A"]
-    max_drac: Float[Array, " A"]
-    min_ttc: Float[Array, " A"]
-    ttc_sum: Float[Array, " A"]
-    ttc_steps: Int[Array, " A"]
-    speed_sum: Float[Array, " A"]
-    yaw_rate_change_sum: Float[Array, " A"]  # absolute, rad/s
-    mu_sum: Float[Array, " A"]
-    friction_utilization_sum: Float[Array, " A"]
-    min_stopping_margin: Float[Array, " A"]
-    max_contact_force: Float[Array, " A"]
+    ttc_steps: Int[Array, " A"]  # with a finite time to collision
+    goal_distance: Float[Array, " A"]  # in the last step
+    sums: dict[str, Float[Array, " A"]]
+    largest: dict[str, Float[Array, " A"]]
+    smallest: dict[str, Float[Array, " A"]]
     signals: FailureSignals
 
 
@@ -58,38 +53,29 @@ def make_metrics(state: State) -> EpisodeMetrics:
     return EpisodeMetrics(
         past_events=termination.make_empty_events(count),
         steps=none,
-        goal_distance=distance,
-        max_drac=zero,
-        min_ttc=zero + jnp.inf,
-        ttc_sum=zero,
         ttc_steps=none,
-        speed_sum=zero,
-        yaw_rate_change_sum=zero,
-        mu_sum=zero,
-        friction_utilization_sum=zero,
-        min_stopping_margin=zero + jnp.inf,
-        max_contact_force=zero,
-        signals=failure_signals.begin(state, distance),
+        goal_distance=distance,
+        sums=dict.fromkeys(SUMS, zero),
+        largest=dict.fromkeys(LARGEST, zero),
+        smallest=dict.fromkeys(SMALLEST, zero + jnp.inf),
+        signals=begin_signals(state, distance),
     )
 
 
-def make_hook(env: Env, *, ttc_limit_s: float, signals: Mapping[str, float]) -> Hook:
+def make_hook(env: Env, *, ttc_limit_s: float, thresholds: SignalThresholds) -> Hook:
     """Returns the hook of a rollout that updates `EpisodeMetrics` and gives an `EpisodeFrame` a step.
 
     Args:
         ttc_limit_s: TTC is clamped to it in an agent's mean (the published evaluation: 10 s).
-        signals: numbers of `failure_signals.update`.
     """
 
     def hook(metrics: EpisodeMetrics, step: ControlStep) -> tuple[EpisodeMetrics, EpisodeFrame]:
-        before, state, result = step.before, step.after, step.result
+        before, state, result, lanes = step.before, step.after, step.result, step.scene.lanes
         boxes = env.current_scene(step.scene, state).traffic
-        found = failure_signals.update(
-            metrics.signals, metrics.past_events, step.scene.lanes, boxes, before, state, result.metrics, **signals
-        )
+        signals = update_signals(metrics.signals, metrics.past_events, lanes, boxes, before, state, result.metrics, thresholds)
         position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events)
-        return _update(metrics, step, found, ttc_limit_s=ttc_limit_s), frame
+        return _update(metrics, step, signals, ttc_limit_s=ttc_limit_s), frame
 
     return hook
 
@@ -98,20 +84,20 @@ def _update(metrics: EpisodeMetrics, step: ControlStep, signals: FailureSignals,
     before, after, now = step.before, step.after, step.result.metrics
     active = before.active & ~now.events.numerical_error  # metrics of a state that is not finite are not valid
     has_ttc = active & jnp.isfinite(now.ttc)
-    add = lambda total, value: total + jnp.where(active, value, 0)  # noqa: E731
+    values = {
+        "ttc": jnp.where(has_ttc, jnp.minimum(now.ttc, ttc_limit_s), 0.0),
+        "speed": now.speed,
+        "yaw_rate_change": jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate),
+        "mu": now.mu,
+        "friction_utilization": now.friction_utilization,
+    }
     return EpisodeMetrics(
         past_events=jax.tree.map(lambda old, new: old | (new & before.active), metrics.past_events, now.events),
         steps=metrics.steps + active.astype(jnp.int32),
-        goal_distance=jnp.where(active, now.goal_distance, metrics.goal_distance),
-        max_drac=jnp.maximum(metrics.max_drac, jnp.where(active, now.drac, 0.0)),
-        min_ttc=jnp.minimum(metrics.min_ttc, jnp.where(active, now.ttc, jnp.inf)),
-        ttc_sum=metrics.ttc_sum + jnp.where(has_ttc, jnp.minimum(now.ttc, ttc_limit_s), 0.0),
         ttc_steps=metrics.ttc_steps + has_ttc.astype(jnp.int32),
-        speed_sum=add(metrics.speed_sum, now.speed),
-        yaw_rate_change_sum=add(metrics.yaw_rate_change_sum, jnp.abs(after.motion.yaw_rate - before.motion.yaw_rate)),
-        mu_sum=add(metrics.mu_sum, now.mu),
-        friction_utilization_sum=add(metrics.friction_utilization_sum, now.friction_utilization),
-        min_stopping_margin=jnp.minimum(metrics.min_stopping_margin, jnp.where(active, now.stopping_margin, jnp.inf)),
-        max_contact_force=jnp.maximum(metrics.max_contact_force, jnp.where(active, now.contact_force, 0.0)),
+        goal_distance=jnp.where(active, now.goal_distance, metrics.goal_distance),
+        sums={name: metrics.sums[name] + jnp.where(active, value, 0) for name, value in values.items()},
+        largest={name: jnp.maximum(old, jnp.where(active, getattr(now, name), 0.0)) for name, old in metrics.largest.items()},
+        smallest={name: jnp.minimum(old, jnp.where(active, getattr(now, name), jnp.inf)) for name, old in metrics.smallest.items()},
         signals=signals,
     )

@@ -3,12 +3,16 @@
 `evaluation/failures.py` derives the failure types from them.
 """
 
+from dataclasses import dataclass
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import dot, safe_norm
 from scenefactory_jax.core.pytree import pytree_dataclass, tree_where
+from scenefactory_jax.core.schema import Bounds, NonNegative
 from scenefactory_jax.core.types import Boxes, Events, Road, State, StepMetrics
 from scenefactory_jax.dynamics.collision import find_box_contact
 from scenefactory_jax.env.surrogate_safety import collect_road_users
@@ -17,6 +21,18 @@ from scenefactory_jax.roadgraph.queries import squared_segment_distance
 
 MARGIN_M = 0.5  # boxes are enlarged by this on every side to find the collision partner, which the impact may have pushed away
 FAILURE_EVENTS = tuple(name for name in EVENTS if name != "goal_reached")  # in the order of precedence
+
+
+@dataclass(frozen=True)
+class SignalThresholds:
+    """Thresholds of the signals: the group `failures.signals`."""
+
+    moving_mps: NonNegative  # a slower car drives neither along a lane nor against it
+    lane_m: NonNegative  # a car is on all lanes whose centre line is within this distance of its centre: on several at intersections
+    wrong_way_cos: Annotated[float, Bounds(min=-1)]  # largest cosine between its velocity and their directions; below: against them
+    wrong_way_m: NonNegative  # length of a stretch against the lanes that counts as wrong way
+    rest_m: NonNegative  # radius of the circle that a car at rest does not leave
+    near_m: NonNegative  # distance within which a car is near its goal
 
 
 @pytree_dataclass
@@ -58,7 +74,7 @@ class FailureSignals:
     stretch: Float[Array, " A"]  # current stretch against the lanes, m
 
 
-def begin(state: State, distance: Float[Array, " A"]) -> FailureSignals:
+def begin_signals(state: State, distance: Float[Array, " A"]) -> FailureSignals:
     """Returns the signals at the start of an episode; `distance` is to the goals."""
     count = state.active.shape[0]
     zero, none, false = jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
@@ -67,7 +83,7 @@ def begin(state: State, distance: Float[Array, " A"]) -> FailureSignals:
     return FailureSignals(false, none, start, zero, collision, distance, start, zero, start, false, start, zero, none, zero)
 
 
-def update(
+def update_signals(
     signals: FailureSignals,
     past_events: Events,
     lanes: Road,
@@ -75,13 +91,7 @@ def update(
     before: State,
     after: State,
     metrics: StepMetrics,
-    *,
-    moving_mps: float,
-    lane_m: float,
-    wrong_way_cos: float,
-    wrong_way_m: float,
-    rest_m: float,
-    near_m: float,
+    thresholds: SignalThresholds,
 ) -> FailureSignals:
     """Computes the signals after one more step, for the agents that are active in `before`.
 
@@ -89,12 +99,6 @@ def update(
         past_events: events before this step.
         lanes: all lanes of the world.
         boxes: background traffic after the step.
-        moving_mps: a slower car drives neither along a lane nor against it.
-        lane_m: a car is on all lanes whose centre line is within this distance of its centre, so on several at intersections.
-        wrong_way_cos: it drives against them if the largest cosine between its velocity and their directions is smaller.
-        wrong_way_m: length of a stretch against the lanes that counts as wrong way.
-        rest_m: radius of the circle that a car at rest does not leave.
-        near_m: distance within which a car is near its goal.
     """
     active, motion = before.active & ~metrics.events.numerical_error, after.motion  # metrics of a non-finite state are not valid
     position = motion.position[:, :2]
@@ -106,12 +110,12 @@ def update(
     collides = active & metrics.events.collision & ~past_events.collision
     closer = active & (metrics.goal_distance < signals.min_goal_distance)
     min_goal_distance = jnp.where(closer, metrics.goal_distance, signals.min_goal_distance)
-    departure = jnp.where(active & (min_goal_distance <= near_m), metrics.goal_distance - min_goal_distance, 0.0)
-    leaves = active & (safe_norm(position - signals.rest.position) > rest_m)
-    alignment = heading_alignment(position, motion.velocity[:, :2], lanes, within_m=lane_m)
-    against = active & (metrics.speed >= moving_mps) & (alignment < wrong_way_cos)
+    departure = jnp.where(active & (min_goal_distance <= thresholds.near_m), metrics.goal_distance - min_goal_distance, 0.0)
+    leaves = active & (safe_norm(position - signals.rest.position) > thresholds.rest_m)
+    alignment = heading_alignment(position, motion.velocity[:, :2], lanes, within_m=thresholds.lane_m)
+    against = active & (metrics.speed >= thresholds.moving_mps) & (alignment < thresholds.wrong_way_cos)
     stretch = jnp.where(against, signals.stretch + driven, 0.0)
-    wrong_way = against & (stretch >= wrong_way_m) & ~signals.has_driven_wrong_way
+    wrong_way = against & (stretch >= thresholds.wrong_way_m) & ~signals.has_driven_wrong_way
     event = (jnp.argmax(events, axis=0).astype(jnp.int32), now, safe_norm(before.motion.velocity[:, :2]))
     first_event, first, speed = tree_where(fails, event, (signals.first_event, signals.first, signals.speed))
     return FailureSignals(
@@ -155,10 +159,10 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
         outline = lambda index: (users.position[index], users.yaw[index], half[index])  # noqa: E731
         return find_box_contact(*outline(row), *outline(column))
 
-    found = jax.vmap(lambda row: jax.vmap(lambda column: find_contact(row, column))(columns))(rows)
-    depth = jnp.where(users.present & (rows[:, None] != columns), found.depths.max(-1), -jnp.inf)
+    contact = jax.vmap(lambda row: jax.vmap(lambda column: find_contact(row, column))(columns))(rows)
+    depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)
     partner = jnp.argmax(jnp.where(jnp.isfinite(depth), depth, -jnp.inf), axis=1).astype(jnp.int32)
-    normal, point = found.normal[rows, partner], found.points[rows, partner].mean(1)
+    normal, point = contact.normal[rows, partner], contact.points[rows, partner].mean(1)
 
     def speed_along_normal(index: Int[Array, " A"]) -> Float[Array, " A"]:
         arm = point - users.position[index]

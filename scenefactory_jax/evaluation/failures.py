@@ -4,12 +4,15 @@ Every such agent has one type; other things that are true of it are flags. An ev
 first, and the first event counts. Without an event the earliest of wrong way, overshoot and stuck counts.
 """
 
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from scenefactory_jax.core import markdown
+from scenefactory_jax.core.schema import NonNegative
 from scenefactory_jax.evaluation.records import Records, RecordsError, check_records
 
 NONE = "none"  # type of a clean success
@@ -71,24 +74,32 @@ class Failure(NamedTuple):
     flags: tuple[str, ...]  # keys of FLAGS, without those that the type implies
 
 
-def classify(
-    signals: Records, *, at_fault_speed_fraction: float, at_fault_min_mps: float, stuck_s: float, departure_m: float
-) -> dict[str, np.ndarray]:
+@dataclass(frozen=True)
+class TypeThresholds:
+    """Thresholds of the types: the group `failures.types`. See `FAILURE_TYPES`."""
+
+    at_fault_speed_fraction: NonNegative
+    at_fault_min_mps: NonNegative
+    stuck_s: NonNegative
+    departure_m: NonNegative
+
+
+def classify(signals: Records, thresholds: TypeThresholds) -> dict[str, np.ndarray]:
     """Computes columns of records: each agent's failure type, its moment and severity, the flags, and `SIGNALS`.
 
     Args:
         signals: records with `SIGNALS` and columns NAME_s, NAME_x_m and NAME_y_m of moments: of the first event ("event"), the smallest
             distance to the goal ("closest"), the start of the last rest ("last_rest"), the first stretch against the lanes
             ("first_wrong_way") and the "end".
-        at_fault_speed_fraction, at_fault_min_mps, stuck_s, departure_m: see `FAILURE_TYPES`.
     """
-    own, other = np.maximum(signals["approach_mps"], 0.0), np.maximum(signals["partner_approach_mps"], 0.0)
-    drove = (own >= at_fault_min_mps) & (own >= at_fault_speed_fraction * (own + other))
-    head_on = drove & (other >= at_fault_speed_fraction * (own + other))
+    own_speed, other_speed = np.maximum(signals["approach_mps"], 0.0), np.maximum(signals["partner_approach_mps"], 0.0)
+    fraction = thresholds.at_fault_speed_fraction
+    drove = (own_speed >= thresholds.at_fault_min_mps) & (own_speed >= fraction * (own_speed + other_speed))
+    head_on = drove & (other_speed >= fraction * (own_speed + other_speed))
     at_fault = signals["collision"] & drove & ~(head_on & signals["partner_wrong_way"] & ~signals["collision_wrong_way"])
     closing = np.maximum(signals["approach_mps"] + signals["partner_approach_mps"], 0.0)
-    stuck = ~signals["goal_reached"] & (signals["rest_s"] >= stuck_s)
-    overshoot = ~signals["goal_reached"] & (signals["departure_m"] >= departure_m)
+    stuck = ~signals["goal_reached"] & (signals["rest_s"] >= thresholds.stuck_s)
+    overshoot = ~signals["goal_reached"] & (signals["departure_m"] >= thresholds.departure_m)
 
     event = signals["first_event"]
     moments = {"wrong_way": "first_wrong_way", "overshoot": "closest", "stuck": "last_rest"}
@@ -126,56 +137,48 @@ def rank_failures(records: Records) -> dict[str, list[Failure]]:
     Raises:
         RecordsError: records without failure types.
     """
-    check_failures(records)
-    found = {}
-    for kind in FAILURE_TYPES:
-        rows = np.flatnonzero(np.asarray(records["failure"]) == kind)
-        order = np.lexsort((rows, -np.asarray(records["severity"], float)[rows]))  # ties as in the records
-        if len(rows):
-            found[kind] = [_failure(records, kind, int(row)) for row in rows[order]]
-    return found
-
-
-def check_failures(records: Records) -> None:
-    """Refuses records without failure types.
-
-    Raises:
-        RecordsError: naming the column.
-    """
     check_records(records)
     columns = ("failure", "failure_s", "failure_x_m", "failure_y_m", "severity", *FLAGS)
-    for name in columns:
-        if name not in records:
-            raise RecordsError(f"records.{name}: column missing; failure types need {', '.join(columns)}, which `evaluate` writes")
+    if missing := [name for name in columns if name not in records]:
+        raise RecordsError(f"records.{missing[0]}: column missing; failure types need {', '.join(columns)}, which `evaluate` writes")
+    kinds, ranked = np.asarray(records["failure"]), {}
+    for row in np.argsort(-np.asarray(records["severity"], float), kind="stable"):  # ties as in the records
+        ranked.setdefault(str(kinds[row]), []).append(_make_failure(records, int(row)))
+    return {kind: ranked[kind] for kind in FAILURE_TYPES if kind in ranked}
 
 
-def _failure(records: Records, kind: str, row: int) -> Failure:
-    at = lambda name: records[name][row]  # noqa: E731
-    flags = tuple(name for name in FLAGS if name != kind and at(name))
-    position = (float(at("failure_x_m")), float(at("failure_y_m")))
-    agent = (str(at("scene")), int(at("world")), int(at("agent")))
-    return Failure(kind, row, *agent, float(at("failure_s")), position, float(at("severity")), flags)
+def _make_failure(records: Records, row: int) -> Failure:
+    at = {name: column[row] for name, column in records.items()}
+    return Failure(
+        kind=str(at["failure"]),
+        row=row,
+        scene=str(at["scene"]),
+        world=int(at["world"]),
+        agent=int(at["agent"]),
+        moment_s=float(at["failure_s"]),
+        position=(float(at["failure_x_m"]), float(at["failure_y_m"])),
+        severity=float(at["severity"]),
+        flags=tuple(name for name in FLAGS if name != at["failure"] and at[name]),
+    )
 
 
 def count_by_scene(failures: list[Failure]) -> list[tuple[str, int]]:
     """Counts these failures in each scene: most first, then those with the worst."""
-    counts: dict[str, int] = {}
-    for failure in failures:
-        counts[failure.scene] = counts.get(failure.scene, 0) + 1
-    return sorted(counts.items(), key=lambda item: -item[1])  # stable: the failures come worst first
+    return Counter(failure.scene for failure in failures).most_common()  # stable: the failures come worst first
 
 
 def find_worst_failures(failures: list[Failure], count: int) -> list[Failure]:
     """Returns the worst of these failures, each of another scene."""
-    first: dict[str, Failure] = {}
+    worst: dict[str, Failure] = {}
     for failure in failures:
-        first.setdefault(failure.scene, failure)
-    return list(first.values())[:count]
+        worst.setdefault(failure.scene, failure)
+    return list(worst.values())[:count]
 
 
-def count_flags(failures: list[Failure]) -> dict[str, int]:
+def _count_flags(failures: list[Failure]) -> dict[str, int]:
     """Counts how many of these failures carry each flag; flags that none carries are left out."""
-    return {name: count for name in FLAGS if (count := sum(name in failure.flags for failure in failures))}
+    counts = Counter(flag for failure in failures for flag in failure.flags)
+    return {name: counts[name] for name in FLAGS if name in counts}
 
 
 def as_json(records: Records) -> dict[str, Any]:
@@ -186,7 +189,7 @@ def as_json(records: Records) -> dict[str, Any]:
             **FAILURE_TYPES[kind]._asdict(),
             "agents": len(failures),
             "fraction": len(failures) / agents,
-            "flags": count_flags(failures),
+            "flags": _count_flags(failures),
             "scenes": dict(count_by_scene(failures)),
             "ranked": [{k: v for k, v in failure._asdict().items() if k != "kind"} for failure in failures],
         }
@@ -199,13 +202,15 @@ def format_table(records: Records, *, max_scenes: int = 3) -> str:
     """Formats a Markdown table: a row a type, with counts, fractions of all agents, flags, and the scenes that have most of it."""
     agents, clean = len(records["scene"]), np.asarray(records["clean"], bool)
     wrong_way = int(np.sum(clean & np.asarray(records["wrong_way"], bool)))
-    also = f"{FLAGS['wrong_way']} {wrong_way}" if wrong_way else ""
-    rows = [["clean success", int(clean.sum()), f"{100 * clean.mean():.1f} %", also, ""]]
+    rows = [["clean success", clean.sum(), {"wrong_way": wrong_way} if wrong_way else {}, ""]]
     for kind, failures in rank_failures(records).items():
-        flags = ", ".join(f"{FLAGS[name]} {count}" for name, count in count_flags(failures).items())
         scenes = ", ".join(f"{scene} ({count})" for scene, count in count_by_scene(failures)[:max_scenes])
-        rows.append([FAILURE_TYPES[kind].label, len(failures), f"{100 * len(failures) / agents:.1f} %", flags, scenes])
-    return markdown.format_table(["First failure", "Agents", f"Of {agents}", "Of these also", "Scenes with most"], rows)
+        rows.append([FAILURE_TYPES[kind].label, len(failures), _count_flags(failures), scenes])
+    cells = [
+        [label, count, f"{100 * count / agents:.1f} %", ", ".join(f"{FLAGS[name]} {number}" for name, number in flags.items()), scenes]
+        for label, count, flags, scenes in rows
+    ]
+    return markdown.format_table(["First failure", "Agents", f"Of {agents}", "Of these also", "Scenes with most"], cells)
 
 
 def list_thresholds(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:

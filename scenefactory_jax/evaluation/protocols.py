@@ -55,13 +55,7 @@ def evaluate_protocols(
 
 
 def make_evaluator(config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any]) -> Evaluator:
-    """A function parameters -> records of one deterministic episode for every scene and repeat.
-
-    It compiles when it is first called, and not again for other parameters.
-
-    Args:
-        config: its group `termination` is the protocol.
-    """
+    """`episode_records.make_episode_runner` without a recording."""
     run = episode_records.make_episode_runner(config, scenes, settings=settings, worlds=0)
     return lambda parameters: run(parameters)[0]
 
@@ -69,10 +63,10 @@ def make_evaluator(config: Mapping[str, Any], scenes: scene_source.Scenes, *, se
 def make_training_callback(
     folder: Path, resume_at: int | None, *, evaluators: Mapping[str, Evaluator], settings: Mapping[str, Any]
 ) -> Callable[[Any, Mapping[str, float | int]], None]:
-    """A function (parameters, row of metrics) that adds one row of held-out estimates to `evaluations.csv` of a run.
+    """Makes a function (parameters, row of metrics) that adds one row of held-out estimates to `evaluations.csv` of a run.
 
     Args:
-        resume_at: iteration after which a run goes on; None: a new run.
+        resume_at: iteration at which a run resumes; None: a new run.
         evaluators: protocol -> evaluator.
         settings: `bootstrap` and `seed` of the intervals.
     """
@@ -80,12 +74,12 @@ def make_training_callback(
 
     def evaluate(parameters: Any, row: Mapping[str, float | int]) -> None:
         start = time.monotonic()
-        found = {key: row[key] for key in ("iteration", "steps/total", "minutes")}
+        cells = {key: row[key] for key in ("iteration", "steps/total", "minutes")}
         for protocol, evaluator in evaluators.items():
             summary = statistics.summarise(evaluator(parameters), bootstrap=settings["bootstrap"], seed=settings["seed"])
             for name, estimate in summary.items():
                 for key in ("value", "low", "high"):
-                    found[f"{protocol}/{name}/{key}"] = np.nan if (number := getattr(estimate, key)) is None else number
-        file.add({**found, "seconds": time.monotonic() - start})
+                    cells[f"{protocol}/{name}/{key}"] = np.nan if (number := getattr(estimate, key)) is None else number
+        file.add({**cells, "seconds": time.monotonic() - start})
 
     return evaluate

@@ -1,16 +1,17 @@
 """Records of an evaluation: one row for every spawned agent and episode, in memory and as files."""
 
 import csv
+import lzma
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefactory_jax.core import result_file, text_file
+from scenefactory_jax.core import result_file
 
 Records = Mapping[str, np.ndarray]  # column -> one value for every agent
-RESULT = "evaluation.json"  # what was evaluated, beside the records
+RESULT = "evaluation.json"  # settings of the evaluation, beside the records
 FILES = (RESULT, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
 FILES += ("trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")
@@ -28,11 +29,7 @@ class RecordsError(ValueError):
 
 
 def check_records(records: Records) -> None:
-    """Refuses records without rows, without a column of `COLUMNS`, or with columns of different lengths.
-
-    Raises:
-        RecordsError: naming the column.
-    """
+    """Raises a RecordsError for records without rows, without a column of `COLUMNS`, or with columns of different lengths."""
     for name in COLUMNS:
         if name not in records:
             raise RecordsError(f"records.{name}: column missing; expected {', '.join(COLUMNS)}")
@@ -50,14 +47,10 @@ def select_rows(records: Records, rows: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def write_records(path: Path, records: Records) -> None:
-    """Writes records as CSV (`.csv` or `.csv.xz`), one row for every agent; each number reads back to the same value.
-
-    Raises:
-        RecordsError: see `check_records`.
-    """
+    """Writes records as CSV (`.csv` or `.csv.xz`), one row for every agent; each number reads back to the same value."""
     check_records(records)
     columns = [np.asarray(column).tolist() for column in records.values()]
-    with text_file.open_text(path, "w") as file:
+    with _open_csv(path, "wt") as file:
         writer = csv.writer(file)
         writer.writerow(records)
         writer.writerows(zip(*columns, strict=True))
@@ -71,7 +64,7 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
     """
     if not path.is_file():
         raise RecordsError(f"{path}: file not found; expected the CSV of an evaluation")
-    with text_file.open_text(path, "r") as file:
+    with _open_csv(path, "rt") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
@@ -88,6 +81,11 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
     return records
 
 
+def _open_csv(path: Path, mode: str) -> Any:
+    """Opens a text file with line ends as they are written; `.xz` is compressed, the same content always to the same bytes."""
+    return (lzma.open if path.suffix == ".xz" else open)(path, mode, newline="", encoding="utf-8")
+
+
 def _parse(cells: list[str], kind: type) -> np.ndarray | None:
     """The cells as one type; None: one does not fit."""
     if kind is bool:
@@ -99,22 +97,18 @@ def _parse(cells: list[str], kind: type) -> np.ndarray | None:
 
 
 def begin_folder(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Notes what is evaluated, and removes the files of an earlier evaluation from the folder."""
+    """Writes the settings of an evaluation, and removes the files of an earlier one from the folder."""
     for file in [file for pattern in FILES for file in folder.glob(pattern)]:
         file.unlink()
     result_file.write(folder / RESULT, settings, digits=None)
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Reads what `begin_folder` noted; of a folder without an evaluation, no scenes and no overrides."""
+    """Reads the settings that `begin_folder` wrote; of a folder without an evaluation, no scenes and no overrides."""
     return result_file.read(folder / RESULT) if (folder / RESULT).is_file() else {"scenes": None, "overrides": []}
 
 
 def read_folder(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none.
-
-    Raises:
-        RecordsError: see `read_records`.
-    """
+    """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none."""
     files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
     return {name: read_records(path) for name, path in files.items() if not name.endswith("-untrained")}

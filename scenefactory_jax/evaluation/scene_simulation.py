@@ -26,38 +26,31 @@ MEANING = {
 
 
 def simulate(config: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """Steps every scene for `simulate.seconds` and counts what went wrong, scene by scene.
+    """Steps every scene for `simulate.seconds` and counts what went wrong: scene name -> counts, see MEANING.
 
     The default follows the log (`dynamics=log_playback`); `dynamics=bicycle spawning=from_rest` lets cars stand.
-
-    Returns:
-        Scene name -> counts, see MEANING.
-
-    Raises:
-        ConfigError: an environment that cannot be made.
-        SceneError: nothing usable at the path.
     """
     scene_source.use_compilation_cache()
     env, loaded = environment.make_env(config), scene_source.load_training_scenes(config["scenes"])
     steps = max(round(config["simulate"]["seconds"] * config["timing"]["control_hz"]), 1)
     run = jax.jit(jax.vmap(lambda key, scene: simulate_scene(env, key, scene, steps=steps)))
-    found: dict[str, dict[str, int]] = {}
+    results: dict[str, dict[str, int]] = {}
     size = min(config["simulate"]["worlds"], len(loaded))
-    for begin in range(0, len(loaded), size):
-        rows = np.minimum(np.arange(begin, begin + size), len(loaded) - 1)  # the last block repeats the last scene: one shape, one program
+    for start in range(0, len(loaded), size):
+        rows = np.minimum(np.arange(start, start + size), len(loaded) - 1)  # the last block repeats the last scene: one shape, one program
         block = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], loaded.scene)
         counts = jax.device_get(run(jax.random.split(jax.random.key(config["seed"]), size), block))
-        for place, index in enumerate(range(begin, min(begin + size, len(loaded)))):
-            found[loaded.names[index]] = {name: int(counts[name][place]) for name in MEANING}
-    return found
+        for position, index in enumerate(range(start, min(start + size, len(loaded)))):
+            results[loaded.names[index]] = {name: int(counts[name][position]) for name in MEANING}
+    return results
 
 
-def describe(found: Mapping[str, Mapping[str, int]]) -> str:
+def describe(results: Mapping[str, Mapping[str, int]]) -> str:
     """Formats a table of the scenes in which something went wrong, and the sums."""
-    bad = {name: row for name, row in found.items() if any(row[key] for key in list(MEANING)[1:])}
-    lines = [markdown.format_table(["scene", *MEANING], [[name, *row.values()] for name, row in bad.items()])]
-    lines += [f"{key}: {sum(row[key] for row in found.values())} {meaning}" for key, meaning in MEANING.items()]
-    return "\n".join([*lines, f"{len(found)} scenes; {len(found) - len(bad)} without any of these"])
+    faulty = {name: row for name, row in results.items() if any(row[key] for key in list(MEANING)[1:])}
+    lines = [markdown.format_table(["scene", *MEANING], [[name, *row.values()] for name, row in faulty.items()])]
+    lines += [f"{key}: {sum(row[key] for row in results.values())} {meaning}" for key, meaning in MEANING.items()]
+    return "\n".join([*lines, f"{len(results)} scenes; {len(results) - len(faulty)} without any of these"])
 
 
 def simulate_scene(env: Env, key: PRNGKeyArray, scene: Scene, *, steps: int) -> dict[str, Array]:

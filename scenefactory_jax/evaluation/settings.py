@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed
+from scenefactory_jax.evaluation.failure_signals import SignalThresholds
+from scenefactory_jax.evaluation.failures import TypeThresholds
 
 Frequency = Annotated[float, Bounds(min=0.1)]
 
@@ -26,28 +28,6 @@ class Video:
     def __post_init__(self) -> None:
         if self.enable and self.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
             raise ConfigError("suffix: .mp4 needs ffmpeg, which is missing; `pip install 'scenefactory_jax[video]'`, or choose .gif")
-
-
-@dataclass(frozen=True)
-class SignalThresholds:
-    """Thresholds of the failure signals."""
-
-    moving_mps: NonNegative
-    lane_m: NonNegative
-    wrong_way_cos: Annotated[float, Bounds(min=-1)]
-    wrong_way_m: NonNegative
-    rest_m: NonNegative
-    near_m: NonNegative
-
-
-@dataclass(frozen=True)
-class TypeThresholds:
-    """Thresholds of the failure types."""
-
-    at_fault_speed_fraction: NonNegative
-    at_fault_min_mps: NonNegative
-    stuck_s: NonNegative
-    departure_m: NonNegative
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ resample draws seeds with replacement, scenes with replacement (the same for all
 (the same for all seeds). The interval of one run measures how well one set of weights is known, that of several how well their recipe is.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,40 +52,35 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
     treat the agents of a scene as independent, so they may be too narrow.
 
     Args:
-        bootstrap: number of resamples.
-        seed: of the resampling.
+        bootstrap: number of resamples; `seed` is theirs.
 
     Raises:
         RecordsError: see `check_records`; or `bootstrap` is not positive.
     """
-    found = _summarise({0: records}, agents=False, bootstrap=bootstrap, seed=seed)
-    for name, estimate in found.items():
+    estimates = _summarise({0: records}, agents=False, bootstrap=bootstrap, seed=seed)
+    for name, estimate in estimates.items():
         if estimate.method == NONE and estimate.count:
             values = np.asarray(METRICS[name].value(records), float)[np.asarray(METRICS[name].counted(records), bool)]
             draws = np.random.default_rng(seed).multinomial(len(values), np.full(len(values), 1 / len(values)), size=bootstrap)
-            low, high = _percentiles(draws @ values / len(values))
-            if _varies(low, high):
-                found[name] = estimate._replace(low=low, high=high, method=AGENTS)
-    return found
+            interval = _compute_percentiles(draws @ values / len(values))
+            if interval is not None and _varies(interval):
+                estimates[name] = estimate._replace(low=interval[0], high=interval[1], method=AGENTS)
+    return estimates
 
 
 def summarise_runs(runs: Runs, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
-    """Estimates every metric over several runs with equal weights; a rate that does not vary takes Wilson's interval, a mean none.
-
-    Raises:
-        RecordsError: no runs; or see `summarise`.
-    """
+    """Estimates every metric over several runs with equal weights; a rate that does not vary takes Wilson's interval, a mean none."""
     return _summarise(runs, agents=True, bootstrap=bootstrap, seed=seed)
 
 
 def summarise_each_run(runs: Runs) -> dict[int, dict[str, float | None]]:
     """Computes the value of every metric for each run."""
-    found = {}
+    values_by_seed = {}
     for seed, records in runs.items():
         (table,) = _tabulate([{seed: records}])
         values = _ratios(table, *_ones(table))[0]
-        found[seed] = {name: float(value) if np.isfinite(value) else None for name, value in zip(METRICS, values, strict=True)}
-    return found
+        values_by_seed[seed] = {name: float(value) if np.isfinite(value) else None for name, value in zip(METRICS, values, strict=True)}
+    return values_by_seed
 
 
 def difference(before: Records, after: Records, *, bootstrap: int, seed: int) -> dict[str, Estimate]:
@@ -135,67 +130,72 @@ def newcombe(before: tuple[float, int], after: tuple[float, int]) -> tuple[float
     return float(low), float(high)
 
 
-# ---- estimates of one or several runs
-
-
 def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
     (table,) = _tabulate([runs])
     values = _ratios(table, *_ones(table))[0]
     weights = _resample(table, [len(runs)], agents=agents, bootstrap=bootstrap, seed=seed)
-    draws = np.concatenate([_ratios(table, *one) for one in weights])
-    found = {}
+    draws = np.concatenate([_ratios(table, *weights_of_chunk) for weights_of_chunk in weights])
+    estimates = {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        value, count = float(values[m]), int(table.counts[:, :, m].sum())
-        low, high = _percentiles(draws[:, m])
-        if not np.isfinite(value):
-            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
-        elif _varies(low, high):
-            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
-        elif metric.rate:
-            found[name] = Estimate(value, *wilson(min(max(value, 0.0), 1.0), _count_agents(table, m)), count, metric.unit, WILSON)
-        else:
-            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
-    return found
+        interval = _compute_percentiles(draws[:, m])
+        score = lambda m=m: wilson(min(max(float(values[m]), 0.0), 1.0), _count_agents(table, m))  # noqa: E731
+        estimates[name] = _make_estimate(
+            metric, values[m], table.counts[:, :, m].sum(), interval if _varies(interval) else None, agents, WILSON, score
+        )
+    return estimates
 
 
 def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
-    scenes = [set(np.concatenate([np.asarray(one["scene"], str) for one in runs.values()]).tolist()) for runs in (before, after)]
-    if odd := sorted(scenes[0] ^ scenes[1]):
-        raise RecordsError(f"records.scene: {odd[0]!r} is in one of the two evaluations only; expected the same scenes in both")
+    scenes = [set(np.concatenate([np.asarray(records["scene"], str) for records in runs.values()]).tolist()) for runs in (before, after)]
+    if unmatched := sorted(scenes[0] ^ scenes[1]):
+        raise RecordsError(f"records.scene: {unmatched[0]!r} is in one of the two evaluations only; expected the same scenes in both")
     first, second = tables = _tabulate([before, after])
     sizes = [len(before)] if list(before) == list(after) else [len(before), len(after)]
     old, new = (_ratios(table, *_ones(table))[0] for table in tables)
     draws = []
     for *seeds, scene, agent in _resample(first, sizes, agents=agents, bootstrap=bootstrap, seed=seed):
         draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
-    draws, found = np.concatenate(draws), {}
+    draws, estimates = np.concatenate(draws), {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        value, count = float(new[m] - old[m]), min(int(table.counts[:, :, m].sum()) for table in tables)
-        low, high = _percentiles(draws[:, m])
-        one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
-        if not np.isfinite(value):
-            found[name] = Estimate(None, None, None, 0, metric.unit, NONE)
-        elif low is not None and not one_scene and (_varies(low, high) or not metric.rate):
-            found[name] = Estimate(value, low, high, count, metric.unit, LEVELS if agents else SCENES)
-        elif metric.rate:
-            ends = newcombe(*((float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)))
-            found[name] = Estimate(value, *ends, count, metric.unit, NEWCOMBE)
-        else:
-            found[name] = Estimate(value, None, None, count, metric.unit, NONE)
-    return found
+        interval, count = _compute_percentiles(draws[:, m]), min(table.counts[:, :, m].sum() for table in tables)
+        is_one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
+        if is_one_scene or (metric.rate and not _varies(interval)):
+            interval = None
+        rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
+        score = lambda rates=rates: newcombe(*rates)  # noqa: E731
+        estimates[name] = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
+    return estimates
 
 
-def _percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float | None, float | None]:
-    """The middle 95 % of the draws that have a value."""
+def _make_estimate(
+    metric: Metric,
+    value: float,
+    count: float,
+    interval: tuple[float, float] | None,
+    agents: bool,
+    score_method: str,
+    score: Callable[[], tuple[float, float]],
+) -> Estimate:
+    """The estimate with its bootstrap interval; without one a rate takes the score interval, a mean none."""
+    if not np.isfinite(value):
+        return Estimate(None, None, None, 0, metric.unit, NONE)
+    if interval is not None:
+        return Estimate(float(value), *interval, int(count), metric.unit, LEVELS if agents else SCENES)
+    low, high = score() if metric.rate else (None, None)
+    return Estimate(float(value), low, high, int(count), metric.unit, score_method if metric.rate else NONE)
+
+
+def _compute_percentiles(draws: Float[np.ndarray, " B"]) -> tuple[float, float] | None:
+    """The middle 95 % of the draws that have a value; None: none has."""
     finite = draws[np.isfinite(draws)]
     if not len(finite):
-        return None, None
+        return None
     low, high = np.percentile(finite, [2.5, 97.5])
     return float(low), float(high)
 
 
-def _varies(low: float | None, high: float | None) -> bool:
-    return low is not None and high is not None and high - low >= 1e-9
+def _varies(interval: tuple[float, float] | None) -> bool:
+    return interval is not None and interval[1] - interval[0] >= 1e-9
 
 
 def _count_agents(table: Table, m: int) -> int:
@@ -203,13 +203,10 @@ def _count_agents(table: Table, m: int) -> int:
     return max(1, int((table.counts[:, :, m].sum(axis=0) > 0).sum()))
 
 
-# ---- tables and resamples
-
-
-def _tabulate(every: Sequence[Runs]) -> list[Table]:
+def _tabulate(groups: Sequence[Runs]) -> list[Table]:
     """The metrics of all runs over one list of agents."""
-    runs = [records for one in every for records in one.values()]
-    if not all(every):
+    runs = [records for group in groups for records in group.values()]
+    if not all(groups):
         raise RecordsError("records: expected one or more runs, got none")
     for records in runs:
         check_records(records)
@@ -223,9 +220,9 @@ def _tabulate(every: Sequence[Runs]) -> list[Table]:
     row = {tuple(agent): index for index, agent in enumerate(agents.tolist())}
     world = np.unique(agents[:, :3], axis=0, return_inverse=True)[1].ravel()
     tables = []
-    for one in every:
-        sums, counts = (np.zeros((len(one), len(agents), len(METRICS))) for _ in range(2))
-        for s, records in enumerate(one.values()):
+    for group in groups:
+        sums, counts = (np.zeros((len(group), len(agents), len(METRICS))) for _ in range(2))
+        for s, records in enumerate(group.values()):
             rows = [row[tuple(agent)] for agent in keys(records).tolist()]
             if len(set(rows)) < len(rows):
                 raise RecordsError("records: expected one row for every scene, world, seed and agent, got two of one")

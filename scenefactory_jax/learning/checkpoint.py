@@ -1,81 +1,69 @@
-"""Train states on disk, by orbax: a folder of checkpoints, one for each saved iteration.
+"""Train states on disk: a folder of checkpoints, one npz file for each saved iteration.
 
-A checkpoint is written under a temporary name and renamed when it is complete, so that an interrupted save leaves the earlier ones as they
-were. Files have nested dicts of arrays, named as the fields and keys of the train state; random keys as their data, empty arrays not at
-all. SHA256SUMS beside them, as `sha256sum` writes it, has the digest of each file; it is checked before anything is read.
+A file has the arrays of a train state by their paths ("parameters/params/actor/trunk/layer_0/kernel"), random keys as their data, and no
+empty arrays. It is written atomically. The checksums of its arrays (CRC-32, as in every zip file) are compared before anything is read.
 """
 
-import contextlib
-import errno
-import hashlib
-import logging
-import os
-import shutil
-import time
-from collections.abc import Iterator, Mapping, Sequence
+import json
+import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 from flax.traverse_util import unflatten_dict
 from jaxtyping import Array
 
 from scenefactory_jax.core.atomic_file import write_atomically
 from scenefactory_jax.core.schema import ConfigError
 
-LEARNT, AVERAGED, REST = "parameters", "ema_parameters", "rest"  # items of a checkpoint: an evaluation reads no more than it needs
-HOST = "host"  # item of the JSON values that the training loop adds
+PARAMETERS, AVERAGED = "parameters/", "ema_parameters/"  # paths of arrays begin with these
+HOST = "host"  # JSON text of the values that the training loop adds
 FILE = "policy.npz"  # in place of checkpoints: parameters alone
-SUMS = "SHA256SUMS"
-ATTEMPTS = 100  # 5 s
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's quota, or a file is full
+Arrays = dict[str, np.ndarray]
 
 
 def save(folder: Path | str, train_state: Any, *, keep: int, host: Mapping[str, Any] | None = None) -> Path:
     """Writes a train state under its iteration's number and keeps the `keep` newest checkpoints of the folder.
-
-    Returns when the checkpoint is complete: the train state may be donated afterwards.
 
     Args:
         host: plain JSON values to save with it.
 
     Raises:
         ConfigError: `keep` below one.
-        OSError: the disk is full; the incomplete checkpoint is removed, earlier ones are as they were.
+        OSError: the disk is full; earlier checkpoints are as they were.
     """
     if keep < 1:
         raise ConfigError(f"keep: expected an integer >= 1, got {keep}")
-    iteration = int(train_state.iteration)
-    place = Path(folder) / str(iteration)
-    with _clean_up_full_disk(place), _manager(Path(folder), keep=keep) as manager:
-        if iteration in manager.all_steps():
-            manager.delete(iteration)
-        items: dict[str, Any] = {name: ocp.args.StandardSave(item) for name, item in _split(_to_stored(train_state)).items()}
-        items |= {} if host is None else {HOST: ocp.args.JsonSave(dict(host))}
-        manager.save(iteration, args=ocp.args.Composite(**items), force=True)
-        _write_sums(place, [file for file in sorted(place.rglob("*")) if file.is_file()])
-    return place
+    file = _path(folder, int(train_state.iteration))
+    arrays: Arrays = jax.device_get({name: _to_data(leaf) for name, leaf in _name_leaves(train_state).items() if leaf.size})
+    arrays |= {} if host is None else {HOST: np.array(json.dumps(host))}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        _write(file, arrays)
+    except OSError as error:
+        hint, newest = "there is no complete checkpoint", latest(folder)
+        if newest is not None:
+            hint = f"checkpoint {newest} is complete: with resume=true training goes on from it"
+        raise OSError(error.errno, f"{error.strerror}; {hint}", str(file)) from None
+    for old in _list_iterations(folder)[:-keep]:
+        _path(folder, old).unlink()
+    return file
 
 
 def latest(folder: Path | str) -> int | None:
-    """Iteration of the newest complete checkpoint; None if the folder has none."""
-    return max(_list_iterations(Path(folder)), default=None)
+    """Iteration of the newest checkpoint; None if the folder has none."""
+    return max(_list_iterations(folder), default=None)
 
 
 def drop_training_state(folder: Path | str) -> None:
     """Removes all but the parameters of the newest checkpoint: for a run that will not be resumed."""
-    newest = latest(folder)
-    for place in Path(folder).iterdir():
-        if place.name == str(newest):
-            for item in (REST, HOST):
-                shutil.rmtree(place / item, ignore_errors=True)
-            lines = (place / SUMS).read_text().splitlines()
-            _write_lines(place / SUMS, [line for line in lines if (place / line.partition("  ")[2]).is_file()])
-        elif place.name.isdigit():
-            shutil.rmtree(place)
+    *earlier, newest = _list_iterations(folder)
+    _write(_path(folder, newest), _load(_path(folder, newest), PARAMETERS) | _load(_path(folder, newest), AVERAGED))
+    for iteration in earlier:
+        _path(folder, iteration).unlink()
 
 
 def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
@@ -88,217 +76,118 @@ def restore(folder: Path | str, like: Any, iteration: int | None = None) -> Any:
         FileNotFoundError: the folder has no such checkpoint; the message lists those it has.
         ConfigError: the checkpoint was made with another config, the message names the arrays that differ; or it is damaged.
     """
-    stored = _to_stored(like)
-    with _open(Path(folder), iteration) as (manager, step):
-        if not (Path(folder) / str(step) / REST).is_dir():
-            raise ConfigError(f"{folder}: checkpoint {step} has parameters only; training cannot go on from it")
-        metadata = manager.item_metadata(step)
-        known = _join({name: metadata[name] for name in (LEARNT, AVERAGED, REST) if name in metadata})
-        _check_same_arrays(known, stored, f"{folder}: checkpoint {step}")
-        items = {name: ocp.args.StandardRestore(item) for name, item in _split(stored).items()}
-        found = manager.restore(step, args=ocp.args.Composite(**items))
-    return _to_structure(_join({name: found[name] for name in items}), like)
+    file = _find(folder, iteration)
+    stored = {name: value for name, value in _load(file).items() if name != HOST}
+    if all(name.startswith((PARAMETERS, AVERAGED)) for name in stored):
+        raise ConfigError(f"{file}: has parameters only; training cannot go on from it")
+    leaves = _name_leaves(like)
+    _check_same_arrays(stored, {name: _to_data(leaf) for name, leaf in leaves.items() if leaf.size}, file)
+    return jax.tree.unflatten(jax.tree.structure(like), [_place(stored.get(name), leaf) for name, leaf in leaves.items()])
 
 
 def restore_host(folder: Path | str, iteration: int | None = None) -> dict[str, Any] | None:
-    """Reads the JSON values that were saved with a train state (the newest by default); None if there were none.
-
-    Raises:
-        FileNotFoundError: the folder has no such checkpoint; the message lists those it has.
-        ConfigError: it is damaged.
-    """
-    with _open(Path(folder), iteration) as (manager, step):
-        if not (Path(folder) / str(step) / HOST).is_dir():
-            return None
-        return manager.restore(step, args=ocp.args.Composite(host=ocp.args.JsonRestore()))[HOST]
+    """Reads the JSON values that were saved with a train state; None if there were none. Raises as `restore`."""
+    stored = _load(_find(folder, iteration), HOST)
+    return json.loads(str(stored[HOST])) if stored else None
 
 
 def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
     """Reads only parameters, as nested dicts of arrays on the default device: for evaluation, wherever training ran.
 
-    The running mean of the parameters, where training kept one. A folder that `write_parameters` wrote has nothing else.
-
-    Raises:
-        FileNotFoundError: the folder has no such checkpoint; the message lists those it has.
-        ConfigError: it is damaged.
+    The running mean of the parameters, where training kept one. A folder that `write_parameters` wrote has nothing else. Raises as
+    `restore`.
     """
-    if iteration is None and (Path(folder) / FILE).is_file():
-        if damage := _find_damage(Path(folder)):
-            raise ConfigError(f"{Path(folder) / FILE}: damaged: {damage}; restore it from a copy")
-        with np.load(Path(folder) / FILE) as file:
-            return unflatten_dict({name: jnp.asarray(file[name]) for name in file.files}, sep="/")
-    with _open(Path(folder), iteration) as (manager, step):
-        held = manager.item_metadata(step)
-        name = AVERAGED if AVERAGED in held else LEARNT
-        plain = jax.tree.map(lambda m: np.zeros(m.shape, m.dtype), held[name], is_leaf=_is_metadata)
-        found = manager.restore(step, args=ocp.args.Composite(**{name: ocp.args.StandardRestore(plain)}))
-    return jax.tree.map(jnp.asarray, found[name])
+    exported = Path(folder) / FILE
+    if iteration is None and exported.is_file():
+        if damage := _find_damage(exported):
+            raise ConfigError(f"{exported}: damaged: {damage}; restore it from a copy")
+        arrays = _load(exported)
+    else:
+        file = _find(folder, iteration)
+        averaged, last = _load(file, AVERAGED), _load(file, PARAMETERS)
+        arrays = {name.partition("/")[2]: value for name, value in (averaged or last).items()}
+    return jax.tree.map(jnp.array, unflatten_dict(arrays, sep="/"))
 
 
 def write_parameters(folder: Path | str, parameters: Any) -> Path:
     """Writes parameters to one compressed file of the folder, which `restore_parameters` reads."""
     file = Path(folder) / FILE
-    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _name_leaves(parameters)}
-    np.savez_compressed(file, **arrays)
-    _write_sums(Path(folder), [file])
+    _write(file, jax.device_get(_name_leaves(parameters)), savez=np.savez_compressed)
     return file
 
 
-@contextlib.contextmanager
-def _manager(folder: Path, *, keep: int | None = None) -> Iterator[ocp.CheckpointManager]:
-    options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=keep is not None, enable_async_checkpointing=False)
-    handlers: dict[str, Any] = {name: ocp.StandardCheckpointHandler() for name in (LEARNT, AVERAGED, REST)}
-    handlers[HOST] = ocp.JsonCheckpointHandler()
-    log = logging.getLogger("absl")  # orbax logs what it raises, with its traceback
-    before = log.level
-    log.setLevel(logging.CRITICAL)
-    try:
-        with ocp.CheckpointManager(folder.absolute(), options=options, item_handlers=handlers) as manager:
-            yield manager
-    finally:
-        log.setLevel(before)
+def _path(folder: Path | str, iteration: int) -> Path:
+    return Path(folder) / f"{iteration}.npz"
 
 
-@contextlib.contextmanager
-def _open(folder: Path, iteration: int | None) -> Iterator[tuple[ocp.CheckpointManager, int]]:
-    """Opens a checkpoint of the folder (None: the newest) after its files are checked; gives the manager and the iteration."""
-    found = _list_iterations(folder)
-    if not found:
+def _list_iterations(folder: Path | str) -> list[int]:
+    """Iterations of the checkpoints, ascending."""
+    return sorted(int(file.stem) for file in Path(folder).glob("*.npz") if file.stem.isdecimal())
+
+
+def _find(folder: Path | str, iteration: int | None) -> Path:
+    """Finds the file of a checkpoint (None: the newest) and compares its checksums."""
+    iterations = _list_iterations(folder)
+    if not iterations:
         raise FileNotFoundError(f"{folder}: no checkpoint there")
-    if iteration is not None and iteration not in found:
-        raise FileNotFoundError(f"{folder}: no checkpoint of iteration {iteration}; there are {', '.join(map(str, found))}")
-    step = found[-1] if iteration is None else iteration
-    if damage := _find_damage(folder / str(step)):
-        place, before = folder / str(step), [one for one in found if one < step and _find_damage(folder / str(one)) is None]
+    if iteration is not None and iteration not in iterations:
+        raise FileNotFoundError(f"{folder}: no checkpoint of iteration {iteration}; there are {', '.join(map(str, iterations))}")
+    chosen = iterations[-1] if iteration is None else iteration
+    file = _path(folder, chosen)
+    if damage := _find_damage(file):
         hint = "the folder has no complete checkpoint before it: restore it from a copy"
-        if before:
-            hint = f"checkpoint {before[-1]} before it is complete: remove {place}, and the same command uses that one"
-        raise ConfigError(f"{place}: damaged: {damage}; {hint}")
-    with _manager(folder) as manager:
-        yield manager, step
+        if before := [earlier for earlier in iterations if earlier < chosen and not _find_damage(_path(folder, earlier))]:
+            hint = f"checkpoint {before[-1]} before it is complete: remove {file}, and the same command uses that one"
+        raise ConfigError(f"{file}: damaged: {damage}; {hint}")
+    return file
 
 
-def _find_damage(place: Path) -> str | None:
-    """Finds the first file that differs from its digest in SHA256SUMS; None: none does."""
-    if not (place / SUMS).is_file():
-        return f"{SUMS} is missing"
-    for line in (place / SUMS).read_text(errors="replace").splitlines() or [""]:
-        digest, _, name = line.partition("  ")
-        if not name:
-            return f"{SUMS} is cut short"
-        if not (place / name).is_file():
-            return f"{name} is missing"
-        if _sha256(place / name) != digest:
-            return f"{name} has changed since it was written"
-    return None
-
-
-def _write_sums(place: Path, files: Sequence[Path]) -> None:
-    _write_lines(place / SUMS, [f"{_sha256(file)}  {file.relative_to(place).as_posix()}" for file in files if file.name != SUMS])
-
-
-def _write_lines(file: Path, lines: Sequence[str]) -> None:
-    with write_atomically(file) as part:
-        part.write_text("".join(f"{line}\n" for line in lines))
-
-
-def _sha256(file: Path) -> str:
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
-
-
-@contextlib.contextmanager
-def _clean_up_full_disk(place: Path) -> Iterator[None]:
-    """Turns an error of a full disk into one line and removes the incomplete checkpoint: orbax raises tensorstore's ValueError, which has
-    the system's reason in its text, and leaves writes of other arrays running that may still add files."""
+def _find_damage(file: Path) -> str | None:
+    """Finds the first array that differs from its checksum, or why the file cannot be read; None: it is as it was written."""
     try:
-        yield
-    except (ValueError, OSError) as error:
-        code = next((code for code in FULL if os.strerror(code) in str(error)), None)
-        if code is None:
-            raise
-        for _ in range(ATTEMPTS):
-            if not (parts := list(place.parent.glob(f"{place.name}.orbax-checkpoint-tmp*"))):
-                break
-            for part in parts:
-                shutil.rmtree(part, ignore_errors=True)
-            time.sleep(0.05)
-        held = latest(place.parent)
-        kept = "there is no complete checkpoint"
-        if held is not None:
-            kept = f"checkpoint {held} is complete: with resume=true training goes on from it"
-        raise OSError(code, f"{os.strerror(code)}; {kept}", str(place)) from None
+        with zipfile.ZipFile(file) as archive:
+            changed = archive.testzip()
+    except Exception as error:  # of zipfile, zlib, struct: whatever the changed bytes lead to
+        return str(error)
+    return changed and f"{changed.removesuffix('.npy')} has changed since it was written"
 
 
-def _list_iterations(folder: Path) -> list[int]:
-    """Iterations of the complete checkpoints, ascending; incomplete ones have other names."""
-    return sorted(int(place.name) for place in folder.iterdir() if place.name.isdecimal()) if folder.is_dir() else []
+def _write(file: Path, arrays: Mapping[str, np.ndarray], *, savez: Callable[..., None] = np.savez) -> None:
+    with write_atomically(file) as part, part.open("wb") as opened:
+        savez(opened, **arrays)
 
 
-def _check_same_arrays(held: Mapping[str, Any], expected: Mapping[str, Any], where: str) -> None:
+def _load(file: Path, prefix: str = "") -> Arrays:
+    """Reads the arrays whose names begin with a prefix; numpy reads bfloat16 as two bytes without a type."""
+    with np.load(file) as stored:
+        arrays = {name: stored[name] for name in stored.files if name.startswith(prefix)}
+    return {name: value.view(jnp.bfloat16) if value.dtype.kind == "V" else value for name, value in arrays.items()}
+
+
+def _check_same_arrays(stored: Mapping[str, Any], expected: Mapping[str, Any], file: Path) -> None:
     """Checks that a checkpoint has the expected arrays, with their shapes and types."""
-    arrays = [{name: (tuple(leaf.shape), str(np.dtype(leaf.dtype))) for name, leaf in tree.items()} for tree in (held, expected)]
-    differ = [name for name in sorted(arrays[0].keys() | arrays[1].keys()) if arrays[0].get(name) != arrays[1].get(name)]
-    named = [name for name in differ if name.startswith(f"{LEARNT}/")] or differ  # optimizer states differ where parameters do
-    if not named:
+    old, new = ({name: f"{tuple(leaf.shape)} {leaf.dtype}" for name, leaf in tree.items()} for tree in (stored, expected))
+    differ = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
+    if not differ:
         return
-    lines = []
-    for name in named[:4]:
-        there, here = arrays[0].get(name), arrays[1].get(name)
-        if there is None or here is None:
-            has, expects = ("no", "one") if there is None else ("an", "none")
-            lines.append(f"checkpoint has {has} array {name}, config expects {expects}")
-        else:
-            index = int(there[0] == here[0])  # the shape, or if that is the same, the type
-            lines.append(f"checkpoint has {name} {there[index]}, config expects {here[index]}")
+    named = [name for name in differ if name.startswith(PARAMETERS)] or differ  # optimizer states differ where parameters do
+    lines = [f"{name}: it has {old.get(name, 'none')}, the config expects {new.get(name, 'none')}" for name in named[:4]]
     more = f"; and {len(named) - 4} more" if len(named) > 4 else ""
-    hint = "use the settings of the run, or another folder"
-    raise ConfigError(f"{where} does not fit this config: {'; '.join(lines)}{more}; {hint}")
+    raise ConfigError(f"{file} does not fit this config: {'; '.join(lines)}{more}; use the settings of the run, or another folder")
 
 
-def _name_leaves(tree: Any) -> list[tuple[str, Any]]:
-    """Leaves with their paths: 'parameters/params/actor/trunk/layer_0/kernel'."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=_is_metadata)
-    return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves]
-
-
-def _to_stored(train_state: Any) -> dict[str, Array]:
-    """The arrays that are written, by name."""
-    return {name: _to_data(leaf) for name, leaf in _name_leaves(train_state) if leaf.size}
+def _name_leaves(tree: Any) -> dict[str, Any]:
+    """Path -> leaf, in the order of the leaves."""
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
 
 
 def _to_data(leaf: Any) -> Array:
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 
-def _to_structure(arrays: dict[str, Any], like: Any) -> Any:
-    """`like` with other values."""
-
-    def place(value: Array, leaf: Array) -> Array:  # bound to a device only if `leaf` is: otherwise a resumed run compiles again
-        return value if leaf.committed else jnp.array(np.asarray(value))
-
-    def put(name: str, leaf: Any) -> Any:
-        if not leaf.size:
-            return jnp.copy(leaf)  # a buffer of its own, so that donating one does not delete the other
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(place(arrays[name], leaf), impl=jax.random.key_impl(leaf))
-        return place(arrays[name], leaf)
-
-    return jax.tree.unflatten(jax.tree.structure(like), [put(name, leaf) for name, leaf in _name_leaves(like)])
-
-
-def _split(stored: dict[str, Any]) -> dict[str, dict]:
-    """Divides named arrays into the items of a checkpoint, nested; items without arrays are left out."""
-    nested = unflatten_dict(stored, sep="/")
-    items = {LEARNT: nested.pop(LEARNT, {}), AVERAGED: nested.pop(AVERAGED, {}), REST: nested}
-    return {name: item for name, item in items.items() if item}
-
-
-def _join(items: Mapping[str, Any]) -> dict[str, Any]:
-    """Joins the items of a checkpoint to leaves by name."""
-    prefixes = {name: "" if name == REST else f"{name}/" for name in items}
-    return {f"{prefixes[name]}{path}": leaf for name, item in items.items() for path, leaf in _name_leaves(item)}
-
-
-def _is_metadata(x: Any) -> bool:
-    return hasattr(x, "shape") and hasattr(x, "dtype")
+def _place(value: np.ndarray | None, leaf: Array) -> Array:
+    """Places a value on the devices of `leaf`. It is bound to a device only if `leaf` is: otherwise a resumed run compiles again."""
+    if value is None:
+        return jnp.copy(leaf)  # an empty array, as a buffer of its own: donating one does not delete the other
+    placed = jax.device_put(value, leaf.sharding) if leaf.committed else jnp.array(value)
+    return jax.random.wrap_key_data(placed, impl=jax.random.key_impl(leaf)) if leaf.dtype != value.dtype else placed

@@ -29,7 +29,7 @@ def defer_interrupt() -> Iterator[Callable[[], int | None]]:
     """
     received: list[int] = []
     before = {one: signal.getsignal(one) for one in STOP_SIGNALS}
-    handled = [one for one, handler in before.items() if handler not in (None, signal.SIG_IGN)]
+    handled = [number for number, handler in before.items() if handler not in (None, signal.SIG_IGN)]
     if threading.current_thread() is not threading.main_thread():
         handled = []
 
@@ -42,13 +42,13 @@ def defer_interrupt() -> Iterator[Callable[[], int | None]]:
             LOG.info("stopping after this iteration; Ctrl-C (once more) stops at once")
         received.append(number)
 
-    for one in handled:
-        signal.signal(one, receive)
+    for number in handled:
+        signal.signal(number, receive)
     try:
         yield lambda: received[0] if received else None
     finally:
-        for one in handled:
-            signal.signal(one, before[one])
+        for number in handled:
+            signal.signal(number, before[number])
 
 
 def _redirect_to_null() -> None:

@@ -3,6 +3,7 @@
 A part's time is the difference of two programs: the parts add up to the iteration, with all that XLA fuses across them.
 """
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -27,7 +28,7 @@ class PhaseTimes(NamedTuple):
     seconds: list[float]  # of each repeat
     compile_s: float
     memory_gib: float  # arguments, results and temporaries of the compiled program
-    left: Any  # the result of the last call
+    result: Any  # of the last call
 
     @property
     def median(self) -> float:
@@ -42,12 +43,10 @@ def control_steps(config: Mapping[str, Any]) -> int:
 def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> Run:
     """Builds a function that makes `steps` control steps of all worlds with random actions, with the parts up to one of `ACTING`.
 
+    It returns the state after the steps, and a sum over all results, so that the compiler removes none.
+
     Args:
         steps: a multiple of `env.action_repeat`.
-
-    Returns:
-        A function of the worlds' state, their scenes and a key, for `jit`: the state after the steps, and a sum over all results, so that
-        the compiler removes none.
     """
     depth = ACTING.index(level)
 
@@ -86,14 +85,14 @@ def make_acting_phase(level: str, parts: EnvParts, env: Env, *, steps: int) -> R
 def time_phase(run: Callable, state: Any, arguments: Callable[[int], tuple], *, warmup: int, repeats: int) -> PhaseTimes:
     """Compiles `run(state, *arguments(i))` and times calls, each with the donated state that the call before returned."""
     state = jax.tree.map(jnp.copy, state)  # `jit` may have returned a scene's buffers, which donating would delete
-    begun = time.perf_counter()
+    start = time.perf_counter()
     compiled = jax.jit(run, donate_argnums=0).lower(state, *arguments(0)).compile()
-    compile_s, seconds, rest = time.perf_counter() - begun, [], None
+    compile_s, seconds, rest = time.perf_counter() - start, [], None
     for repeat in range(warmup + repeats):
-        given = arguments(repeat)
-        begun = time.perf_counter()
-        state, rest = jax.block_until_ready(compiled(state, *given))
-        seconds.append(time.perf_counter() - begun)
+        prepared = arguments(repeat)
+        start = time.perf_counter()
+        state, rest = jax.block_until_ready(compiled(state, *prepared))
+        seconds.append(time.perf_counter() - start)
     return PhaseTimes(seconds[warmup:], compile_s, memory_gib(compiled), (state, rest))
 
 
@@ -102,13 +101,11 @@ def memory_gib(compiled: Any) -> float:
     sizes = compiled.memory_analysis()
     if sizes is None:
         return 0.0
-    held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
-    return held / 2**30
+    total = sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
+    return total / 2**30
 
 
 def time_phases(nested: Mapping[str, float]) -> dict[str, float]:
     """Computes the time that each part adds from the times of nested programs."""
-    before, found = 0.0, {}
-    for name, value in nested.items():
-        found[name], before = value - before, value
-    return found
+    times = [0.0, *nested.values()]
+    return {name: after - before for name, (before, after) in zip(nested, itertools.pairwise(times), strict=True)}

@@ -34,12 +34,8 @@ def load_policy(run: str | Path, *, trust: bool = False) -> TrainedPolicy:
         mean, log_std, value = trained.policy.apply(trained.parameters, observation)
 
     Args:
-        run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package.
-        trust: whether its config may name functions outside of the package, which are then imported and called; they are logged.
-
-    Raises:
-        ConfigError: neither; or a config that names such functions without `trust`.
-        FileNotFoundError: a run without a checkpoint.
+        run: a folder that `train` or `export` wrote, or the name of a policy that comes with the package; else a ConfigError.
+        trust: whether its config may name functions outside of the package, which are then imported and called; else a ConfigError.
     """
     folder = find(run)
     config = configs.read(folder, trust=trust)
@@ -59,11 +55,7 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
 
 
 def find(run: str | Path) -> Path:
-    """Finds the folder of a run, or of a policy that comes with the package by its name.
-
-    Raises:
-        ConfigError: there is neither; the message names the policies that come with the package.
-    """
+    """Finds the folder of a run, or of a policy that comes with the package by its name; a ConfigError lists these."""
     if (Path(run) / configs.FILE).is_file():
         return Path(run)
     shipped = {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob(f"*/{configs.FILE}"))}

@@ -62,13 +62,11 @@ def collect_rollout(
 ) -> tuple[Worlds, Sample, Counts, SceneStats]:
     """Acts `horizon` times in `W` worlds; a world that is done restarts with a new key before it is observed.
 
-    An action is held for `env.action_repeat` control steps.
+    An action is held for `env.action_repeat` control steps. Returns the worlds to continue from, samples `[T, W, A]`, the counts of all
+    steps, and the counts of each world.
 
     Args:
         axis: mesh axis of the devices that share the worlds, see `sharding`.
-
-    Returns:
-        The worlds to continue from, samples `[T, W, A]`, the counts of all steps, and the counts of each world.
     """
 
     def step(worlds: Worlds, key: PRNGKeyArray) -> tuple[Worlds, tuple[Sample, Counts]]:

@@ -17,7 +17,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import checkpoint
 
 LOG = logging.getLogger(__name__)
-MOST = 80  # letters of a sweep's changes in the name of a folder
+MAX_LETTERS = 80  # of a sweep's changes in the name of a folder
 # Keys that may change when a run is resumed, with all below them
 FREE = ("out", "resume", "progress", "name", "iterations", "minutes", "checkpoint_every", "checkpoints_kept", "devices", "scenes.workers")
 FREE += ("loggers", "evaluation", "scenes.heldout")
@@ -28,13 +28,12 @@ def open_run_folder(config: Mapping[str, Any]) -> Iterator[tuple[Path, bool]]:
     """Opens and locks the run's folder; gives it, and whether it has a checkpoint to resume from.
 
     Raises:
-        ConfigError: a folder that holds a run already, or `resume` where there is none, or one of other settings.
-        folders.Busy: another command trains there.
+        ConfigError: the folder has a run already, or for `resume` none, or one of other settings; or another command trains there.
     """
     if config["resume"] and config["out"] is None:
         raise ConfigError("resume=true needs out=RUN_DIR: the folder to go on in")
-    with _made(config) as folder, folder_lock.lock_folder(folder):
-        yield folder, _goes_on(folder, config)
+    with _make_folder(config) as folder, folder_lock.lock_folder(folder):
+        yield folder, _find_resumable(folder, config)
 
 
 def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:
@@ -42,18 +41,18 @@ def make_folder_name(name: str, changes: Sequence[str] = ()) -> Path:
 
     Args:
         changes: overrides in which the run differs from the others. Each is written as the last part of its key and its value, without
-            characters that a shell or Hydra interprets; beyond MOST letters a checksum follows.
+            characters that a shell or Hydra interprets; beyond MAX_LETTERS a checksum follows.
     """
     parts = [f"{key.rpartition('.')[2]}={value}" for key, _, value in (change.partition("=") for change in changes)]
     text = "-".join(re.sub(r"[^A-Za-z0-9.-]+", "_", part).strip("_") for part in parts)
-    if len(text) > MOST:
-        text = f"{text[: MOST - 9]}-{zlib.crc32(text.encode()):08x}"
+    if len(text) > MAX_LETTERS:
+        text = f"{text[: MAX_LETTERS - 9]}-{zlib.crc32(text.encode()):08x}"
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     return Path("runs", "-".join(part for part in (name, text, stamp) if part))
 
 
 @contextlib.contextmanager
-def _made(config: Mapping[str, Any]) -> Iterator[Path]:
+def _make_folder(config: Mapping[str, Any]) -> Iterator[Path]:
     """Makes the folder; if an error ends the run while it is empty, it is removed with its new parents."""
     named, base = config["out"] is not None, Path(config["out"] or make_folder_name(config["name"]))
     for folder in itertools.chain([base], (base.with_name(f"{base.name}-{attempt}") for attempt in itertools.count(2))):
@@ -71,14 +70,14 @@ def _made(config: Mapping[str, Any]) -> Iterator[Path]:
         raise
 
 
-def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
+def _find_resumable(folder: Path, config: Mapping[str, Any]) -> bool:
     """Whether there is a checkpoint to resume from; a run that was stopped before its first one starts again."""
-    begun, last = (folder / configs.FILE).is_file(), checkpoint.latest(folder / "checkpoints")
+    has_config, last = (folder / configs.FILE).is_file(), checkpoint.latest(folder / "checkpoints")
     if not config["resume"]:
-        if begun or last is not None:
+        if has_config or last is not None:
             raise ConfigError(f"out={folder}: holds a run already; add resume=true to go on with it, or choose another folder")
         return False
-    if not begun:
+    if not has_config:
         raise ConfigError(f"out={folder}: no run to go on with: it has no {configs.FILE}; valid: a folder that `train` wrote")
     _check_same(folder, config)
     if last is None:
@@ -87,10 +86,10 @@ def _goes_on(folder: Path, config: Mapping[str, Any]) -> bool:
 
 
 def _check_same(folder: Path, config: Mapping[str, Any]) -> None:
-    """Checks that the settings are the run's own, except for those of `FREE`."""
-    shown = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
-    found = find_differences(configs.read_values(folder), config).items()
-    bound = [(place, pair) for place, pair in found if not any(f"{place}.".startswith(f"{free}.") for free in FREE)]
-    if changed := [f"{place}={shown(wanted)} (the run has {shown(held)})" for place, (held, wanted) in bound]:
+    """Checks that the settings are those of the run, except for `FREE`."""
+    show = lambda value: "{...}" if isinstance(value, Mapping) else value  # noqa: E731
+    differences = find_differences(configs.read_values(folder), config).items()
+    fixed = [(key, pair) for key, pair in differences if not any(f"{key}.".startswith(f"{free}.") for free in FREE)]
+    if changed := [f"{key}={show(new)} (the run has {show(old)})" for key, (old, new) in fixed]:
         more = f"; and {len(changed) - 8} more" if len(changed) > 8 else ""
         raise ConfigError(f"resume=true: {'; '.join(changed[:8])}{more}: {folder} keeps its settings; for others choose another out")

@@ -75,12 +75,7 @@ def init_parameters(key: PRNGKeyArray, policy: Policy, observation: Observation)
 def init_train_state(
     key: PRNGKeyArray, scenes: Scene, env: Env, policy: Policy, optimizer: optax.GradientTransformation, *, starts: int, ema: bool
 ) -> TrainState:
-    """Computes the train state before the first iteration.
-
-    Args:
-        starts: worlds begin at random at one of the first `starts` actions of their episodes; 1: all at the beginning.
-        ema: keep a running mean of the parameters.
-    """
+    """Computes the train state before the first iteration; `starts`: see `start_worlds`, `ema`: keep a running mean of the parameters."""
     _, start_key, next_key = split_key(key)
     worlds = start_worlds(env, start_key, scenes, starts=starts)
     parameters = init_parameters(key, policy, worlds.observation)
@@ -98,7 +93,7 @@ def init_train_state(
 
 
 def start_worlds(env: Env, key: PRNGKeyArray, scenes: Scene, *, starts: int = 1) -> Worlds:
-    """Starts an episode in every world, each at one of the first `starts` actions of its episode."""
+    """Starts an episode in every world, each at one of its first `starts` actions, at random; 1: all at the beginning."""
 
     def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, Observation]:
         step_key, state_key = jax.random.split(key)
@@ -142,7 +137,7 @@ def restart(train_state: TrainState, scenes: Scene, *, env: Env, starts: int) ->
     return _copy(replace(train_state, worlds=worlds, scene_stats=make_empty_scene_stats(worlds.state), key=key))
 
 
-def replace_scenes(
+def put_scenes(
     train_state: TrainState, scenes: Scene, rows: Int[Array, " N"], new: Scene, *, env: Env, axis: str | None
 ) -> tuple[TrainState, Scene]:
     """Puts new scenes into some worlds, on every device: all start the new episodes, each keeps those of its own worlds.
@@ -163,43 +158,40 @@ def replace_scenes(
 
 def compile_trainer(
     init: Callable[[PRNGKeyArray, Scene], TrainState],
-    train_iteration: Callable[[TrainState, Scene], tuple[TrainState, Metrics]],
+    iterate: Callable[[TrainState, Scene], tuple[TrainState, Metrics]],
     env: Env,
     *,
     starts: int,
     mesh: Mesh | None,
 ) -> Trainer:
-    """Compiles an algorithm's functions; on a mesh each device runs `train_iteration` on its own worlds.
+    """Compiles an algorithm's functions; on a mesh each device runs `iterate` on its own worlds.
 
     Args:
         starts: see `start_worlds`.
         mesh: of devices with the axis `sharding.AXIS`, along which worlds are divided; None: one device.
     """
-    axis = None if mesh is None else sharding.AXIS
-    begin, swap = functools.partial(restart, env=env, starts=starts), functools.partial(replace_scenes, env=env, axis=axis)
-    if mesh is None:
-        compiled = jax.jit(train_iteration, donate_argnums=0), jax.jit(begin, donate_argnums=0), jax.jit(swap, donate_argnums=(0, 1))
-        return Trainer(jax.jit(init), *compiled)
+    swap = functools.partial(put_scenes, env=env, axis=None if mesh is None else sharding.AXIS)
+    sharded, replicated = sharding.make_sharded_specs, sharding.make_replicated_specs
 
     def place(train_state: TrainState) -> TrainState:
+        if mesh is None:
+            return train_state
         return jax.lax.with_sharding_constraint(train_state, jax.tree.map(functools.partial(NamedSharding, mesh), _make_specs(train_state)))
 
-    def sharded_train_iteration(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
-        arguments = [(train_state, _make_specs(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
-        specs = lambda result: (_make_specs(result[0]), sharding.make_replicated_specs(result[1]))  # noqa: E731
-        return sharding.map_over_devices(train_iteration, arguments, specs, mesh)
+    def train_iteration(train_state: TrainState, scenes: Scene) -> tuple[TrainState, Metrics]:
+        specs = lambda result: (_make_specs(result[0]), replicated(result[1]))  # noqa: E731
+        return sharding.map_over_devices(iterate, (train_state, scenes), (_make_specs, sharded), specs, mesh)
 
-    def sharded_replace_scenes(train_state: TrainState, scenes: Scene, rows: Array, new: Scene) -> tuple[TrainState, Scene]:
-        arguments = [(train_state, _make_specs(train_state)), (scenes, sharding.make_sharded_specs(scenes))]
-        arguments += [(part, sharding.make_replicated_specs(part)) for part in (rows, new)]
-        specs = lambda result: (_make_specs(result[0]), sharding.make_sharded_specs(result[1]))  # noqa: E731
-        return sharding.map_over_devices(swap, arguments, specs, mesh)
+    def replace_scenes(train_state: TrainState, scenes: Scene, rows: Array, new: Scene) -> tuple[TrainState, Scene]:
+        specs = lambda result: (_make_specs(result[0]), sharded(result[1]))  # noqa: E731
+        trees, in_specs = (train_state, scenes, rows, new), (_make_specs, sharded, replicated, replicated)
+        return sharding.map_over_devices(swap, trees, in_specs, specs, mesh)
 
     return Trainer(
         init=jax.jit(lambda key, scenes: place(init(key, scenes))),
-        train_iteration=jax.jit(sharded_train_iteration, donate_argnums=0),
-        restart=jax.jit(lambda train_state, scenes: place(begin(train_state, scenes)), donate_argnums=0),
-        replace_scenes=jax.jit(sharded_replace_scenes, donate_argnums=(0, 1)),
+        train_iteration=jax.jit(train_iteration, donate_argnums=0),
+        restart=jax.jit(lambda train_state, scenes: place(restart(train_state, scenes, env=env, starts=starts)), donate_argnums=0),
+        replace_scenes=jax.jit(replace_scenes, donate_argnums=(0, 1)),
     )
 
 

@@ -31,7 +31,7 @@ MakeCallback = Callable[[Path, int | None], Callable[[Any, Mapping[str, float | 
 
 
 class Prepared(NamedTuple):
-    """What runs share that differ only in seed, scenes or budget, so that they compile once.
+    """Shared parts of runs that differ only in seed, scenes or budget, so that they compile once.
 
     `scenes`: to train on, before `scenes.take`; None: they are read again.
     """
@@ -55,11 +55,7 @@ class Run(NamedTuple):
 
 
 def prepare(config: Mapping[str, Any]) -> Prepared:
-    """Builds environment, policy and trainer of a config.
-
-    Raises:
-        ConfigError: a key that does not fit, by name.
-    """
+    """Builds environment, policy and trainer of a config."""
     env, policy, mesh = environment.make_env(config), make_policy(config), sharding.make_mesh(config["devices"])
     return Prepared(env, policy, mesh, make_trainer(config, env, policy, mesh=mesh))
 
@@ -91,44 +87,32 @@ def train(
     scene_source.use_compilation_cache()
     prepared = prepared or prepare(config)
     with run_folder.open_run_folder(config) as (folder, resume):
-        state = _trained(config, folder, prepared, watching, on_iteration, make_callback, resume=resume)
+        with _open_scenes(config, folder, prepared, resume=resume) as (worlds, flow):
+            state = prepared.trainer.init(jax.random.key(config["seed"]), worlds)
+            if resume:
+                state = checkpoint.restore(folder / "checkpoints", state)
+                LOG.info(f"resumed at iteration {int(state.iteration)}")
+            first = int(state.iteration) if resume else None
+            configs.write(folder, config)  # once scenes and checkpoint are read: a failed start leaves no config
+            callbacks = [on_iteration] if on_iteration else []
+            if callback := make_callback and make_callback(folder, first):
+                callbacks.insert(0, lambda state, row: callback(get_policy_parameters(state), row))
+            state = _loop(config, folder, prepared.trainer, worlds, state, flow, watching, first=first, callbacks=callbacks)
         if finish is not None:
             finish(folder)
     return Run(folder, config, prepared.env, prepared.policy, state, metrics_csv.read(folder))
 
 
-def _trained(
-    config: dict[str, Any],
-    folder: Path,
-    prepared: Prepared,
-    watching: Mapping[str, loggers.Logger],
-    on_iteration: OnIteration | None,
-    make_callback: MakeCallback | None,
-    *,
-    resume: bool,
-) -> TrainState:
-    """Trains to the last iteration. The config is written after scenes and checkpoint are read, so that a failed start leaves none."""
-    trainer = prepared.trainer
-    with _scenes(config, folder, prepared, resume=resume) as (worlds, flow):
-        state = trainer.init(jax.random.key(config["seed"]), worlds)
-        if resume:
-            state = checkpoint.restore(folder / "checkpoints", state)
-            LOG.info(f"resumed at iteration {int(state.iteration)}")
-        configs.write(folder, config)
-        callback = make_callback and make_callback(folder, int(state.iteration) if resume else None)
-        on_parameters = callback and (lambda state, row: callback(get_policy_parameters(state), row))
-        callbacks = [c for c in (on_parameters, on_iteration) if c]
-        return _loop(config, folder, trainer, worlds, state, flow, watching, resume=resume, callbacks=callbacks)
-
-
 @contextlib.contextmanager
-def _scenes(
+def _open_scenes(
     config: Mapping[str, Any], folder: Path, prepared: Prepared, *, resume: bool
 ) -> Iterator[tuple[Scene, stream.SceneStream | None]]:
     """Loads the scenes of all worlds onto their devices; the second value is the stream of further scenes, if there is one."""
     if config["stream"] is None:
-        given = prepared.scenes
-        loaded = scene_source.load_training_scenes(config["scenes"]) if given is None else scene_source.take_scenes(given, config["scenes"])
+        if prepared.scenes is None:
+            loaded = scene_source.load_training_scenes(config["scenes"])
+        else:
+            loaded = scene_source.take_scenes(prepared.scenes, config["scenes"])
         worlds, chosen = scene_source.assign_scenes(loaded, config["worlds"], seed=config["seed"], mesh=prepared.mesh)
         LOG.info(f"run {folder}\n{loaded.account}\n{chosen}")
         yield worlds, None
@@ -152,31 +136,34 @@ def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: M
 
 
 def _loop(
-    config,
+    config: Mapping[str, Any],
     folder: Path,
     trainer: Trainer,
-    worlds,
-    state,
+    worlds: Scene,
+    state: TrainState,
     flow: stream.SceneStream | None,
     watching: Mapping[str, loggers.Logger],
     *,
-    resume: bool,
+    first: int | None,
     callbacks: list[OnIteration],
-):
+) -> TrainState:
     """Iterates until `iterations` or `minutes` is reached; every row is written to metrics.csv before the next iteration starts.
 
     `minutes` counts iterations, compilation included, not checkpoints or evaluations. A signal ends the loop after the current iteration,
     with a checkpoint.
+
+    Args:
+        first: iteration that the run resumes at; None: a new run.
     """
-    first, total = int(state.iteration), config["iterations"]
-    file = metrics_csv.MetricsFile(folder, resume_at=first if resume else None)
+    total, start = config["iterations"], first or 0
+    file = metrics_csv.MetricsFile(folder, resume_at=first)
     spent = file.rows[-1]["minutes"] if file.rows else 0.0
     with (
         interrupt.defer_interrupt() as get_signal,
-        loggers.open_loggers(watching, folder, config, after=first if resume else 0) as note,
-        metrics_csv.progress(total, enable=config["progress"], start=first) as show,
+        loggers.open_loggers(watching, folder, config, after=start) as log,
+        metrics_csv.progress(total, enable=config["progress"], start=start) as show,
     ):
-        for iteration in range(first + 1, total + 1):
+        for iteration in range(start + 1, total + 1):
             before = time.monotonic()
             state, worlds, row = step(trainer, state, worlds, flow, first=iteration == 1)
             seconds = time.monotonic() - before
@@ -184,7 +171,7 @@ def _loop(
             row = {"iteration": iteration, "minutes": spent, "steps/total": count_spawned_steps(state), **row, "seconds": seconds}
             row["casps"] = row["steps/spawned"] / seconds
             file.add(row)
-            note(row)
+            log(row)
             show(iteration, describe(row))
             check_finite(row)
             for callback in callbacks:
@@ -205,9 +192,6 @@ def check_finite(row: Mapping[str, float | int]) -> None:
 
     A car whose state is not finite ends as `numerical_error`; then single minibatches are left out (`ppo/skipped`), which is no error.
 
-    Args:
-        row: metrics of an iteration.
-
     Raises:
         ConfigError: naming the terms.
     """
@@ -224,15 +208,14 @@ def step(
     trainer: Trainer, state: TrainState, worlds: Scene, flow: stream.SceneStream | None, *, first: bool
 ) -> tuple[TrainState, Scene, dict[str, float | int]]:
     """Makes one iteration, with the stream's next scenes in some worlds if there is a stream; gives its metrics on the host."""
-    if flow is None:
-        state, metrics = trainer.train_iteration(state, worlds)
-        return state, worlds, {name: float(value) for name, value in jax.device_get(metrics).items()}
-    if not first:
+    if flow is not None and not first:
         state, worlds = flow.exchange(trainer.replace_scenes, state, worlds)
     state, metrics = trainer.train_iteration(state, worlds)
-    flow.draw()  # while the devices compute
-    metrics, record = jax.device_get((metrics, state.scene_stats))
-    return state, worlds, {name: float(value) for name, value in metrics.items()} | flow.note(record.episodes, record.successes)
+    if flow is not None:
+        flow.draw()  # while the devices compute
+    metrics, stats = jax.device_get((metrics, state.scene_stats))
+    row = {name: float(value) for name, value in metrics.items()}
+    return state, worlds, row if flow is None else row | flow.note(stats.episodes, stats.successes)
 
 
 def describe(row: Mapping[str, float | int]) -> str:

@@ -19,11 +19,7 @@ Logger = Callable[[Path, Mapping[str, Any], int], contextlib.AbstractContextMana
 
 
 def make(entries: Mapping[str, Any]) -> dict[str, Logger]:
-    """Builds the loggers of a config; null entries are left out.
-
-    Raises:
-        ConfigError: an entry or key that does not fit, or a package that is not installed, by name.
-    """
+    """Builds the loggers of a config; null entries are left out. A package that is not installed is a ConfigError."""
     chosen = {name: entry for name, entry in entries.items() if entry is not None}
     return {name: instantiate(entry, builtins=__name__, where=f"loggers.{name}")() for name, entry in chosen.items()}
 

@@ -21,9 +21,6 @@ def make(*, experiment: str, uri: str | None) -> Logger:
     Args:
         experiment: created if missing.
         uri: of the tracking server or database, `sqlite:///mlflow.db`; None: MLFLOW_TRACKING_URI, or MLflow's default.
-
-    Raises:
-        ConfigError: MLflow is not installed.
     """
     try:
         from mlflow import MlflowClient  # pyright: ignore[reportMissingImports]

@@ -15,8 +15,9 @@ def make() -> Logger:
 
     @contextlib.contextmanager
     def log(folder: Path, config: Mapping[str, Any], after: int) -> Iterator[Add]:
-        own = {"purge_step": after + 1 if after else None, "filename_suffix": f".{after}"}  # files of one second would overwrite each other
-        with SummaryWriter(str(Path(folder) / "tensorboard"), **own) as writer:
+        # the suffix keeps files of one second from overwriting each other
+        options = {"purge_step": after + 1 if after else None, "filename_suffix": f".{after}"}
+        with SummaryWriter(str(Path(folder) / "tensorboard"), **options) as writer:
 
             def add(row: Row) -> None:
                 for name, value in row.items():

@@ -19,9 +19,6 @@ def make(*, project: str, entity: str | None, group: str | None, mode: Literal["
     Args:
         project, entity, group: of the run; None: W&B's default, or its environment variables.
         mode: None: WANDB_MODE, or online.
-
-    Raises:
-        ConfigError: W&B is not installed.
     """
     try:
         import wandb  # pyright: ignore[reportMissingImports]

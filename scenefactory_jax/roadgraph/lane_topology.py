@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from scenefactory_jax.core.instantiate import check_number, check_range
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
+from scenefactory_jax.core.schema import NonNegative, Positive, Range
 from scenefactory_jax.core.types import DRIVABLE
 from scenefactory_jax.roadgraph import lane_graph
 
@@ -39,33 +39,19 @@ class Samples(NamedTuple):
 def infer_lane_links(
     raw: RawScene,
     *,
-    max_link_gap_m: float,
+    max_link_gap_m: NonNegative,
     max_link_turn_deg: float,
     max_height_difference_m: float,
-    neighbour_distance_m: list[float],
+    neighbour_distance_m: Range,
     max_neighbour_turn_deg: float,
     min_overlap_m: float,
-    sample_spacing_m: float,
+    sample_spacing_m: Positive,
 ) -> RawScene:
-    """The scene with entries and exits if no lane has any, and with left and right neighbours if no lane has any.
+    """Returns the scene with entries and exits if no lane has any, and with left and right neighbours if no lane has any.
 
     Only lanes for cars are linked: WOMD links no bicycle lanes. Lanes with inferred links are marked `rebuilt`. A scene whose source has
-    both is returned unchanged.
-
-    Args:
-        max_link_gap_m: distance in the plane between the end of a lane and the start of its exit.
-        max_link_turn_deg: angle between their directions.
-        max_height_difference_m: between ends and between neighbours; beyond, they are on different levels.
-        neighbour_distance_m: range of the distance between the centres of neighbours; lanes that come closer cross.
-        max_neighbour_turn_deg: angle between the directions of neighbours.
-        min_overlap_m: length over which they are neighbours.
-        sample_spacing_m: distance of the points at which lanes are compared.
-
-    Raises:
-        ConfigError: `neighbour_distance_m` or `sample_spacing_m` out of range.
+    both is returned unchanged. The numbers are described in `conf/lanes/base.yaml`.
     """
-    check_range(neighbour_distance_m, where="lanes.topology.neighbour_distance_m")
-    check_number(sample_spacing_m, where="lanes.topology.sample_spacing_m", above=0)
     order = [index for index, line in enumerate(raw.roads) if line.kind in DRIVABLE and len(line.xyz)]
     lanes = [raw.roads[index] for index in order]
     has_links = any(line.entry or line.exit for line in raw.roads)
@@ -147,7 +133,7 @@ def _find_left_branches(starts: Ends, stops: Ends, samples: Samples, **link: flo
 
 
 def _find_left_neighbours(
-    samples: Samples, lanes: int, distance_m: list[float], turn_deg: float, overlap_m: float, height_m: float
+    samples: Samples, lanes: int, distance_m: tuple[float, float], turn_deg: float, overlap_m: float, height_m: float
 ) -> Relation:
     """[i, j]: lane j is to the left of lane i in the same direction over the overlap, and they come nowhere closer than the range."""
     low, high = distance_m

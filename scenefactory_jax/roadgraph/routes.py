@@ -34,14 +34,6 @@ class Route(NamedTuple):
     cost: float  # length, lane changes, and distances of start and goal from their lanes
 
 
-class RoutePath(NamedTuple):
-    """A cheapest path: indices of its start and goal among the candidates, and its nodes."""
-
-    start: int
-    goal: int
-    nodes: list[int]
-
-
 def build_network(
     lanes: LaneGraph,
     *,
@@ -51,15 +43,7 @@ def build_network(
     max_lane_change_turn_deg: float,
     max_lane_distance_m: float,
 ) -> Network:
-    """Builds the network on which routes are searched.
-
-    Args:
-        node_spacing_m: approximate length of the pieces; lane changes start and end at nodes.
-        lane_change_m: distance along the lanes of a lane change.
-        lane_change_cost_m: cost of a lane change beyond its length.
-        max_lane_change_turn_deg: angle between the two lanes at the change.
-        max_lane_distance_m: distance between their centres there; lanes that diverge are neighbours only near their fork.
-    """
+    """Builds the network on which routes are searched. The numbers are described in `conf/lanes/base.yaml`."""
     count = np.maximum(1, np.round(lanes.length / node_spacing_m)).astype(int)
     first = np.cumsum([0, *count])
     lane = np.repeat(np.arange(len(count)), count)
@@ -125,36 +109,24 @@ def find_routes(
     """Finds routes from a pose to a goal, the cheapest first; an empty list where no lane leads there.
 
     Alternatives come from the penalty method: the lanes of the routes found so far become more expensive. An alternative has a lane that
-    no other route has.
-
-    Args:
-        goal_yaw: None: any direction.
-        match_radius_m: distance from a pose to the centre of a candidate lane.
-        max_turn_deg: angle between a pose and such a lane.
-        max_height_difference_m: between them.
-        offset_cost: cost of a metre between a pose and the lane's centre, in metres along the lane.
-        count: maximum number of routes.
-        max_cost_ratio: alternatives that cost more than this times the cheapest route are left out.
-        reuse_penalty: increase of the cost of the lanes of a route, as a fraction.
+    no other route has. The numbers are described in `conf/lanes/base.yaml`; without `goal_yaw` the goal may be passed in any direction.
     """
     limits = (match_radius_m, max_turn_deg, max_height_difference_m)
     starts, goals = _match_lanes(net.lanes, start, yaw, *limits), _match_lanes(net.lanes, goal, goal_yaw, *limits)
     if not len(starts.lane) or not len(goals.lane):
         return []
-    found: list[Route] = []
+    found: dict[frozenset[int], Route] = {}  # by lanes
     factor = np.ones(len(net.lanes.id))
     for _ in range(2 * count - 1):  # a search may return a route that is known
-        path = _find_cheapest_path(net, starts, goals, factor, offset_cost)
-        if path is None:
+        route = _find_cheapest_route(net, starts, goals, factor, offset_cost)
+        if route is None:
             break
-        route = _assemble_route(net, starts, goals, path, offset_cost)
-        known = {frozenset(other.lanes) for other in found}
-        if frozenset(route.lanes) not in known and (not found or route.cost <= max_cost_ratio * found[0].cost):
-            found.append(route)
+        if not found or route.cost <= max_cost_ratio * next(iter(found.values())).cost:
+            found.setdefault(frozenset(route.lanes), route)
         if len(found) == count:
             break
         factor[np.isin(net.lanes.id, route.lanes)] += reuse_penalty
-    return sorted(found, key=lambda route: route.cost)
+    return sorted(found.values(), key=lambda route: route.cost)
 
 
 def _match_lanes(
@@ -168,10 +140,10 @@ def _match_lanes(
     return LaneProjections(*(column[fits] for column in places))
 
 
-def _find_cheapest_path(
+def _find_cheapest_route(
     net: Network, starts: LaneProjections, goals: LaneProjections, factor: Float[np.ndarray, " N"], offset_cost: float
-) -> RoutePath | None:
-    """The cheapest path from any start to any goal, with the costs of lanes multiplied by `factor`."""
+) -> Route | None:
+    """The cheapest route from any start to any goal, with the costs of lanes multiplied by `factor`."""
     start_node, goal_node = (_node_before(net, places.lane, places.arc) for places in (starts, goals))
     size, count = len(net.lane), len(start_node)
     edge_cost = net.cost * factor[net.lane[net.edge[:, 0]]]
@@ -191,35 +163,34 @@ def _find_cheapest_path(
     if not np.isfinite(total[start, goal]):
         return None
     nodes = [int(goal_node[goal])]
-    while not ahead[start, goal] and before[start, nodes[-1]] != size + start:
+    while not ahead[start, goal] and nodes[-1] != size + start:
         nodes.append(int(before[start, nodes[-1]]))
-    return RoutePath(start, goal, nodes[::-1] if ahead[start, goal] else [int(start_node[start]), *nodes[::-1]])
+    if not ahead[start, goal]:
+        nodes[-1] = int(start_node[start])
+    offset = float(starts.distance[start] + goals.distance[goal])
+    return _assemble_route(net, nodes[::-1], float(starts.arc[start]), float(goals.arc[goal]), offset_cost * offset)
 
 
-def _assemble_route(net: Network, starts: LaneProjections, goals: LaneProjections, path: RoutePath, offset_cost: float) -> Route:
-    """The route along a path."""
-    # stretches: lane, and the lengths along it at which the route enters and leaves it
-    stretches: list[list[float]] = [[int(starts.lane[path.start]), float(starts.arc[path.start]), float(net.arc[path.nodes[0]])]]
-    successors = {(int(one), int(other)) for one, other in net.lanes.successor}
-    changes = 0
-    for before, node in itertools.pairwise(path.nodes):
-        one, other = int(net.lane[before]), int(net.lane[node])
-        if before == net.first[one + 1] - 1 and node == net.first[other] and (one, other) in successors:
-            stretches[-1][2] = float(net.lanes.length[one])
-            stretches.append([other, 0.0, 0.0])
-        elif one != other:
+def _assemble_route(net: Network, nodes: list[int], start: float, goal: float, offset_cost: float) -> Route:
+    """The route along nodes, from a length along the lane of the first to one along the lane of the last."""
+    stretches: list[tuple[int, float, float]] = []  # lane, and the lengths along it at which the route enters and leaves it
+    successors = set(map(tuple, net.lanes.successor.tolist()))
+    changes, enter = 0, start
+    for node, following in itertools.pairwise(nodes):
+        lane, next_lane = int(net.lane[node]), int(net.lane[following])
+        if node == net.first[lane + 1] - 1 and following == net.first[next_lane] and (lane, next_lane) in successors:
+            stretches.append((lane, enter, float(net.lanes.length[lane])))
+            enter = 0.0
+        elif lane != next_lane:
             changes += 1
-            stretches[-1][2] = max(float(net.arc[before]), stretches[-1][1])
-            stretches.append([other, float(net.arc[node]), float(net.arc[node])])
-        else:
-            stretches[-1][2] = float(net.arc[node])
-    stretches[-1][2] = float(goals.arc[path.goal])
-    xyz = np.concatenate([_stretch_points(net.lanes, int(lane), low, high) for lane, low, high in stretches])
+            stretches.append((lane, enter, max(float(net.arc[node]), enter)))
+            enter = float(net.arc[following])
+    stretches.append((int(net.lane[nodes[-1]]), enter, goal))
+    xyz = np.concatenate([_stretch_points(net.lanes, *stretch) for stretch in stretches])
     xyz = xyz[np.concatenate([[True], np.diff(xyz[:, :2], axis=0).any(axis=1)])]
     length = float(np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1).sum())
-    offset = float(starts.distance[path.start] + goals.distance[path.goal])
-    cost = length + changes * net.lane_change_cost + offset_cost * offset
-    return Route(tuple(int(net.lanes.id[int(lane)]) for lane, *_ in stretches), xyz, length, changes, cost)
+    cost = length + changes * net.lane_change_cost + offset_cost
+    return Route(tuple(int(net.lanes.id[lane]) for lane, *_ in stretches), xyz, length, changes, cost)
 
 
 def _stretch_points(lanes: LaneGraph, lane: int, low: float, high: float) -> Float[np.ndarray, "N 3"]:

@@ -1,11 +1,12 @@
-"""The articulated car on the teacher's manoeuvres: recorded commands replayed open loop, thousands of cars with their own numbers at once.
+"""Simulates the articulated car on recorded manoeuvres, open loop, for thousands of candidate parameters at once.
 
-A pair (parameters, manoeuvre) is one world with one car. Errors are squared and summed on the device while it drives; only `trace` keeps
-what happened.
+A pair (parameters, manoeuvre) is one world with one car. Errors are squared and summed on the device during the simulation; only `trace`
+keeps the motion.
 """
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from scenefactory_jax.sysid import parameter_space as spaces
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 from scenefactory_jax.sysid.parameter_space import Space
 
+COMPARED = ("position", "yaw", "pace", "yaw_rate", "wheel_spin", "steer")  # fields of `CandidatePath` and `ManoeuvreBatch`
 TERMS = ("position", "yaw", "speed", "yaw_rate", "wheel_spin", "steer", "end_position", "end_speed")
 
 
@@ -45,7 +47,7 @@ class ManoeuvreBatch:
 
 
 class CandidatePath(NamedTuple):
-    """What a car did at the end of a frame."""
+    """Motion of a candidate at the end of a frame."""
 
     position: Float[Array | np.ndarray, "*n 2"]
     yaw: Float[Array | np.ndarray, "*n"]
@@ -57,197 +59,159 @@ class CandidatePath(NamedTuple):
     travel: Float[Array | np.ndarray, "*n 4"]  # of the suspension, m
 
 
-class Replay(NamedTuple):
-    """A compiled car that drives recordings."""
+class Simulator(NamedTuple):
+    """A compiled car that simulates recorded manoeuvres."""
 
-    terms: Callable[..., Array]  # (rows [N, P], manoeuvre [N], suite, frames) -> squared errors [N, 8]
-    trace: Callable[..., CandidatePath]  # (rows [N, P], manoeuvre [N], suite) -> leaves [N, T, ...]
+    square_errors: Callable[..., Array]  # (rows [N, P], manoeuvre [N], batch, frames) -> squared errors [N, 8], see TERMS
+    trace: Callable[..., CandidatePath]  # (rows [N, P], manoeuvre [N], batch) -> leaves [N, T, ...]
 
 
-def suite(recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreBatch:
-    """Recordings stacked. Behind their ends commands and records repeat the last one; `frames` says where that is."""
+def stack_recordings(recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreBatch:
+    """Stacks recordings. Beyond their ends commands and motion repeat the last frame; `frames` counts the valid ones."""
     frames = [len(recording.yaw) for recording in recordings]
-    longest, strips = max(frames), max(len(r.manoeuvre.left) for r in recordings)
+    strips = max(len(recording.manoeuvre.left) for recording in recordings)
 
-    def long(column: Callable[[ManoeuvreRecording], np.ndarray]) -> Array:
-        rows = [np.asarray(column(r), float) for r in recordings]
-        return jnp.asarray(np.stack([np.concatenate([x, np.repeat(x[-1:], longest - len(x), axis=0)]) for x in rows]), jnp.float32)
+    def pad(columns: Sequence[np.ndarray], length: int, fill: float | None, dtype: Any) -> Array:
+        ends = [np.repeat(x[-1:], length - len(x), axis=0) if fill is None else np.full(length - len(x), fill) for x in columns]
+        return jnp.asarray(np.stack([np.concatenate(pair) for pair in zip(columns, ends, strict=True)]), dtype)
 
-    def wide(column: Callable[[ManoeuvreRecording], np.ndarray], count: int, fill: float | None, kind: Any) -> Array:
-        rows = [np.asarray(column(r)) for r in recordings]
-        ends = [np.full(count - len(x), x[-1] if fill is None else fill) for x in rows]
-        return jnp.asarray(np.stack([np.concatenate(pair) for pair in zip(rows, ends, strict=True)]), kind)
-
+    motion = {"position": "position", "yaw": "yaw", "pace": "speed", "yaw_rate": "yaw_rate", "wheel_spin": "wheel_spin", "steer": "steer"}
+    plans = [recording.manoeuvre for recording in recordings]
     return ManoeuvreBatch(
-        controls=long(lambda r: r.manoeuvre.controls),
+        controls=pad([plan.controls for plan in plans], max(frames), None, jnp.float32),
         frames=jnp.asarray(frames, jnp.int32),
-        speed=jnp.asarray([r.manoeuvre.speed for r in recordings], jnp.float32),
-        edges=wide(lambda r: r.manoeuvre.edges, strips - 1, np.inf, jnp.float32),
-        left=wide(lambda r: r.manoeuvre.left, strips, None, jnp.int32),
-        right=wide(lambda r: r.manoeuvre.right, strips, None, jnp.int32),
-        position=long(lambda r: r.position),
-        yaw=long(lambda r: r.yaw),
-        pace=long(lambda r: r.speed),
-        yaw_rate=long(lambda r: r.yaw_rate),
-        wheel_spin=long(lambda r: r.wheel_spin),
-        steer=long(lambda r: r.steer),
+        speed=jnp.asarray([plan.speed for plan in plans], jnp.float32),
+        edges=pad([plan.edges for plan in plans], strips - 1, np.inf, jnp.float32),
+        left=pad([plan.left for plan in plans], strips, None, jnp.int32),
+        right=pad([plan.right for plan in plans], strips, None, jnp.int32),
+        **{name: pad([getattr(r, field) for r in recordings], max(frames), None, jnp.float32) for name, field in motion.items()},
     )
 
 
-def make(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *, physics_hz: float) -> Replay:
-    """The car of a config's dynamics with the parameters of a space left open.
+def make_simulator(dynamics: Mapping[str, Any], space: Space, friction: Sequence[float], *, physics_hz: float) -> Simulator:
+    """Compiles the car of a config's dynamics with the parameters of a space as arguments.
 
     Args:
         dynamics: of the articulated car; its randomization is replaced.
-        friction: of the surfaces, where the space leaves them alone.
+        friction: of the surfaces, where the space does not contain them.
     """
     car, solver = cars.read_parameters(dynamics)
-    plant = articulated_car.compile_car(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
-    contact = collision.make_contact(dynamics["contact"], height=car.height)
-    empty = _ground(car)
+    compiled = articulated_car.compile_car(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
+    contact = collision.make_contact(dynamics["contact"], height=car.height, step_s=collision.REPORT_S)
+    zero, size = np.zeros((1, 1), np.float32), (car.length, car.width)
+    worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=size)
+    empty = jax.tree.map(lambda leaf: leaf[0], worlds)
 
-    def bound(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Dynamics, Scene]:
-        own, mu = spaces.apply(space, car, friction, row)
+    def make_world(row: Array, index: Array, batch: ManoeuvreBatch) -> tuple[Dynamics, Scene]:
+        candidate, mu = spaces.set_parameters(space, car, friction, row)
 
-        def friction_at(weather: Any, position: Float[Array, "1 4 2"], speed: Array) -> Array:
+        def read_friction(weather: Any, position: Float[Array, "1 4 2"], speed: Array) -> Array:
             del weather, speed
-            strip = (position[..., 0][..., None] >= plan.edges[index]).sum(-1)
-            surface = jnp.where(position[..., 1] > 0.0, plan.left[index][strip], plan.right[index][strip])
+            strip = (position[..., 0][..., None] >= batch.edges[index]).sum(-1)
+            surface = jnp.where(position[..., 1] > 0.0, batch.left[index][strip], batch.right[index][strip])
             return mu[surface]
 
-        crew = jax.tree.map(lambda leaf: leaf[None], own)
-        scene = replace(empty, agents=replace(empty.agents, speed=plan.speed[index][None]))
-        return articulated_car.make_dynamics(plant._replace(sample=lambda key, scene: crew), contact, friction_at), scene
+        agents: CarParameters = jax.tree.map(lambda leaf: leaf[None], candidate)
+        scene = replace(empty, agents=replace(empty.agents, speed=batch.speed[index][None]))
+        return articulated_car.make_dynamics(compiled._replace(sample=lambda key, scene: agents), contact, read_friction), scene
 
-    def driver(row: Array, index: Array, plan: ManoeuvreBatch) -> tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]:
-        backend, scene = bound(row, index, plan)
-        active = jnp.ones(1, bool)
+    def start(row: Array, index: Array, batch: ManoeuvreBatch) -> Any:
+        backend, scene = make_world(row, index, batch)
+        return backend.init(jax.random.key(0), scene)
 
-        def step(body: Any, frame: Array) -> tuple[Any, CandidatePath]:
-            body = backend.advance(scene, body, plan.controls[index, frame][None], active)
-            return body, _seen(backend, plant, body)
+    def step(row: Array, index: Array, batch: ManoeuvreBatch, body: Any, frame: Array) -> tuple[Any, CandidatePath]:
+        backend, scene = make_world(row, index, batch)
+        body = backend.advance(scene, body, batch.controls[index, frame][None], jnp.ones(1, bool))
+        motion, at = backend.read(body), compiled.addresses
+        path = CandidatePath(
+            position=motion.position[0, :2],
+            yaw=motion.yaw[0],
+            pace=jnp.sqrt((motion.velocity[0, :2] ** 2).sum() + 1e-12),
+            yaw_rate=motion.yaw_rate[0],
+            wheel_spin=body.qvel[0, at.spin_v],
+            steer=body.qpos[0, at.steer_q],
+            normal=body.tyres.normal[0],
+            travel=body.qpos[0, at.suspension_q],
+        )
+        return body, path
 
-        return backend.init(jax.random.key(0), scene), step
+    def trace(rows: Array, index: Array, batch: ManoeuvreBatch) -> CandidatePath:
+        def trace_pair(row: Array, index: Array) -> CandidatePath:
+            frames = jnp.arange(batch.yaw.shape[1])
+            return jax.lax.scan(functools.partial(step, row, index, batch), start(row, index, batch), frames)[1]
 
-    return Replay(jax.jit(functools.partial(_terms, driver)), jax.jit(functools.partial(_trace, driver)))
+        return jax.vmap(trace_pair)(rows, index)
 
-
-Driver = Callable[
-    [Array, Array, ManoeuvreBatch], tuple[Any, Callable[[Any, Array], tuple[Any, CandidatePath]]]
-]  # -> (body at the start, step)
-
-
-def _terms(driver: Driver, rows: Array, index: Array, plan: ManoeuvreBatch, frames: Array) -> Array:
-    """Squared errors of all pairs, up to `frames`, the longest of their manoeuvres."""
-
-    def begin(row: Array, index: Array) -> Any:
-        return driver(row, index, plan)[0]
-
-    def step(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
-        body, path = driver(row, index, plan)[1](body, frame)
-        now, count = _errors(path, index, frame, plan), plan.frames[index]
-        end, share = jnp.where(frame == count - 1, 1.0, 0.0), 1.0 / count
-        now = jnp.concatenate([share * now, end * now[jnp.array([0, 2])]])
-        return body, total + jnp.where(frame < count, now, 0.0)
-
-    def once(frame: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
-        body, total = carry
-        return jax.vmap(step, in_axes=(0, 0, 0, 0, None))(rows, index, body, total, frame)
-
-    bodies = jax.vmap(begin)(rows, index)
-    return jax.lax.fori_loop(0, frames, once, (bodies, jnp.zeros((len(rows), len(TERMS)), jnp.float32)))[1]
+    return Simulator(jax.jit(functools.partial(_sum_square_errors, start, step)), jax.jit(trace))
 
 
-def _trace(driver: Driver, rows: Array, index: Array, plan: ManoeuvreBatch) -> CandidatePath:
-    """What all pairs do in every frame."""
+def _sum_square_errors(start: Callable, step: Callable, rows: Array, index: Array, batch: ManoeuvreBatch, frames: Array) -> Array:
+    """Computes the squared errors of all pairs [N, 8]; `frames` is the length of their longest manoeuvre."""
 
-    def one(row: Array, index: Array) -> CandidatePath:
-        body, step = driver(row, index, plan)
-        return jax.lax.scan(step, body, jnp.arange(plan.yaw.shape[1]))[1]
+    def add_frame(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
+        body, path = step(row, index, batch, body, frame)
+        errors = _differences(path, batch, (index, frame), jnp)
+        position, yaw, pace, yaw_rate, spin, steer = (error**2 for error in errors)
+        squares, count = jnp.stack([position.sum(), yaw, pace, yaw_rate, spin.mean(), steer.mean()]), batch.frames[index]
+        end, weight = jnp.where(frame == count - 1, 1.0, 0.0), 1.0 / count
+        squares = jnp.concatenate([weight * squares, end * squares[jnp.array([0, 2])]])
+        return body, total + jnp.where(frame < count, squares, 0.0)
 
-    return jax.vmap(one)(rows, index)
+    def add_frames(frame: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
+        return jax.vmap(add_frame, in_axes=(0, 0, 0, 0, None))(rows, index, *carry, frame)
+
+    bodies = jax.vmap(start, in_axes=(0, 0, None))(rows, index, batch)
+    return jax.lax.fori_loop(0, frames, add_frames, (bodies, jnp.zeros((len(rows), len(TERMS)), jnp.float32)))[1]
 
 
-def _errors(path: CandidatePath, index: Array, frame: Array, plan: ManoeuvreBatch) -> Array:
-    """Squared errors of a frame, TERMS without the last two."""
-    gap = path.position - plan.position[index, frame]
-    turn = path.yaw - plan.yaw[index, frame]
-    spin, steer = path.wheel_spin - plan.wheel_spin[index, frame], path.steer - plan.steer[index, frame]  # of both front wheels
-    pace, rate = path.pace - plan.pace[index, frame], path.yaw_rate - plan.yaw_rate[index, frame]
-    turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
-    return jnp.stack([(gap**2).sum(), turn**2, pace**2, rate**2, (spin**2).mean(), (steer**2).mean()])
+def _differences(path: CandidatePath, recorded: Any, at: Any, numpy: ModuleType) -> list[Any]:
+    """Computes the differences of the fields COMPARED: leaves of `path` less rows `at` of the recorded ones, the yaw wrapped."""
+    targets = {name: getattr(recorded, name)[at] for name in COMPARED}
+    targets["steer"] = targets["steer"][..., None]  # of both front wheels
+    errors = {name: getattr(path, name) - target for name, target in targets.items()}
+    errors["yaw"] = numpy.arctan2(numpy.sin(errors["yaw"]), numpy.cos(errors["yaw"]))
+    return list(errors.values())
 
 
-def make_scorer(replay: Replay, plan: ManoeuvreBatch, *, width: int) -> Callable[[np.ndarray, Sequence[int]], Float[np.ndarray, "N M 8"]]:
-    """(rows [N, P], manoeuvres) -> squared errors [N, M, 8] of every candidate on every manoeuvre, `width` pairs at a time.
+def make_scorer(simulator: Simulator, batch: ManoeuvreBatch, *, width: int) -> Callable[[np.ndarray, Sequence[int]], np.ndarray]:
+    """Makes the function (rows [N, P], manoeuvres) -> squared errors [N, M, 8] of every candidate on every manoeuvre.
 
-    Pairs are sorted by length, so that a piece runs no longer than its longest manoeuvre: one compilation for all.
+    It simulates `width` pairs at a time, sorted by length: one compilation for all, and a chunk runs no longer than its longest manoeuvre.
     """
-    length = np.asarray(plan.frames)
+    length = np.asarray(batch.frames)
 
     def score(rows: np.ndarray, manoeuvres: Sequence[int]) -> np.ndarray:
         chosen = np.asarray(manoeuvres, np.int32)
-        chosen_first = np.argsort(length[chosen], kind="stable")
-        candidate, place = np.tile(np.arange(len(rows)), len(chosen)), np.repeat(chosen_first, len(rows))
-        found = np.empty((len(rows), len(chosen), len(TERMS)))
-        pieces = []
+        candidate, column = np.tile(np.arange(len(rows)), len(chosen)), np.repeat(np.argsort(length[chosen], kind="stable"), len(rows))
+        errors = np.empty((len(rows), len(chosen), len(TERMS)))
+        chunks = []
         for begin in range(0, len(candidate), width):
-            some = np.resize(np.arange(begin, min(begin + width, len(candidate))), width)  # the last piece repeats itself
-            index = chosen[place[some]]
-            arguments = (jnp.asarray(rows[candidate[some]], jnp.float32), jnp.asarray(index), plan, jnp.int32(length[index].max()))
-            pieces.append((some, replay.terms(*arguments)))
-        for some, terms in pieces:
-            found[candidate[some], place[some]] = np.asarray(terms)
-        return found
+            pairs = np.resize(np.arange(begin, min(begin + width, len(candidate))), width)  # the last chunk repeats itself
+            index = chosen[column[pairs]]
+            arguments = (jnp.asarray(rows[candidate[pairs]], jnp.float32), jnp.asarray(index), batch, jnp.int32(length[index].max()))
+            chunks.append((pairs, simulator.square_errors(*arguments)))
+        for pairs, squares in chunks:
+            errors[candidate[pairs], column[pairs]] = np.asarray(squares)
+        return errors
 
     return score
 
 
 def residuals(
-    path: CandidatePath, plan: ManoeuvreBatch, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]
+    path: CandidatePath, batch: ManoeuvreBatch, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]
 ) -> Float[np.ndarray, "*n R"]:
-    """Of traced manoeuvres [M, T], flat: their squares sum to the loss of `fit.losses`."""
+    """Computes the residuals of traced manoeuvres [M, T], flat: their squares sum to the loss of `optimization.losses`."""
     rows = np.asarray(index)
-    count = np.asarray(plan.frames)[rows][:, None]
-    frame = np.arange(plan.yaw.shape[1])[None]
-    inside, end = frame < count, frame == count - 1
-    pick = lambda leaf: np.asarray(leaf, float)[rows]  # noqa: E731
-    turn = np.asarray(path.yaw, float) - pick(plan.yaw)
-    gap = np.asarray(path.position, float) - pick(plan.position)
-    pace = np.asarray(path.pace, float) - pick(plan.pace)
-    spin = (np.asarray(path.wheel_spin, float) - pick(plan.wheel_spin)) / 2.0  # the mean of four squares
-    steer = (np.asarray(path.steer, float) - pick(plan.steer)[..., None]) / np.sqrt(2.0)
-    rate = np.asarray(path.yaw_rate, float) - pick(plan.yaw_rate)
-    turn = np.arctan2(np.sin(turn), np.cos(turn))
-    share = np.where(inside, 1.0 / np.sqrt(count), 0.0)
+    count, frame = np.asarray(batch.frames)[rows][:, None], np.arange(batch.yaw.shape[1])[None]
+    end, mean = frame == count - 1, np.where(frame < count, 1.0 / np.sqrt(count), 0.0)
+    as_double = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, float))
+    position, yaw, pace, yaw_rate, spin, steer = _differences(as_double(path), as_double(batch), rows, np)
     columns = [
-        (weights[0], share, gap), (weights[1], share, turn), (weights[2], share, pace), (weights[3], share, rate),
-        (weights[4], share, spin), (weights[5], share, steer), (weights[6], end, gap), (weights[7], end, pace),
+        (mean, position), (mean, yaw), (mean, pace), (mean, yaw_rate), (mean, spin / 2.0), (mean, steer / np.sqrt(2.0)),
+        (end, position), (end, pace),
     ]  # fmt: skip
     parts = []
-    for weight, share_of, error in columns:
+    for weight, (per_frame, error) in zip(weights, columns, strict=True):
         error = error if error.ndim == 3 else error[..., None]
-        parts.append((np.sqrt(weight / len(rows)) * np.asarray(share_of, float)[..., None] * error).ravel())
+        parts.append((np.sqrt(weight / len(rows)) * np.asarray(per_frame, float)[..., None] * error).ravel())
     return np.concatenate(parts)
-
-
-def _ground(car: CarParameters) -> Scene:
-    """A world that holds one car at the origin."""
-    zero = np.zeros((1, 1), np.float32)
-    worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=(car.length, car.width))
-    return jax.tree.map(lambda leaf: leaf[0], worlds)
-
-
-def _seen(backend: Dynamics, plant: articulated_car.CompiledCar, body: Any) -> CandidatePath:
-    """Of the only car."""
-    motion, at = backend.read(body), plant.addresses
-    return CandidatePath(
-        position=motion.position[0, :2],
-        yaw=motion.yaw[0],
-        pace=jnp.sqrt((motion.velocity[0, :2] ** 2).sum() + 1e-12),
-        yaw_rate=motion.yaw_rate[0],
-        wheel_spin=body.qvel[0, at.spin_v],
-        steer=body.qpos[0, at.steer_q],
-        normal=body.tyres.normal[0],
-        travel=body.qpos[0, at.suspension_q],
-    )

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.data.loading import raw_scenes, scene_source
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import stack
 from scenefactory_jax.env import environment
@@ -46,7 +46,7 @@ def choose_scenes(config: Mapping[str, Any], *, count: int, skip: int) -> ShownS
     parts = scene_source.make_packing(config)
     packed: list[tuple[Packed, RoadPosts]] = []
     reasons: list[str] = []
-    for raw in raw_scenes.scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
+    for raw in scene_source.read_scenes(config, limit=None if config["path"] is not None else max(config["count"], skip + count)):
         if isinstance(raw, str):
             reasons.append(raw)
             continue
@@ -93,6 +93,12 @@ def record_episodes(settings: Mapping[str, Any], scene: Scene, policy: tuple[Act
     steps = max(round(min(seconds, settings["timing"]["episode_s"]) * settings["timing"]["control_hz"]), 1)
     act, parameters = policy
     return jax.device_get(record(environment.make_env(settings), act, parameters, scene, jax.random.key(seed), steps=steps))
+
+
+def find_shown_steps(active: Bool[np.ndarray, "T A"]) -> Int[np.ndarray, "T A"]:
+    """Step whose values are shown at each step: the last active one; before the first active step, that one."""
+    last = np.maximum.accumulate(np.where(active, np.arange(len(active))[:, None], 0), axis=0)
+    return np.maximum(last, np.argmax(active, axis=0))
 
 
 def cut_world(recording: Recording, index: int) -> tuple[Scene, Any, Bool[np.ndarray, "T A"], float]:

@@ -18,7 +18,8 @@ from scenefactory_jax.env.rollout import Recording, StepRecord
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.mujoco import world_mjcf
 from scenefactory_jax.visualization.recorded_episodes import cut_world
-from scenefactory_jax.visualization.web.replay_data import LAYERS, MAX_TTC_S, STRAIGHT_M
+from scenefactory_jax.visualization.road_lines import LAYERS, join_segments
+from scenefactory_jax.visualization.web import replay_data
 
 TRAIL_S, TRAIL_HZ = 3.0, 10.0
 CAR_M, TRAFFIC_M, GREY = 1.5, 1.5, (150, 152, 158)  # heights of boxes, colour of traffic
@@ -41,11 +42,7 @@ class RerunError(ValueError):
 
 
 def check() -> None:
-    """Checks that rerun is installed.
-
-    Raises:
-        RerunError: rerun is not installed.
-    """
+    """Raises RerunError if rerun is not installed."""
     if importlib.util.find_spec("rerun") is None:
         raise RerunError("writing .rrd needs rerun; `pip install scenefactory_jax[rerun]`, or choose out=NAME.html")
 
@@ -56,9 +53,6 @@ def write(path: Path | str, recording: Recording, *, names: Sequence[str], title
     Args:
         recording: of one or several worlds, see `env.rollout.record`.
         names: of the worlds.
-
-    Raises:
-        RerunError: rerun is not installed.
     """
     check()
     import rerun as rr  # an optional dependency  # pyright: ignore[reportMissingImports]
@@ -121,7 +115,7 @@ class _World:
     def _send_map(self, scene: Scene) -> None:
         lines: dict[str, list[Float[np.ndarray, "n 3"]]] = {}
         colours = {}
-        for points, kind in world_mjcf.join_segments(scene.road, STRAIGHT_M):
+        for points, kind in join_segments(scene.road):
             layer = next((name for name, kinds in LAYERS.items() if kind in kinds), "other")
             lines.setdefault(layer, []).append(np.c_[points, np.zeros(len(points))])
             colours[layer] = [round(255 * channel) for channel in world_mjcf.COLOURS.get(kind, world_mjcf.GREY)[:3]]
@@ -179,12 +173,10 @@ class _World:
 
 def series(shots: StepRecord) -> Mapping[str, Float[np.ndarray, "T A"]]:
     """Values of `SERIES` of every car at every step; missing ones are not finite."""
-    action = np.asarray(shots.action, float)
-    read = {"throttle": action[..., 0], "steer": action[..., 1], "brake": action[..., 2], "friction": shots.grip}
-    read |= {"reward": sum(np.asarray(term, float) for term in shots.terms.values())}
-    near = {name: np.where(getattr(shots, name) <= MAX_TTC_S, getattr(shots, name), np.nan) for name in ("ttc", "edge_ttc")}
-    read |= near
-    return {name: np.asarray(read[name] if name in read else getattr(shots, name), float) for name in SERIES}
+    columns = replay_data.car_columns(shots)
+    columns |= {"steer": columns["turn"], "friction": columns["grip"]}
+    columns |= {"reward": np.sum([np.asarray(term, float) for term in shots.terms.values()], axis=0)}
+    return {name: columns[name] for name in SERIES}
 
 
 def pack_colour(colour: drawing.Colour) -> np.uint32:

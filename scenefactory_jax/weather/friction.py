@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number, check_numbers, instantiate
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import SURFACES, Patches, Rain, Weather
 from scenefactory_jax.weather.patches import read_condition
 
@@ -21,30 +22,31 @@ from scenefactory_jax.weather.patches import read_condition
 class Tyre:
     """Constants of a tyre and of the water under it, SI units."""
 
-    load: float  # normal load of the wheel, N
-    pressure: float  # inflation pressure, Pa
-    width: float  # of the tyre, m
-    patch_length: float  # of the contact patch, m
-    patch_width: float  # of the contact patch, m
-    radius: float  # of the wheel, m
-    tread_radius: float  # of the tread, m
-    water_density: float  # kg/m^3
-    water_viscosity: float  # Pa s
-    minimum_spacing: float  # between tread and texture, m
-    spacing_ratio: float  # initial spacing / water film
-    bristle_stiffness: float  # sigma0, 1/m
-    coulomb: float  # mu_c
-    static: float  # mu_s
-    stribeck_exponent: float  # alpha
-    stribeck_velocity: tuple[float, float, float, float] | list[float]  # b1..b4: v_s(h) = b1 exp(b2 h_mm + b3) + b4, m/s
+    load: Positive  # normal load of the wheel, N
+    pressure: Positive  # inflation pressure, Pa
+    width: Positive  # of the tyre, m
+    patch_length: Positive  # of the contact patch, m
+    patch_width: Positive  # of the contact patch, m
+    radius: Positive  # of the wheel, m
+    tread_radius: Positive  # of the tread, m
+    water_density: Positive  # kg/m^3
+    water_viscosity: Positive  # Pa s
+    minimum_spacing: Positive  # between tread and texture, m
+    spacing_ratio: Positive  # initial spacing / water film
+    bristle_stiffness: Positive  # sigma0, 1/m
+    coulomb: Positive  # mu_c
+    static: Positive  # mu_s
+    stribeck_exponent: Positive  # alpha
+    # b1..b4: v_s(h) = b1 exp(b2 h_mm + b3) + b4, m/s, positive for any film
+    stribeck_velocity: tuple[Positive, float, float, Positive]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Surface:
     """Ratio of a road surface's friction to that of asphalt concrete, and amplitude of its texture."""
 
-    theta: float
-    texture_mm: float
+    theta: Positive
+    texture_mm: Positive
 
 
 def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"], Float[Array, "*shape"]], Float[Array, "*shape"]]:
@@ -117,64 +119,32 @@ def compute_mu(
     speed: Float[Array, "*shape"],
     *,
     mode: Literal["static", "dynamic", "speed"],
-    reference_speed: float,
-    slip_static: float,
-    slip_dynamic: float,
-    floor: float,
-    tyre: dict[str, Any],
-    surfaces: dict[str, Any],
+    reference_speed: NonNegative,
+    slip_static: NonNegative,
+    slip_dynamic: NonNegative,
+    floor: Positive,
+    tyre: Tyre,
+    surfaces: dict[str, Surface],
 ) -> Float[Array, "*shape"]:
     """Computes the friction coefficient of wheels.
 
     Args:
-        weather: road condition of this world.
         position: of the wheels, m; the road condition is read at each.
         speed: of the cars, m/s.
         mode: `static` and `dynamic` evaluate the model at `reference_speed` and `slip_static` or `slip_dynamic` (the published choice is
             `static`); `speed` evaluates it at each car's own speed and `slip_static`.
-        floor: smallest coefficient of a contact.
-        tyre: values of `Tyre`.
-        surfaces: values of `Surface` for every name of `types.SURFACES`.
-
-    Raises:
-        ConfigError: an unknown mode, tyre constant or surface, or a number out of its range, by name.
+        floor: smallest coefficient of a contact; at 0 cars would fall through the road.
+        surfaces: of every name of `types.SURFACES`.
     """
-    constants = _tyre(tyre)
-    check_number(floor, where="weather.friction.floor", above=0.0)  # at 0 cars fall through the road
-    slips = {"reference_speed": reference_speed, "slip_static": slip_static, "slip_dynamic": slip_dynamic}
-    check_numbers(slips, where="weather.friction", least=0.0)
-    if mode not in ("static", "dynamic", "speed"):
-        raise ConfigError(f"weather.friction.mode: {mode!r}; valid: static, dynamic, speed")
+    if set(surfaces) != set(SURFACES):
+        raise ConfigError(f"weather.friction.surfaces: expected {', '.join(SURFACES)}, got {', '.join(surfaces)}")
     film_mm, surface = read_condition(weather, position)
     speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # integers would make the slip an integer
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
-    theta, texture = (table[surface] for table in _surfaces(surfaces))
-    return jnp.maximum(compute_lugre_friction(v, film_mm, theta, texture, s, tyre=constants), floor)
-
-
-def _tyre(entry: Mapping[str, Any]) -> Tyre:
-    tyre: Tyre = instantiate({**entry, "_target_": "Tyre"}, builtins=__name__, where="weather.friction.tyre")()
-    numbers = dict(vars(tyre))
-    stribeck = {f"stribeck_velocity[{i}]": b for i, b in enumerate(numbers.pop("stribeck_velocity"))}
-    if len(stribeck) != 4:
-        raise ConfigError(f"weather.friction.tyre.stribeck_velocity: {list(stribeck.values())}; expected [b1, b2, b3, b4]")
-    check_numbers(stribeck, where="weather.friction.tyre")
-    first, last = "stribeck_velocity[0]", "stribeck_velocity[3]"  # b1 and b4 > 0: the Stribeck velocity is positive for any film
-    check_numbers({**numbers, first: stribeck[first], last: stribeck[last]}, where="weather.friction.tyre", above=0.0)
-    return tyre
-
-
-def _surfaces(surfaces: Mapping[str, Any]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-    """Reads theta and texture in the order of `types.SURFACES`."""
-    if set(surfaces) != set(SURFACES):
-        raise ConfigError(f"weather.friction.surfaces: {', '.join(surfaces)}; expected exactly {', '.join(SURFACES)}")
-    rows = [
-        instantiate({**surfaces[n], "_target_": "Surface"}, builtins=__name__, where=f"weather.friction.surfaces.{n}")() for n in SURFACES
-    ]
-    for name, row in zip(SURFACES, rows, strict=True):
-        check_numbers(vars(row), where=f"weather.friction.surfaces.{name}", above=0.0)
-    return jnp.array([row.theta for row in rows], jnp.float32), jnp.array([row.texture_mm for row in rows], jnp.float32)
+    theta = jnp.array([surfaces[name].theta for name in SURFACES], jnp.float32)[surface]
+    texture = jnp.array([surfaces[name].texture_mm for name in SURFACES], jnp.float32)[surface]
+    return jnp.maximum(compute_lugre_friction(v, film_mm, theta, texture, s, tyre=tyre), floor)
 
 
 def make_uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:

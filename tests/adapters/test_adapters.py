@@ -90,15 +90,16 @@ def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
 
 
 def test_a_step_of_an_episode_is_the_environments_own():
-    settings = hydra_config.load_config("train", SMOKE)
+    settings = hydra_config.load_config("train", SMOKE, "~observations.road", "~observations.neighbours")  # less to compile
     pool = episodes.make_pool(settings, (), scenes(agents=4), alone=False)
     episode, seen = jax.jit(lambda key: episodes.begin_episode(pool.env, pool.scenes, key, 2))(jax.random.key(3))
     action = jnp.full((4, 3), 0.5)
-    _, moment = jax.jit(lambda given: episodes.step_worlds(pool.env, pool.scenes, given, action))(episode)
+    following, moment = jax.jit(lambda begun: episodes.step_world(pool.env, pool.scenes, begun, action))(episode)
+    observation = episodes.observe(pool.env, pool.scenes, following)
     env, scene = environment.make_env(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
     after, outcome = jax.jit(env.step)(scene, episode.state, action)
     assert seen.shape == (4, pool.columns)
-    np.testing.assert_allclose(moment.observation, flatten_observation(outcome.observation), atol=1e-5)
+    np.testing.assert_allclose(observation, flatten_observation(outcome.observation), atol=1e-5)
     driving = np.asarray(episode.state.active)
     assert 0 < driving.sum() < 4  # scene 2 leaves slots empty
     np.testing.assert_allclose(moment.reward, np.where(driving, outcome.reward, 0), atol=1e-5)
@@ -108,13 +109,14 @@ def test_a_step_of_an_episode_is_the_environments_own():
 
 
 def test_a_step_is_all_control_steps_of_an_action():
-    held = episodes.make_pool(hydra_config.load_config("train", SMOKE), ["actions.action_repeat=3"], scenes(agents=4), alone=False)
-    assert (held.steps, held.step_hz) == (20, 10.0)
-    episode = episodes.start_episodes(held.env, held.scenes, jax.random.key(3), 1)
-    action = jnp.array([[1.0, 0.1, 0.0]] * held.agents)
-    after, moment = jax.jit(functools.partial(episodes.step_worlds, held.env))(held.scenes, episode, action)
-    scene, state = jax.tree.map(lambda leaf: leaf[1], held.scenes), episode.state
-    step, paid = jax.jit(held.env.control_step), 0.0
+    settings = hydra_config.load_config("train", SMOKE, "~observations.road", "~observations.neighbours")  # less to compile
+    repeating = episodes.make_pool(settings, ["actions.action_repeat=3"], scenes(agents=4), alone=False)
+    assert (repeating.steps, repeating.step_hz) == (20, 10.0)
+    episode = jax.jit(functools.partial(episodes.start_episodes, repeating.env))(repeating.scenes, jax.random.key(3), 1)
+    action = jnp.array([[1.0, 0.1, 0.0]] * repeating.agents)
+    after, moment = jax.jit(functools.partial(episodes.step_world, repeating.env))(repeating.scenes, episode, action)
+    scene, state = jax.tree.map(lambda leaf: leaf[1], repeating.scenes), episode.state
+    step, paid = jax.jit(repeating.env.control_step), 0.0
     for _ in range(3):
         driving = state.active
         state, outcome = step(scene, state, action)

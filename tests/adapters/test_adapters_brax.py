@@ -45,7 +45,7 @@ def test_a_step_keeps_the_shape_of_the_state_and_says_what_happened(env):
     assert state.done == 1 and state.metrics["events/road_edge_contact"] == 1 and step._cache_size() == 1
 
 
-@pytest.mark.parametrize("wrapping", [wrap, repeating])
+@pytest.mark.parametrize("wrapping", [wrap, pytest.param(repeating, marks=pytest.mark.slow)])
 def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_wrapper(env, wrapping):
     braking = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (WORLDS, 1))
     states, first = driven(wrapping(env, episode_length=env.episode_length), braking, steps=62)
@@ -68,12 +68,11 @@ def test_time_that_is_up_is_a_truncation_and_what_comes_after_it_depends_on_the_
     ("train", "plan", "loss"),
     [
         (ppo.train, {"num_timesteps": 64, "unroll_length": 4, "num_minibatches": 1, "num_updates_per_batch": 1, **EVALS}, "total_loss"),
-        pytest.param(
-            sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss", marks=pytest.mark.slow
-        ),
+        (sac.train, {"num_timesteps": 48, "min_replay_size": 16, "max_replay_size": 64}, "critic_loss"),
     ],
     ids=["ppo", "sac"],
 )
+@pytest.mark.slow
 def test_the_learners_of_brax_train_on_it(train, plan, loss):
     env = Drive(None, [*ALONE, "~observations.road", "~observations.neighbours"], scenes())  # less to compile
     sizes = {"num_envs": 4, "num_eval_envs": 2, "batch_size": 4, "episode_length": env.episode_length, "max_devices_per_host": 1}
@@ -87,6 +86,13 @@ def test_the_learners_of_brax_train_on_it(train, plan, loss):
     assert hasattr(jax, "device_put_replicated") is HAD
 
 
+def test_learners_find_the_copy_to_devices_that_jax_has_dropped():
+    with learning():
+        copies = jax.device_put_replicated({"a": jnp.arange(3)}, jax.local_devices()[:1])
+    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
+    assert hasattr(jax, "device_put_replicated") is HAD
+
+
 def test_a_randomisation_of_braxs_kind_is_refused(env):
-    with pytest.raises(ConfigError, match="randomization_fn: unknown here"):
+    with pytest.raises(ConfigError, match="randomization_fn: not supported"):
         wrap(env, 60, randomization_fn=lambda system: (system, system))

@@ -1,6 +1,7 @@
 """Gymnasium's own checker, and its SyncVectorEnv over single environments as the oracle of the vector environment."""
 
 import copy
+import functools
 import warnings
 
 import jax
@@ -34,8 +35,14 @@ def alone():
     return Drive(None, ALONE, scenes())
 
 
-def many(mode=AutoresetMode.NEXT_STEP, **options):
+@functools.cache
+def compiled(mode, **options):
     return DriveVector(WORLDS, None, ALONE, scenes(), mode, **options)
+
+
+def many(mode=AutoresetMode.NEXT_STEP, **options):
+    """A vector environment before its first reset; those of the same arguments share what is compiled."""
+    return copy.copy(compiled(mode, **options))
 
 
 def same(ours, theirs, *, where=""):
@@ -158,28 +165,28 @@ def test_without_autoreset_worlds_begin_anew_where_a_mask_says():
 
 
 def test_gymnasium_makes_both_and_its_wrappers_work():
-    made = gymnasium.make_vec(ID, num_envs=2, overrides=ALONE, scenes=scenes(), render_mode="rgb_array")
+    made = gymnasium.make_vec(ID, num_envs=WORLDS, overrides=ALONE, scenes=scenes(), render_mode="rgb_array")
     assert isinstance(made.unwrapped, DriveVector) and made.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     envs = NormalizeObservation(RecordEpisodeStatistics(made))  # which knows NEXT_STEP alone
     envs.reset(seed=0)
-    assert [frame.shape for frame in envs.render()] == [(400, 400, 3)] * 2
-    total, lengths = np.zeros(2), []
+    assert [frame.shape for frame in envs.render()] == [(400, 400, 3)] * WORLDS
+    total, lengths = np.zeros(WORLDS), []
     for _ in range(61):
-        _, reward, terminated, truncated, info = envs.step(np.tile(np.float32([0, 0, 1]), (2, 1)))
+        _, reward, terminated, truncated, info = envs.step(np.tile(np.float32([0, 0, 1]), (WORLDS, 1)))
         if (truncated | terminated).any() and not lengths:
             total += reward
             np.testing.assert_allclose(info["episode"]["r"], total, atol=1e-3)
             lengths = info["episode"]["l"].tolist()
         total += reward
-    assert lengths == [60, 60]
+    assert lengths == [60] * WORLDS
     with pytest.raises(ConfigError, match="arrays: 'torch'; valid: numpy, jax"):
         many(arrays="torch")
     with pytest.raises(ConfigError, match="seed: 2 seeds for 3 worlds"):
         many().reset(seed=[1, 2])
 
 
-def test_what_cannot_be_stepped_is_refused_in_a_line():
-    for env, shape in ((Drive(None, ALONE, scenes()), (3,)), (many(), (WORLDS, 3))):
+def test_what_cannot_be_stepped_is_refused_in_a_line(alone):
+    for env, shape in ((copy.copy(alone), (3,)), (many(), (WORLDS, 3))):
         with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
             env.step(np.zeros(shape))
         assert env.render() is None

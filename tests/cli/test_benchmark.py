@@ -91,9 +91,9 @@ def test_the_readme_shows_what_was_measured():
     result = result_file.read(ROOT / "experiments" / "throughput" / "bench.json")
     text = (ROOT / "README.md").read_text()
     assert report.compare_with_published(result).count("\n") >= 2 and report.compare_with_published(result) in text
-    shares, said = re.findall(r"[\d,]+ steps/s|[\d.]+ times", report.split(result)), " ".join(text.split())
+    shares, said = re.findall(r"[\d,]+ steps/s|[\d.]+ times", report.split_ratios(result)), " ".join(text.split())
     assert len(shares) == 3 and all(share in said for share in shares)
-    devices = report.over_devices(result_file.read(ROOT / "experiments" / "devices" / "bench.json"))
+    devices = report.compare_devices(result_file.read(ROOT / "experiments" / "devices" / "bench.json"))
     assert f"{devices.splitlines()[-1].split(' | ')[-1].strip(' |')} times the slots" in said
 
 
@@ -114,19 +114,19 @@ def test_the_ratio_is_split_into_plain_jax_and_kernels():
     row = {"worlds": 256, "slots": 16, "scope": "training", "devices": 1, "horizon": 8, "fits": True}
     row |= {"changes": {"phases": True}, "per_s": 77000.0}
     plain = {**row, "changes": {"policy": {"kernels": False}, "step_metrics": {"kernels": False}}, "per_s": 38500.0}
-    assert report.split({"rows": [row, plain]}) == (
+    assert report.split_ratios({"rows": [row, plain]}) == (
         "At 256 x 16 plain JAX alone makes 38,500 steps/s, 2.0 times the published figure; the kernels make that 2.0 times faster."
     )
     for other in ({"changes": {"phases": False}}, {"worlds": 255}, {"changes": {"step_metrics": {"kernels": False}, "seed": 0}}):
-        assert report.split({"rows": [row, {**plain, **other}]}) == ""
+        assert report.split_ratios({"rows": [row, {**plain, **other}]}) == ""
 
 
 def test_devices_are_compared_by_slots():
     """Steps count spawned slots, whose share differs between worlds."""
     one = {"name": "one", "devices": 1, "scope": "training", "fits": True, "slots_per_s": 100.0, "per_s": 40.0}
     two = {**one, "name": "two", "devices": 2, "slots_per_s": 194.0, "per_s": 100.0}
-    assert report.over_devices({"rows": [one, two]}).splitlines()[-1] == "| two | 2 | 194 | 1.94 |"
-    assert report.over_devices({"rows": [one]}) == report.over_devices({"rows": [two]}) == ""
+    assert report.compare_devices({"rows": [one, two]}).splitlines()[-1] == "| two | 2 | 194 | 1.94 |"
+    assert report.compare_devices({"rows": [one]}) == report.compare_devices({"rows": [two]}) == ""
 
 
 def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
@@ -154,12 +154,12 @@ def test_what_does_not_fit_is_a_row(monkeypatch, tmp_path, capsys):
 def test_variants_change_values_and_replace_entries():
     config = load_config("benchmark", "experiment=smoke")
     changes = {"ppo": {"horizon": 5}, "dynamics": {"_target_": "mine", "mass": 1.0}, "worlds": 3}
-    found = command.changed(config, changes, where="variants.mine")
+    found = command.change(config, changes, where="variants.mine")
     assert found["ppo"] == {**config["ppo"], "horizon": 5} and found["worlds"] == 3
     assert found["dynamics"] == {"_target_": "mine", "mass": 1.0}
     assert config["worlds"] == 4 and config["ppo"]["horizon"] == 8  # the config itself stays
     with pytest.raises(ConfigError, match=r"variants\.mine\.ppo\.horizont: unknown; valid: horizon, "):
-        command.changed(config, {"ppo": {"horizont": 5}}, where="variants.mine")
+        command.change(config, {"ppo": {"horizont": 5}}, where="variants.mine")
     with pytest.raises(ConfigError, match=r"scope: expected one of training, environment, physics, got 'driving'"):
         command.benchmark({**config, "variants": {"mine": {"scope": "driving"}}})
 
@@ -168,13 +168,13 @@ def test_variants_change_values_and_replace_entries():
 def test_every_variant_of_a_suite_is_a_config(suite):
     config = load_config("benchmark", "experiment=paper", f"suite={suite}")
     for name, changes in config["variants"].items():
-        schema.check(command.changed(config, changes, where=name), schema.Benchmark)
+        schema.check(command.change(config, changes, where=name), schema.Benchmark)
 
 
 def test_the_loop_stands_beside_the_first_configuration():
     phases_ms = {"policy": 1.25, "physics": 2.0, "whole": 3.25}
     loop = {"agent_steps_per_s": 500.0, "agent_steps_per_s_range": [490.0, 510.0], "phase_ms_a_control_step": phases_ms, "cars": 16.0,
             "steps": 60, "repeats": 3}  # fmt: skip
-    text = report.set_beside({"baseline": loop, "rows": [{"name": "256 x 16", "scope": "training", "per_s": 250_000.0}]})
+    text = report.compare_with_baseline({"baseline": loop, "rows": [{"name": "256 x 16", "scope": "training", "per_s": 250_000.0}]})
     assert "500 agent steps/s (490 to 510, 3 repeats of 60 steps, 16 cars a world)" in text and "policy 1.2, physics 2.0." in text
     assert text.endswith("`256 x 16` (training) makes 500 times as many.")

@@ -79,7 +79,7 @@ def test_the_folder_of_a_sweeps_run_says_what_differs():
     name = run_folder.make_folder_name("wet", ["weather=dry", "ppo.gamma=0.97", "scenes.path=/a b/c", "+dynamics/randomization=sizes"]).name
     assert re.fullmatch(r"wet-weather_dry-gamma_0\.97-path_a_b_c-dynamics_randomization_sizes-\d{8}-\d{6}", name)
     long = [run_folder.make_folder_name("a", [f"scenes.path={'x' * 200}{end}"]).name for end in "12"]
-    assert len(set(long)) == 2 and max(map(len, long)) <= len("a--20261125-010203") + run_folder.MOST
+    assert len(set(long)) == 2 and max(map(len, long)) <= len("a--20261125-010203") + run_folder.MAX_LETTERS
     assert re.fullmatch(r"a-\d{8}-\d{6}", run_folder.make_folder_name("a").name)
 
 

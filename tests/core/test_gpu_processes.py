@@ -1,4 +1,4 @@
-"""Processes that divide a work: each piece is done once, each process sees one GPU, and what fails is told."""
+"""Processes that share tasks: claims, the GPU and cores of each process, errors and signals."""
 
 import multiprocessing
 import os
@@ -49,7 +49,7 @@ def leading(folder):
         (folder / "gathered").touch()
 
 
-def test_each_piece_is_done_once_and_each_process_sees_a_gpu_of_its_own(tmp_path, monkeypatch):
+def test_each_task_is_claimed_once_and_each_process_has_its_gpu(tmp_path, monkeypatch):
     monkeypatch.setenv(gpu_processes.VISIBLE, "4,GPU-7a")
     pieces = [f"piece-{index}" for index in range(40)]
     answers = gpu_processes.run_on_gpus(work, 2, pieces, tmp_path)
@@ -59,14 +59,14 @@ def test_each_piece_is_done_once_and_each_process_sees_a_gpu_of_its_own(tmp_path
     assert gpu_processes.run_on_gpus(work, 1, [], tmp_path)[0]["sees"] == "0" and gpu_processes.VISIBLE not in os.environ
 
 
-def test_a_failing_process_is_told_once_the_others_have_ended(tmp_path, capfd):
+def test_an_error_is_raised_after_all_processes_have_ended(tmp_path, capfd):
     with pytest.raises(RuntimeError, match="1 of 2 processes ended with an error"):
         gpu_processes.run_on_gpus(failing, 2, tmp_path)
     assert (tmp_path / "done").exists() and "this one fails" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
-def test_nobody_computes_on_when_the_first_is_ended(how, tmp_path):
+def test_processes_end_with_the_first(how, tmp_path):
     """Told to terminate, it ends the others and does what is left to do with their notes; killed, it can do neither, and they end alone."""
     first = multiprocessing.get_context("spawn").Process(target=leading, args=(tmp_path,))
     first.start()
@@ -111,12 +111,12 @@ def test_without_a_gpu_each_process_has_a_core(tmp_path, monkeypatch):
     assert gpu_processes.run_on_gpus(cores, 1, tmp_path) == [own]
 
 
-def test_alone_all_is_ones_own_once():
+def test_one_process_claims_each_task_once():
     claims = gpu_processes.TaskClaims(None)
     assert claims.take("piece") and not claims.take("piece") and claims.take("another")
 
 
-def test_each_begins_with_groups_that_nobody_has_begun_and_helps_at_the_end(tmp_path):
+def test_groups_without_a_claim_come_first(tmp_path):
     groups = {"wide": ["a", "b"], "narrow": ["c"], "deep": ["d"]}
     first, second = (gpu_processes.TaskClaims(tmp_path).shares(groups) for _ in range(2))
     assert [next(first)[0], next(second)[0], next(first)[0]] == ["wide", "narrow", "deep"]

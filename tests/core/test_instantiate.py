@@ -40,7 +40,7 @@ def test_binds_numbers_and_context():
         ({"names": [1]}, "x.names"),
     ],
 )
-def test_refuses_by_name(change, message):
+def test_entries_that_do_not_fit_are_named(change, message):
     with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
         instantiate({**ENTRY, **change}, builtins=_module(), where="x")
 
@@ -49,7 +49,7 @@ IMPORTED = ["build", "scenefactory_jax.env.rewards.build", "scenefactory_jax.env
 
 
 @pytest.mark.parametrize("target", IMPORTED)
-def test_a_part_is_what_a_module_defines_not_what_it_imports(target):
+def test_imported_functions_are_no_targets(target):
     with pytest.raises(ConfigError, match=r"^x\._target_: "):
         instantiate({"_target_": target}, builtins=rewards, where="x")
 

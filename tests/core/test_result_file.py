@@ -33,7 +33,7 @@ def test_digits_and_digests(tmp_path):
     assert one == other != result_file.digest({"a": 1, "b": [2.1]}) and len(one) == 16
 
 
-def test_metrics_that_were_cut_short_are_read_up_to_there(tmp_path, monkeypatch):
+def test_an_incomplete_last_row_of_metrics_is_left_out(tmp_path, monkeypatch):
     file = tmp_path / metrics_csv.FILE
     file.write_text("iteration,reward\r\n1,0.5\r\n2,\r\n3,0.1")  # of 0.125, perhaps
     first, second = metrics_csv.read(tmp_path)

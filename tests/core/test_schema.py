@@ -58,7 +58,7 @@ def test_a_mapping_becomes_an_instance_with_its_parts():
         ({"part": 3}, "whole.part: expected a mapping or null, got 3"),
     ],
 )
-def test_what_does_not_fit_is_named(change, message):
+def test_values_that_do_not_fit_are_named(change, message):
     with pytest.raises(ConfigError) as caught:
         schema.check({**GOOD, **change}, Whole, where="whole")
     assert str(caught.value).startswith(message)

@@ -1,4 +1,4 @@
-"""Processes that work for this one: what signals to stop and an error do to them."""
+"""Worker processes: signals to stop, errors, and the end of their parent."""
 
 import multiprocessing
 import os
@@ -18,7 +18,7 @@ def interrupted(seconds):
     return "done"
 
 
-def test_an_interrupt_is_for_the_process_that_started_them():
+def test_workers_ignore_signals_to_stop():
     with open_pool(1) as task_map:
         assert list(task_map(interrupted, [0.2])) == ["done"]
 
@@ -35,7 +35,7 @@ def beats(beat):
         time.sleep(0.05)
 
 
-def test_they_end_with_the_process_that_started_them(tmp_path):
+def test_workers_end_with_their_parent(tmp_path):
     first = multiprocessing.get_context("spawn").Process(target=lead, args=(tmp_path / "beat",))
     first.start()
     until(lambda: (tmp_path / "beat").is_file())
@@ -65,7 +65,7 @@ def note(folder_and_seconds):
     time.sleep(seconds)
 
 
-def test_an_error_ends_them_whatever_they_are_at(tmp_path):
+def test_an_error_ends_busy_workers(tmp_path):
     with pytest.raises(KeyboardInterrupt), open_pool(2) as task_map:
         results = iter(task_map(note, [(tmp_path, 0.0), *[(tmp_path, 600.0)] * 3]))
         assert next(results) is None

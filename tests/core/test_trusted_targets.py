@@ -11,6 +11,7 @@ from scenefactory_jax.cli.compare import _read
 from scenefactory_jax.cli.evaluate import evaluate
 from scenefactory_jax.cli.export import export
 from scenefactory_jax.cli.view import load_run_config, replay
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.learning import policy_io, run_folder
@@ -67,7 +68,7 @@ def test_a_run_names_parts_of_the_package_alone(folder, target):
     ],
     ids=["load_policy", "export", "evaluate", "replay", "run config"],
 )
-def test_every_door_is_the_same(folder, tmp_path, door):
+def test_every_command_checks_targets(folder, tmp_path, door):
     change(folder, lambda own: own["scenes"]["formats"].update(mine={"_target_": "planted.make", "more": [{"_target_": "os.system"}]}))
     named = r"scenes\.formats\.mine\._target_: 'planted\.make'; scenes\.formats\.mine\.more\.0\._target_: 'os\.system'"
     with pytest.raises(ConfigError, match=named):
@@ -75,7 +76,7 @@ def test_every_door_is_the_same(folder, tmp_path, door):
     assert not (folder / "ran").exists() and not (tmp_path / "out").exists()
 
 
-def test_what_is_trusted_is_named_and_runs(folder, tmp_path, capsys):
+def test_trusted_targets_are_named_and_run(folder, tmp_path, capsys):
     change(folder, lambda own: own["policy"].update(_target_="planted.make"))
     trained = sf.load_policy(folder, trust=True)
     assert (folder / "ran").exists() and trained.config["policy"]["_target_"] == "planted.make"
@@ -89,10 +90,10 @@ def test_what_is_trusted_is_named_and_runs(folder, tmp_path, capsys):
 
 def test_a_policy_of_the_package_needs_no_trust(capsys):
     assert trusted_targets.find_outside_targets(sf.load_policy("town").config) == {} and capsys.readouterr().out == ""
-    assert policy_card._code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
+    assert policy_card._describe_code(()) in (policy_io.SHIPPED / "town" / "README.md").read_text()
 
 
-def test_whatever_a_training_can_choose_may_be_named():
+def test_all_targets_of_the_configs_are_inside():
     whole = hydra_config.load_config("train")
     groups = [group for group in whole if (hydra_config.find_conf() / group).is_dir()]
     files = [file for group in groups for file in (hydra_config.find_conf() / group).rglob("*.yaml")]
@@ -108,10 +109,10 @@ def test_yaml_that_names_itself_is_read_once(tmp_path):
     assert "a.1._target_: 'os.system'" in str(caught.value) and "\x1b" not in str(caught.value)
 
 
-def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path, capsys):
+def test_a_run_resumes_with_the_parts_of_the_command(tmp_path, capsys):
     mine = "+reward.mine={_target_: planted.make, weight: 1.0}"
     before = hydra_config.load_config("train", mine, f"out={tmp_path}")
-    hydra_config.write(tmp_path, before)
+    run_config.write(tmp_path, before)
     with run_folder.open_run_folder(before | {"resume": True}) as (
         folder,
         resume,
@@ -124,6 +125,6 @@ def test_a_run_goes_on_with_the_parts_that_the_command_names(tmp_path, capsys):
 
 
 def test_runs_are_compared_without_trust(tmp_path):
-    hydra_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
+    run_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
     (tmp_path / "metrics.csv").write_text("iteration\n1\n")
     assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"

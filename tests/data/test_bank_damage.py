@@ -136,7 +136,7 @@ def test_a_damaged_index_is_refused(tmp_path, scenes):
         told = bank_reader.is_bank(path)
         assert outcome(path, wanted, file) == "refused" and told, bytes(changed)
         with pytest.raises(SceneError, match=r"bank\.json: damaged"):
-            bank_writer.check_free_space(path)  # it may be a bank of which something can be saved: nothing takes its place
+            bank_writer.check_target(path)  # it may be a bank of which something can be saved: nothing takes its place
     for place in (0, 1, len(content) // 2, len(content) - 3):
         put(file, content[:place])
         assert outcome(path, wanted, file) == "refused"
@@ -180,7 +180,8 @@ def options(**changes):
     return {"tools": tools, "settings": WOMD["pack"], "spread": map, "shard_scenes": 2, "compression": None} | changes
 
 
-@pytest.mark.parametrize("number", [1, 2, 5])  # before the first catalogue, the first index, and the second one take their places
+# before the first catalogue, the first index, and the second index take their places
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2, 5])
 def test_a_bank_whose_writing_was_killed_becomes_the_undisturbed_one(tmp_path, number):
     folder, out = tmp_path / "in", tmp_path / "bank"
     folder.mkdir()

@@ -1,5 +1,6 @@
 """Readers of ScenarioNet's, Argoverse 2's, PufferDrive's and GPUDrive's files, against independent readings of the same files."""
 
+import gzip
 import json
 import lzma
 import os
@@ -11,6 +12,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import shapely
+from support import womd_records as records
 from support.format_documents import (
     STEPS,
     argoverse2_files,
@@ -218,6 +220,8 @@ def test_a_hostile_pickle_is_refused_by_name_and_does_nothing(tmp_path, readers)
         (b"\x80\x04](" + b"".join(b"J" + struct.pack("<i", n) for n in range(999)) + b"e\x94cbuiltins\nset\n\x94("
          + b"h\x01h\x00\x85R" * 500 + b"t.", "shared over and over"),  # half a million values, copied from 999
         (b"\x80\x04Vtext\n.", "opcode UNICODE is refused"),
+        (b"\x80\x04cnumpy.core.numeric\n_frombuffer\n(C\x08" + bytes(8) + b"cnumpy\ndtype\n\x8c\x02f8\x85R(" + b"K\x01" * 33
+         + b"t\x8c\x01CtR.", "at most 32 sizes"),
         (pickle.dumps(np.array(["a"]), protocol=4).replace(b"a\0\0\0", struct.pack("<I", 0x110000)), "code point 0x110000"),
         (pickle.dumps(np.str_("a"), protocol=4).replace(b"a\0\0\0", struct.pack("<I", 0xFFFFFFFF)), "code point 0xffffffff"),
         (pickle.dumps(np.array([object], object), protocol=4), "builtins.object is refused"),
@@ -231,9 +235,23 @@ def test_a_bomb_is_refused(tmp_path, content, message):
         safe_pickle.load(written(tmp_path, content), **LIMITS)
 
 
+def test_lights_of_more_lanes_than_a_scene_has_are_refused(tmp_path, readers):
+    lights = [[{"lane": step}] for step in range(1001)]  # a state of each lane at each step
+    path = written(tmp_path, dumped(in_march_2023(scenarionet_document()) | {"dynamic_map_states": lights}))
+    with pytest.raises(SceneError, match=r"dynamic_map_states\[999\]\[0\]: expected at most 1000000 states of all lights"):
+        one(path, readers)
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, lzma.compress], ids=["gzip", "xz"])
+def test_pickles_and_records_may_be_compressed(tmp_path, readers, compress):
+    record = records.framed(records.scenario().SerializeToString())
+    for content in (dumped(scenarionet_document()), record):
+        assert one(written(tmp_path, compress(content), "scene"), readers).name == "street"
+
+
 def test_a_pickle_has_limits(tmp_path):
     path = written(tmp_path, dumped(list(range(1000))))
-    with pytest.raises(SceneError, match="a pickle of 0 MB; file_limit_mb is 0"):
+    with pytest.raises(SceneError, match="expected a content of up to 0 MB, got more"):
         safe_pickle.load(path, file_limit_mb=0, opcode_limit=10**6)
     with pytest.raises(SceneError, match="more than 100 opcodes"):
         safe_pickle.load(path, file_limit_mb=1, opcode_limit=100)
@@ -354,10 +372,10 @@ def test_lights_of_gpudrive_json(tmp_path, readers):
     assert found.lane == 1 and found.valid.nonzero()[0].tolist() == [0, 4] and found.stop.tolist() == [1, 2, 3]
     assert [LIGHT_STATES[code] for code in found.state[[0, 4]]] == ["stop", "go"]
     bad = {
-        r"tl_states\.1\.state\[0\]: expected one of .*, got 'red'": light | {"state": ["red", "go"]},
-        r"tl_states\.1\.time_index\[1\]: expected a step, 0 to 11, got 12": light | {"time_index": [0, 12]},
-        r"tl_states\.1\.state: expected 1 entries, .*, got 2": light | {"time_index": [0]},
-        r"tl_states\.1\.x: expected 2 entries, .*, got 1": light | {"x": [1.0]},
+        r"tl_states\['1'\]\.state\[0\]: expected one of .*, got 'red'": light | {"state": ["red", "go"]},
+        r"tl_states\['1'\]\.time_index\[1\]: expected a step, 0 to 11, got 12": light | {"time_index": [0, 12]},
+        r"tl_states\['1'\]\.state: expected 1 entries, .*, got 2": light | {"time_index": [0]},
+        r"tl_states\['1'\]\.x: expected 2 entries, .*, got 1": light | {"x": [1.0]},
     }
     for message, record in bad.items():
         with pytest.raises(SceneError, match=message):

@@ -22,9 +22,9 @@ from scenefactory_jax.data.curation import duplicates, filter_expressions, geogr
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
 
-SHARES = {"train": 0.6, "val": 0.2, "test": 0.2}
+FRACTIONS = {"train": 0.6, "val": 0.2, "test": 0.2}
 TOWN = {"metadata": {"dataset": "windows", "town": "one"}}  # scenes of one frame
-NUMBERS = {"tolerance_m": 0.2, "share": 0.95, "slack": 0.02}
+THRESHOLDS = {"tolerance_m": 0.2, "min_matched_fraction": 0.95, "max_relative_difference": 0.02}
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_conditions_mean_what_they_mean_in_python():
     for _ in range(100):
         text = condition(rng)
         wanted = [index for index, row in enumerate(rows) if eval(text, {}, dict(row))]
-        assert filter_expressions.rows(table, text, where="filter").tolist() == wanted, text
+        assert filter_expressions.rows(table, text, where="select.filter").tolist() == wanted, text
         held += 0 < len(wanted) < len(rows)
     assert held > 50
 
@@ -81,13 +81,13 @@ def test_a_missing_value_meets_no_condition():
         "sdc_distance_m > 10": [2], "not sdc_distance_m > 10": [0], "sdc_distance_m > 10 or vehicles == 2": [1, 2],
         "sdc_distance_m in [5]": [0], "vehicles / 0 > 1 and 100 + 100 > vehicles": [0, 1, 2],
     }.items():  # fmt: skip
-        assert filter_expressions.rows(table, text, where="filter").tolist() == wanted, text
+        assert filter_expressions.rows(table, text, where="select.filter").tolist() == wanted, text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("vehicls > 3", "filter: unknown column 'vehicls'; did you mean vehicles\\? valid: dataset, vehicles"),
+        ("vehicls > 3", "select.filter: unknown column 'vehicls'; did you mean vehicles\\? valid: dataset, vehicles"),
         ("__import__('os').system('true')", "has no place in a condition; valid: columns, numbers"),
         ("vehicles.real > 1", "'vehicles.real' has no place"),
         ("[x for x in vehicles]", "has no place"),
@@ -102,7 +102,7 @@ def test_a_missing_value_meets_no_condition():
 )
 def test_what_is_no_condition_is_refused(text, message):
     with pytest.raises(ConfigError, match=message):
-        filter_expressions.rows(pa.table({"vehicles": [1, 2], "dataset": ["a", "b"]}), text, where="filter")
+        filter_expressions.rows(pa.table({"vehicles": [1, 2], "dataset": ["a", "b"]}), text, where="select.filter")
 
 
 # ---- streets
@@ -125,7 +125,7 @@ def test_groups_are_connected_by_shared_streets(block, monkeypatch):
     for least, reach in ((1, 40), (2, 60), (3, 60)):
         sets = [set(rng.integers(0, reach * 4, rng.integers(0, 9)).tolist()) for _ in range(40)]
         starts = np.cumsum([0, *map(len, sets)])
-        found = geographic_split.find_groups(np.array([key for one in sets for key in one], int), starts, least_shared=least)
+        found = geographic_split.find_groups(np.array([key for one in sets for key in one], int), starts, min_shared_places=least)
         wanted = np.unique(components(sets, least), return_inverse=True)[1]
         pairs = {(a, b) for a, b in zip(found.tolist(), wanted.tolist(), strict=True)}
         assert len(pairs) == len(set(found.tolist())) == len(set(wanted.tolist())) > 1
@@ -134,36 +134,37 @@ def test_groups_are_connected_by_shared_streets(block, monkeypatch):
 def test_groups_are_dealt_whole_and_shares_are_met():
     rng = np.random.default_rng(0)
     group = np.unique(rng.integers(0, 300, 1000), return_inverse=True)[1]
-    parts = geographic_split.assign_groups(group, SHARES, seed=0)
+    parts = geographic_split.assign_groups(group, FRACTIONS, seed=0)
     assert np.array_equal(np.sort(np.concatenate(list(parts.values()))), np.arange(1000))
     assert not any(set(group[a]) & set(group[b]) for a, b in itertools.combinations(parts.values(), 2))
     assert [len(rows) for rows in parts.values()] == [600, 200, 200] and not any(geographic_split.find_leaks(group, parts).values())
-    again, other = geographic_split.assign_groups(group, SHARES, seed=0), geographic_split.assign_groups(group, SHARES, seed=1)
+    again, other = geographic_split.assign_groups(group, FRACTIONS, seed=0), geographic_split.assign_groups(group, FRACTIONS, seed=1)
     assert all(np.array_equal(parts[name], again[name]) for name in parts) and any(set(parts[name]) != set(other[name]) for name in parts)
-    by_scene = geographic_split.assign_groups(np.arange(1000), SHARES, seed=0)
+    by_scene = geographic_split.assign_groups(np.arange(1000), FRACTIONS, seed=0)
     apart = {name: sum(g in set().union(*(group[r] for n, r in by_scene.items() if n != name)) for g in group[rows])
              for name, rows in by_scene.items()}  # fmt: skip
     assert geographic_split.find_leaks(group, by_scene) == apart and apart["test"] > 100
-    with pytest.raises(ConfigError, match=r"split.shares.val: 0.2 of 9 scenes in 1 groups"):
-        geographic_split.assign_groups(np.zeros(9, int), SHARES, seed=0)
-    for wrong, message in (({"train": 1.0}, "two parts or more"), ({"a": 1, "b": 0}, "split.shares.b: 0")):
+    with pytest.raises(ConfigError, match=r"split.fractions.val: 0.2 of 9 scenes in 1 groups"):
+        geographic_split.assign_groups(np.zeros(9, int), FRACTIONS, seed=0)
+    for wrong, message in (({"train": 1.0}, "two parts or more"), ({"a": 1, "b": 0}, "split.fractions.b: ")):
         with pytest.raises(ConfigError, match=message):
             geographic_split.assign_groups(group, wrong, seed=0)
 
 
 def test_a_split_never_divides_a_street(town):
     table = operations.describe_scenes(town, FEATURES)
-    groups = operations.streets(table, least_shared=2)
+    groups = operations.find_street_groups(table, min_shared_places=2)
     assert sorted(np.bincount(groups).tolist()) == [1] * 6 + [3, 3]
     assert [set(groups[6:9]), set(groups[9:])] == [{groups[6]}, {groups[9]}]
     for seed in range(6):
-        made = operations.split(town, table, shares={"train": 0.5, "test": 0.5}, by="streets", least_shared=2, seed=seed)
+        made = operations.split(town, table, fractions={"train": 0.5, "test": 0.5}, by="streets", min_shared_places=2, seed=seed)
         names = {part: set(bank.names) for part, bank in made.banks.items()}
         assert not names["train"] & names["test"] and names["train"] | names["test"] == set(town.names)
         assert made.account["leaks"] == {"train": 0, "test": 0} and made.account["groups_by_size"] == {"1": 6, "3": 2}
         for part in names.values():
             assert sum(name.startswith("window") for name in part) % 3 == 0
-    leaky = [operations.split(town, table, shares={"train": 0.5, "test": 0.5}, by="scene", least_shared=2, seed=s) for s in range(6)]
+    halves = {"train": 0.5, "test": 0.5}
+    leaky = [operations.split(town, table, fractions=halves, by="scene", min_shared_places=2, seed=seed) for seed in range(6)]
     assert any(made.account["leaks"]["test"] for made in leaky)
 
 
@@ -175,7 +176,7 @@ def womd(folder, part, names=None):
 
 def shown(raws):
     found = [geographic_split.find_streets(raw, **hydra_config.load_config("scenes")["features"]["streets"]) for raw in raws]
-    return geographic_split.find_groups(np.concatenate(found), np.cumsum([0, *map(len, found)]), least_shared=3)
+    return geographic_split.find_groups(np.concatenate(found), np.cumsum([0, *map(len, found)]), min_shared_places=3)
 
 
 def test_real_scenes_of_one_street_are_found(shared_data):
@@ -208,51 +209,75 @@ def test_copies_are_found_and_different_scenes_kept(tmp_path):
     faster = replace(crossing, name="another run", tracks=tuple(replace(t, xyz=np.roll(t.xyz, 8, axis=0)) for t in crossing.tracks))
     fewer = replace(crossing, name="one car fewer", tracks=crossing.tracks[1:])
     bank = banked(tmp_path / "bank", [*raws, copy, faster, fewer])
-    made = duplicates.dedupe(bank, operations.describe_scenes(bank, FEATURES), **NUMBERS)
-    assert made.account["groups"] == [[crossing.name, "a copy"]] and made.account["compared"] >= 1
+    made = select(bank, dedupe=True)
+    assert made.account["dedupe"]["groups"] == [[crossing.name, "a copy"]] and made.account["dedupe"]["compared"] >= 1
     assert list(made.bank.names) == [*(raw.name for raw in raws), "another run", "one car fewer"]
-    alike = functools.partial(duplicates.is_same_scene, crossing, tolerance_m=0.2, share=0.95)
+    alike = functools.partial(duplicates.is_same_scene, crossing, tolerance_m=0.2, min_matched_fraction=0.95)
     assert alike(copy) and not alike(faster) and not alike(fewer)
-    again = duplicates.dedupe(made.bank, operations.describe_scenes(made.bank, FEATURES), **NUMBERS)
-    assert again.account["groups"] == [] and len(again.bank) == len(made.bank)
+    again = select(made.bank, dedupe=True)
+    assert again.account["dedupe"]["groups"] == [] and len(again.bank) == len(made.bank)
 
 
-# ---- samples, merges, statistics
+# ---- selections, statistics
+
+NO_SAMPLE = {"count": None, "fraction": None, "stratify": None}
+
+
+def select(*several, **settings):
+    """A selection whose other steps are off."""
+    sample = NO_SAMPLE | settings.pop("sample", {})
+    off = {"on_same_name": "refuse", "dedupe": False, "duplicates": THRESHOLDS, "filter": None, "seed": 0}
+    return operations.select(several, lambda bank: operations.describe_scenes(bank, FEATURES), sample=sample, **off | settings)
 
 
 def test_samples_are_seeded_and_keep_strata(town):
-    table = operations.describe_scenes(town, FEATURES)
-    draw = functools.partial(operations.sample, town, table)
-    one, same, other = (draw(count=5, share=None, stratify=None, seed=seed).bank.names for seed in (0, 0, 1))
+    one, same, other = (select(town, sample={"count": 5}, seed=seed).bank.names for seed in (0, 0, 1))
     assert one == same != other and len(set(one)) == 5 and [name for name in town.names if name in one] == list(one)
-    by = draw(count=None, share=0.5, stratify="dataset", seed=0).bank.metadata["dataset"].to_pylist()
+    by = select(town, sample={"fraction": 0.5, "stratify": "dataset"}).bank.metadata["dataset"].to_pylist()
     assert sorted(by) == ["town"] * 3 + ["windows"] * 3
-    assert operations._quotas(np.array([5, 3, 2]), 5).tolist() in ([3, 1, 1], [2, 2, 1])
+    assert operations._compute_quotas(np.array([5, 3, 2]), 5).tolist() in ([3, 1, 1], [2, 2, 1])
     for wrong, message in (
-        ({"count": 5, "share": 0.5}, "count 5 and share 0.5; give one"), ({"count": None, "share": None}, "give one of the two"),
-        ({"count": 13, "share": None}, "sample.count: 13 of 12 scenes; valid: 1 to 12"),
-        ({"count": None, "share": 1.5}, "sample.share: 1.5"),
-        ({"count": 2, "share": None, "stratify": "colour"}, "sample.stratify: no column 'colour'; valid: bike_lane_m"),
-        ({"count": 2, "share": None, "stratify": "streets"}, "holds lists"),
-    ):  # fmt: skip
+        ({"count": 5, "fraction": 0.5}, "select.sample: expected count or fraction, got count 5 and fraction 0.5"),
+        ({"stratify": "dataset"}, "select.sample: expected count or fraction, got count None"),
+        ({"count": 13}, "select.sample.count: expected 1 to 12 scenes, got 13"),
+        ({"fraction": 0.001}, "select.sample.fraction: expected 1 to 12 scenes, got 0"),
+        ({"count": 2, "stratify": "colour"}, "select.sample.stratify: no column 'colour'; valid: bike_lane_m"),
+        ({"count": 2, "stratify": "streets"}, "holds lists"),
+    ):
         with pytest.raises(ConfigError, match=message):
-            draw(**{"stratify": None, "seed": 0} | wrong)
+            select(town, sample=wrong)
 
 
-def test_a_merge_has_every_scene_once(town, tmp_path):
+def test_a_join_has_every_scene_once(town, tmp_path):
     table = operations.describe_scenes(town, FEATURES)
-    parts = operations.split(town, table, shares=SHARES, by="scene", least_shared=2, seed=0).banks
-    whole = operations.merge(list(parts.values()), duplicates="refuse")
-    assert sorted(whole.bank.names) == sorted(town.names) and whole.account["banks"] == [len(bank) for bank in parts.values()]
+    parts = operations.split(town, table, fractions=FRACTIONS, by="scene", min_shared_places=2, seed=0).banks
+    joined = select(*parts.values())
+    assert sorted(joined.bank.names) == sorted(town.names) and joined.account["join"]["banks"] == [len(bank) for bank in parts.values()]
     for index in (0, 5, 11):
-        assert banks.read_raw(whole.bank, index).name == whole.bank.names[index]
-    with pytest.raises(SceneError, match=r"merge: \d scenes have the name of another: town-.*duplicates=first"):
-        operations.merge([town, parts["test"]], duplicates="refuse")
-    assert operations.merge([town, parts["test"]], duplicates="first").bank.names == town.names
+        assert banks.read_raw(joined.bank, index).name == joined.bank.names[index]
+    with pytest.raises(SceneError, match=r"select.banks: \d scenes repeat a name: town-.*on_same_name=first"):
+        select(town, parts["test"])
+    assert select(town, parts["test"], on_same_name="first").bank.names == town.names
     bare = banked(tmp_path / "bare", [generated(6)], described=False)
-    mixed = operations.describe_scenes(operations.merge([town, bare], duplicates="refuse").bank, FEATURES)
+    mixed = operations.describe_scenes(select(town, bare).bank, FEATURES)
     assert mixed["lane_m"].to_pylist()[-1] == FEATURES(generated(6))["lane_m"] and mixed["streets"].null_count == 0
     assert mixed.slice(0, 12).select(["lane_m", "streets"]).equals(table.select(["lane_m", "streets"]))
+
+
+def test_the_steps_of_a_selection_follow_one_another(town, tmp_path):
+    """The sample is of the scenes that the filter keeps, the filter sees the joined banks without their duplicates."""
+    names = [name for name in town.names if name.startswith("window")]
+    raws = [banks.read_raw(town, town.names.index(name)) for name in names[:2]]
+    copies = banked(tmp_path / "copies", [replace(raw, name=f"copy of {raw.name}") for raw in raws])
+    made = select(town, copies, dedupe=True, filter='dataset == "windows"', sample={"fraction": 0.5}, seed=3)
+    steps = {name: (step["scenes"], step["kept"]) for name, step in made.account.items() if isinstance(step, dict)}
+    assert steps == {"join": (14, 14), "dedupe": (14, 12), "filter": (12, 6), "sample": (6, 3)} and set(made.bank.names) < set(names)
+    assert (made.account["scenes"], made.account["kept"]) == (14, 3)
+    whole = operations.select(
+        [town], lambda bank: pytest.fail("features are not needed"), on_same_name="refuse", dedupe=False, duplicates=THRESHOLDS,
+        filter=None, sample=NO_SAMPLE, seed=0,
+    )  # fmt: skip
+    assert whole.bank is town and whole.account == {"scenes": 12, "kept": 12}
 
 
 def test_statistics_agree_with_numpy(town):
@@ -285,18 +310,20 @@ def test_commands_write_views(town, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "dataset = windows: 6 scenes" in printed and "| lane_m |" in printed and "Length of all driving lanes." in printed
 
-    kept = command(town, "op=filter", "filter=intersections >= 1 and dataset in [\"town\", 'x']", f"out={tmp_path / 'filtered'}")
-    assert len(kept) == 3 and banks.open(tmp_path / "filtered").names == kept.names and "filter: 3 of 12 scenes" in capsys.readouterr().out
-    assert kept.settings["made_by"]["op"] == "filter" and not list((tmp_path / "filtered").glob("scenes*"))
-    halves = ["split.shares={train: 0.5, test: 0.5}", "split.least_shared=2"]
+    kept = command(town, "op=select", "select.filter=intersections >= 1 and dataset in [\"town\", 'x']", f"out={tmp_path / 'filtered'}")
+    assert len(kept) == 3 and banks.open(tmp_path / "filtered").names == kept.names
+    assert "filter: 3 of 12 scenes\nselect: 3 of 12" in capsys.readouterr().out
+    assert kept.settings["made_by"]["op"] == "select" and not list((tmp_path / "filtered").glob("scenes*"))
+    halves = ["split.fractions={train: 0.5, test: 0.5}", "split.min_shared_places=2"]
     parts = command(town, "op=split", *halves, f"out={tmp_path / 'parts'}", "copy=true")
     assert set(parts) == {"train", "test"} and list((tmp_path / "parts" / "train").glob("scenes*"))
-    assert "12 scenes on 8 streets of their own" in capsys.readouterr().out
-    with pytest.raises(ConfigError, match=r"out: .* is a bank; give another folder"):
+    assert "12 scenes in 8 groups without common streets" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"out: expected a folder for the banks of the parts, got the bank"):
         command(town, "op=split", *halves, f"out={town.path}")
-    merged = command(parts["train"], "op=merge", f"merge.banks=[{parts['test'].path}]", f"out={tmp_path / 'merged'}")
+    merged = command(parts["train"], "op=select", f"select.banks=[{parts['test'].path}]", f"out={tmp_path / 'merged'}")
     assert sorted(merged.names) == sorted(town.names)
-    assert len(command(town, "op=sample", "sample.share=0.25", "seed=4")) == 3 and len(command(town, "op=dedupe")) == 12
+    both = ["select.dedupe=true", "select.sample.fraction=0.25", "seed=4"]
+    assert len(command(town, "op=select", *both)) == 3 and "dedupe: 12 of 12 scenes\nsample: 3 of 12" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["filtered", "merged", "parts"]  # without `out` nothing is written
 
 
@@ -338,7 +365,7 @@ def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
     bank = banked(tmp_path / "bank", [evil, replace(evil, source="again")])
     command(bank, "op=info")
     command(bank, "op=check")
-    command(bank, "op=dedupe")
+    command(bank, "op=select", "select.dedupe=true")
     command(bank, "op=export", "export.format=gpudrive", f"out={tmp_path / 'out'}")
     with pytest.raises(SystemExit) as ended:
         command_line.end(SceneError(f"scenes.path: no scene\n{name}"))
@@ -349,12 +376,12 @@ def test_names_and_tags_cannot_command_a_terminal(tmp_path, capsys):
 
 def test_a_bank_is_held_against_its_checksums(tmp_path, capsys):
     bank = banked(tmp_path / "bank", [generated(0)])
-    assert len(command(bank, "op=verify")) == 1
-    assert "1 scenes in 1 files, all as they were written" in capsys.readouterr().out
+    assert command(bank, "op=info", "info.verify=true")["all"]["scenes"] == 1
+    assert f"{bank.path}: all files match their checksums" in capsys.readouterr().err
     for name, damage in {"scenes-00000.arrow": lambda old: old[:-1] + b"!", "metadata-00000.arrow": lambda old: old[:-1]}.items():
         (bank.path / name).write_bytes(damage((bank.path / name).read_bytes()))
     with pytest.raises(SceneError, match=r"damaged: scenes-00000\.arrow, metadata-00000\.arrow: not what was written"):
-        command(bank, "op=verify")
+        command(bank, "op=info", "info.verify=true")
 
 
 def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
@@ -363,7 +390,7 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     found = command(bank, "op=info", "info.json=true")
     told = capsys.readouterr()
     assert json.loads(told.out) == found and f"bank {bank.path}, whose conversion was stopped" in told.err
-    command(bank, "op=sample", "sample.count=1", f"out={tmp_path / 'sample'}")
+    command(bank, "op=select", "select.sample.count=1", f"out={tmp_path / 'sample'}")
     assert "whose conversion was stopped" in capsys.readouterr().err
     assert (
         "whose conversion was stopped"
@@ -375,7 +402,7 @@ def test_banks_are_judged_and_compared(town, tmp_path):
     counts = command(town, "op=quality", f"out={tmp_path / 'quality'}", "quality.report.examples=1")
     assert counts.keys() == hydra_config.load_config("scenes")["quality"]["rules"].keys()
     assert "12 scenes" in (tmp_path / "quality" / "quality.md").read_text()
-    others = ["compare.others=[streets]", "compare.limit=2", f"out={tmp_path / 'compared'}"]
+    others = ["compare.others=[streets]", "compare.max_scenes=2", f"out={tmp_path / 'compared'}"]
     text = command(town, "op=compare", *others).read_text()
     assert f"median {town.path.name}" in text and "median streets" in text
 
@@ -383,27 +410,26 @@ def test_banks_are_judged_and_compared(town, tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["op=compare", "out=x"], "compare.others: none; give paths, or entries of `scenes`: streets, town, womd"),
-        (["op=quality"], "out: null; give a folder for the report"),
-        (["op=export", "export.format=bvh", "out=x"], "export.format: 'bvh'; valid: gpudrive, scenarionet"),
-        (["op=export"], "out: null; give a folder for the files"),
-        (["op=polish"], "op: 'polish'; valid: check, sheet, quality, compare, simulate, info, filter"),
-        (["op=filter"], "filter: null; give a condition"),
-        (["op=filter", "filter='cars > 3'"], "filter: unknown column 'cars'"),
-        (["op=filter", "filter='vehicles > 300'"], "none of 12 scenes meets it"),
-        (["op=split"], "split.shares: null; give the parts' shares"),
+        (["op=compare", "out=x"], "compare.others: expected paths, or options of `scenes`: streets, town, womd; got"),
+        (["op=quality"], "out: expected a folder for the report, got null"),
+        (["op=export", "export.format=bvh", "out=x"], "export.format: expected gpudrive or scenarionet, got 'bvh'"),
+        (["op=export"], "out: expected a folder for the files, got null"),
+        (["op=polish"], "op: 'polish'; valid: check, quality, compare, simulate, info, select, split, export$"),
+        (["op=select", "select.filter='cars > 3'"], "select.filter: unknown column 'cars'"),
+        (["op=select", "select.filter='vehicles > 300'"], "none of 12 scenes meets it"),
+        (["op=split"], "split.fractions: expected a fraction per part"),
         (["op=split", "split.by=road"], "split.by: expected scene or streets, got 'road'"),
-        (["op=split", "split.shares={a: 1, b: much}"], "split.shares.b: expected a number, got 'much'"),
-        (["op=split", "split.shares={a: 1}"], "two parts or more"),
-        (["op=sample"], "give one of the two"),
-        (["op=sample", "+sample.size=3"], "sample.size: unknown key; valid: count, share, stratify"),
-        (["op=sheet"], "out: null; give a folder"),
+        (["op=split", "split.fractions={a: 1, b: much}"], "split.fractions.b: expected a number, got 'much'"),
+        (["op=split", "split.fractions={a: 1}"], "two parts or more"),
+        (["op=select", "select.sample.stratify=dataset"], "select.sample: expected count or fraction"),
+        (["op=select", "select.sample.fraction=1.5"], "select.sample.fraction: expected"),
+        (["op=select", "+select.sample.size=3"], "select.sample.size: unknown key; valid: count, fraction, stratify"),
         (["op=info", "scenes.path=null"], "scenes.path: null; op=info needs a bank"),
-        (["op=verify", "scenes.path=null"], "scenes.path: null; op=verify needs a bank"),
-        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: expected a number >= 0, got -1"),
+        (["op=select", "scenes.path=null"], "scenes.path: null; op=select needs a bank"),
+        (["scenes.pack.traffic=-1"], "scenes.pack.traffic: expected an integer >= 0, got -1"),
         (["scenes.pack.scene_size_m=0.0"], "scenes.pack.scene_size_m: expected a number > 0, got 0"),
-        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: \[4.0\]; wanted are length and width"),
-        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: \[4.0, -2.0\]; wanted are length and width"),
+        (["scenes.pack.car_size_m=[4.0]"], r"scenes.pack.car_size_m: expected \[length, width\] or null, got \[4.0\]"),
+        (["scenes.pack.car_size_m=[4.0,-2.0]"], r"scenes.pack.car_size_m: expected .* > 0 or null, got \[4.0, -2.0\]"),
     ],
 )
 def test_what_cannot_be_done_is_named(town, overrides, message):

@@ -7,7 +7,7 @@ import pytest
 from support.scene_documents import FORMATS, checker, document, prepared, written
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.cli.scene_quality import quality as report_quality
+from scenefactory_jax.cli.scenes import quality as report_quality
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import DRIVEWAY, EDGES
@@ -20,14 +20,14 @@ from scenefactory_jax.roadgraph import lane_topology
 
 QUALITY = hydra_config.load_config("scenes")["quality"]
 STREETS = hydra_config.load_config("scenes")["scenes"]["generate"]
-RULES = quality_gate.make(QUALITY["rules"])
+RULES = quality_gate.make(QUALITY)
 rebuild = instantiate(hydra_config.load_config("scenes")["lanes"]["topology"], builtins=lane_topology, where="lanes.topology")
 LOG = 91
 ALONG = np.arange(0.0, 121.0)
 
 
 def judge(raw):
-    return quality_gate.find_defects(raw, RULES, reject=QUALITY["reject"], drop=QUALITY["drop"])
+    return quality_gate.find_defects(raw, RULES)
 
 
 def line(id, points, kind=2, height=0.0, **relations):
@@ -133,7 +133,7 @@ def test_a_defect_is_found_by_its_rules_alone(defect):
 
 def test_every_rule_has_its_defect_here():
     found = set().union(*(rules for _, rules, _ in DEFECTS.values()))
-    assert found | {"edges_across_driveways"} == set(RULES)
+    assert found | {"edges_across_driveways"} == set(RULES.rules)
 
 
 def test_a_sound_street_and_generated_scenes_have_no_findings():
@@ -164,7 +164,7 @@ def test_places_and_steps_are_those_of_the_defect():
 
 
 def gate(raw, reject=(), drop=()):
-    return quality_gate.gate(raw, RULES, check=checker(), reject=list(reject), drop=list(drop))
+    return quality_gate.gate(raw, quality_gate.make(QUALITY | {"reject": list(reject), "drop": list(drop)}), check=checker())
 
 
 def test_the_gate_judges_what_the_check_makes_of_a_scene_and_passes_the_whole():
@@ -174,8 +174,8 @@ def test_the_gate_judges_what_the_check_makes_of_a_scene_and_passes_the_whole():
     assert passed.tracks == boxless.tracks and passed.metadata["quality"] == {}
     broken = replace(scene.roads[0], xyz=np.full((3, 3), np.nan))
     for message, bad in {
-        "times: they must be finite and rise from step to step": replace(scene, times=np.zeros(len(scene.times))),
-        r"roads\[0\] \(id 1\): xyz\[0\]\[0\]: nan is not finite": replace(scene, roads=(broken, *scene.roads[1:])),
+        "times: expected finite times that rise from step to step": replace(scene, times=np.zeros(len(scene.times))),
+        r"roads\[0\] \(id 1\): xyz\[0\]\[0\]: expected a finite number up to .*, got nan": replace(scene, roads=(broken, *scene.roads[1:])),
     }.items():
         with pytest.raises(SceneError, match=message):  # in its words, not in those of a library that stumbles over it
             conversion.complete(bad, check=checker(), rebuild=rebuild, gate=gate)
@@ -209,14 +209,16 @@ def test_the_gate_refuses_drops_and_counts():
     left = gate(replace(jumping, sdc=1), drop=["jumps"])
     assert [track.id for track in left.tracks] == [8] and left.sdc == 0
     assert gate(jumping, drop=["jumps"]).sdc is None
-    with pytest.raises(ConfigError, match=r"quality\.drop: 'jump' is no rule"):
+    with pytest.raises(ConfigError, match=r"quality\.drop: expected names of rules, got 'jump'"):
         gate(jumping, drop=["jump"])
 
 
 def test_a_rule_of_one_s_own_is_an_entry_and_a_rule_can_be_left_out():
-    rules = quality_gate.make({"times": None, "crowded": {"_target_": f"{__name__}.crowded", "most": 1}})
-    assert list(rules) == ["crowded"]
-    (finding,) = quality_gate.find_defects(street(), rules, reject=["crowded"], drop=[]).rejected
+    rules = quality_gate.make(
+        {"rules": {"times": None, "crowded": {"_target_": f"{__name__}.crowded", "most": 1}}, "reject": ["crowded"], "drop": []}
+    )
+    assert list(rules.rules) == ["crowded"]
+    (finding,) = quality_gate.find_defects(street(), rules).rejected
     assert (finding.rule, finding.value, finding.limit) == ("crowded", 2.0, 1.0)
 
 
@@ -233,7 +235,7 @@ def test_the_report_counts_and_draws(tmp_path, capsys):
     assert counts["length"] == (cars, 2, cars) and counts["times"] == (0, 0, 0)
     text = (tmp_path / "quality.md").read_text()
     assert f"| length | {cars} | 2 | {cars} | 100 % | drops |" in text and (tmp_path / "length.png").stat().st_size > 10_000
-    assert f"2 scenes judged, 0 refused, {cars} objects left out" in capsys.readouterr().out
+    assert f"2 scenes checked, 0 refused, {cars} objects left out" in capsys.readouterr().out
 
 
 def test_what_the_check_refuses_is_not_judged(tmp_path, capsys):
@@ -241,7 +243,7 @@ def test_what_the_check_refuses_is_not_judged(tmp_path, capsys):
     written(tmp_path, document(roads=document()["roads"][:1]), "laneless.json")
     scenes = hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={tmp_path}")["scenes"]
     counts = report_quality({"scenes": scenes, "quality": QUALITY | {"drop": []}, "out": str(tmp_path / "out")})
-    assert counts["missing_map"].findings == 0 and "1 scenes judged, 0 refused, 0 objects left out, 1 not read" in capsys.readouterr().out
+    assert counts["missing_map"].findings == 0 and "1 scenes checked, 0 refused, 0 objects left out, 1 not read" in capsys.readouterr().out
     assert "no driving lane" in (tmp_path / "out" / "quality.md").read_text()
 
 

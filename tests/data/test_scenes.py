@@ -32,7 +32,7 @@ from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import EDGES, POLYGONS
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
-from scenefactory_jax.data.loading import raw_scenes
+from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, pack
 
 
@@ -79,7 +79,7 @@ def test_anything_is_read_from_python(tmp_path):
 def test_a_reader_that_breaks_costs_its_file_alone(tmp_path):
     for name in ("a", "b_broken", "c_two", "d_map", "e"):
         written(tmp_path, document(name=name), f"{name}.json")
-    found = list(raw_scenes.scenes({"path": str(tmp_path), "formats": {"eventful": {"_target_": "support.eventful.read"}}}))
+    found = list(scene_source.read_scenes({"path": str(tmp_path), "formats": {"eventful": {"_target_": "support.eventful.read"}}}))
     assert [one if isinstance(one, str) else one.name for one in found] == [
         "a", f"{tmp_path / 'b_broken.json'}: KeyError: 'x'", "c_two",
         f"{tmp_path / 'c_two.json'}: second: record 2 at byte 77: its checksum is wrong", "c_two", "e",
@@ -271,25 +271,26 @@ def test_refusals_name_the_element(street):
     refused(r"no driving lane.*15, 17", roads=(street.roads[0], street.roads[2]))
     broken = street.roads[1].xyz.copy()
     broken[4, 1] = np.nan
-    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: nan", roads=(street.roads[0], replace(street.roads[1], xyz=broken)))
+    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: expected a finite number up to 1e\+07 .*, got nan", roads=(
+        street.roads[0], replace(street.roads[1], xyz=broken)))  # fmt: skip
     yaw = street.tracks[1].yaw.copy()
     yaw[3] = np.inf
-    refused(r"tracks\[1\] \(id 8\): yaw\[3\]: inf", tracks=(street.tracks[0], replace(street.tracks[1], yaw=yaw)))
-    refused("current: 40 is no step", current=40)
+    refused(r"tracks\[1\] \(id 8\): yaw\[3\]: expected a finite .*, got inf", tracks=(street.tracks[0], replace(street.tracks[1], yaw=yaw)))
+    refused("current: expected a step of the log, 0 to 11, got 40", current=40)
     far = street.roads[1].xyz.copy()
     far[4, 1] = -1e39  # finite, but not in float32
-    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: -1e\+39 is too large; valid: up to 1e\+07", roads=(
+    refused(r"roads\[1\] \(id 1\): xyz\[4\]\[1\]: expected up to 1e\+07 \(scenes.check.max_coordinate_m\), got -1e\+39", roads=(
         street.roads[0], replace(street.roads[1], xyz=far)))  # fmt: skip
     fast = street.tracks[1].velocity.copy()
     fast[5, 0] = 1e39
-    refused(r"tracks\[1\] \(id 8\): velocity\[5\]: 1e\+39 is too large", tracks=(
+    refused(r"tracks\[1\] \(id 8\): velocity\[5\]: expected up to 340 .*, got 1e\+39", tracks=(
         street.tracks[0], replace(street.tracks[1], velocity=fast)))  # fmt: skip
     long = replace(street.tracks[0], size=(1e39, 2.0, 1.0))
-    refused(r"tracks\[0\] \(id 7\): size\[0\]: 1e\+39 is too large", tracks=(long, street.tracks[1]))
-    refused("times: they must be finite and rise", times=np.zeros(STEPS))
-    refused("sdc: 5 is no track", sdc=5)
+    refused(r"tracks\[0\] \(id 7\): size\[0\]: expected up to 100 .*, got 1e\+39", tracks=(long, street.tracks[1]))
+    refused("times: expected finite times that rise", times=np.zeros(STEPS))
+    refused("sdc: expected a track, 0 to 1, got 5", sdc=5)
     light = Light(lane=1, state=np.zeros(STEPS - 1, int), valid=np.ones(STEPS - 1, bool))
-    refused(rf"lights\[0\] \(lane 1\): {STEPS - 1} steps; the log has {STEPS}", lights=(light,))
+    refused(rf"lights\[0\] \(lane 1\): expected {STEPS} steps, as the log has, got {STEPS - 1}", lights=(light,))
 
 
 def test_no_single_number_asks_for_much_work(street):
@@ -302,18 +303,19 @@ def test_no_single_number_asks_for_much_work(street):
     edge, lane, sign = street.roads
     car, other = street.tracks
     far = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e7, 0.0, 0.0]])
-    message = r"roads\[1\] \(id 1\): the segment from xyz\[1\] is 1e\+07 m long; valid: up to 1000 \(scenes\.check\.max_segment_m\)"
+    message = r"roads\[1\] \(id 1\): length from xyz\[1\] on: expected up to 1000 \(scenes\.check\.max_segment_m\), got 1e\+07"
     refused(message, roads=(edge, replace(lane, xyz=far), sign))
     refused(r"roads\[0\].*max_segment_m", roads=(replace(edge, xyz=far[1:]), lane))
     to_and_fro = 900.0 * (np.arange(120) % 2)[:, None] * np.array([1.0, 0.0, 0.0])
-    message = r"roads: 107180 m of driving lanes; valid: up to 100000 \(scenes\.check\.max_lanes_m\)"
+    message = r"roads: length of all driving lanes: expected up to 100000 \(scenes\.check\.max_lanes_m\), got 107180"
     refused(message, roads=(edge, lane, replace(lane, id=5, xyz=to_and_fro)))
     checker()(replace(street, roads=(replace(edge, xyz=to_and_fro), lane)))  # nothing counts along edges
-    refused(r"tracks\[1\] \(id 8\): velocity\[0\]: 9e\+06 .* 340", tracks=(car, replace(other, velocity=other.velocity + 9e6 - 40)))
-    refused(r"size\[1\]: 1e\+06 is too large; valid: up to 100 \(scenes\.check\.max_size", tracks=(replace(car, size=(4.0, 1e6, 1.0)),))
-    refused(r"times: 20000 steps; valid: up to 10000 \(scenes\.check\.max_steps\)", times=np.arange(20_000.0))
-    refused(r"times\[11\]: 1e\+06 s after the step before; valid: 0\.001 to 10 s", times=np.append(street.times[:-1], 1e6 + 1.0))
-    refused(r"times\[1\]: 1e-12 s after", times=1e-12 * np.arange(STEPS))
+    fast = replace(other, velocity=other.velocity + 9e6 - 40)
+    refused(r"tracks\[1\] \(id 8\): velocity\[0\]: expected up to 340 .*, got 9e\+06", tracks=(car, fast))
+    refused(r"size\[1\]: expected up to 100 \(scenes\.check\.max_size_m\), got 1e\+06", tracks=(replace(car, size=(4.0, 1e6, 1.0)),))
+    refused(r"times: expected up to 10000 steps \(scenes\.check\.max_steps\), got 20000", times=np.arange(20_000.0))
+    refused(r"times\[11\]: .* 0\.001 to 10 s \(scenes\.check\.step_s\), got 1e\+06 s", times=np.append(street.times[:-1], 1e6 + 1.0))
+    refused(r"times\[1\]: expected a step of .*, got 1e-12 s", times=1e-12 * np.arange(STEPS))
 
 
 def test_a_jitter_of_the_clock_is_resampled_and_counted(street):

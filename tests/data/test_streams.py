@@ -1,6 +1,7 @@
 """Scenes that pass through the worlds: what a swap changes, what samplers draw, what is loaded, and that a resumed run is unbroken."""
 
 import contextlib
+import json
 from types import SimpleNamespace
 
 import jax
@@ -76,7 +77,7 @@ def test_a_swap_is_a_fresh_start_in_those_scenes(swapped):
     assert not np.asarray(state.worlds.state.step)[swapped.worlds].any()  # or the clock would cut lives short, which count as failures
 
 
-def test_a_swap_leaves_everybody_else_alone(swapped):
+def test_a_swap_changes_no_other_world(swapped):
     others = np.setdiff1d(np.arange(WORLDS), swapped.worlds)
     rest = lambda tree: jax.tree.map(lambda leaf: leaf[others], tree)  # noqa: E731
     (before, stage_before), (after, stage_after) = swapped.before, swapped.after
@@ -150,7 +151,7 @@ def test_failing_scenes_come_more_often_in_proportion_to_failure():
 
 
 @pytest.mark.parametrize("floor", [0.25, 1.0])
-def test_failing_starves_nobody(floor):
+def test_failing_scenes_leave_draws_for_all_others(floor):
     """Whatever happens, every scene comes once in N / floor draws, again and again."""
     scenes_, rounds = 60, 4
     episodes = np.full(scenes_, 50.0)
@@ -169,8 +170,8 @@ def test_failing_draws_new_scenes_of_an_endless_source():
     np.testing.assert_array_equal(known.successes[:4], [0, 0, 0, 4])  # never more than lives
     drawn = samplers.prioritize_failures(known, 6, seed=0, floor=0.5)
     assert set(drawn[:2]) == {2, 3} and list(drawn[2:]) == [10, 11, 12, 13]  # only two were driven in: new ones fill up
-    with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: 0\.0; .* scenes could starve"):
-        samplers.prioritize_failures(known, 6, seed=0, floor=0.0)
+    with pytest.raises(ConfigError, match=r"stream\.sampler\.floor: expected a number > 0 and <= 1, got 0"):
+        instantiate({"_target_": "prioritize_failures", "floor": 0.0}, builtins=samplers, where="stream.sampler", seed=0)
 
 
 def test_what_was_learnt_earlier_fades():
@@ -237,6 +238,28 @@ def test_every_world_holds_the_scene_that_the_stream_says():
     assert (settled[3:] > 0).all() and told["draws"] == [1] * 24
 
 
+def test_a_resumed_stream_brings_the_scenes_of_an_unbroken_one():
+    found = entry("worlds=6", "stream=failing")
+    _, swap = flowing(found)
+
+    def advance(flow, turns):
+        held = flow.scenes()
+        for turn in turns:
+            _, held = flow.exchange(swap, None, held)
+            flow.draw()
+            flow.note(np.full(6, 3), np.arange(6) % (turn + 2))
+        return held, json.loads(json.dumps(flow.state()))
+
+    with stream.open_stream(found, mesh=None, before=None) as flow:
+        whole, whole_state = advance(flow, range(5))
+    with stream.open_stream(found, mesh=None, before=None) as flow:
+        _, state = advance(flow, range(2))
+    with stream.open_stream(found, mesh=None, before=state) as flow:
+        resumed, resumed_state = advance(flow, range(2, 5))
+    assert resumed_state == whole_state and state != whole_state and whole_state["exchanges"] == 5
+    same(resumed, whole)
+
+
 def test_a_bank_and_a_generator_stream_the_same_scenes(tmp_path, monkeypatch):
     monkeypatch.setattr(bank_reader, "SHARD", 2)  # scenes 1 and 4 lie in different files
     found = entry("scenes.pack.agents=3")
@@ -300,10 +323,10 @@ def test_room_for_more_changes_no_look_up():
     [
         (["stream.capacity.road=8"], r"stream\.capacity\.road: 8; all 4 scenes of the sample need more: 177 to 213"),
         (["stream.capacity.road=1000000000"], r"stream\.capacity\.road: 1000000000; the scenes of 8 worlds would take .* GiB, stream\.mem"),
-        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected 1 or more"),
+        (["stream.capacity.lanes=true"], r"stream\.capacity\.lanes: expected an integer or null, got True"),
         (["+stream.capacity.lane=8"], r"stream\.capacity\.lane: unknown; valid: road, lanes, "),
         (["stream.swap_fraction=1.5"], r"stream\.swap_fraction: expected a number >= 0 and <= 1, got 1\.5"),
-        (["stream.prefetch=0"], r"stream\.prefetch: expected a number >= 1, got 0"),
+        (["stream.prefetch=0"], r"stream\.prefetch: expected an integer >= 1, got 0"),
         (["stream.on_overflow=drop"], r"stream\.on_overflow: expected cut or skip, got 'drop'"),
         (["stream.sampler._target_=random"], r"stream\.sampler\._target_: 'random' is not in .*; valid: .*prioritize_failures, .*shuffled"),
         (["+stream.speed=2"], r"stream\.speed: unknown key"),
@@ -349,6 +372,7 @@ def streamed(folder, *overrides):
     return found
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_run_is_the_unbroken_one(tmp_path):
     whole = run_train(streamed(tmp_path / "whole", "iterations=5", "checkpoint_every=2"))
 

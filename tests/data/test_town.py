@@ -2,27 +2,28 @@
 
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 import shapely
 import yaml
 
 from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, SceneError
 from scenefactory_jax.core.types import DRIVABLE, EDGES, STOP_SIGN
 from scenefactory_jax.data.curation import distribution_distance
 from scenefactory_jax.data.generators.town import (
     driver_model,
+    intersections,
     lane_paths,
-    network_choice,
-    path_conflicts,
     street_plan,
     town_scene,
     traffic_lights,
 )
-from scenefactory_jax.data.generators.town.intersections import Arm, find_turns, intersection
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Street, assemble
+from scenefactory_jax.data.generators.town.intersections import Arm, find_turns
+from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, Street
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing.pack import prepare
 from scenefactory_jax.visualization.report import scene_comparison
@@ -41,9 +42,13 @@ def generator(**changes):
 
 @pytest.fixture(scope="module")
 def scenes():
-    """A series, and two motorways, which are rare."""
+    """A series, and two motorways, which are rare. All but the first are made without checks of annotations, in a fourth of the time."""
     town, motorway = generator(), generator(network=NETWORK | {"motorway_fraction": 1.0})
-    return [town(8, index) for index in range(COUNT)] + [motorway(8, COUNT), motorway(8, COUNT + 1)]
+    first = town(8, 0)
+    jaxtyping.config.update("jaxtyping_disable", True)
+    others = [*(town(8, index) for index in range(1, COUNT)), motorway(8, COUNT), motorway(8, COUNT + 1)]
+    jaxtyping.config.update("jaxtyping_disable", False)
+    return [first, *others]
 
 
 def lanes_of(scene):
@@ -171,12 +176,12 @@ def test_cars_wait_at_red_lights(scenes):
 def test_conflicting_lights_are_never_green_together():
     street = Street(2, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
     arms = [Arm(yaw, street, 2, 2) for yaw in (0.0, 1.6, 3.1, 4.7)]
-    numbers = {key: value for key, value in NETWORK["blocks"]["intersection"].items() if key != "_target_"}
-    block = intersection(np.random.default_rng(0), np.zeros(2), arms, "signal", **numbers)
-    network = assemble([block], [])
+    network = Network()
+    build = instantiate(NETWORK["blocks"]["intersection"], builtins=intersections, where="intersection")
+    build(np.random.default_rng(0), network, np.zeros(2), arms, "signal")
     times = np.arange(0.0, 200.0, 0.1)
-    light = {key: value for key, value in CONFIG["traffic_lights"].items() if key != "_target_"}
-    state = traffic_lights.draw_gates(np.random.default_rng(1), network, times, **light).state
+    draw = instantiate(CONFIG["traffic_lights"], builtins=traffic_lights, where="traffic_lights")
+    state = draw(np.random.default_rng(1), network, times).state
     moving = state != traffic_lights.CLOSED
     arm = np.array([stop.arm for stop in network.stops])
     for one in range(len(arm)):
@@ -260,7 +265,7 @@ def test_the_demo_runs_on_towns():
         ({"log_current": 90}, "generate.log_current"),
         ({"network": NETWORK | {"streets": {"minor": MINOR | {"lanes": [2, 1]}}}}, "streets.minor.lanes"),
         ({"network": NETWORK | {"streets": {"minor": MINOR | {"tram_share": 1.0}}}}, "streets.minor.tram_share"),
-        ({"network": NETWORK | {"blocks": {"roundabout": NETWORK["blocks"]["roundabout"]}}}, "network.blocks.driveway"),
+        ({"network": NETWORK | {"blocks": {"roundabout": NETWORK["blocks"]["roundabout"]}}}, "network.blocks.intersection: missing"),
         ({"traffic": TRAFFIC | {"driver": TRAFFIC["driver"] | {"headway_s": 0.0}}}, "traffic.driver.headway_s"),
         ({"traffic": TRAFFIC | {"cars": [5, 3]}}, "traffic.cars"),
         ({"network": NETWORK | {"roads": NETWORK["roads"] | {"kerb_m": 1.0}}}, "network.roads.kerb_m"),
@@ -273,7 +278,7 @@ def test_bad_numbers_are_refused_by_name(changes, named):
 
 def test_a_grid_without_its_middle_crossing_is_drawn_anew():
     draw = instantiate(NETWORK["plans"]["grid"], builtins=street_plan, where="grid")
-    classes = [network_choice._make_class("minor", 1, MINOR)]
+    classes = {1: schema.read(MINOR, street_plan.StreetClass)}
     drawn = [draw(np.random.default_rng(seed), 45.0, classes) for seed in range(20)]
     assert {plan is None for plan in drawn} == {True, False} and all(plan.edges for plan in drawn if plan)
 
@@ -286,40 +291,30 @@ def test_too_many_cars_are_refused(monkeypatch):
         jammed(0, 0)
 
 
-def follow(begin, speed, seconds, *, ways=None, ranks=(ON_ROAD, ON_ROAD), gate=(), gates=None):
-    """Two cars on given ways (the same straight one) for a while, in steps of 0.1 s."""
-    straight = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
-    ways = ways or (straight, straight)
-    paths = [
-        lane_paths.make_path([piece], limit_fraction=1.0, lateral=2.0, braking=2.0)._replace(gates=gate)
-        for piece in (lane_paths.PathPiece(way, 15.0, rank, None, 0) for way, rank in zip(ways, ranks, strict=True))
-    ]
-    users = driver_model.Users(np.full(2, 4.0), np.full(2, 2.0), np.array(begin), np.array(speed), np.full(2, -np.inf))
-    table, zones = path_conflicts.find_conflicts(paths, users.width)
+STRAIGHT = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
+
+
+def drive(ways, speeds, seconds, *, limits=(15.0, 15.0), ranks=(ON_ROAD, ON_ROAD), gates=(), states=None):
+    """Two cars from the starts of their ways, in steps of 0.1 s."""
+    users = []
+    for way, speed, limit, rank in zip(ways, speeds, limits, ranks, strict=True):
+        path = lane_paths.make_path([lane_paths.PathPiece(way, limit, rank, None, 0)], limit_fraction=1.0, lateral=2.0, braking=2.0)
+        users.append(driver_model.SimulatedUser("vehicle", (4.0, 2.0, 1.5), path._replace(gates=gates), speed))
     times = np.arange(0.0, seconds, 0.1)
-    state = np.zeros((0, len(times)), int) if gates is None else gates(times)
-    return driver_model.simulate(paths, users, table, zones, state, times, DRIVER)
+    states = np.zeros((0, len(times)), int) if states is None else states(times)
+    return driver_model.simulate(users, states, times, DRIVER)
 
 
 def test_a_follower_keeps_the_gap_of_the_idm():
     """Behind a car at speed v the IDM's gap is (s0 + v T) / sqrt(1 - (v / v0)^4)."""
-    slow = np.stack([np.arange(0.0, 900.0, 0.5), np.zeros(1800)], -1)
-    paths = [
-        lane_paths.make_path([lane_paths.PathPiece(slow, limit, ON_ROAD, None, 0)], limit_fraction=1.0, lateral=2.0, braking=2.0)
-        for limit in (15.0, 8.0)
-    ]
-    users = driver_model.Users(np.full(2, 4.0), np.full(2, 2.0), np.array([0.0, 60.0]), np.array([15.0, 8.0]), np.full(2, -np.inf))
-    table, zones = path_conflicts.find_conflicts(paths, users.width)
-    times = np.arange(0.0, 80.0, 0.1)
-    motion = driver_model.simulate(paths, users, table, zones, np.zeros((0, len(times)), int), times, DRIVER)
-    gap, speed = motion.place[-1, 1] - motion.place[-1, 0] - 4.0, motion.speed[-1, 1]
+    motion = drive((STRAIGHT, STRAIGHT[120:]), (15.0, 8.0), 80.0, limits=(15.0, 8.0))
+    gap, speed = 60.0 + motion.place[-1, 1] - motion.place[-1, 0] - 4.0, motion.speed[-1, 1]
     assert gap == pytest.approx((DRIVER.gap_m + speed * DRIVER.headway_s) / np.sqrt(1 - (speed / 15.0) ** 4), rel=0.03)
 
 
 def test_a_car_stops_at_a_red_light_and_goes_when_it_is_green():
-    gate = ((100.0, 0),)
-    turns = lambda times: np.where(times < 25.0, traffic_lights.CLOSED, traffic_lights.OPEN)[None]  # noqa: E731
-    motion = follow([0.0, 300.0], [10.0, 10.0], 40.0, gate=gate, gates=turns)
+    states = lambda times: np.where(times < 25.0, traffic_lights.CLOSED, traffic_lights.OPEN)[None]  # noqa: E731
+    motion = drive((STRAIGHT, STRAIGHT[600:]), (10.0, 10.0), 40.0, gates=((100.0, 0),), states=states)
     front = motion.place[:, 0] + 2.0
     assert 97.5 < front[240] <= 100.0 and motion.speed[240, 0] < 0.1 and front[-1] > 120.0
 
@@ -328,7 +323,7 @@ def test_the_lower_rank_waits_where_ways_cross():
     """Both would be at the crossing at once; the car with the right of way does not slow down."""
     east = np.stack([np.arange(-60.0, 60.0, 0.5), np.zeros(240)], -1)
     for ranks, winner in (((5, 1), 0), ((1, 5), 1)):
-        motion = follow([0.0, 0.0], [9.0, 9.0], 16.0, ways=(east, east[:, ::-1].copy()), ranks=ranks)
+        motion = drive((east, east[:, ::-1].copy()), (9.0, 9.0), 16.0, ranks=ranks)
         assert motion.speed[motion.present[:, winner], winner].min() > 8.5 and motion.speed[:, 1 - winner].min() < 5.0
         apart = np.abs(np.stack([motion.place[:, 0] - 60, motion.place[:, 1] - 60])).max(axis=0)
         assert apart[motion.present.all(axis=1)].min() > 3.0
@@ -351,7 +346,7 @@ def test_realism_separates_different_sets(scenes):
     assert distribution_distance.mean_distance(same) == 0.0 and all(one is None or one.wasserstein == 0.0 for one in same.values())
     slow = half | {"speed_mps": half["speed_mps"] + 100.0}
     apart = distribution_distance.compare(half, slow)["speed_mps"]
-    assert apart is not None and apart.ks == 1.0 and apart.medians[1] - apart.medians[0] == pytest.approx(100.0)
+    assert apart is not None and apart.ks == 1.0
     assert distribution_distance.mean_distance(distribution_distance.compare(half, other)) < 0.35
     assert distribution_distance.compare(half, other | {"lights": np.zeros(3)})["lights"] is None
 

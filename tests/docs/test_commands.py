@@ -13,6 +13,7 @@ from test_extension import BACKEND, READER
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.scenes import scenes
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.learning.training_loop import train
 
 PAGES = ["README.md", "docs/commands.md", "docs/extending.md", "docs/sweeps.md"]
@@ -24,7 +25,7 @@ SHORTER = {  # words of the pages, and what stands for them here
     "common=[minutes=2]": "common=[iterations=1]",
     "until_s=540": "until_s=5400",
     "out=train.bank": "out=again.bank",  # that one is there already
-    "filter=moving_vehicles >= 8 and intersections > 0": "filter=moving_vehicles >= 2",
+    "select.filter=moving_vehicles >= 8 and intersections > 0": "select.filter=moving_vehicles >= 2",
 }
 SMALL = {
     "train": ["progress=false", "iterations=1", "evaluation.video.enable=false", "evaluation.untrained=false"],
@@ -38,7 +39,7 @@ SMALL = {
         "sysid.every=40",
         "sysid.refine.rounds=1",
     ],
-    "scenes": ["progress=false", "limit=2"],
+    "scenes": ["progress=false", "check.max_pictures=2"],
     "convert": ["progress=false"],
 }
 
@@ -65,7 +66,7 @@ def desk(tmp_path_factory):
         train(smoke(folder / "runs" / "RUN", "evaluation.enable=false"))
     for seed, name in enumerate(("A-0", "A-1", "B", "wet-0")):
         shutil.copytree(folder / "runs" / "RUN", folder / "runs" / name)
-        hydra_config.write(folder / "runs" / name, {**hydra_config.read(folder / "runs" / name), "seed": seed})
+        run_config.write(folder / "runs" / name, {**hydra_config.read(folder / "runs" / name), "seed": seed})
     own = {"my_backend.py": textwrap.dedent(BACKEND), "my_reader.py": textwrap.dedent(READER)}
     for name, code in (own | snippets((ROOT / "docs" / "extending.md").read_text())).items():
         (folder / name).write_text(code)

@@ -16,6 +16,7 @@ from support.running import ROOT, shell, smoke
 import scenefactory_jax.__main__ as command_line
 from scenefactory_jax.cli import error_messages, hydra_config
 from scenefactory_jax.cli.train import train
+from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.data.bank import bank_index
 from scenefactory_jax.data.loading import scene_source
@@ -40,9 +41,8 @@ def place(tmp_path_factory):
     (folder / "old.bank" / bank_index.INDEX).write_text(json.dumps({"format": bank_index.FORMAT, "schema": 2}))
     (folder / "my_reward.py").write_text(OWN_REWARD)
     shutil.copytree(folder / "runs" / "mine", folder / "runs" / "damaged")
-    shutil.copytree(folder / "runs" / "mine" / "checkpoints" / "1", folder / "runs" / "damaged" / "checkpoints" / "2")
-    (folder / "runs" / "damaged" / "checkpoints" / "2" / "parameters" / "_METADATA").write_text("{")
-    hydra_config.write(folder / "runs" / "theirs", smoke(None, "+reward.haste={_target_: my_reward.haste, weight: 1.0}"))
+    (folder / "runs" / "damaged" / "checkpoints" / "2.npz").write_text("{")
+    run_config.write(folder / "runs" / "theirs", smoke(None, "+reward.haste={_target_: my_reward.haste, weight: 1.0}"))
     return folder
 
 

@@ -13,13 +13,15 @@ from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics import collision
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 NUMBERS = yaml.safe_load((ROOT / "conf" / "dynamics" / "base.yaml").read_text())["contact"]
 MASS = NUMBERS["mass"]
 touch = jax.jit(jax.vmap(collision.find_box_contact))
 
 
 def with_numbers(**changes):
-    model = collision.make(**{**NUMBERS, "height": 1.0, **changes})
+    model = collision.make_contact(NUMBERS | changes, height=1.0)
     return lambda cars, others: model.forces(cars, model.neighbours(cars, others))
 
 

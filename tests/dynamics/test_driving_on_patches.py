@@ -18,6 +18,8 @@ from scenefactory_jax.core.types import SURFACES, Patches
 from scenefactory_jax.weather.friction import make_uniform
 from scenefactory_jax.weather.patches import read_condition
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 G, CARS, CHUNK = 9.81, 8, 30
 LANES = 500.0 * np.arange(CARS)
 MU = {"AC": 1.1048, "GRAVEL": 0.6, "SNOW": 0.2, "ICE": 0.1}

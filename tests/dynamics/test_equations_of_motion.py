@@ -67,36 +67,36 @@ def cases(model):
 
 
 def step_input(own, qpos, qvel, inputs, friction):
-    """State of one car; forces, friction loss and tyre input of a step."""
+    """The input of a step of one car."""
     (command, push, mu), state = inputs, states.from_mujoco(own.car, qpos, qvel)
     drive = actuators.compute_drive_torque(own.car, command.drive_torque, state.spin)
     forces = actuators.compute_applied_forces(own.car, state, command.steer, drive, push)
-    return state, (forces, friction, tyres.TyreInput(mu, tyres.compute_slip_damping(own.car, state)))
+    tyre = tyres.TyreInput(mu, tyres.compute_slip_damping(own.car, state))
+    return closed_form_step.StepInput(own, state, forces, friction, tyre)
 
 
 def of_closed_form(own, *case):
     """The problem in closed form, and the rows of which tyres count."""
-    state, load = step_input(own, *case)
-    patch = tyres.find_contact_patches(own.car, state)
-    return closed_form_step.make_contact_problem(own, state, patch, *load, **STEP), patch.depth > 0.0
+    inputs = step_input(own, *case)
+    patch = tyres.find_contact_patches(own.car, inputs.state)
+    return closed_form_step.make_contact_problem(inputs, patch, **STEP), patch.depth > 0.0
 
 
 def of_mjx(own, *case, stages):
     """MJX's model and data, and the reference with what `tyres.turning` adds."""
     qpos, qvel = case[:2]
-    state, load = step_input(own, *case)
-    own_model, data = mjx_backend.compute_smooth_dynamics(
-        stages, mjx_backend.fit_model(stages, own), state, *load, qpos, qvel
-    )
+    inputs = step_input(own, *case)
+    state = inputs.state
+    own_model, data = mjx_backend.compute_smooth_dynamics(stages, mjx_backend.fit_model(stages, own), inputs, qpos, qvel)
     away = tyres.compute_jdot_qvel(tyres.find_contact_patches(own.car, state), equations_of_motion.compute_bias_acceleration(state))
     turn = jnp.stack([dot(axis, away) for axis in (state.north, -state.east)], axis=-1)
-    return own_model, data, data._impl.efc_aref.at[stages.rows[:, 1:]].add(-turn), load
+    return own_model, data, data._impl.efc_aref.at[stages.rows[:, 1:]].add(-turn), inputs
 
 
 def problem_of_mjx(own, *case, stages):
-    _, data, reference, load = of_mjx(own, *case, stages=stages)
+    _, data, reference, inputs = of_mjx(own, *case, stages=stages)
     rows, rotation = data._impl, jnp.stack([jnp.stack(row) for row in states.rotation_matrix(case[0][3:7])])
-    arrays = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, load[2].mu, load[1])
+    arrays = (rows.M, data.qfrc_smooth, rows.efc_J, reference, rows.efc_D, inputs.tyre.mu, inputs.friction_loss)
     return taken_apart(*arrays, stages=stages, friction_ratio=SOLVER.friction_ratio, rotation=rotation)
 
 
@@ -175,6 +175,7 @@ def test_inertia_and_forces_are_the_c_engines(cases, seed):
     assert (apart < 2e-5 * np.maximum(np.abs(wanted).max(0), 10.0)).all(), apart / np.abs(wanted).max(0)
 
 
+@pytest.mark.slow
 def test_slopes_of_the_problem_are_those_of_mjx(quick, crew, cases, stages):
     """Of a weighted sum of its numbers, with respect to the car's own, its velocities and what it is told. The solver's are its own."""
     few = jax.tree.map(lambda leaf: leaf[:12], (crew, *cases))
@@ -283,10 +284,8 @@ def test_the_solver_converges_where_it_is_compiled_with_its_problem():
         articulated_car.compile_car(CAR, dataclasses.replace(SOLVER, **more), brakes="friction", physics_dt=DT, control_dt=4 * DT)
         for more in ({}, {"iterations": 20, "line_search": 10})
     ]
-    shipped, patient = (
-        jax.jit(jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.constants, {})), compiler_options=BY_DEFAULT)
-        for plant in plants
-    )
+    steps = [jax.vmap(functools.partial(articulated_car.physics_step, plant, plant.constants, {})) for plant in plants]
+    shipped, patient = jax.jit(steps[0], compiler_options=BY_DEFAULT), jax.jit(steps[1])
     draw = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (count, *shape)), jnp.float32)  # noqa: E731
     qpos = jnp.tile(jnp.asarray(plants[0].rest_pose, jnp.float32), (count, 1))
     speed = draw(0.0, 25.0)

@@ -13,6 +13,8 @@ from experiments.validation import extreme_states, robustness_report
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 BOUNDS = dict(speed_max=80.0, rise_max_m=10.0, sink_max_m=0.5, acceleration_max=2000.0, gain_max=0.02)
 SIZES = dict(wall_m=60.0, hold_s=0.2, physics_hz=120.0, control_hz=30.0)
 

@@ -9,6 +9,8 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import AgentLog
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 
 def logged(valid):
     """Cars that run at 10 m/s along x and turn at 0.5 rad/s through the wrap of the angle, every 0.1 s."""

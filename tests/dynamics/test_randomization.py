@@ -24,6 +24,8 @@ from scenefactory_jax.dynamics.articulated import constants, mjx_backend, random
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CAR, SOLVER = numbers_of("articulated")
 COMPILED = {"physics_dt": 1 / 120, "visual": False, "brake_rows": True}
 WHEEL_BODIES, CHASSIS = [2, 3, 4, 5], 1

@@ -17,6 +17,8 @@ from scenefactory_jax.dynamics.articulated import actuators, constants, randomiz
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 FREE = dataclasses.replace(  # nothing else slows it
     CAR, wheel_damping=0.0, yaw_damping=0.0, rolling_torque=0.0, air_drag=0.0, tyre_slip_damping=5.0, tyre_slip_speed=1e3
 )

@@ -18,7 +18,10 @@ from scenefactory_jax.core.types import RewardInput
 from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
+from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.roadgraph import queries
+
+pytestmark = pytest.mark.usefixtures("quickly")
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +167,7 @@ def test_encounters_by_hand_and_from_any_frame(env):
         scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
         state, _ = env.reset(jax.random.key(0), scene)
         state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.1, 0.3, 0.0])))
-        return jax.tree.map(np.asarray, observations.closest_approach(scene, state, **numbers))
+        return jax.tree.map(np.asarray, jax.jit(functools.partial(observations.closest_approach, **numbers))(scene, state))
 
     rows = seen(0.0, [0.0, 0.0])
     squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
@@ -192,7 +195,7 @@ def test_controls_are_what_dynamics_and_rewards_are_given(config):
 
     def speed_after(entry):
         env = environment.make_env({**own, "actions": {"command": entry, "action_repeat": 1}})
-        state, _ = env.reset(jax.random.key(0), scene)
+        state, _ = jax.jit(env.reset)(jax.random.key(0), scene)
         state, _ = jitted(env.step)(scene, state, jnp.array([[-0.5, 0.0, -1.0]]))
         return float(geometry.safe_norm(state.motion.velocity)[0]), np.asarray(state.previous_action[0])
 
@@ -288,7 +291,7 @@ def test_without_road_edges_every_observation_is_finite():
     numbers = scenefactory_jax.load_config("task", "observations=lane_preview", "dynamics=bicycle")
     scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
     scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
-    _, seen = environment.make_env(numbers).reset(jax.random.key(0), scene)
+    _, seen = jax.jit(environment.make_env(numbers).reset)(jax.random.key(0), scene)
     assert set(seen) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
     np.testing.assert_allclose(seen["lane"][:, 3:5], [[1.0, 0.0]] * 2)
     slope = jax.grad(lambda length: compress_length(length, 2.0).sum())(jnp.array([jnp.inf, 1.0]))
@@ -372,11 +375,11 @@ def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     broken = lambda parameters, observation, key: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
     state = env.init_state(jax.random.key(0), two_cars)
     start = rollout.start_rollout(state, episodes.make_metrics(state))
-    hook = episodes.make_hook(env, ttc_limit_s=10.0, signals=signals)
+    hook = episodes.make_hook(env, ttc_limit_s=10.0, thresholds=SignalThresholds(**signals))
     end, _ = rollout.rollout(env, broken, None, two_cars, start, jax.random.key(0), steps=2, hook=hook)
     metrics = end.carry
     assert metrics.past_events.numerical_error.tolist() == [True, False] and metrics.steps.tolist() == [0, 2]
-    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.speed_sum.any()
+    assert float(metrics.goal_distance[0]) == float(start.carry.goal_distance[0]) and not metrics.sums["speed"].any()
     motion = replace(state.motion, velocity=jnp.array([[1e20, 0, 0], [1.0, 0, 0]]))
     assert step_metrics.is_finite(motion).tolist() == [False, True]
 
@@ -463,7 +466,7 @@ def test_steps_trace_once_under_vmap(env, two_cars):
         traces.append(1)
         return jax.vmap(env.step)(scenes, states, action)
 
-    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2), scenes)
+    states, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2), scenes)
     for _ in range(3):
         states, _ = step(scenes, states, jnp.zeros((2, 2, 3)))
     assert len(traces) == 1

@@ -15,6 +15,8 @@ from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning.training_loop import make_policy, make_trainer
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 NUMBERS = dict(seed=3, steps=12, fault_step=5, world=0, agent=1, iterations=2)
 
 
@@ -59,6 +61,7 @@ def test_the_same_seed_drives_the_same(report):
     assert len(report.driving) > 80 and all(report.driving.values())
 
 
+@pytest.mark.slow  # tests/learning/test_ppo.py compares one iteration
 def test_the_same_seed_learns_the_same():
     """Two PPO iterations at toy size, twice."""
     settings = load_config("train", "experiment=smoke")

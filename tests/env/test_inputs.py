@@ -16,6 +16,8 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.roadgraph import spatial_grid
 from scenefactory_jax.weather import friction
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 STEPS, BROKEN = 3, 1  # control steps to drive; the agent whose numbers are spoilt
 UNUSABLE = {
     "goal nan": ("goal", jnp.nan),

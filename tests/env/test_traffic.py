@@ -23,6 +23,8 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, stack, validation
 from scenefactory_jax.env import environment, spawning, traffic
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 CONTROL = 1 / 30
 KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 
@@ -59,7 +61,7 @@ def with_tracks(scene, *rows):
 
 
 def at(scene, name, step, **changes) -> Boxes:
-    return bound(name, **changes)(scene, jnp.int32(step))
+    return jax.jit(bound(name, **changes))(scene, jnp.int32(step))
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +212,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
     scene = replace(scene, traffic=at(scene, "parked", 0))
     numbers = load_config("task", "spawning=random_pairs")["spawning"]["sampler"] | {"travel_max_m": 20.0}
     del numbers["_target_"]
-    agents = jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers))(jax.random.split(jax.random.key(3), 20))
+    agents = jax.jit(jax.vmap(lambda key: spawning.random_pairs(key, scene, **numbers)))(jax.random.split(jax.random.key(3), 20))
     starts = np.asarray(agents.position)[np.asarray(agents.present)]
     beyond = np.maximum(np.abs(starts[:, None] - np.asarray(scene.traffic.position)) - [2.25, 0.95], 0)
     assert len(starts) > 30 and np.linalg.norm(beyond, axis=-1).min() >= 4.0
@@ -225,7 +227,7 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
 def test_a_car_that_drives_into_a_parked_one_has_collided():
     env = environment.make_env(load_config("task", "dynamics=bicycle", "traffic=parked", "observations=small"))
     scene = with_tracks(scene_of([[0, 0], [0, 4]], [[50, 0], [50, 4]], speeds=[10.0, 10.0], half_width=9.0), track([14.0, 0.3]))
-    state, step = env.init_state(jax.random.key(0), scene), jax.jit(env.control_step)
+    state, step = jax.jit(env.init_state)(jax.random.key(0), scene), jax.jit(env.control_step)
     when = None
     for count in range(45):
         state, outcome = step(scene, state, jnp.zeros((2, 3)))

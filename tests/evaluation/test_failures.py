@@ -134,13 +134,13 @@ def row_of(records, name, agent=0) -> int:
         ("stops_short", 0, "stuck"), ("late", 0, "out_of_time"), ("late", 1, "stuck"),
     ],
 )  # fmt: skip
-def test_a_scripted_drive_has_its_kind(played, name, agent, kind):
+def test_a_scripted_drive_has_its_type(played, name, agent, kind):
     records, _ = played
     row = row_of(records, name, agent)
     assert records["failure"][row] == kind, {column: values[row] for column, values in records.items()}
 
 
-def test_every_failure_has_one_kind_and_no_other_agent_has(played):
+def test_every_failure_has_one_type(played):
     records, _ = played
     assert set(records["failure"]) == {*failures.FAILURE_TYPES, failures.NONE}
     np.testing.assert_array_equal(records["failure"] == failures.NONE, records["clean"])
@@ -149,7 +149,7 @@ def test_every_failure_has_one_kind_and_no_other_agent_has(played):
     assert sorted(rows) == np.flatnonzero(~records["clean"]).tolist() and list(found) == list(failures.FAILURE_TYPES)
 
 
-def test_when_where_and_how_much(played):
+def test_moments_places_and_severities(played):
     records, _ = played
     of = lambda name, agent=0: {column: values[row_of(records, name, agent)] for column, values in records.items()}  # noqa: E731
     hit = of("rear_end")
@@ -179,7 +179,7 @@ def test_weaving_shows_as_yaw_acceleration(played):
     assert swing["arrives"] == pytest.approx(0.0, abs=0.01) and swing["circles"] < 0.2  # whose start is a turn out of none
 
 
-def test_flags_tell_what_else_is_true(played):
+def test_flags_are_further_failures(played):
     records, _ = played
     found = {(failure.scene, failure.agent): failure for ranked in failures.rank_failures(records).values() for failure in ranked}
     assert found["wrong_way_into", 0].flags == ("wrong_way",)
@@ -197,7 +197,7 @@ def test_the_worst_come_first(played):
     assert len({failure.scene for failure in chosen}) == 3 and chosen[0].scene == "head_on_off_lane"
 
 
-def test_records_keep_their_kinds_in_a_file(played, tmp_path):
+def test_records_keep_failure_types_in_a_file(played, tmp_path):
     records, _ = played
     write_records(tmp_path / "agents.csv", records)
     again = read_records(tmp_path / "agents.csv")
@@ -248,7 +248,7 @@ def test_lanes_that_cross_are_not_driven_against():
     np.testing.assert_allclose(found, [1, -1, 0, 1], atol=1e-6)
 
 
-def test_settings_are_checked_at_the_door():
+def test_thresholds_are_checked():
     config = configs.load_config("evaluate", "run=x")
     del config["failures"]["signals"]["near_m"]
     with pytest.raises(ConfigError, match=r"failures\.signals\.near_m: missing"):

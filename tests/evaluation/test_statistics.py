@@ -76,7 +76,7 @@ def test_one_run_has_the_values_of_its_own_tables():
     assert mine["min_ttc_s"].value == pytest.approx(np.minimum(one["min_ttc_s"], 10)[one["has_ttc"]].mean())
 
 
-def test_a_paired_difference_knows_more_than_two_intervals():
+def test_a_paired_difference_has_a_narrower_interval():
     """Scenes differ much, the two policies by the same car in each: the difference is sure, the rates are not."""
     before = np.arange(12)[:, None] * np.ones(8) > np.arange(8) * 1.5 + 2
     after = before.copy()
@@ -102,13 +102,13 @@ def test_a_mean_that_does_not_vary_has_no_interval():
     assert tables.format_estimate(found) == "142.0 %" and found.method == statistics.NONE
 
 
-def test_agents_with_nobody_ahead_have_no_stopping_margin():
+def test_agents_without_an_obstacle_have_no_stopping_margin():
     one = records(np.ones((2, 2)), stopping_margin_m=[[1.0, np.inf], [3.0, np.inf]])
     found = statistics.summarise_runs({0: one}, bootstrap=10, seed=0)["stopping_margin_m"]
     assert (found.value, found.count) == (2.0, 2)
 
 
-def test_what_cannot_be_compared_is_named():
+def test_runs_that_cannot_be_compared_are_named():
     with pytest.raises(RecordsError, match="expected one or more runs"):
         statistics.summarise_runs({}, bootstrap=10, seed=0)
     with pytest.raises(RecordsError, match="'s2' is in one of the two"):

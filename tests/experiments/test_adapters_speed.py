@@ -11,6 +11,7 @@ from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core.instantiate import ConfigError
 
 
+@pytest.mark.slow
 def test_every_adapter_that_is_installed_is_measured_beside_the_packages_own(tmp_path, capsys):
     lean = ["experiment=smoke", "scenes.pack.agents=1", "~observations.road", "~observations.neighbours"]  # less to compile
     with quick_compilation():

@@ -17,6 +17,7 @@ from scenefactory_jax.env import environment
 from scenefactory_jax.env.termination import EVENTS
 from scenefactory_jax.learning.training_loop import make_policy
 
+pytestmark = pytest.mark.usefixtures("quickly")
 SMALL = ["scenes.count=2", "scenes.pack.agents=6", "observations.road.count=24", "spawning=random_pairs", "weather=wet"]
 NETWORK = ["policy.vector=[8,8]", "policy.rows.road=[8,8]", "policy.rows.neighbours=[8]", "policy.trunk=[8]", "policy.actor_head_scale=1.0"]
 MOMENTS, SECONDS = 16, 1.0

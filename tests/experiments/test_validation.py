@@ -6,13 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments.validation import encounters, engines, equivalence, impacts, random_drives
+from experiments.validation import c_engine_encounters, encounters, engines, equivalence, impacts, random_drives
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics import mujoco_c
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
 SETTINGS = load_config("validate")["validation"]  # what `validate` runs, at toy size
 DRIVES = {**SETTINGS["drives"]["draw"], "control_hz": 30.0, "seconds": 2.0}
 MEETINGS = {**SETTINGS["encounters"]["draw"], "control_hz": 30.0}
@@ -146,7 +147,7 @@ def head_on(entry, impedance, *, position, speed=(10.0, 0.0), yaw=(0.0, 0.0), fr
     contact = engines.touch(entry, impedance=impedance)
     options = dict(physics_dt=1 / 1920, substeps=64, iterations=100, line_search=50)
     arrays = {"position": np.array(position, float), "speed": np.array(speed, float), "yaw": np.array(yaw, float)}
-    return mujoco_c.simulate_two(car, solver, np.zeros((15, 2, 3)), np.full((2, 4), friction), contact, **arrays, **options)
+    return c_engine_encounters.simulate_two(car, solver, np.zeros((15, 2, 3)), np.full((2, 4), friction), contact, **arrays, **options)
 
 
 @pytest.mark.parametrize("impedance", [0.95, 0.01])
@@ -178,9 +179,10 @@ def test_near_misses_and_hits_are_told_apart(entry):
 
 def test_mechanics_are_those_of_rigid_bodies(entry):
     car, solver = cars.read_parameters(entry)
-    rig = mujoco_c.make_encounter(car, solver, engines.touch(entry, impedance=0.5), physics_dt=1 / 120, iterations=1, line_search=1)
+    contact = engines.touch(entry, impedance=0.5)
+    rig = c_engine_encounters.make_encounter(car, solver, contact, physics_dt=1 / 120, iterations=1, line_search=1)
     mujoco_c.place(rig, rig.model.qpos0[:17], np.array([[0.0, 3.0], [0.0, -2.0]]), np.zeros(2), np.array([10.0, 4.0]))
-    found = mujoco_c.compute_mechanics(rig, rig.qpos.copy(), rig.qvel.copy())
+    found = c_engine_encounters.compute_mechanics(rig, rig.qpos.copy(), rig.qvel.copy())
     mass = rig.model.body_subtreemass[0] / 2
     np.testing.assert_allclose(found.momentum[:2], [14 * mass, 0], atol=1e-6)
     np.testing.assert_allclose(found.angular_momentum[2], (-3 * 10 + 2 * 4) * mass, rtol=1e-6)

@@ -15,6 +15,7 @@ from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
+pytestmark = pytest.mark.usefixtures("quickly")
 G = 9.81
 RATES = dict(physics_hz=120.0, control_hz=30.0)
 CLOCK = dict(control_hz=30.0)
@@ -206,6 +207,7 @@ def test_a_run_writes_numbers_figures_and_verdicts(measured, capsys):
     assert results["drives"]["result"]["count"] == 13 and results["drives"]["seconds"] > 0
 
 
+@pytest.mark.usefixtures("undrawn_figures")
 def test_resume_keeps_what_fits_and_no_parts_write_the_report_anew(measured, capsys):
     out, results = measured
     (out / "validation.md").unlink()
@@ -216,6 +218,7 @@ def test_resume_keeps_what_fits_and_no_parts_write_the_report_anew(measured, cap
     assert "**no**" in (out / "validation.md").read_text() and "NOT MET" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn_figures")
 def test_other_settings_are_measured_again(measured, monkeypatch, tmp_path, capsys):
     out, results = measured
     (tmp_path / "results").mkdir()
@@ -256,6 +259,7 @@ def test_verdicts_can_fail(measured):
     assert [a.what for a, b in zip(honest, broken, strict=True) if a.met and not b.met] == [honest[0].what, honest[-1].what]
 
 
+@pytest.mark.usefixtures("undrawn_figures")
 def test_the_committed_report_is_made_of_its_results(tmp_path):
     """No number in it was typed in."""
     committed = configs.find_conf().parent / "experiments" / "validation"

@@ -54,7 +54,7 @@ def test_any_leading_axes_give_the_same_numbers(tiny):
     np.testing.assert_allclose(one[2], value[1], atol=1e-6)
 
 
-def test_widths_of_none_are_widths_that_nobody_named(tiny):
+def test_widths_of_none_are_the_default_widths(tiny):
     _, parameters, observation = tiny
     same = late_fusion.make(**{**TINY, "rows": {"road": [8, 8], "neighbours": None}}).init(jax.random.key(1), observation)
     assert jax.tree.map(jnp.shape, same) == jax.tree.map(jnp.shape, parameters)
@@ -121,7 +121,7 @@ def test_pooling_before_the_activation_is_pooling_after_it():
         np.testing.assert_array_equal(activate(late_fusion.pool(road.features, road.mask)), after)
 
 
-def test_new_groups_need_no_code(tiny):
+def test_new_observation_groups_are_encoded(tiny):
     policy, _, observation = tiny
     extra = {**observation, "memory": jnp.ones((W, A, 2)), "lights": SetObservation(jnp.ones((W, A, 2, 9)), jnp.ones((W, A, 2), bool))}
     actor = jax.eval_shape(policy.init, jax.random.key(0), extra)["params"]["actor"]
@@ -137,7 +137,7 @@ def test_published_network_has_the_published_size():
     assert sum(leaf.size for leaf in jax.tree.leaves(parameters)) == 132_359  # the paper's, without LayerNorm
 
 
-def test_bfloat16_is_near_and_stays_inside(tiny):
+def test_bfloat16_is_near_float32_and_not_in_parameters(tiny):
     policy, parameters, observation = tiny
     half = late_fusion.make(**{**TINY, "dtype": "bfloat16"})
     mean, _, value = half.apply(parameters, observation)
@@ -148,7 +148,7 @@ def test_bfloat16_is_near_and_stays_inside(tiny):
 
 
 def test_mistakes_are_named(tiny):
-    with pytest.raises(ConfigError, match=r"policy\.trunk: expected a list of integers >= 1, got \[\]"):
+    with pytest.raises(ConfigError, match=r"policy\.trunk: expected one width or more, got \[\]"):
         late_fusion.make(**{**TINY, "trunk": []})
     with pytest.raises(ConfigError, match=r"policy\.mean_init: expected 3 numbers"):
         late_fusion.make(**{**TINY, "mean_init": [0.0]})

@@ -123,7 +123,7 @@ def test_samples_without_weight_change_nothing(batch):
     assert not loss.normalize_advantages(garbage.returns, jnp.zeros(24)).any()
 
 
-def test_empty_slots_and_samples_whose_time_ran_out_carry_no_weight():
+def test_empty_slots_and_truncated_samples_have_no_weight():
     rng, none = np.random.default_rng(0), jnp.zeros((T, W, A))
     active, truncated = (jnp.asarray(rng.random((T, W, A)) < share) for share in (0.7, 0.3))
     observation, pair = {"cue": none[..., None]}, jnp.zeros((T, W, A, 3))
@@ -144,13 +144,13 @@ def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
-def test_what_is_left_out_is_counted_group_by_group():
+def test_left_out_samples_are_counted_for_each_group():
     """Of 12 active samples in the first half and 2 in the second, two minibatches of 3 from each half hold 6 and 2."""
     weight = (jnp.arange(24) < 14).astype(jnp.float32)
     assert float(minibatches.count_left_out(weight, size=12, groups=2, axis=None)) == pytest.approx(6 / 14)
 
 
-def test_what_is_not_finite_moves_nothing_and_is_counted(batch):
+def test_minibatches_that_are_not_finite_are_skipped_and_counted(batch):
     """Two minibatches of 12."""
     policy, parameters, samples, log_std = batch
     ppo = PPO(probe(), policy, ppo_config(epochs=1, minibatches=2, desired_kl=0.01, learning_rate=1e-3, permutation="once"))
@@ -249,7 +249,7 @@ def test_metrics_count_what_happened(course):
 
 
 @pytest.mark.parametrize("life, length", [(5, 100), (100, 6)])
-def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length):
+def test_a_repeated_action_is_one_sample(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
     env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
     worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
@@ -271,14 +271,14 @@ def test_an_action_that_stands_is_one_sample_of_all_that_came_of_it(life, length
     assert record.episodes.tolist() == [4, 4] and not after.episode_stats.steps.any() and (after.state.step == 0).all()
 
 
-def test_worlds_begin_where_an_action_is_read():
+def test_worlds_start_at_whole_actions():
     env = probe(life=5, episode_steps=12)._replace(action_repeat=3)
     trainer = make_trainer(env, episode_steps=12, stagger_episodes=True)
     steps = np.asarray(trainer.init(jax.random.key(0), scenes(64)).worlds.state.step)
     assert set(steps.tolist()) == {0, 3, 6, 9}
 
 
-def test_restart_keeps_what_was_learnt(course):
+def test_restart_keeps_parameters(course):
     trainer, _ = course
     stage = scenes(WORLDS)
     train_state, _ = run(trainer, stage, 1)
@@ -330,13 +330,13 @@ def test_probe_1_value(probes):
     np.testing.assert_allclose(look(0.0)[1], [1.0], atol=0.05)
 
 
-def test_probe_2_value_of_what_is_seen(probes):
+def test_probe_2_value_of_the_observation(probes):
     look, history = probes(2, 25)
     np.testing.assert_allclose(look(-1.0, 1.0)[1], [-1.0, 1.0], atol=0.05)
     assert float(history[-1]["ppo/explained_variance"]) > 0.95
 
 
-def test_probe_3_value_of_what_comes_later(probes):
+def test_probe_3_value_of_a_later_reward(probes):
     look, _ = probes(3, 25)
     np.testing.assert_allclose(look(0.0, 1.0)[1], [NUMBERS["gamma"], 1.0], atol=0.05)
 
@@ -346,7 +346,7 @@ def test_probe_4_action(probes):
     np.testing.assert_allclose(look(0.0)[0], [0.5], atol=0.1)
 
 
-def test_probe_5_action_that_depends_on_what_is_seen(probes):
+def test_probe_5_action_that_depends_on_the_observation(probes):
     look, history = probes(5, 40)
     np.testing.assert_allclose(look(-1.0, 1.0)[0], [-0.5, 0.5], atol=0.1)
     assert float(history[-1]["reward"]) > float(history[0]["reward"]) + 0.1

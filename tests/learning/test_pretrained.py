@@ -15,14 +15,14 @@ TOWN = policy_io.SHIPPED / "town" / "README.md"
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
-def test_a_policy_is_small_and_told_about(folder):
+def test_a_policy_is_small_and_has_a_card(folder):
     assert sum(file.stat().st_size for file in folder.rglob("*")) < 1_000_000
     card = (folder / "README.md").read_text()
     assert card.startswith(f"# {folder.name}\n") and "## Training" in card and "## Scores" in card and "agent steps" in card
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
-def test_a_policy_learnt_on_generated_scenes(folder):
+def test_a_policy_was_trained_on_generated_scenes(folder):
     scenes = hydra_config.read(folder)["scenes"]
     assert scenes["path"] is None and scenes["heldout"]["path"] is None
     assert scenes["generate"]["_target_"].startswith("scenefactory_jax.data.generators.") and scenes["seed"] != scenes["heldout"]["seed"]
@@ -34,7 +34,7 @@ def drive_town(out, *, scenes, untrained, dynamics):
     return sf.evaluate(sf.load_config("evaluate", "run=town", f"out={out}", overrides, *plainly)).records
 
 
-def test_town_drives_where_it_has_never_been(tmp_path):
+def test_town_drives_on_other_scenes(tmp_path):
     """In bicycles, which compile in seconds: they drive as the articulated car does on a dry road."""
     records = drive_town(tmp_path, scenes=1, untrained="false", dynamics="bicycle")["strict"]
     bends = records["route_m"] >= agent_metrics.BEND * records["start_distance_m"]

@@ -1,4 +1,4 @@
-"""Loggers beside metrics.csv: what they were told can be read back, a resumed run goes on, and a missing package is refused."""
+"""Loggers beside metrics.csv: rows are read back, a resumed run continues, and a missing package is an error."""
 
 import sys
 
@@ -16,8 +16,8 @@ ROWS = [
 ]
 
 
-def told(folder, rows, *overrides, after=0):
-    """What a training does with its rows; the config it ran with."""
+def log_rows(folder, rows, *overrides, after=0):
+    """Logs rows as a training does; returns its config."""
     whole = hydra_config.load_config("train", *overrides)
     with loggers.open_loggers(loggers.make(whole["loggers"]), folder, whole, after=after) as note:
         for row in rows:
@@ -37,8 +37,8 @@ def events(folder):
 
 
 def test_tensorboard(tmp_path):
-    told(tmp_path, ROWS[:3], "loggers=[tensorboard]")
-    told(tmp_path, ROWS[2:], "loggers=[tensorboard]", after=2)
+    log_rows(tmp_path, ROWS[:3], "loggers=[tensorboard]")
+    log_rows(tmp_path, ROWS[2:], "loggers=[tensorboard]", after=2)
     rewards = [(step, value) for name, step, value in events(tmp_path / "tensorboard") if name == "reward"]
     assert rewards == [(1, 0.5), (2, 1.0), (3, 1.5), (3, 1.5), (4, 2.0)]
     assert {name for name, *_ in events(tmp_path / "tensorboard")} == set(ROWS[0])
@@ -64,8 +64,8 @@ def test_wandb_offline(tmp_path, monkeypatch):
     from wandb.proto import wandb_internal_pb2
 
     monkeypatch.setenv("WANDB_SILENT", "true")
-    whole = told(tmp_path, ROWS[:3], "loggers=[wandb]", "loggers.wandb.mode=offline", "loggers.wandb.group=mine", "name=mine")
-    told(tmp_path, ROWS[2:], "loggers=[wandb]", "loggers.wandb.mode=offline", after=2)
+    whole = log_rows(tmp_path, ROWS[:3], "loggers=[wandb]", "loggers.wandb.mode=offline", "loggers.wandb.group=mine", "name=mine")
+    log_rows(tmp_path, ROWS[2:], "loggers=[wandb]", "loggers.wandb.mode=offline", after=2)
     rows, ids, configs = [], set(), {}
     for file in sorted((tmp_path / "wandb").glob("offline-run-*/*.wandb"), key=lambda file: file.stat().st_mtime_ns):
         for data in blocks(file.read_bytes()):
@@ -86,8 +86,8 @@ def test_mlflow(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     place = "sqlite:///mlflow.db"
     overrides = ["loggers=[mlflow]", f"loggers.mlflow.uri={place}", "loggers.mlflow.experiment=cars"]
-    told(tmp_path, ROWS[:3], *overrides, "seed=7")
-    told(tmp_path, ROWS[2:], *overrides, "seed=7", "iterations=999", after=2)
+    log_rows(tmp_path, ROWS[:3], *overrides, "seed=7")
+    log_rows(tmp_path, ROWS[2:], *overrides, "seed=7", "iterations=999", after=2)
     client = mlflow.MlflowClient(place)
     [run] = client.search_runs([client.get_experiment_by_name("cars").experiment_id])
     assert run.info.run_id == (tmp_path / "mlflow.id").read_text().strip()

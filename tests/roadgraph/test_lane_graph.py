@@ -1,4 +1,4 @@
-"""How lanes hang together, where points lie on them, and routes over them."""
+"""Links between lanes, projections of points onto them, and routes over them."""
 
 import itertools
 from dataclasses import replace
@@ -38,7 +38,7 @@ def generated(index):
 
 
 def bare(raw):
-    """A scene whose source knows nothing of how lanes hang together."""
+    """A scene without links between lanes."""
     return replace(raw, roads=tuple(replace(line, entry=(), exit=(), left=(), right=(), rebuilt=False) for line in raw.roads))
 
 
@@ -71,7 +71,7 @@ def test_links_of_generated_scenes_are_those_that_they_were_built_with(index):
     assert {line.rebuilt for line in found.roads if line.kind in DRIVABLE} == {True}
 
 
-def test_what_a_source_knows_is_kept():
+def test_links_of_the_source_are_kept():
     first, second = lane(1, (0, 0), (50, 0), left=(2,)), lane(2, (0, 3.5), (50, 3.5), right=(1,), exit=(3,))
     known = scene(first, second, lane(3, (60, 3.5), (80, 3.5), entry=(2,)))
     assert rebuild(known) is known
@@ -80,7 +80,7 @@ def test_what_a_source_knows_is_kept():
     assert rebuild(scene()).roads == ()
 
 
-def test_neighbours_run_the_same_way_at_a_lane_s_width_on_one_level_and_do_not_cross():
+def test_neighbours_have_one_direction_and_level_lie_a_lane_width_apart_and_do_not_cross():
     middle = lane(1, (0, 0), (60, 0))
     beside = [lane(2, (10, 3.5), (50, 3.5)), lane(3, (30, -3.5), (90, -3.5))]
     others = [
@@ -95,7 +95,7 @@ def test_neighbours_run_the_same_way_at_a_lane_s_width_on_one_level_and_do_not_c
     assert (found.left, found.right) == ((2,), (3,))
 
 
-def test_lanes_that_part_or_join_are_neighbours_there_on_the_sides_that_they_take():
+def test_lanes_that_diverge_or_merge_are_neighbours():
     stem, left, right = lane(1, (0, 0), (30, 0)), lane(2, (30, 0), (40, 0), (55, 10)), lane(3, (30, 0), (40, 0), (55, -10))
     merging = lane(4, (20, -15), (45, -12), (54, -10), (55, -10))
     found = {line.id: line for line in rebuild(scene(stem, left, right, merging)).roads}
@@ -137,7 +137,7 @@ PICKLES = (
     [(PROTOS, 327, 247), pytest.param(PICKLES, 539, 598, marks=pytest.mark.slow)],
     ids=["protos", "pickles"],
 )
-def test_the_topology_of_womd_is_found_again(shared_data, names, links, neighbours):
+def test_inferred_links_of_womd_are_those_of_its_files(shared_data, names, links, neighbours):
     """Every link of five scenes, none invented, and of neighbours 97 % with 4 % invented; no threshold was chosen on the second proto."""
     readers = reader_selection.make(FORMATS)
     pairs = {"exit": np.zeros(3, int), "left": np.zeros(3, int)}  # right, in the source, found
@@ -147,14 +147,14 @@ def test_the_topology_of_womd_is_found_again(shared_data, names, links, neighbou
         rounded = replace(raw, roads=tuple(replace(line, xyz=np.round(line.xyz, 2)) for line in raw.roads))  # as GPUDrive's files are
         found = rebuild(bare(rounded))
         for relation, total in pairs.items():
-            wanted, have = relations(raw, relation), relations(found, relation)
-            total += [len(wanted & have), len(wanted), len(have)]
+            expected, have = relations(raw, relation), relations(found, relation)
+            total += [len(expected & have), len(expected), len(have)]
     assert pairs["exit"].tolist() == [links] * 3
-    right, wanted, have = pairs["left"]
-    assert wanted == neighbours and right / wanted > 0.96 and right / have > 0.93
+    right, expected, have = pairs["left"]
+    assert expected == neighbours and right / expected > 0.96 and right / have > 0.93
 
 
-def test_numbers_that_make_no_sense_are_refused():
+def test_numbers_out_of_range_are_refused():
     for wrong in ({"neighbour_distance_m": [4.0, 2.0]}, {"sample_spacing_m": 0.0}):
         with pytest.raises(ConfigError, match=rf"lanes\.topology\.{next(iter(wrong))}: "):
             rebuild(scene(lane(1, (0, 0), (9, 0))), **wrong)
@@ -183,7 +183,7 @@ def test_places_on_lanes_are_those_of_a_search_through_all_segments():
     np.testing.assert_allclose(ends, graph.xyz[graph.first[1:] - 1])
 
 
-def test_lanes_leave_out_what_no_car_drives_on_and_links_that_lead_nowhere():
+def test_the_graph_has_no_bicycle_lanes_and_no_links_to_missing_lanes():
     others = [lane(7, (0, 1), (9, 1), kind=3), Polyline(2, np.zeros((3, 3)), 8)]
     graph = lane_graph.make([lane(5, (0, 0), (9, 0), exit=(6, 99)), lane(6, (9, 0), (9, 9)), *others])
     assert graph.id.tolist() == [5, 6] and graph.successor.tolist() == [[0, 1]] and graph.length.tolist() == [9.0, 9.0]
@@ -235,7 +235,7 @@ def test_alternatives_take_other_lanes_the_shortest_first():
 
 
 @pytest.mark.parametrize("index", range(KINDS))
-def test_generated_cars_took_the_shortest_route(index):
+def test_generated_cars_drive_the_shortest_route(index):
     """Cars of the generator draw their way at random, but in one block no two ways lead from a lane to another."""
     raw = generated(index)
     net = network(rebuild(raw).roads)

@@ -1,5 +1,4 @@
-"""Looking the road up by cells is looking through all of it, bit for bit."""
-
+"""A search by the grid finds what a search through all segments finds, bit for bit."""
 
 import jax
 import jax.numpy as jnp
@@ -14,20 +13,27 @@ from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import observations
 from scenefactory_jax.roadgraph import spatial_grid
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WOMD = SHARED / "womd" / "test"
 PLACES = 256
 
 
-@pytest.fixture(scope="module", params=["streets", "womd"])
-def scenes(request):
-    """Stacked scenes without cells."""
-    overrides = ["scenes.count=3", "scenes.generate.kinds=[intersection]", "scenes.road_grid.radius_m=null"]
-    if request.param == "womd":
-        if not WOMD.is_dir():
-            pytest.skip(f"no data at {WOMD}")
-        first = sorted(WOMD.iterdir())[0]
-        overrides = ["scenes=womd", f"scenes.path={first}", "scenes.road_grid.radius_m=null"]
-    return scene_source.load_training_scenes(load_config("train", *overrides)["scenes"]).scene
+def load(*overrides):
+    """Stacked scenes without a grid."""
+    return scene_source.load_training_scenes(load_config("train", "scenes.road_grid.radius_m=null", *overrides)["scenes"]).scene
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return load("scenes.count=2", "scenes.generate.kinds=[intersection]")
+
+
+@pytest.fixture(scope="module")
+def womd_scenes():
+    if not WOMD.is_dir():
+        pytest.skip(f"no data at {WOMD}")
+    return load("scenes=womd", f"scenes.path={sorted(WOMD.iterdir())[0]}")
 
 
 def places(scene, seed):
@@ -56,19 +62,20 @@ def look(count):
     return jax.jit(at)
 
 
-@pytest.mark.parametrize(("size_m", "count"), [(5.0, 350), (3.0, 20), (25.0, 64)])
-def test_cells_find_what_looking_through_all_finds(scenes, size_m, count):
-    quick, find = spatial_grid.attach_grid(scenes, radius_m=10.0, size_m=size_m), look(count)
+@pytest.mark.parametrize(("source", "size_m", "count"), [("scenes", 5.0, 350), ("scenes", 3.0, 20), ("womd_scenes", 25.0, 64)])
+def test_a_grid_finds_what_a_search_through_all_segments_finds(request, source, size_m, count):
+    scenes = request.getfixturevalue(source)
+    with_grid, find = spatial_grid.attach_grid(scenes, radius_m=10.0, size_m=size_m), look(count)
     for world in range(len(scenes.log.dt)):
-        one = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), quick)  # noqa: B023
-        position = places(one, world)
-        found, wanted = find(one, position), find(replace(one, road_grid=None), position)
-        jax.tree.map(np.testing.assert_array_equal, found, wanted)
-        assert wanted.mask.any(axis=1).sum() > PLACES // 4 and not wanted.mask[-2:].any()
-        assert int(one.road_grid.longest_list) < int(one.road.valid.sum())
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), with_grid)  # noqa: B023
+        position = places(scene, world)
+        found, expected = find(scene, position), find(replace(scene, road_grid=None), position)
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+        assert expected.mask.any(axis=1).sum() > PLACES // 4 and not expected.mask[-2:].any()
+        assert int(scene.road_grid.longest_list) < int(scene.road.valid.sum())
 
 
-def test_a_larger_radius_looks_through_all(scenes):
+def test_a_larger_radius_searches_all_segments(scenes):
     narrow = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), spatial_grid.attach_grid(scenes, radius_m=4.0, size_m=5.0))
     find, position = look(350), places(narrow, 0)
     jax.tree.map(np.testing.assert_array_equal, find(narrow, position), find(replace(narrow, road_grid=None), position))
@@ -84,7 +91,7 @@ def test_a_world_without_a_road_has_empty_lists(scenes):
     assert not listed.any()
 
 
-def test_configs_look_as_far_as_their_observation():
+def test_the_radius_of_the_grid_is_that_of_the_observation():
     assert load_config("train", "experiment=paper")["scenes"]["road_grid"]["radius_m"] == 10.0
     assert load_config("train", "observations.road.radius_m=25")["scenes"]["road_grid"]["radius_m"] == 25
     assert load_config("convert")["scenes"]["road_grid"]["radius_m"] is None

@@ -53,7 +53,8 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         control_dt=1 / 30,
         respawn_clearance_m=respawn,
     )
-    return environment.assemble(parts)
+    env = environment.assemble(parts)  # compiled: operations that run one by one are compiled one by one
+    return env._replace(reset=jax.jit(env.reset), init_state=jax.jit(env.init_state), observe=jax.jit(env.observe))
 
 
 @functools.cache

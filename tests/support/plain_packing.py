@@ -11,8 +11,8 @@ import numpy as np
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
 from scenefactory_jax.data.packing import columns
-from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _centre, overlaps
-from scenefactory_jax.data.packing.validation import DUPLICATE_M, _some
+from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _find_centre, overlaps
+from scenefactory_jax.data.packing.validation import DUPLICATE_M, list_ids
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
 
 
@@ -65,7 +65,7 @@ def _repair_tracks(raw, car_size, lines):
     if empty:
         lines.append(f"tracks without a valid step dropped: {empty}")
     if sizes:
-        lines.append(f"sizes that are not positive replaced by {car_size}: {len(sizes)} (ids {_some(sizes)})")
+        lines.append(f"sizes that are not positive replaced by {car_size}: {len(sizes)} (ids {list_ids(sizes)})")
     if stale:
         lines.append(f"tracks with values at invalid steps zeroed there: {stale}")
     return tuple(kept), sdc
@@ -81,7 +81,7 @@ def _report_jumps(raw, limit_m_s, lines):
             steps += jumps
             ids.append(track.id)
     if ids:
-        lines.append(f"track jumps above {limit_m_s:g} m/s: {steps} steps (ids {_some(ids)})")
+        lines.append(f"track jumps above {limit_m_s:g} m/s: {steps} steps (ids {list_ids(ids)})")
 
 
 def pack(
@@ -100,7 +100,7 @@ def pack(
     traffic,
     min_traffic_size_m,
 ):
-    origin, centred_on = _centre(raw, centre)
+    origin, centred_on = _find_centre(raw, centre)
     half = scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     chosen, dropped = _choose(raw, origin, half, min_travel_m, agents, car_size_m)

@@ -1,5 +1,7 @@
 """A recording of seconds for the tests of the replay's page: two worlds of three cars, with wheels, others, a light and a sign made up."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,7 @@ NAMES = ("first </script> world", "second")
 POSTS = (RoadPosts((Light((10.0, 0.0), 0.0, [(0.0, "stop"), (1.0, "go")]),), ((12.0, 5.0),)), RoadPosts())
 
 
+@functools.cache
 def made() -> Recording:
     """Car 0 reaches its goal, car 1 steers off the road, car 2 drives on; the second world is the first one mirrored in its order."""
     settings = hydra_config.load_config("train", "experiment=smoke", "termination=goal_only", "timing.episode_s=10")

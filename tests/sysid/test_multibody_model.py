@@ -1,4 +1,4 @@
-"""The teacher of system identification against the laws of driving, and the manoeuvres against the published table."""
+"""The reference car of system identification against laws of motion, and the manoeuvres against the published table."""
 
 import dataclasses
 import math
@@ -11,8 +11,8 @@ import pytest
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.sysid import heldout_manoeuvres, manoeuvres, multibody_model
-from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Manoeuvre, on_one_surface
-from scenefactory_jax.sysid.reference_recordings import load, record, road_of, save
+from scenefactory_jax.sysid.manoeuvres import RATE_HZ, SURFACES, Manoeuvre, open_loop
+from scenefactory_jax.sysid.reference_recordings import load, make_road, record, save
 
 from omegaconf import OmegaConf  # isort: skip
 from support.running import ROOT  # isort: skip
@@ -35,14 +35,14 @@ def entries():
 
 @pytest.fixture(scope="module")
 def training(entries):
-    return manoeuvres.training(entries["training"])
+    return manoeuvres.make_suite(entries["training"], builtins=manoeuvres, where="training")
 
 
 @pytest.fixture(scope="module")
 def unseen(entries, teacher):
     """The held-out ones, with one lane change of each track."""
     fewer = {key: dict(entry, cases=entry["cases"][1:2]) if "track" in entry else entry for key, entry in entries["heldout"].items()}
-    return heldout_manoeuvres.heldout(fewer, teacher=teacher)
+    return manoeuvres.make_suite(fewer, builtins=heldout_manoeuvres, where="heldout", reference=teacher)
 
 
 @pytest.fixture(scope="module")
@@ -52,17 +52,17 @@ def car():
 
 @pytest.fixture(scope="module")
 def teacher(car):
-    return instantiate(conf("sysid/teacher"), builtins=multibody_model, where="sysid.teacher")(car)
+    return instantiate(conf("sysid/teacher"), builtins=multibody_model, where="teacher", car=car)()
 
 
 @pytest.fixture(scope="module")
 def left_turn(teacher):
     """4 s at 9 m/s into a left turn of about 5 m/s^2."""
-    return record(drive((1.0, 0.1, 0.0, 0.0), (3.0, 0.2, 0.25, 0.0), speed=9.0), teacher=teacher)
+    return record(drive((1.0, 0.1, 0.0, 0.0), (3.0, 0.2, 0.25, 0.0), speed=9.0), reference=teacher)
 
 
 def drive(*segments, speed=0.0, surface=0) -> Manoeuvre:
-    return on_one_surface("test", "straight_accel", segments, speed=speed, surface=surface)
+    return open_loop("straight_accel", ["test"], segments, speed=speed, surface=SURFACES[surface])
 
 
 def whole_mass(teacher):
@@ -93,11 +93,9 @@ def test_training_is_the_published_suite(training):
     assert chirp[60 + 3 * 100, 1] == pytest.approx(0.3 * math.sin(2 * math.pi * 1.3 * 5.0))  # at 5 s f is 1.3 Hz
 
 
-def test_heldout_manoeuvres_are_others(training, unseen):
+def test_heldout_manoeuvres_differ_from_training(training, unseen):
     assert not {m.name for m in training} & {m.name for m in unseen}
-    assert {m.family for m in training} == set(manoeuvres.TRAINING)
-    assert {m.family for m in unseen} == set(manoeuvres.HELDOUT)
-    assert not set(manoeuvres.TRAINING) & set(manoeuvres.HELDOUT)
+    assert not {m.family for m in training} & {m.family for m in unseen}
     for m in unseen:
         assert m.speed > 0.0 and len(m.left) == len(m.right) == len(m.edges) + 1
         assert not any(len(m.controls) == len(t.controls) and np.array_equal(m.controls, t.controls) for t in training)
@@ -105,7 +103,7 @@ def test_heldout_manoeuvres_are_others(training, unseen):
 
 def test_straight_acceleration_is_force_over_mass(teacher):
     throttle, speed = 0.5, 8.0
-    r = record(drive((2.0, throttle, 0.0, 0.0), speed=speed), teacher=teacher)
+    r = record(drive((2.0, throttle, 0.0, 0.0), speed=speed), reference=teacher)
     mass, rolling = whole_mass(teacher)
     force = 2 * throttle * teacher.drive_torque / teacher.car.wheel_radius - teacher.rolling_resistance * mass * 9.81
     drag = 0.5 * teacher.air_density * teacher.drag_area * np.mean(r.speed[60:]) ** 2
@@ -116,7 +114,7 @@ def test_straight_acceleration_is_force_over_mass(teacher):
 
 @pytest.mark.parametrize("surface", [0, 1])
 def test_gentle_stops_are_limited_by_torque(teacher, surface):
-    r = record(drive((5.0, 0.0, 0.0, 0.5), speed=10.0, surface=surface), teacher=teacher)
+    r = record(drive((5.0, 0.0, 0.0, 0.5), speed=10.0, surface=surface), reference=teacher)
     mass, rolling = whole_mass(teacher)
     force = (teacher.brake_torque_front + teacher.brake_torque_rear) / teacher.car.wheel_radius + teacher.rolling_resistance * mass * 9.81
     assert r.position[-1, 0] == pytest.approx(way_to_stop(10.0, force, mass, rolling, teacher), rel=0.015)
@@ -129,21 +127,21 @@ def test_locked_wheels_slide_at_the_grip_of_the_surface(teacher, surface):
     peak, p = vehicle.peak[0] * teacher.grip[surface], vehicle.body.tyres[0]
     stiff = p.p_kx1 / (p.p_cx1 * peak)  # Pacejka at slip 1
     sliding = peak * math.sin(p.p_cx1 * math.atan(stiff - p.p_ex1 * (stiff - math.atan(stiff))))
-    r = record(drive((3.0, 0.0, 0.0, 1.0), speed=10.0, surface=surface), teacher=strong)
+    r = record(drive((3.0, 0.0, 0.0, 1.0), speed=10.0, surface=surface), reference=strong)
     mass, _ = whole_mass(teacher)
     assert r.wheel_spin[30].max() < 0.3
     assert r.position[-1, 0] == pytest.approx(way_to_stop(10.0, sliding * mass * 9.81, mass, mass, teacher), rel=0.05)
 
 
 def test_standing_car_stands_and_brakes_hold(teacher):
-    still = record(drive((0.5, 0.0, 0.0, 0.0), (1.0, 0.0, 1.0, 1.0), (0.5, 0.3, 0.5, 1.0)), teacher=teacher)
+    still = record(drive((0.5, 0.0, 0.0, 0.0), (1.0, 0.0, 1.0, 1.0), (0.5, 0.3, 0.5, 1.0)), reference=teacher)
     assert np.abs(still.position[:89]).max() < 1e-6 and np.abs(still.yaw[:89]).max() < 1e-6
     assert np.abs(still.position[-1]).max() < 2e-3  # brakes hold against the engine, with a creep
-    stop = record(drive((0.5, 0.0, 0.3, 0.0), (3.5, 0.0, 0.3, 1.0), speed=6.0), teacher=teacher)
+    stop = record(drive((0.5, 0.0, 0.3, 0.0), (3.5, 0.0, 0.3, 1.0), speed=6.0), reference=teacher)
     fall = -np.diff(stop.speed[30:])
     assert fall.min() > -1e-6 and fall.max() < 1.3 * 5.7 / RATE_HZ  # it never gains speed, nor loses it in a jump
     assert stop.speed[-60:].max() < 1e-6 and np.ptp(stop.position[-60:], axis=0).max() < 1e-4
-    away = record(drive((1.5, 0.4, 0.5, 0.0)), teacher=teacher)
+    away = record(drive((1.5, 0.4, 0.5, 0.0)), reference=teacher)
     mass, rolling = whole_mass(teacher)
     pull = (2 * 0.4 * teacher.drive_torque / teacher.car.wheel_radius - teacher.rolling_resistance * mass * 9.81) / rolling
     assert away.speed[5] == pytest.approx(pull * 0.1, rel=0.1)  # slower than the tyre model goes
@@ -151,7 +149,7 @@ def test_standing_car_stands_and_brakes_hold(teacher):
 
 
 def test_slow_circle_is_ackermanns(teacher):
-    r = record(drive((2.0, 0.05, 0.2, 0.0), speed=2.0), teacher=teacher)
+    r = record(drive((2.0, 0.05, 0.2, 0.0), speed=2.0), reference=teacher)
     steer, length = r.steer[-1], teacher.car.wheelbase
     assert steer == pytest.approx(0.2 * teacher.steering_lock, rel=1e-3)
     radius = math.hypot(length / math.tan(steer), length / 2)  # of the centre of mass
@@ -169,20 +167,20 @@ def test_left_is_positive_and_the_outer_wheels_are_the_right_ones(left_turn):
 
 
 def test_mirrored_commands_give_the_mirrored_path(teacher, left_turn):
-    r = record(manoeuvres.mirror(left_turn.manoeuvre), teacher=teacher)
+    r = record(manoeuvres.mirror(left_turn.manoeuvre), reference=teacher)
     assert r.position * [1, -1] == pytest.approx(left_turn.position, abs=1e-3)
     assert -r.yaw == pytest.approx(left_turn.yaw, abs=1e-4)
     assert r.wheel_spin[:, [1, 0, 3, 2]] == pytest.approx(left_turn.wheel_spin, abs=1e-2)
 
 
 def test_halved_tolerance_moves_nothing(teacher, left_turn):
-    finer = record(left_turn.manoeuvre, teacher=dataclasses.replace(teacher, tolerance=teacher.tolerance / 2))
+    finer = record(left_turn.manoeuvre, reference=dataclasses.replace(teacher, tolerance=teacher.tolerance / 2))
     assert finer.position == pytest.approx(left_turn.position, abs=1e-3)
 
 
 def test_cornering_ends_at_the_tyres_peak(teacher):
     peak = multibody_model.Vehicle(teacher).peak[1] * 9.81
-    dry, wet = (record(drive((4.0, 0.3, 0.5, 0.0), speed=14.0, surface=surface), teacher=teacher) for surface in (0, 1))
+    dry, wet = (record(drive((4.0, 0.3, 0.5, 0.0), speed=14.0, surface=surface), reference=teacher) for surface in (0, 1))
     assert 0.75 * peak < np.median(dry.lateral[60:120]) < 1.02 * peak
     assert np.median(wet.lateral[60:120]) < 1.02 * 0.72 * peak
 
@@ -191,7 +189,7 @@ def test_cornering_ends_at_the_tyres_peak(teacher):
 def test_a_split_road_turns_the_car_to_the_side_that_grips(teacher, side):
     strong = dataclasses.replace(teacher, brake_torque_front=2500.0, brake_torque_rear=1500.0)
     even = drive((0.7, 0.0, 0.0, 1.0), speed=12.0)
-    r = record(even._replace(**{side: np.array([2])}), teacher=strong)
+    r = record(even._replace(**{side: np.array([2])}), reference=strong)
     assert r.yaw[-1] * (-1.0 if side == "left" else 1.0) > 0.02
     slippery, gripping = ([0, 2], [1, 3]) if side == "left" else ([1, 3], [0, 2])
     assert r.wheel_spin[20:30, slippery].max() < r.wheel_spin[20:30, gripping].max()
@@ -199,23 +197,23 @@ def test_a_split_road_turns_the_car_to_the_side_that_grips(teacher, side):
 
 def test_strips_follow_one_another_along_the_road(teacher):
     m = drive((0.1, 0.0, 0.0, 0.0))._replace(edges=np.array([5.0, 9.0]), left=np.array([0, 1, 2]), right=np.array([2, 1, 0]))
-    road = road_of(m, multibody_model.Vehicle(teacher))
+    road = make_road(m, multibody_model.Vehicle(teacher))
     assert road is not None
     assert [road(x, 1.0) for x in (-50.0, 4.0, 6.0, 10.0)] == pytest.approx([1.0, 1.0, 0.72, 0.58])
     assert [road(x, -1.0) for x in (-50.0, 6.0, 99.0)] == pytest.approx([0.58, 0.72, 1.0])
-    with pytest.raises(ConfigError, match="2 surfaces"):
-        road_of(m, multibody_model.Vehicle(dataclasses.replace(teacher, grip=(1.0, 0.72))))
+    with pytest.raises(ConfigError, match="grip: expected a number for each of 3 surfaces, got 2"):
+        make_road(m, multibody_model.Vehicle(dataclasses.replace(teacher, grip=[1.0, 0.72])))
 
 
-def test_the_driver_changes_lanes_and_comes_back(teacher, unseen):
+def test_the_driver_changes_lanes_and_returns(teacher, unseen):
     m = next(m for m in unseen if m.name.startswith("lane_change_iso_3888_1"))
-    r = record(m, teacher=teacher)
+    r = record(m, reference=teacher)
     x, y = r.position.T
     assert y[(x > 60.0) & (x < 75.0)] == pytest.approx(3.5, abs=0.6)
     assert np.abs(y[(x < 20.0) | (x > 125.0)]).max() < 0.6
 
 
-def test_recordings_come_back_from_their_file(tmp_path, teacher, left_turn):
+def test_recordings_are_equal_after_save_and_load(tmp_path, teacher, left_turn):
     split = left_turn._replace(manoeuvre=left_turn.manoeuvre._replace(name="b", edges=np.ones(2), left=np.arange(3), right=np.arange(3)))
     mark = "0123456789abcdef"
     save(tmp_path / "r.npz", [left_turn, split], digest=mark)
@@ -225,12 +223,12 @@ def test_recordings_come_back_from_their_file(tmp_path, teacher, left_turn):
         assert a.manoeuvre[:3] == b.manoeuvre[:3]
         assert all(np.array_equal(x, y) for x, y in zip((*a.manoeuvre[3:], *a[1:]), (*b.manoeuvre[3:], *b[1:]), strict=True))
     other = "fedcba9876543210"
-    with pytest.raises(ConfigError, match="other settings"):
+    with pytest.raises(ConfigError, match="expected a recording with the settings fedc"):
         load(tmp_path / "r.npz", digest=other)
 
 
-def test_the_teacher_takes_from_the_car_what_its_recordings_are_known_by(car, teacher):
-    """`READS`, from which the digest of the recordings is made: each of these numbers changes the teacher, no other does."""
+def test_reads_lists_the_parameters_that_change_the_reference_car(car, teacher):
+    """The digest of the recordings is made from `READS`: each of these numbers changes the reference car, no other does."""
 
     def numbers(own):
         vehicle = multibody_model.Vehicle(dataclasses.replace(teacher, car=own))
@@ -245,14 +243,15 @@ def test_the_teacher_takes_from_the_car_what_its_recordings_are_known_by(car, te
         assert changed == (field.name in multibody_model.READS), field.name
 
 
-def test_wrong_settings_are_named(monkeypatch, car, teacher, entries):
-    with pytest.raises(ConfigError, match="steering_lag_s: 0"):
-        instantiate({**conf("sysid/teacher"), "steering_lag_s": 0.0}, builtins=multibody_model, where="sysid.teacher")(car)
+def test_errors_name_the_wrong_setting(monkeypatch, car, teacher, entries):
+    with pytest.raises(ConfigError, match=r"teacher.steering_lag_s: expected a number > 0, got 0"):
+        instantiate({**conf("sysid/teacher"), "steering_lag_s": 0.0}, builtins=multibody_model, where="teacher", car=car)()
     twice = {"a": entries["training"]["straight_accel"], "b": entries["training"]["straight_accel"]}
     with pytest.raises(ConfigError, match="straight_accel_0"):
-        manoeuvres.training(twice)
+        manoeuvres.make_suite(twice, builtins=manoeuvres, where="training")
     with pytest.raises(ConfigError, match="dry, wet, gravel"):
-        manoeuvres.training({"a": {**entries["training"]["surface_transition"], "surfaces": ["dry", "wet", "ice"]}})
+        icy = {**entries["training"]["surface_transition"], "surfaces": ["dry", "wet", "ice"]}
+        manoeuvres.make_suite({"a": icy}, builtins=manoeuvres, where="training")
     monkeypatch.setitem(sys.modules, "vehiclemodels.vehicle_dynamics_mb", None)
     with pytest.raises(ConfigError, match=r"pip install scenefactory_jax\[sysid\]"):
         multibody_model.Vehicle(teacher)

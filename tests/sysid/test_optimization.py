@@ -1,4 +1,4 @@
-"""The search and the refinement on problems whose answer is known, and the car replaying itself."""
+"""Search and refinement on problems with known solutions, and the car on recordings of itself."""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 import yaml
 
-from scenefactory_jax.cli import sysid as command
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.cli.sysid import sysid
 from scenefactory_jax.core.instantiate import ConfigError
-from scenefactory_jax.sysid import candidate_simulation, error_metrics, optimization, parameter_space
+from scenefactory_jax.sysid import candidate_simulation, error_metrics, identification, optimization, parameter_space
 from scenefactory_jax.sysid.candidate_simulation import TERMS
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, ManoeuvreRecording
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 WEIGHTS = {name: 1.0 for name in TERMS}
-SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, tell=lambda line: None)
+SEARCH = dict(elite_share=0.25, first_spread=0.25, least_spread=0.05, clock=lambda: 0.0, report=lambda line: None)
 
 
 def between(least, most, *, start, scale="linear"):
@@ -33,24 +35,24 @@ BOX = parameter_space.make(
 # ---- the space
 
 
-def test_values_and_places_are_inverse():
+def test_unit_box_and_values_are_inverse():
     values = np.array([[2.5, 1.0, 0.5], [12.0, 20.0, -2.0]])
-    places = parameter_space.unit(BOX, values)
-    np.testing.assert_allclose(places[0], [0.25, 0.5, 0.75])
-    assert (places[1, :2] > 1.0).all() and places[1, 2] < 0.0
-    np.testing.assert_allclose(parameter_space.values(BOX, places), values)
+    points = parameter_space.to_unit_box(BOX, values)
+    np.testing.assert_allclose(points[0], [0.25, 0.5, 0.75])
+    assert (points[1, :2] > 1.0).all() and points[1, 2] < 0.0
+    np.testing.assert_allclose(parameter_space.from_unit_box(BOX, points), values)
 
 
 @pytest.mark.parametrize(
     "entry, message",
     [
-        ({"mas": between(0.0, 1.0, start=0.5)}, r"sysid.space.mas: unknown parameter; valid: length.*friction_gravel"),
-        ({"mass": between(1.0, 1.0, start=1.0)}, r"sysid.space.mass: \[1, 1\] is no range"),
-        ({"mass": between(0.0, 1.0, start=0.5, scale="log")}, r"sysid.space.mass: \[0, 1\] is no range"),
-        ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass: .*write {range: \[least, most\]"),
-        ({"mass": [0.5, 1.0]}, r"sysid.space.mass: .*write {range: \[least, most\]"),
-        ({"mass": between(2.0, 1.0, start=1.5)}, r"sysid.space.mass: expected \[min, max\], got \[2.0, 1.0\]"),
-        ({"mass": between(0.5, 1.0, start=2.0)}, r"sysid.space.mass.start: 2.0; it must be in \[0.5, 1\]"),
+        ({"mas": between(0.0, 1.0, start=0.5)}, r"sysid.space.mas: unknown key; valid: .*friction_gravel.*length"),
+        ({"mass": between(1.0, 1.0, start=1.0)}, r"sysid.space.mass.range: expected \[min, max\] with min < max"),
+        ({"mass": between(0.0, 1.0, start=0.5, scale="log")}, r"sysid.space.mass.range: .* min > 0 with scale log, got \[0.0, 1.0\]"),
+        ({"mass": {"range": [0.5, 1.0]}}, r"sysid.space.mass.scale: missing; sysid.space.mass needs range, scale, start"),
+        ({"mass": [0.5, 1.0]}, r"sysid.space.mass: expected a mapping"),
+        ({"mass": between(2.0, 1.0, start=1.5)}, r"sysid.space.mass.range: expected \[min, max\], got \[2.0, 1.0\]"),
+        ({"mass": between(0.5, 1.0, start=2.0)}, r"sysid.space.mass.start: expected a number in \[0.5, 1.0\], got 2"),
     ],
 )
 def test_bad_spaces_are_refused(entry, message):
@@ -63,7 +65,7 @@ def test_bad_spaces_are_refused(entry, message):
 
 def bowl(rows, manoeuvres):
     """Least at mass 7, track 0.5, wheelbase 0.2; wheelbase counts on the second manoeuvre alone."""
-    gap = parameter_space.unit(BOX, rows) - parameter_space.unit(BOX, np.array([7.0, 0.5, 0.2]))
+    gap = parameter_space.to_unit_box(BOX, rows) - parameter_space.to_unit_box(BOX, np.array([7.0, 0.5, 0.2]))
     terms = np.zeros((len(rows), 2, len(TERMS)))
     terms[:, 0, 0], terms[:, 1, 1] = gap[:, 0] ** 2 + gap[:, 1] ** 2, gap[:, 2] ** 2
     return terms[:, list(manoeuvres)]
@@ -73,7 +75,7 @@ def searched(stage, manoeuvres, begin=BOX.start, **changes):
     return optimization.search(bowl, BOX, np.array(begin), stage, manoeuvres, seed=1, weights=WEIGHTS, **{**SEARCH, **changes})
 
 
-def test_the_search_finds_the_bottom_of_what_it_tunes_and_leaves_the_rest():
+def test_search_minimizes_over_the_tuned_parameters_only():
     found = searched(optimization.Stage("all", (), ("mass", "track"), 1.0, 64, 12), [0])
     np.testing.assert_allclose(found.best[:2], [7.0, 0.5], rtol=0.03)
     assert found.best[2] == 0.9 and found.loss < 1e-4 < found.start_loss and found.evaluations == 1 + 64 * 12
@@ -85,20 +87,20 @@ def test_a_stage_never_ends_worse_than_it_began():
     assert found.loss == found.start_loss == 0.0
 
 
-def test_a_window_holds_the_search_near_its_start():
+def test_a_window_limits_the_search_to_its_start():
     found = searched(optimization.Stage("near", (), ("mass",), 0.1, 64, 8), [0], begin=(1.0, 0.5, 0.2))
     assert found.best[0] == pytest.approx(1.5)
 
 
-def test_cars_that_do_not_stay_finite_lose():
+def test_losses_that_are_not_finite_are_infinite():
     terms = np.zeros((3, 2, len(TERMS)))
     terms[1, 0, 3], terms[2, 1, 0] = np.nan, 4.0
     np.testing.assert_array_equal(optimization.losses(terms, WEIGHTS), [0.0, np.inf, 2.0])
-    with pytest.raises(ConfigError, match=r"sysid.weights: position; wanted are position, yaw"):
+    with pytest.raises(ConfigError, match=r"sysid.weights: expected exactly position, yaw.*, got position"):
         optimization.losses(terms, {"position": 1.0})
 
 
-def test_least_squares_recover_a_line_and_how_well_it_is_known():
+def test_least_squares_recover_a_line_and_its_uncertainty():
     """y = a x + b with noise: textbook deviations and correlation; the third parameter does nothing."""
     rng, x = np.random.default_rng(0), np.linspace(0.0, 1.0, 200)
     noise = rng.normal(0.0, 0.1, 200)
@@ -140,30 +142,30 @@ def config():
 def lesson(config):
     """What the default car does, as if it had been the teacher; the second manoeuvre is shorter."""
     where = parameter_space.make({"drive_torque": between(300.0, 900.0, start=567.4), "friction_wet": between(0.01, 1.0, start=0.7)})
-    replay = candidate_simulation.make(config["dynamics"], where, [1.0, 0.7, 0.5], physics_hz=120.0)
+    simulator = candidate_simulation.make_simulator(config["dynamics"], where, [1.0, 0.7, 0.5], physics_hz=120.0)
     begin = where.start
     plans = [manoeuvre("left", 0.3), manoeuvre("straight", 0.0, frames=18)]
     empty = [ManoeuvreRecording(m, *(np.zeros((len(m.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ()))) for m in plans]
-    path = traced(replay, begin, candidate_simulation.suite(empty))
+    path = traced(simulator, begin, candidate_simulation.stack_recordings(empty))
     own = []
     for index, plan in enumerate(plans):
         frames = len(plan.controls)
         cut = jax.tree.map(lambda leaf, i=index, n=frames: leaf[i, :n], path)
         flat = np.zeros(frames)
         own.append(ManoeuvreRecording(plan, cut.position, cut.yaw, cut.pace, cut.yaw_rate, cut.wheel_spin, cut.steer.mean(-1), flat, flat))
-    return replay, begin, own
+    return simulator, begin, own
 
 
-def traced(replay, row, plan):
+def traced(simulator, row, plan):
     index = np.arange(len(plan.frames))
     rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), replay.trace(rows, jnp.asarray(index), plan))
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float), simulator.trace(rows, jnp.asarray(index), plan))
 
 
-def test_a_car_that_replays_itself_makes_no_error_and_another_does(lesson, config):
-    replay, begin, own = lesson
+def test_a_car_on_its_own_recording_makes_no_error_and_another_does(lesson, config):
+    simulator, begin, own = lesson
     weights = config["sysid"]["weights"]
-    score = candidate_simulation.make_scorer(replay, candidate_simulation.suite(own), width=3)
+    score = candidate_simulation.make_scorer(simulator, candidate_simulation.stack_recordings(own), width=3)
     rows = np.stack([begin, begin + np.array([100.0, 0.0]), begin + np.array([0.0, -0.65])])
     losses = optimization.losses(score(rows, [0, 1]), weights)
     assert losses[0] < 1e-6 and (losses[1:] > 1e-3).all()
@@ -172,21 +174,21 @@ def test_a_car_that_replays_itself_makes_no_error_and_another_does(lesson, confi
 
 
 def test_residuals_square_to_the_loss(lesson, config):
-    replay, begin, own = lesson
-    weights, plan = config["sysid"]["weights"], candidate_simulation.suite(own)
+    simulator, begin, own = lesson
+    weights, plan = config["sysid"]["weights"], candidate_simulation.stack_recordings(own)
     row = begin + np.array([80.0, -0.2])
-    path = traced(replay, row, plan)
+    path = traced(simulator, row, plan)
     square = (candidate_simulation.residuals(path, plan, [0, 1], optimization.weight_row(weights)) ** 2).sum()
     assert square == pytest.approx(
-        optimization.losses(candidate_simulation.make_scorer(replay, plan, width=3)(row[None], [0, 1]), weights)[0], rel=1e-3
+        optimization.losses(candidate_simulation.make_scorer(simulator, plan, width=3)(row[None], [0, 1]), weights)[0], rel=1e-3
     )
 
 
-def test_strips_of_road_have_their_own_grip(lesson):
+def test_strips_of_road_have_different_friction(lesson):
     """Beyond one metre the left wheels are on the wet, the right ones on gravel: those that grip push first, then brake."""
-    replay, begin, own = lesson
-    plan = candidate_simulation.suite(own)
-    even, split = (traced(replay, np.array([begin[0], wet]), plan).yaw_rate[1] for wet in (0.5, 0.05))
+    simulator, begin, own = lesson
+    plan = candidate_simulation.stack_recordings(own)
+    even, split = (traced(simulator, np.array([begin[0], wet]), plan).yaw_rate[1] for wet in (0.5, 0.05))
     assert np.abs(even).max() < 1e-4, "wet is as good as gravel"
     assert split[8] > 1e-3 and split[17] < split[8] - 1e-3
 
@@ -198,13 +200,13 @@ FAMILIES = ("straight_brake", "step_steer", "limit", "surface_transition")
 
 
 def stand_ins():
-    """Manoeuvres that nobody drives, one a family."""
+    """Recordings of zeros, one a family."""
     plans = [manoeuvre(family, 0.0)._replace(family=family) for family in FAMILIES]
     zeros = lambda plan: [np.zeros((len(plan.controls), *width)) for width in ((2,), (), (), (), (4,), (), (), ())]  # noqa: E731
     return [ManoeuvreRecording(plan, *zeros(plan)) for plan in plans]
 
 
-def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
+def test_stages_continue_each_other_and_resume_with_equal_settings(tmp_path, capsys):
     budget = {name: [4, 2] for name in ("longitudinal", "steering", "surface", "refinement", "brake_preservation")}
     config = load_config("sysid", f"sysid.budget={budget}".replace("'", ""), "resume=true")
     where, asked = parameter_space.make(config["sysid"]["space"]), []
@@ -213,11 +215,11 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
     def score(rows, manoeuvres):
         asked.append((len(rows), tuple(manoeuvres)))
         terms = np.zeros((len(rows), len(manoeuvres), len(TERMS)))
-        terms[..., 0] = ((parameter_space.unit(where, rows) - parameter_space.unit(where, target)) ** 2).sum(-1)[:, None]
+        terms[..., 0] = ((parameter_space.to_unit_box(where, rows) - parameter_space.to_unit_box(where, target)) ** 2).sum(-1)[:, None]
         return terms
 
     (tmp_path / "stages").mkdir()
-    found = command.stages(config, tmp_path, stand_ins(), where, score)
+    found = identification.search_stages(config, tmp_path, stand_ins(), where, score)
     assert [outcome.name for outcome in found] == list(config["sysid"]["stages"])
     losses = [loss for outcome in found[:4] for loss in (outcome.start_loss, outcome.loss)]
     assert (np.diff(losses) <= 1e-12).all() and losses[-1] < losses[0]
@@ -227,13 +229,14 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
     restored = [where.names.index(name) for name in config["sysid"]["stages"]["brake_preservation"]["tuned"]]
     again = found[3].best.copy()
     again[restored] = found[0].best[restored]
-    assert found[4].start_loss == pytest.approx(((parameter_space.unit(where, again) - parameter_space.unit(where, target)) ** 2).sum())
+    gap = parameter_space.to_unit_box(where, again) - parameter_space.to_unit_box(where, target)
+    assert found[4].start_loss == pytest.approx((gap**2).sum())
 
     asked.clear()
-    kept = command.stages(config, tmp_path, stand_ins(), where, score)
+    kept = identification.search_stages(config, tmp_path, stand_ins(), where, score)
     assert not asked and all(np.array_equal(a.best, b.best) and a.loss == b.loss for a, b in zip(found, kept, strict=True))
     other = {**config, "sysid": {**config["sysid"], "budget": {**budget, "surface": [4, 3]}}}
-    command.stages(other, tmp_path, stand_ins(), where, score)
+    identification.search_stages(other, tmp_path, stand_ins(), where, score)
     assert asked[0] == (1, (2, 3)), "the first two stages stay, the third is searched anew"
     assert len(list((tmp_path / "stages").iterdir())) == 5
 
@@ -245,26 +248,26 @@ def test_stages_follow_one_another_and_resume_where_they_fit(tmp_path, capsys):
         ("sysid.stages.surface.families=[ice]", r"sysid.stages.surface.families: \['ice'\]; sysid.every=16 leaves none"),
     ],
 )
-def test_stages_that_cannot_be_are_refused(tmp_path, override, message):
+def test_stages_with_unknown_names_are_errors(tmp_path, override, message):
     config = load_config("sysid", override, "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1]}")
     where = parameter_space.make(config["sysid"]["space"])
     (tmp_path / "stages").mkdir()
     with pytest.raises(ConfigError, match=message):
-        command.stages(config, tmp_path, stand_ins(), where, lambda rows, manoeuvres: np.ones((len(rows), len(manoeuvres), len(TERMS))))
+        identification.search_stages(config, tmp_path, stand_ins(), where, lambda rows, _: np.ones((len(rows), 1, len(TERMS))))
 
 
 @pytest.mark.slow
 def test_the_whole_command(tmp_path):
     budget = "{longitudinal: [2,1], steering: [2,1], surface: [2,1], refinement: [2,1], brake_preservation: [2,1]}"
     config = load_config("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
-    found = command.sysid(config)
+    found = sysid(config)
     written = {path.name for path in tmp_path.iterdir()}
     figures = {"search.png", "slices.png", "heldout.png", "paths.png"}
     assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
     assert found["refined"]["loss"] <= found["refined"]["start_loss"] and set(found["cars"]) == {"fitted", "default", "published"}
     car = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["car"]
     fitted = load_config("train", *(f"dynamics.car.{name}={value}" for name, value in car.items()))["dynamics"]["car"]
-    assert all(fitted[name] == value for name, value in car.items()), "what was fitted is a car"
+    assert all(fitted[name] == value for name, value in car.items()), "the fitted parameters are a valid car"
     text = (tmp_path / "sysid.md").read_text()
     assert "steering_limit" in text and "steady_circle" in text
 

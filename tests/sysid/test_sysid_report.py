@@ -66,6 +66,7 @@ def test_the_report_is_written_from_its_results(tmp_path, result):
         assert f"({name}.png)" in text and (tmp_path / f"{name}.png").stat().st_size > 5_000
 
 
+@pytest.mark.usefixtures("undrawn_figures")
 def test_families_that_miss_a_target_are_named_with_their_medians(tmp_path, result):
     text = report.write(tmp_path, result, TARGETS).read_text()
     misses = next(line for line in text.splitlines() if line.startswith("Families whose own median"))
@@ -74,6 +75,7 @@ def test_families_that_miss_a_target_are_named_with_their_medians(tmp_path, resu
     assert "No family's own median misses a target." in report.write(tmp_path, result, loose).read_text()
 
 
+@pytest.mark.usefixtures("undrawn_figures")
 def test_the_committed_report_is_made_of_its_results(tmp_path):
     result = result_file.read(COMMITTED / "result.json")
     written = report.write(tmp_path, result, load_config("sysid", "sysid=full")["sysid"]["targets"])

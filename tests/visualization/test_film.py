@@ -58,13 +58,13 @@ def test_prisms_enclose_area_times_height(shape):
 
 def test_a_road_has_asphalt_kerbs_and_paint():
     found = {surface.name: surface for surface in ground_meshes.find_surfaces(scene_of(np.zeros((1, 2)), np.ones((1, 2))))}
-    assert set(found) == {"asphalt", "kerb"}
+    assert set(found) == {"asphalt", "edge"}
     low, high = found["asphalt"].vertices.min(axis=0), found["asphalt"].vertices.max(axis=0)
     assert high[1] == pytest.approx(ground_meshes.LANE_M, abs=0.05) and low[0] == pytest.approx(-60 - ground_meshes.LANE_M, abs=0.1)
-    assert found["kerb"].vertices[:, 2].max() == pytest.approx(ground_meshes.LAYERS["kerb"].height_m)
+    assert found["edge"].vertices[:, 2].max() == pytest.approx(ground_meshes.LOOKS["edge"].height_m)
 
 
-def test_cars_stand_and_steer_as_they_are_put():
+def test_cars_have_the_given_posture():
     scene = scene_of([[0.0, 0.0], [20.0, 3.0]], np.ones((2, 2)), size=(5.0, 2.2))
     built = scene_model.build(scene, CAR)
     data = mujoco.MjData(built.model)
@@ -89,18 +89,18 @@ def test_cars_stand_and_steer_as_they_are_put():
 
 def test_recorded_joints_are_shown_as_they_are(recording):
     joints = np.random.default_rng(1).normal(size=(*recording.shots.yaw.shape, scene_model.JOINTS))
-    whole = actors.make_actors(changed(recording, joints=joints), 0, CAR)
-    last = np.flatnonzero(whole.active[:, 0])[-1]
-    assert last < len(whole.yaw) - 1  # it reached its goal
-    np.testing.assert_array_equal(whole.joints[: last + 1, 0], joints[0, : last + 1, 0])
-    np.testing.assert_array_equal(whole.joints[last + 1 :, 0], np.tile(joints[0, last, 0], (len(whole.yaw) - last - 1, 1)))
-    assert whole.opacity[last, 0] == 1.0 and whole.opacity[-1, 0] == 0.0 and (np.diff(whole.opacity[last:, 0]) <= 0).all()
+    world = actors.make_actors(changed(recording, joints=joints), 0, CAR)
+    last = np.flatnonzero(world.active[:, 0])[-1]
+    assert last < len(world.yaw) - 1  # it reached its goal
+    np.testing.assert_array_equal(world.joints[: last + 1, 0], joints[0, : last + 1, 0])
+    np.testing.assert_array_equal(world.joints[last + 1 :, 0], np.tile(joints[0, last, 0], (len(world.yaw) - last - 1, 1)))
+    assert world.opacity[last, 0] == 1.0 and world.opacity[-1, 0] == 0.0 and (np.diff(world.opacity[last:, 0]) <= 0).all()
 
 
 def test_wheels_without_joints_turn_as_fast_as_the_road_passes(recording):
-    whole = actors.make_actors(recording, 0, CAR)
-    spin = whole.joints[:, 2, scene_model.SPIN[0]]
-    way = np.linalg.norm(np.diff(whole.joints[:, 2, :2], axis=0), axis=1)
+    world = actors.make_actors(recording, 0, CAR)
+    spin = world.joints[:, 2, scene_model.SPIN[0]]
+    way = np.linalg.norm(np.diff(world.joints[:, 2, :2], axis=0), axis=1)
     np.testing.assert_allclose(np.diff(spin) * CAR.wheel_radius, way, rtol=0.02)
 
 
@@ -112,23 +112,23 @@ def hue(colour):
     return (colour - colour.min()) / max(np.ptp(colour), 1.0)
 
 
-def test_from_above_every_car_is_seen_where_it_is(opened, recording):
-    whole, look = actors.make_actors(recording, 0, CAR), settings(view="bird", width=960, height=540)
-    [picture] = film.frames(whole, [20], settings=look, slot=0, **LOOK)
-    camera = film.look_from_above(whole, aspect=look.width / look.height)
+def test_from_above_every_car_is_at_its_position(opened, recording):
+    world, look = actors.make_actors(recording, 0, CAR), settings(view="bird", width=960, height=540)
+    [picture] = film.frames(world, [20], settings=look, slot=0, **LOOK)
+    camera = film.look_from_above(world, aspect=look.width / look.height)
     scale = look.height / (2 * camera.distance * np.tan(np.radians(film.FOVY / 2)))
     for slot in range(3):
-        yaw = whole.yaw[20, slot]
-        hood = whole.joints[20, slot, :2] + 1.6 * np.array([np.cos(yaw), np.sin(yaw)])
+        yaw = world.yaw[20, slot]
+        hood = world.joints[20, slot, :2] + 1.6 * np.array([np.cos(yaw), np.sin(yaw)])
         right, up = (hood - camera.lookat[:2]) * scale
-        seen = picture[round(look.height / 2 - up), round(look.width / 2 + right)]
-        assert np.abs(hue(seen) - hue(drawing.colour_of(slot))).max() < 0.25, slot
+        pixel = picture[round(look.height / 2 - up), round(look.width / 2 + right)]
+        assert np.abs(hue(pixel) - hue(drawing.colour_of(slot))).max() < 0.25, slot
 
 
 def test_from_behind_the_followed_car_fills_the_middle(opened, recording):
-    whole = actors.make_actors(recording, 0, CAR)
+    world = actors.make_actors(recording, 0, CAR)
     for slot in (0, 2):
-        [picture] = film.frames(whole, [20], settings=settings(trail_s=0.0), slot=slot, **LOOK)
+        [picture] = film.frames(world, [20], settings=settings(trail_s=0.0), slot=slot, **LOOK)
         middle = picture[90:135, 130:190].reshape(-1, 3)
         same = [np.abs(hue(pixel) - hue(drawing.colour_of(slot))).max() < 0.2 for pixel in middle]
         assert np.mean(same) > 0.2, slot
@@ -138,13 +138,13 @@ def test_a_film_ends_a_second_after_the_followed_car(opened, recording, tmp_path
     look = settings(width=64, height=64, stride=30, view="both")
     for slot in (0, 2):
         out = film.write(tmp_path / f"{slot}.gif", recording, settings=look, slot=slot, **LOOK)
-        whole = actors.make_actors(recording, 0, CAR)
-        end = min(np.flatnonzero(whole.active[:, slot])[-1] + 1 + 30, STEPS)
+        world = actors.make_actors(recording, 0, CAR)
+        end = min(np.flatnonzero(world.active[:, slot])[-1] + 1 + 30, STEPS)
         with Image.open(out) as image:
             assert image.n_frames == len(range(0, end, 30)) and image.size == (128, 64)
 
 
-def test_mp4_wants_its_extra_or_is_written(opened, recording, tmp_path):
+def test_mp4_is_written_with_its_extra(opened, recording, tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     out = film.write(tmp_path / "film.mp4", recording, settings=settings(width=128, height=72, stride=20), **LOOK)
     assert out.stat().st_size > 500
@@ -161,7 +161,7 @@ def test_mp4_wants_its_extra_or_is_written(opened, recording, tmp_path):
         ("film.png", 15.0, 9, "car: expected one of 0, 1, 2, got 9"),
     ],
 )
-def test_a_film_that_cannot_be_is_refused(recording, tmp_path, name, fps, slot, message):
+def test_wrong_arguments_of_a_film_are_refused(recording, tmp_path, name, fps, slot, message):
     with pytest.raises(VideoError, match=message):
         film.write(tmp_path / name, recording, settings=settings(fps=fps), slot=slot, **LOOK)
     assert not list(tmp_path.iterdir())

@@ -20,11 +20,12 @@ RESPONSE = KeyboardResponse(rise_s=0.4, fall_s=0.2, turn_s=0.5, centre_s=0.25, h
 DT, NONE = 1 / 30, frozenset()
 
 
-def after(seconds, held=NONE, *, pressed=NONE, start=None, speed=0.0):
-    """Pedals and wheel some seconds later, with keys held all the time and others pressed at its beginning."""
+def after(seconds, keys_down=NONE, *, pressed=NONE, start=None, speed=0.0):
+    """Pedals and wheel some seconds later, with keys down all the time and others pressed at its beginning."""
     controls = start or Controls()
     for step in range(round(seconds / DT)):
-        controls = keyboard_control.move_controls(controls, pressed if step == 0 else NONE, held, speed=speed, response=RESPONSE, dt=DT)
+        tapped = pressed if step == 0 else NONE
+        controls = keyboard_control.move_controls(controls, tapped, keys_down, speed=speed, response=RESPONSE, dt=DT)
     return controls
 
 
@@ -65,7 +66,7 @@ def test_stop_brakes_at_once_whatever_else_is_held():
 
 @pytest.fixture(scope="module")
 def built():
-    """Two bicycles; yours is the one in slot 1, and its goal would lie right before it."""
+    """Two bicycles; the driven one has slot 1, and its logged goal is right ahead."""
     settings = hydra_config.load_config("view", "dynamics=bicycle", "traffic=none", "observations=small", "timing.episode_s=3600")
     scene = scene_of([[-20.0, 0.0], [-50.0, -3.0]], [[60.0, 0.0], [-44.0, -3.0]], speeds=[5.0, 5.0])
     act = lambda parameters, observation, key: jnp.full((2, 3), 0.0)  # noqa: E731
@@ -73,11 +74,11 @@ def built():
 
 
 def driven(built, script, drive=None):
-    """A drive after a script of (steps, held, pressed at the first of them)."""
+    """A drive after a script of (steps, keys_down, pressed at the first of them)."""
     drive = drive or keyboard_control.start(built, seed=0)
-    for steps, held, pressed in script:
+    for steps, keys_down, pressed in script:
         for step in range(steps):
-            drive = keyboard_control.advance(built, drive, set(pressed) if step == 0 else NONE, held, response=RESPONSE)
+            drive = keyboard_control.advance(built, drive, set(pressed) if step == 0 else NONE, keys_down, response=RESPONSE)
     return drive
 
 
@@ -95,17 +96,17 @@ def test_a_script_of_keys_drives_one_car_and_leaves_the_other_alone(built):
     assert float(begun.state.motion.position[1, 0]) == -50.0
 
 
-def test_your_car_has_no_goal_that_ends_it(built):
+def test_the_driven_car_has_no_goal_that_ends_it(built):
     far = driven(built, [(90, {"throttle"}, ())])
     assert far.shot.position[1, 0] > -44.0 and bool(far.state.active[1]) and far.resets == 0
 
 
 def test_pause_holds_the_world_and_reset_starts_anew(built):
     moved = driven(built, [(20, {"throttle"}, ())])
-    held = driven(built, [(10, {"throttle"}, ("pause",))], moved)
-    assert held.paused and held.steps == 20
-    np.testing.assert_array_equal(held.shot.position, moved.shot.position)
-    on = driven(built, [(5, NONE, ("pause",))], held)
+    paused = driven(built, [(10, {"throttle"}, ("pause",))], moved)
+    assert paused.paused and paused.steps == 20
+    np.testing.assert_array_equal(paused.shot.position, moved.shot.position)
+    on = driven(built, [(5, NONE, ("pause",))], paused)
     assert not on.paused and on.steps == 25 and on.shot.position[1, 0] > moved.shot.position[1, 0]
     again = driven(built, [(1, NONE, ("reset",))], on)
     assert again.resets == 1 and again.steps == 0 and again.controls == Controls() and again.shot is None
@@ -157,8 +158,8 @@ def test_the_viewers_keys_become_commands(monkeypatch):
     assert keyboard.read() == (set(), set())  # before the first press nobody knows the window
     keyboard(window.KEY_CODES["r"])
     keyboard(999)
-    pressed, held = keyboard.read()
-    assert "reset" in pressed and held == {"throttle"} and keyboard.read() == (set(), {"throttle"})
+    pressed, keys_down = keyboard.read()
+    assert "reset" in pressed and keys_down == {"throttle"} and keyboard.read() == (set(), {"throttle"})
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def file(recording, tmp_path_factory):
 
 @pytest.fixture
 def opened(browser, file):
-    """Opens the page; nothing may be logged, thrown or asked for but the file itself."""
+    """Opens the page; it may log and throw nothing and request only the file itself."""
     troubles, contexts = [], []
 
     def open(address="", before="", **options):
@@ -70,7 +70,7 @@ def step_of(page) -> int:
 
 
 def settle(page) -> None:
-    """Until the page has drawn what it was told."""
+    """Waits until the page is drawn."""
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
@@ -84,11 +84,11 @@ def number(page, selector: str) -> float:
 
 
 def selected(page) -> str:
-    return page.text_content("#who").split(" ")[1][0]
+    return page.text_content("#car-title").split(" ")[1][0]
 
 
 def colours(page) -> int:
-    """How many colours the map shows."""
+    """Number of colours on the map."""
     return page.evaluate("""() => {
       const map = document.getElementById("map");
       const data = new Uint32Array(map.getContext("2d").getImageData(0, 0, map.width, map.height).data.buffer);
@@ -114,7 +114,7 @@ def test_it_opens_paused_and_plays_to_the_end(opened):
     page.wait_for_function("() => !document.body.classList.contains('playing')")
 
 
-def test_numbers_are_the_recordings(opened, recording):
+def test_numbers_are_those_of_the_recording(opened, recording):
     page, shots = opened(), recording.shots
     page.keyboard.press("1")
     for step in (0, 17, 60):
@@ -143,13 +143,13 @@ def test_numbers_are_the_recordings(opened, recording):
         assert abs(float(page.text_content("#time").split(" ")[0]) - float(shots.time_s[0, step])) < 0.006
 
 
-def test_the_keyboard_does_everything(opened, recording):
+def test_all_keys_work(opened, recording):
     page = opened()
     assert selected(page) == "0"
     page.focus("#map")
-    for wanted in "12":
+    for slot in "12":
         page.keyboard.press("Tab")
-        assert selected(page) == wanted
+        assert selected(page) == slot
     page.keyboard.press("Tab")  # behind the last car the focus goes on
     assert selected(page) == "2" and page.evaluate("() => document.activeElement.id") != "map"
     page.keyboard.press("n")
@@ -273,7 +273,7 @@ def test_terms_and_things_on_the_map_have_legends(opened, recording):
     assert page.eval_on_selector_all("#legend li", "all => all.map((one) => one.textContent)") == ["traffic"]
 
 
-def test_a_phone_has_room(opened):
+def test_the_page_fits_a_phone(opened):
     page = opened(viewport=PHONE, has_touch=True, is_mobile=True, device_scale_factor=2)
     assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
     for selector in ("#play", "#scrub", "#map", "#world"):
@@ -285,7 +285,7 @@ def test_a_phone_has_room(opened):
     assert selected(page) == "1" and page.query_selector(".plot").bounding_box()["width"] > 300
 
 
-def test_the_dark_is_dark(opened):
+def test_the_dark_scheme_is_dark(opened):
     brightness = []
     for scheme in ("light", "dark"):
         page = opened(color_scheme=scheme)
@@ -302,5 +302,5 @@ def test_a_notebook_shows_it_inline(browser, recording):
     page.set_content(replay_page.show(recording, goal_radius_m=3.0).data)
     frame = page.frame_locator("iframe")
     frame.locator("#cars button").first.wait_for()
-    assert frame.locator("#who").text_content().startswith("Car 0") and not errors
+    assert frame.locator("#car-title").text_content().startswith("Car 0") and not errors
     page.close()

@@ -65,8 +65,9 @@ def test_the_page_reads_what_there_is(page):
     scripts = "\n".join(path.read_text() for path in (ROOT / "scenefactory_jax" / "visualization" / "web" / "page").glob("*.js"))
     derived = {"array", "bySlot", "end", "road"}
     assert set(re.findall(r"\bworld\.(\w+)", scripts)) <= set(unpacked(page)[0]) | derived
-    corners = re.search(r"const corners = \{([^}]+)\}\[name\]", scripts).group(1)
-    assert set(re.findall(r"(\w+):", corners)) <= {field.name for field in dataclasses.fields(Events)}
+    glyphs = re.search(r"const GLYPHS = \{(.+?)\n\};", scripts, re.DOTALL).group(1)
+    named = set(re.findall(r"^  (\w+):", glyphs, re.MULTILINE)) | set(re.findall(r'name === "(\w+_\w+)"', scripts))
+    assert len(named) == 5 and named <= {field.name for field in dataclasses.fields(Events)}
 
 
 @pytest.mark.parametrize("values", [
@@ -107,8 +108,8 @@ def test_cars_events_and_traffic(page, recording):
     first, second = unpacked(page)
     events, active = recording.shots.events, recording.shots.active
     for index, world in enumerate((first, second)):
-        told = {(event["name"], event["step"], event["car"]) for event in world["events"]}
-        assert told == {(n, t, a) for n, where in vars(events).items() for t, a in np.argwhere(where[index] & active[index])}
+        shown = {(event["name"], event["step"], event["car"]) for event in world["events"]}
+        assert shown == {(n, t, a) for n, where in vars(events).items() for t, a in np.argwhere(where[index] & active[index])}
         for car in world["cars"]:
             driven = np.zeros(STEPS, bool)
             for begin, end in car["spans"]:

@@ -71,8 +71,8 @@ def test_map_goals_others_and_events_are_there(chunks, recording):
     np.testing.assert_allclose(np.mean(np.asarray(ring[0])[:-1, :2], axis=0), [-8.0, 0.0], atol=1e-5)
     counts = [len(value or []) for _, value in column(chunks["/world0/traffic"], "Boxes3D:half_sizes")]
     assert counts == [1] * (STEPS // 2) + [2] * (STEPS - STEPS // 2)
-    told = {value[0] for _, value in column(chunks["/world0/events"], "TextLog:text")}
-    assert {"car 0: goal", "car 1: road edge"} <= told
+    texts = {value[0] for _, value in column(chunks["/world0/events"], "TextLog:text")}
+    assert {"car 0: goal", "car 1: road edge"} <= texts
 
 
 def test_rewards_are_the_sum_of_their_terms_and_what_is_not_there_is_nan(recording):

@@ -1,4 +1,4 @@
-"""Looks of reward terms: distinguishable, the same everywhere, and stable for terms of one's own."""
+"""Looks of reward terms: they differ, are the same in all figures, and are stable for new terms."""
 
 import itertools
 import re
@@ -18,15 +18,15 @@ DEUTAN = np.array([[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.04741
 NORMAL = np.eye(3)
 
 
-def lab(colour, seen=NORMAL):
+def lab(colour, receptors=NORMAL):
     """CIELAB of an sRGB colour, white D65."""
     share = np.asarray(colour) / 255
-    linear = np.clip(seen @ np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4), 0, 1)
+    linear = np.clip(receptors @ np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4), 0, 1)
     x, y, z = (np.cbrt(v) if v > 0.008856 else 7.787 * v + 16 / 116 for v in XYZ @ linear / [0.9505, 1.0, 1.089])
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def test_the_terms_of_every_reward_are_told_apart():
+def test_the_looks_of_all_terms_differ():
     for reward in ("paper", "safe", "safe_smooth"):
         names = list(hydra_config.load_config("task", f"reward={reward}")["reward"])
         assert TERMS.keys() >= set(names) and len(set(term_looks(names).values())) == len(names)
@@ -39,7 +39,7 @@ def test_the_terms_of_every_reward_are_told_apart():
         assert np.linalg.norm(lab(one.colour, DEUTAN) - lab(other.colour, DEUTAN)) > 10
 
 
-def test_own_terms_look_the_same_beside_others():
+def test_a_new_term_has_the_same_look_beside_others():
     alone = term_looks(["jerk"])["jerk"]
     assert alone in OWN and alone not in TERMS.values()
     assert term_looks(["progress", "jerk", "goal"])["jerk"] == alone == term_looks(["haste", "jerk"])["jerk"]

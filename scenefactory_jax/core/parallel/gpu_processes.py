@@ -1,4 +1,4 @@
-"""Several processes of this machine on one task, each on a GPU of its own, or several to a GPU."""
+"""Runs one function in several processes of this machine, each with its own GPU, or several with one."""
 
 import contextlib
 import functools
@@ -37,7 +37,7 @@ class TaskClaims:
         return True
 
     def shares(self, groups: Mapping[str, T]) -> Iterator[tuple[str, T]]:
-        """First the groups that no other process has begun, so that what a group has in common is made once; then all, to help."""
+        """First the groups that no other process has begun, so that what a group shares is made once; then all groups, to help."""
         yield from (item for item in groups.items() if self.take(item[0]))
         yield from groups.items()
 
@@ -46,13 +46,10 @@ def run_on_gpus(work: Callable[..., Any], processes: int, *arguments: Any, per_g
     """Computes `work(index, *arguments)` in each process.
 
     An error or SIGTERM in this process ends the others first (a training after its iteration), so that their results can be used; Ctrl-C
-    reaches all processes of a terminal.
+    reaches all processes of a terminal. Raises RuntimeError after all have ended, if one ended with an error, which it has printed.
 
     Args:
         per_gpu: processes that share a GPU and its memory: while one compiles on the CPU, the others compute.
-
-    Raises:
-        RuntimeError: a process ended with an error, which it has printed; the others have ended, too.
     """
     environments = [_choose_gpu(index, per_gpu) for index in range(processes)]
     with _raise_on_sigterm(), open_pool(processes, environments=environments, stops=True) as task_map:
@@ -74,14 +71,15 @@ def _run(index: int, *, work: Callable[..., Any], arguments: tuple[Any, ...]) ->
 
 
 def _choose_gpu(index: int, per_gpu: int) -> dict[str, str]:
-    """The GPU of a process, of those that this process sees, and its fraction of the memory.
+    """Environment with the GPU of a process, of those that this process sees, and its fraction of the memory.
 
-    JAX's own `jax_cuda_visible_devices` does not do: programs fail on any GPU but the first (0.11.2).
+    With `jax_cuda_visible_devices` of JAX 0.11.2 programs fail on any GPU but the first.
     """
-    given, place = [name for name in os.environ.get(VISIBLE, "").split(",") if name], index // per_gpu
-    if given and place >= len(given):
-        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(given)}; `processes` is at most {per_gpu * len(given)}")
-    variables = {VISIBLE: given[place] if given else str(place)}
+    visible, gpu = [name for name in os.environ.get(VISIBLE, "").split(",") if name], index // per_gpu
+    if visible and gpu >= len(visible):
+        most = per_gpu * len(visible)
+        raise RuntimeError(f"process {index + 1} finds no GPU: {VISIBLE}={','.join(visible)}; `processes` is at most {most}")
+    variables = {VISIBLE: visible[gpu] if visible else str(gpu)}
     return variables | ({MEMORY: f"{USED_FRACTION / per_gpu:.3f}"} if per_gpu > 1 else {})
 
 

@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.connection import wait
 from typing import Any
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number
 from scenefactory_jax.core.parallel import worker
 from scenefactory_jax.core.parallel.worker import FailedTask, Unloadable, Worker
 from scenefactory_jax.core.raw_scene import SceneError
+from scenefactory_jax.core.schema import ConfigError, Count, Positive
 
 IN_PROCESS = "spread=local scenes.workers=1 spread.timeout_s=null works without other processes"
 NO_ACCELERATOR = {"JAX_PLATFORMS": "cpu"}
@@ -29,10 +29,10 @@ TaskMap = Callable[[Work, Sequence[Any]], Iterable[Any]]
 def open_pool(
     workers: int, *, timeout_s: float | None = None, environments: Sequence[Mapping[str, str]] | None = None, stops: bool = False
 ) -> Iterator[TaskMap]:
-    """A task map over processes that stay between its calls; they end with the context, at once after an error.
+    """Opens a task map over processes that stay between its calls; they end with the context, at once after an error.
 
     Args:
-        workers: processes; 0: this process, whose death is the command's own.
+        workers: processes; 0: this process.
         timeout_s: limit of one item.
         environments: variables of each process; item i of a call goes to process i first. None: the accelerator is left to this process.
         stops: the processes obey signals to stop, and are asked to stop (SIGTERM) rather than killed.
@@ -54,26 +54,23 @@ def in_process(work: Work, items: Sequence[Any]) -> Iterator[Any]:
     return (_checked(worker.run_work(work, item)) for item in items)
 
 
-def local(work: Work, items: Sequence[Any], *, workers: int, timeout_s: float | None) -> Iterator[Any]:
+def local(work: Work, items: Sequence[Any], *, workers: Count, timeout_s: Positive | None) -> Iterator[Any]:
     """Maps over processes of this machine.
 
     Args:
         work: a function of a module, bound to values that can be sent to another process.
-        items: each goes to a free process.
         workers: processes; 1 without a time limit works in this process.
         timeout_s: limit of one item; null: none.
 
     Raises:
         SceneError: a process cannot be started, or cannot load the work.
-        ConfigError: numbers out of range, or a `ConfigError` of an item's work.
+        ConfigError: of an item's work.
     """
-    check_number(workers, where="spread.workers", least=1)
-    _check_timeout(timeout_s)
     with open_pool(0 if workers == 1 and timeout_s is None else workers, timeout_s=timeout_s) as task_map:
         yield from task_map(work, items)
 
 
-def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, timeout_s: float | None) -> Iterator[Any]:
+def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: Count, timeout_s: Positive | None) -> Iterator[Any]:
     """Maps over a Ray cluster (`pip install "scenefactory_jax[ray]"`). All machines must see the files and the bank under the same paths.
 
     Args:
@@ -83,10 +80,8 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
 
     Raises:
         SceneError: Ray is not installed, or its workers cannot load the work.
-        ConfigError: as for `local`.
+        ConfigError: of an item's work.
     """
-    check_number(pending, where="spread.pending", least=1)
-    _check_timeout(timeout_s)
     try:
         cluster = importlib.import_module("ray")
     except ImportError as error:
@@ -107,11 +102,7 @@ def ray(work: Work, items: Sequence[Any], *, address: str | None, pending: int, 
 
 
 def require_results(results: Iterable[Any]) -> Iterator[Any]:
-    """The results of a task map where no task may fail.
-
-    Raises:
-        RuntimeError: with the reason of the first failure.
-    """
+    """The results of a task map; raises RuntimeError with the reason of the first task that failed."""
     for result in results:
         if isinstance(result, FailedTask):
             raise RuntimeError(result.reason) from result.error
@@ -193,7 +184,7 @@ class _Pool:
 
 
 def _pack(work: Work, dumps: Callable[[Work], bytes]) -> bytes:
-    """The work as bytes, which a process loads where it can say what goes wrong."""
+    """The work as bytes, which each process loads itself: so it can report what goes wrong."""
     try:
         return dumps(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:  # pickle raises all three for values that it cannot send
@@ -208,8 +199,3 @@ def _checked(result: Any) -> Any:
         hint = "every process, on every machine of a cluster, must be able to import readers and parts"
         raise SceneError(f"spread: a process cannot load the work: {result.reason}; {hint}; {IN_PROCESS}")
     return result
-
-
-def _check_timeout(timeout_s: float | None) -> None:
-    if timeout_s is not None:
-        check_number(timeout_s, where="spread.timeout_s", above=0)

@@ -90,10 +90,7 @@ def _end_with(parent: int) -> None:
 
 
 def run_task(packed: bytes, timeout_s: float | None, item: Any) -> Any:
-    """Computes the result of an item, or why there is none; of a mistake in the config the error itself.
-
-    After `timeout_s` the kernel's alarm ends the process, whatever code runs.
-    """
+    """Computes the result of an item, as `run_work`; after `timeout_s` the kernel's alarm ends the process, whatever code runs."""
     if isinstance(work := _load(packed), Unloadable):
         return work
     if timeout_s is not None:
@@ -115,7 +112,7 @@ def run_work(work: Callable[[Any], Any], item: Any) -> Any:
 
 @functools.lru_cache(maxsize=8)
 def _load(packed: bytes) -> Callable[[Any], Any] | Unloadable:
-    """The work, loaded once in a process; loading imports modules, and any error of theirs is the reason."""
+    """Loads the work once in a process; any error of the modules that it imports is the reason of a failure."""
     try:
         return pickle.loads(packed)
     except Exception as error:

@@ -1,7 +1,4 @@
-"""`bank.json`: which files a bank consists of and how the bank came to be. It is replaced as a whole, never changed in place.
-
-Its last line is the SHA-256 of what stands before it.
-"""
+"""`bank.json`: the files of a bank and how it was made. It is replaced as a whole; its last line is the SHA-256 of the text before."""
 
 import hashlib
 import json
@@ -26,7 +23,7 @@ DIGEST = "sha256"  # key of the checksum
 
 @dataclass(frozen=True)
 class Shard:
-    """One file of a bank, as it was when it was finished."""
+    """One file of a bank, with its size and checksum when it was written."""
 
     file: str  # relative to the bank's folder; those of a view lie in other folders
     scenes: int
@@ -36,20 +33,20 @@ class Shard:
 
 @dataclass(frozen=True)
 class Index:
-    """What `bank.json` says."""
+    """Content of `bank.json`."""
 
-    settings: dict[str, Any]  # what the scenes were read, checked and chosen with
+    settings: dict[str, Any]  # with which the scenes were read, checked and selected
     shards: tuple[Shard, ...] = ()  # of scenes
-    metadata: tuple[Shard, ...] = ()  # of the catalogue: a row a scene, and where the scene lies
-    files: tuple[str, ...] = ()  # source files that are done, relative to the source
+    metadata: tuple[Shard, ...] = ()  # of the catalogue: a row a scene, with its place
+    files: tuple[str, ...] = ()  # converted source files, relative to the source
     rejects: tuple[dict[str, Any], ...] = ()  # source, scene (null: the file itself) and reason
     companions: tuple[dict[str, Any], ...] = ()  # source and reason of files that belong to scenes beside them
-    account: dict[str, Any] = field(default_factory=dict)  # counts of what the trial packing kept and dropped
-    complete: bool = False  # false: the conversion was stopped; it goes on where it stopped
+    account: dict[str, Any] = field(default_factory=dict)  # counts of the trial packing
+    complete: bool = False  # false: the conversion was stopped
 
 
 def is_bank(path: Path | str) -> bool:
-    """Whether a folder says of itself that it is a bank, of any schema; one whose index is damaged may be."""
+    """Whether a folder has the index of a bank, of any schema; true if the index is damaged."""
     try:
         return _format(_entries(Path(path))) == FORMAT
     except SceneError:
@@ -57,11 +54,7 @@ def is_bank(path: Path | str) -> bool:
 
 
 def check_replaceable(path: Path) -> None:
-    """Refuse a folder that is not surely a bank.
-
-    Raises:
-        SceneError: it is none, or its index is damaged.
-    """
+    """Raises a SceneError unless a folder is a bank whose index is sound."""
     if _format(_entries(path)) != FORMAT:
         raise SceneError(f"{path}: exists and is no bank; give another path, or remove it")
 
@@ -90,10 +83,10 @@ def read(path: Path) -> Index:
 
 
 def _entries(path: Path) -> dict[str, Any] | None:
-    """What the index of a folder holds, in whatever format; None where there is none.
+    """Entries of a folder's index, of any format; None without an index.
 
     Raises:
-        SceneError: it cannot be read, or is not what was written.
+        SceneError: it cannot be read, or is damaged.
     """
     file = path / INDEX
     try:
@@ -123,18 +116,13 @@ def _format(entries: Mapping[str, Any] | None) -> Any:
 
 
 def _shard(entry: Any) -> Shard:
-    """One file's entry.
-
-    Raises:
-        TypeError: other keys or values than such an entry has.
-    """
     if not isinstance(entry, dict) or {name: type(value) for name, value in entry.items()} != Shard.__annotations__:
         raise TypeError(f"{repr(entry)[:80]} in place of {', '.join(Shard.__annotations__)}")
     return Shard(**entry)
 
 
 def write(folder: Path, index: Index) -> None:
-    """Replace the index, so that a reader finds the one of before or this one, whole."""
+    """Replaces the index atomically."""
     entries = {"format": FORMAT, "schema": SCHEMA} | {entry.name: getattr(index, entry.name) for entry in fields(Index)}
     entries |= {name: [asdict(shard) for shard in entries[name]] for name in ("shards", "metadata")}
     lines = [f'"{name}": {json.dumps(value, default=_plain)}' for name, value in entries.items()]  # a line each: json's indent is slow
@@ -144,7 +132,7 @@ def write(folder: Path, index: Index) -> None:
 
 
 def describe(folder: Path, file: str, scenes: int) -> Shard:
-    """A finished file's size and checksum."""
+    """The entry of a finished file: size and checksum."""
     return Shard(file, scenes, (folder / file).stat().st_size, digest(folder / file))
 
 
@@ -155,7 +143,7 @@ def digest(path: Path) -> str:
 
 
 def check_complete(path: Path, shard: Shard) -> None:
-    """Refuse a shard that is missing or of another size than it was, by name."""
+    """Raises a SceneError if a file is missing or has another size than when it was written."""
     size = path.stat().st_size if path.is_file() else None
     if size is None:
         raise SceneError(f"{path}: missing; a bank needs all of its files, a view also the banks that it refers to: copy them together")
@@ -169,10 +157,10 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
 
 
 def plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as JSON gives them back, to be compared with those of a bank."""
+    """Settings with JSON values only, to be compared with those of a bank."""
     return json.loads(json.dumps(settings, default=_plain))
 
 
 def _plain(value: Any) -> Any:
-    """What JSON has no word for, in its words."""
+    """A JSON value for one that JSON lacks."""
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)

@@ -1,8 +1,8 @@
-"""Banks: whole scenes on disk, nothing cut and nothing chosen; they are checked and packed into worlds when they are loaded.
+"""Banks: scenes on disk as their source holds them; checks and packing into worlds happen when they are loaded.
 
-A bank is a folder with `bank.json` (`bank_index`), shards of scenes (`arrow`: Arrow IPC files, a record batch a scene) and their catalogue
-(`catalogue`: a row a scene). It can be moved. A view is a bank whose shards lie in other banks, by relative path: choosing scenes copies
-none. Shards are mapped when they are first read, and hold no file open; a scene that is not what was written is refused (`shard_files`).
+A bank is a folder with `bank.json` (`bank_index`), shards of scenes (`arrow_codec`: Arrow IPC files, a record batch a scene) and their
+catalogue (`catalogue`: a row a scene). It can be moved. A view is a bank whose shards are in other banks, by relative path.
+Shards are mapped when they are first read, and keep no file open; a damaged scene is refused (`shard_files`).
 """
 
 import itertools
@@ -29,17 +29,17 @@ Readers = dict[int, shard_files.Reader]
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """An open bank, or a choice of the scenes of some: `open`, `view`, `join`. Scenes stay on disk until they are asked for."""
+    """An open bank, or a selection of scenes of banks: `open`, `view`, `join`. Scenes are read from disk on demand."""
 
-    path: Path  # the folder that was opened; of a view that was never saved: of its first bank
+    path: Path  # the opened folder; of a view that was never saved: of its first bank
     index: Index
     shards: tuple[Shard, ...]  # by absolute path
-    places: Int[np.ndarray, "N 5"]  # of each scene: shard, and where in it, with a checksum (`shard_files.PLACE`)
+    places: Int[np.ndarray, "N 5"]  # of each scene: shard, place in it and checksum (`shard_files.PLACE`)
     metadata: pa.Table  # the catalogue: a row a scene
-    readers: Readers = field(default_factory=dict, repr=False)  # of the shards that were mapped so far; views share them
+    readers: Readers = field(default_factory=dict, repr=False)  # of the shards mapped so far; views share them
 
     def __getstate__(self) -> dict[str, Any]:
-        """Another process maps shards of its own."""
+        """Readers cannot be sent to another process."""
         return vars(self) | {"readers": {}}
 
     @property
@@ -56,7 +56,7 @@ class Bank:
 
     @property
     def unfinished(self) -> str:
-        """What to say after the bank's name where scenes may be missing; else nothing."""
+        """A remark to the bank's name if its conversion was stopped; else empty."""
         return "" if self.index.complete else ", whose conversion was stopped: the same `convert` goes on with it"
 
     def __len__(self) -> int:
@@ -64,10 +64,10 @@ class Bank:
 
 
 def open(path: Path | str) -> Bank:
-    """Open a bank. Its catalogue is read and held against its checksum, its scenes are not touched.
+    """Opens a bank: reads and checks its catalogue, but not its scenes.
 
     Raises:
-        SceneError: no bank, a bank of another schema, or a file that is missing, cut short or damaged, by name.
+        SceneError: no bank, a bank of another schema, or a file that is missing or damaged, by name.
     """
     path = Path(path).resolve()
     index = bank_index.read(path)
@@ -85,7 +85,7 @@ def open(path: Path | str) -> Bank:
 
 
 def verify(path: Path | str) -> None:
-    """Read every byte of a bank, and of those that a view refers to, against the checksums.
+    """Reads every byte of a bank, and of the banks that a view refers to, and compares it with the checksums.
 
     Raises:
         SceneError: as `open`, or the files that have changed, by name.
@@ -100,11 +100,7 @@ def verify(path: Path | str) -> None:
 
 
 def read_raw(bank: Bank, index: int) -> RawScene:
-    """One scene as its reader gave it. Its arrays are views of the file, read-only.
-
-    Raises:
-        SceneError: no such scene, or its shard has changed or vanished.
-    """
+    """One scene as its source holds it. Its arrays are read-only views of the file."""
     return next(read_raws(bank, [index]))
 
 
@@ -112,13 +108,13 @@ def read_raws(bank: Bank, indices: Sequence[int] | np.ndarray) -> Iterator[RawSc
     """Scenes one after another.
 
     Raises:
-        SceneError: as `raw`.
+        SceneError: no such scene, or a shard that is missing or damaged.
     """
     yield from _scenes(bank.shards, bank.places[_rows(bank, indices)], bank.readers)
 
 
 def view(bank: Bank, indices: Sequence[int] | np.ndarray) -> Bank:
-    """A bank of these scenes in this order, without copying; an index may occur many times.
+    """A bank of these scenes in this order, without copying; an index may be repeated.
 
     Raises:
         SceneError: no such scene, or no indices.
@@ -133,10 +129,8 @@ def join(banks: Sequence[Bank]) -> Bank:
     """The scenes of several banks, one bank after another, without copying.
 
     Raises:
-        SceneError: no banks, or columns of their catalogues that do not go together.
+        SceneError: catalogues with different types of a column.
     """
-    if not banks:
-        raise SceneError("no banks to join; give at least one")
     shards = {shard.file: shard for bank in banks for shard in bank.shards}
     number = {file: place for place, file in enumerate(shards)}
     places = []
@@ -149,12 +143,12 @@ def join(banks: Sequence[Bank]) -> Bank:
 
 
 def save(bank: Bank, path: Path | str, *, copy: bool, settings: Mapping[str, Any]) -> Bank:
-    """Write a bank or a view and open it. A bank that is there is replaced once the new one is complete.
+    """Writes a bank or a view and opens it. An existing bank is replaced when the new one is complete.
 
     Args:
-        path: folder to make.
-        copy: write the scenes too, so that the folder needs no other; else refer to those of the banks that they lie in.
-        settings: what the scenes were chosen with, kept for the record.
+        path: of the new folder.
+        copy: also write the scenes; else refer to the banks that hold them.
+        settings: stored in the bank.
 
     Raises:
         SceneError: the path exists and is no bank, or is one that the view would refer to.
@@ -180,17 +174,17 @@ def write(
     features: Features | None = None,
     compression: bank_writer.Compression = None,
 ) -> Bank:
-    """Write scenes that somebody made, and open the bank. A bank that is there is replaced once the new one is complete.
+    """Writes scenes as a bank and opens it. An existing bank is replaced when the new one is complete.
 
     Args:
-        path: folder to make.
+        path: of the new folder.
         scenes: taken one shard at a time.
-        settings: what they were made with, kept for the record.
-        features: more columns for the catalogue.
+        settings: stored in the bank.
+        features: computes further columns of the catalogue.
         compression: of the shards; None can be mapped without copying.
 
     Raises:
-        SceneError: the path exists and is no bank, there are no scenes, or one that no bank can hold.
+        SceneError: the path exists and is no bank, there are no scenes, or one that cannot be encoded.
     """
     path, scenes = Path(path).resolve(), iter(scenes)
     with bank_writer.replace_bank(path) as folder:
@@ -203,12 +197,12 @@ def write(
 
 
 def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[RawScene]:
-    """Scenes one after another; a shard is mapped when the first of its scenes is asked for."""
+    """Scenes one after another; a shard is mapped when its first scene is read."""
     return (_reader(shards, number, readers).scene(place) for number, *place in places.tolist())
 
 
 def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[pa.RecordBatch]:
-    """Scenes as they lie in their shards."""
+    """Scenes as they are encoded in their shards."""
     return (_reader(shards, number, readers).batch(place) for number, *place in places.tolist())
 
 
@@ -219,7 +213,7 @@ def _reader(shards: Sequence[Shard], number: int, readers: Readers) -> shard_fil
 
 
 def _concatenated(tables: Sequence[pa.Table], where: str) -> pa.Table:
-    """Catalogues one below the other; a column that one lacks is null there."""
+    """Concatenated catalogues; a column that one lacks is null there."""
     try:
         return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
@@ -227,7 +221,7 @@ def _concatenated(tables: Sequence[pa.Table], where: str) -> pa.Table:
 
 
 def _rows(bank: Bank, indices: Sequence[int] | np.ndarray) -> Int[np.ndarray, " N"]:
-    """Indices as rows; those below zero count from the end."""
+    """Indices as rows; negative ones count from the end."""
     rows, count = np.asarray(indices, np.int64).reshape(-1), len(bank)
     if (wrong := rows[(rows < -count) | (rows >= count)]).size:
         raise SceneError(f"{bank.path}: no scene {wrong[0]}; valid: 0 to {count - 1}")
@@ -235,5 +229,5 @@ def _rows(bank: Bank, indices: Sequence[int] | np.ndarray) -> Int[np.ndarray, " 
 
 
 def _chosen(settings: Mapping[str, Any], banks: Sequence[Bank]) -> Index:
-    """The index of what was chosen: as complete as the banks are, and without the account of a conversion."""
+    """The index of a selection: complete if all banks are, without the account of a conversion."""
     return Index(settings=dict(settings), complete=all(bank.index.complete for bank in banks))

@@ -1,4 +1,4 @@
-"""What is known of each scene of a bank without reading it: a row of names and numbers, by which scenes are found and chosen."""
+"""The catalogue of a bank: a row of names and numbers for each scene, by which scenes are selected without reading them."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -13,15 +13,31 @@ from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, EDGES, LINES, STOP_
 Features = Callable[[RawScene], Mapping[str, Any]]  # more columns; a value is a number, a text, true, false or None
 
 PACKED = "packed"
-COLUMNS: dict[str, pa.DataType] = {
-    **dict.fromkeys(("name", "source", "dataset", "format"), pa.string()),
-    **{"steps": pa.int64(), "current": pa.int64(), "dt_s": pa.float64()},
-    **dict.fromkeys(("lanes", "edges", "lines", "crosswalks", "stop_signs", "lights"), pa.int64()),
-    **dict.fromkeys(("vehicles", "pedestrians", "cyclists"), pa.int64()),
-    "findings": pa.int64(),  # of the rules of quality; null where nobody judged
-    "packing": pa.string(),  # PACKED, or why packing refused it at conversion (`pack.REFUSALS`); null: not tried
-    "sdc": pa.int64(),  # id of the car that recorded the log; null without one
-    **dict.fromkeys(("min_x", "min_y", "max_x", "max_y"), pa.float64()),  # of the map, in the source's coordinates
+TEXT, WHOLE, REAL = pa.string(), pa.int64(), pa.float64()
+COLUMNS: dict[str, tuple[pa.DataType, str]] = {  # type and meaning
+    "name": (TEXT, "Name of the scene."),
+    "source": (TEXT, "File that it came from, or generator."),
+    "dataset": (TEXT, "Data set."),
+    "format": (TEXT, "Format that it was read from."),
+    "steps": (WHOLE, "Steps of the log."),
+    "current": (WHOLE, "Step at which a simulation takes over from the log."),
+    "dt_s": (REAL, "Time between two steps."),
+    "lanes": (WHOLE, "Driving lanes."),
+    "edges": (WHOLE, "Road edges."),
+    "lines": (WHOLE, "Painted lines."),
+    "crosswalks": (WHOLE, "Crosswalks."),
+    "stop_signs": (WHOLE, "Stop signs."),
+    "lights": (WHOLE, "Lanes with a traffic light."),
+    "vehicles": (WHOLE, "Vehicles, the SDC included."),
+    "pedestrians": (WHOLE, "Pedestrians."),
+    "cyclists": (WHOLE, "Cyclists."),
+    "findings": (WHOLE, "Findings of the quality rules; null if the rules were not applied."),
+    "packing": (TEXT, "Result of packing at conversion: packed, or the kind of its refusal (`pack.REFUSALS`); null: not tried."),
+    "sdc": (WHOLE, "Id of the car that recorded the log; null without one."),
+    "min_x": (REAL, "West end of the map in the source's coordinates, m."),
+    "min_y": (REAL, "South end, m."),
+    "max_x": (REAL, "East end, m."),
+    "max_y": (REAL, "North end, m."),
 }
 
 
@@ -56,11 +72,7 @@ def row(raw: RawScene) -> dict[str, Any]:
 
 
 def extend_table(raw: RawScene, features: Features | None) -> dict[str, Any]:
-    """The row with the columns of one's own.
-
-    Raises:
-        SceneError: a column of one's own has the name of one that every bank has.
-    """
+    """The row with further columns; SceneError if one has the name of a column that every bank has."""
     more = {} if features is None else dict(features(raw))
     if taken := [name for name in more if name in COLUMNS]:
         raise SceneError(f"{raw.source}: features: {taken[0]!r} is a column that every bank has; choose another name")
@@ -70,5 +82,4 @@ def extend_table(raw: RawScene, features: Features | None) -> dict[str, Any]:
 def table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
     """Rows as a table; a column that a row lacks is null there."""
     names = list(dict.fromkeys([*COLUMNS, *(name for one in rows for name in one)]))
-    return pa.table({name: pa.array([one.get(name) for one in rows], COLUMNS.get(name)) for name in names})
-
+    return pa.table({name: pa.array([one.get(name) for one in rows], COLUMNS[name][0] if name in COLUMNS else None) for name in names})

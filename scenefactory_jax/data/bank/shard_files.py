@@ -1,8 +1,8 @@
-"""Reading the files of a bank: they are mapped, and nothing is taken from them that is not what was written.
+"""Reads the files of a bank: maps them and compares their content with checksums.
 
-A scene is a message of Arrow's IPC format: a span of bytes of its shard. The catalogue holds each span and its CRC-32, as a TFRecord does
-of its records, so that checking grows with the scene and not with its shard: about 4 GB/s, 1 to 2 % of the time that packing takes.
-Banks of schema 3 have no such column. Their shards are held against their SHA-256 as a whole, once in a process: about 1.7 GB/s.
+A scene is a message of Arrow's IPC format: a span of bytes of its shard. The catalogue holds each span and its CRC-32, so that
+the time to check grows with the scene and not with its shard: about 4 GB/s, 1 to 2 % of the time to pack it.
+Banks of schema 3 have no such column: the SHA-256 of a shard is compared once in a process, at about 1.7 GB/s.
 """
 
 import functools
@@ -18,17 +18,17 @@ from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.data.bank import arrow_codec, bank_index
 from scenefactory_jax.data.bank.bank_index import Shard
 
-PLACE = ("_shard", "_row", "_first", "_bytes", "_crc32")  # columns of the catalogue on disk: where each scene lies, and its checksum
+PLACE = ("_shard", "_row", "_first", "_bytes", "_crc32")  # columns of the catalogue on disk: place and checksum of each scene
 OF_SCHEMA_3 = PLACE[:2]
-UNKNOWN = -1  # in the other columns, of a scene that schema 3 wrote
+UNKNOWN = -1  # in the other columns of schema 3
 MAGIC = 8  # bytes before the first message of an Arrow file
 
 
 class Reader:
-    """A shard, mapped. No descriptor stays open, and the map lives as long as anything that was read from it.
+    """A mapped shard. No descriptor stays open; the map lives as long as anything that was read from it.
 
     Raises:
-        SceneError: the file is missing, or of another size than it was.
+        SceneError: the file is missing or has another size.
     """
 
     def __init__(self, shard: Shard):
@@ -42,7 +42,7 @@ class Reader:
             place: row in the shard, first byte, bytes and CRC-32.
 
         Raises:
-            SceneError: the file does not hold what was written, by name.
+            SceneError: the file is damaged, by name.
         """
         row, first, size, checksum = place
         try:
@@ -53,7 +53,7 @@ class Reader:
                 if zlib.crc32(span) != checksum:
                     raise self._damaged(row, "its checksum is another")
                 batch = pa.ipc.read_record_batch(span, arrow_codec.SCHEMA)
-            batch.validate(full=True)  # memory is safe even where the checksum was made for damaged bytes
+            batch.validate(full=True)  # keeps memory safe if the checksum belongs to damaged bytes
         except (pa.ArrowException, OSError, EOFError) as error:
             raise self._damaged(row, str(error)) from error
         if batch.num_rows != 1:
@@ -65,12 +65,12 @@ class Reader:
         batch = self.batch(place)
         try:
             return arrow_codec.decode(batch)
-        except (TypeError, ValueError, IndexError) as error:  # values that no scene has
+        except (TypeError, ValueError, IndexError) as error:  # values of no scene
             raise self._damaged(place[0], str(error)) from error
 
     @functools.cached_property
     def _whole(self) -> pa.ipc.RecordBatchFileReader:
-        """The file by its own table of contents, once all of it has been held against its checksum."""
+        """The file by its own table of contents, after its checksum was compared."""
         _require_same(self._shard)
         reader = pa.ipc.open_file(pa.BufferReader(self._content))
         if not reader.schema.equals(arrow_codec.SCHEMA):
@@ -82,10 +82,10 @@ class Reader:
 
 
 def table(path: Path, shard: Shard) -> pa.Table:
-    """A part of the catalogue, whole.
+    """A file of the catalogue.
 
     Raises:
-        SceneError: it is missing or not what was written, by name.
+        SceneError: it is missing or damaged, by name.
     """
     _require_same(Shard(str(path), shard.scenes, shard.bytes, shard.sha256))
     try:
@@ -107,7 +107,7 @@ def places(table: pa.Table) -> Int[np.ndarray, "N 5"]:
 
 
 def spans(path: Path, scenes: int) -> Int[np.ndarray, "N 3"]:
-    """Of each scene of a finished shard: first byte, bytes and CRC-32."""
+    """First byte, number of bytes and CRC-32 of each scene of a finished shard."""
     content, found = _mapped(path), []
     with pa.BufferReader(content) as file:
         file.seek(MAGIC)
@@ -129,7 +129,7 @@ def _mapped(path: Path) -> pa.Buffer:
 
 
 def _require_same(shard: Shard) -> None:
-    """Refuse a file that is not what was written; a process reads it once, and again after it was changed."""
+    """Compares a file with its checksum, once in a process, and again after a change."""
     path = Path(shard.file)
     bank_index.check_complete(path, shard)
     state = path.stat()

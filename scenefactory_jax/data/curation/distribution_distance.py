@@ -1,4 +1,4 @@
-"""How alike two sets of scenes are: what is on their maps and how traffic moves, as distributions side by side."""
+"""Compares sets of scenes: distributions of map elements and of the motion of traffic."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import RawScene, Track
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LINES, STOP_SIGN
 
-CURVE_M = 3.0  # step over which a lane's curvature is measured: logged points are rounded to centimetres
-ACCELERATION_STEPS = 5  # over which a speed's change is measured, for the same reason
-MOVING_M = 3.0  # a vehicle that goes farther within the log moves
-STANDING_MPS = 0.5  # slower vehicles have no heading to speak of and stand
+CURVE_M = 3.0  # step of lane curvature: logged points are rounded to centimetres
+ACCELERATION_STEPS = 5  # over which changes of speed and heading are measured, for the same reason
+MOVING_M = 3.0  # smallest distance that a moving vehicle travels in the log
+STANDING_MPS = 0.5  # slower vehicles have no yaw rate
 Samples = dict[str, Float[np.ndarray, " N"]]
 
 
 class Quantity(NamedTuple):
-    """What is compared: its axis label, and what one sample of it belongs to."""
+    """A compared quantity: axis label, and the unit of one sample."""
 
     label: str
     each: str
@@ -35,7 +35,7 @@ QUANTITIES: dict[str, Quantity] = {
     "curvature_1_m": Quantity("curvature of lanes, 1/m", "3 m of lane"),
     "crosswalks": Quantity("crosswalks", "scene"),
     "stop_signs": Quantity("stop signs", "scene"),
-    "driveways": Quantity("driveways", "scene"),
+    "drivedistances": Quantity("drivedistances", "scene"),
     "lights": Quantity("lanes with a light", "scene"),
     "vehicles": Quantity("vehicles in the box", "scene"),
     "moving": Quantity("moving vehicles in the box", "scene"),
@@ -44,8 +44,8 @@ QUANTITIES: dict[str, Quantity] = {
     "speed_mps": Quantity("speed of moving vehicles, m/s", "vehicle"),
     "acceleration_mps2": Quantity("acceleration of moving vehicles, m/s²", "vehicle and half second"),
     "yaw_rate": Quantity("yaw rate of moving vehicles, rad/s", "vehicle and half second"),
-    "travel_m": Quantity("way of moving vehicles in the log, m", "vehicle"),
-    "recorded": Quantity("share of the log in which a vehicle is seen", "vehicle"),
+    "travel_m": Quantity("distance of moving vehicles in the log, m", "vehicle"),
+    "recorded": Quantity("fraction of the log in which a vehicle is valid", "vehicle"),
     "nearest_m": Quantity("from a moving vehicle to the next vehicle, m", "vehicle"),
 }
 
@@ -55,15 +55,13 @@ class Difference(NamedTuple):
 
     ks: float  # Kolmogorov-Smirnov statistic: largest difference between the two distribution functions, 0 to 1
     wasserstein: float  # earth mover's distance over the standard deviation of both together
-    medians: tuple[float, float]
-    counts: tuple[int, int]
 
 
 def measure(raw: RawScene, *, scene_size_m: float) -> Samples:
     """Samples of every quantity in one scene.
 
     Args:
-        scene_size_m: side of the square in which things count, around the recording car at the current step, or the mean road point.
+        scene_size_m: side of the box, around the recording car at the current step, or the mean road point.
     """
     centre = _centre(raw)
     inside = lambda points: np.abs(points[:, :2] - centre).max(axis=1) <= scene_size_m / 2  # noqa: E731
@@ -81,23 +79,23 @@ def measure(raw: RawScene, *, scene_size_m: float) -> Samples:
         "curvature_1_m": _joined([_curvature(points[near]) for points, near in lanes]),
         "crosswalks": count(CROSSWALK),
         "stop_signs": count(STOP_SIGN),
-        "driveways": count(DRIVEWAY),
+        "drivedistances": count(DRIVEWAY),
         "lights": np.array([len({light.lane for light in raw.lights})], float),
     }
     return samples | _measure_traffic(raw, centre, scene_size_m / 2)
 
 
 def _measure_traffic(raw: RawScene, centre: Float[np.ndarray, "2"], half: float) -> Samples:
-    """Samples of who is in the box at the current step and how they move."""
+    """Samples of the road users in the box at the current step, and of their motion."""
     now, dt = raw.current, float(np.median(np.diff(raw.times)))
     here = [track for track in raw.tracks if track.valid[now] and np.abs(track.xyz[now, :2] - centre).max() <= half]
     number = lambda kind: np.array([sum(track.kind == kind for track in here)], float)  # noqa: E731
     vehicles = [track for track in here if track.kind == "vehicle"]
-    ways = [_way(track) for track in vehicles]
-    moving = [track for track, way in zip(vehicles, ways, strict=True) if way > MOVING_M]
+    distances = [_measure_travel(track) for track in vehicles]
+    moving = [track for track, distance in zip(vehicles, distances, strict=True) if distance > MOVING_M]
     places = np.array([track.xyz[now, :2] for track in vehicles]).reshape(-1, 2)
-    mine = np.array([track.xyz[now, :2] for track in moving]).reshape(-1, 2)
-    nearest = KDTree(places).query(mine, k=2)[0][:, 1] if len(places) > 1 and len(mine) else np.zeros(0)
+    positions = np.array([track.xyz[now, :2] for track in moving]).reshape(-1, 2)
+    nearest = KDTree(places).query(positions, k=2)[0][:, 1] if len(places) > 1 and len(positions) else np.zeros(0)
     changes = [_changes(track, dt) for track in moving]
     return {
         "vehicles": number("vehicle"),
@@ -107,7 +105,7 @@ def _measure_traffic(raw: RawScene, centre: Float[np.ndarray, "2"], half: float)
         "speed_mps": np.array([float(np.hypot(*track.velocity[now])) for track in moving]),
         "acceleration_mps2": _joined([change[0] for change in changes]),
         "yaw_rate": _joined([change[1] for change in changes]),
-        "travel_m": np.array([way for way in ways if way > MOVING_M]),
+        "travel_m": np.array([distance for distance in distances if distance > MOVING_M]),
         "recorded": np.array([track.valid.mean() for track in vehicles]),
         "nearest_m": nearest,
     }
@@ -145,14 +143,14 @@ def _curvature(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " M"]:
     return np.abs(np.mod(turn + np.pi, 2 * np.pi) - np.pi) / CURVE_M
 
 
-def _way(track: Track) -> float:
+def _measure_travel(track: Track) -> float:
     """From the first to the last valid position, m."""
     rows = np.flatnonzero(track.valid)
     return float(np.linalg.norm(track.xyz[rows[-1], :2] - track.xyz[rows[0], :2]))
 
 
 def _changes(track: Track, dt: float) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " M"]]:
-    """Acceleration along the way and yaw rate, over half seconds in which the track is valid throughout."""
+    """Acceleration along the path and yaw rate, over half seconds without an invalid step."""
     speed = np.hypot(*track.velocity.T)
     first = np.arange(0, len(speed) - ACCELERATION_STEPS, ACCELERATION_STEPS)
     last = first + ACCELERATION_STEPS
@@ -170,7 +168,7 @@ def collect(scenes: Iterable[RawScene], *, scene_size_m: float) -> Samples:
 
 
 def compare(one: Samples, other: Samples) -> dict[str, Difference | None]:
-    """How far apart two sets are, quantity by quantity; None where one of them holds none at all, as lights in a format without."""
+    """Distances between two sets by quantity; None where a set has no sample, as lights in a format without them."""
     return {name: _difference(one[name], other[name], counted=name == "lights") for name in QUANTITIES}
 
 
@@ -182,8 +180,6 @@ def _difference(one: Float[np.ndarray, " N"], other: Float[np.ndarray, " M"], *,
     return Difference(
         ks=float(result.statistic),  # pyright: ignore[reportAttributeAccessIssue]
         wasserstein=float(stats.wasserstein_distance(one, other)) / spread,
-        medians=(float(np.median(one)), float(np.median(other))),
-        counts=(len(one), len(other)),
     )
 
 

@@ -1,8 +1,8 @@
-"""What a scene is like, in numbers: one metadata column each, to filter by, to stratify by and to compare data sets with.
+"""Computes numbers that describe a scene: metadata columns to filter by, to stratify by and to compare data sets with.
 
-Together with the columns that every bank has they hold what ScenarioNet counts of its scenarios (Li et al. 2023, arXiv 2306.12241;
-MetaDrive's `get_number_summary`: objects by kind, moving ones, lights, map features, relief, the SDC's distance), and more of roads and
-motion. What a source does not know is None, never zero.
+Together with the columns of every bank they hold the counts of ScenarioNet (Li et al. 2023, arXiv 2306.12241; MetaDrive's
+`get_number_summary`: objects by kind, moving ones, lights, map features, relief, the SDC's distance), and more of roads and motion.
+A value that the source does not hold is None, never zero.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,51 +20,26 @@ from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LI
 from scenefactory_jax.data.curation import geographic_split
 from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
-STOREY_M = 3.0  # lanes that are farther apart in height do not meet: one is on a bridge
+LEVEL_M = 3.0  # lanes farther apart in height do not cross
 CROSSING_M = 2.0  # side of the cells on which crossings are looked for: narrower than a lane, so that neighbours do not share one
 
-EVERY_BANK: dict[str, str] = {  # the columns that a bank has by itself (catalogue.py)
-    "name": "The scene's name.",
-    "source": "File that it came from, or generator.",
-    "dataset": "Data set that it is of.",
-    "format": "Format that it was read from.",
-    "steps": "Steps of the log.",
-    "current": "Step at which a simulation takes over from the log.",
-    "dt_s": "Time between two steps.",
-    "lanes": "Driving lanes.",
-    "edges": "Road edges.",
-    "lines": "Painted lines.",
-    "crosswalks": "Crosswalks.",
-    "stop_signs": "Stop signs.",
-    "lights": "Lanes with a traffic light.",
-    "vehicles": "Vehicles, the SDC among them.",
-    "pedestrians": "Pedestrians.",
-    "cyclists": "Cyclists.",
-    "findings": "Findings of the rules of quality; none where nobody judged.",
-    "packing": "Result of packing at conversion: packed, or the reason for its refusal; the scene stays in the bank. None: not tried.",
-    "sdc": "Id of the car that recorded the log; none without one.",
-    "min_x": "West end of the map in the source's coordinates, m.",
-    "min_y": "South end, m.",
-    "max_x": "East end, m.",
-    "max_y": "North end, m.",
-}
 COLUMNS: dict[str, str] = {
     "duration_s": "Time from the log's first step to its last.",
-    "objects": "Objects of all kinds that are seen at some step.",
-    "moving_objects": "Objects that come farther than `moving_m` from where they were first seen.",
-    "moving_vehicles": "Vehicles of these.",
-    "moving_pedestrians": "Pedestrians of these.",
-    "moving_cyclists": "Cyclists of these.",
+    "objects": "Objects of all kinds that are valid at some step.",
+    "moving_objects": "Objects that come farther than `moving_m` from their first position.",
+    "moving_vehicles": "Moving vehicles.",
+    "moving_pedestrians": "Moving pedestrians.",
+    "moving_cyclists": "Moving cyclists.",
     "parked_vehicles": "Vehicles that do not move.",
-    "present_objects": "Objects that are there at the current step.",
+    "present_objects": "Objects that are valid at the current step.",
     "overlaps": "Pairs of boxes that share ground at the current step: errors of the log, or of its labels.",
-    "distance_m": "What all moving objects travelled together.",
-    "mean_speed_m_s": "Of the moving vehicles, over all steps at which they are seen; none without any.",
+    "distance_m": "Distance travelled by all moving objects.",
+    "mean_speed_m_s": "Mean speed of the moving vehicles over their valid steps; null without any.",
     "top_speed_m_s": "Largest speed of a vehicle.",
-    "sdc_distance_m": "What the SDC travelled; this and the next three are none without an SDC.",
+    "sdc_distance_m": "Distance travelled by the SDC; this and the next three are null without an SDC.",
     "sdc_mean_speed_m_s": "The SDC's mean speed.",
     "sdc_top_speed_m_s": "The SDC's largest speed.",
-    "sdc_turn_deg": "How far the SDC's heading turned from first to last, left is positive.",
+    "sdc_turn_deg": "Turn of the SDC's heading from first to last step, left is positive.",
     "map_features": "Polylines, polygons and points of the map.",
     "lane_m": "Length of all driving lanes.",
     "bike_lane_m": "Length of all bike lanes.",
@@ -73,13 +48,13 @@ COLUMNS: dict[str, str] = {
     "extent_x_m": "Width of the driving lanes' bounding box, west to east.",
     "extent_y_m": "Its depth, south to north.",
     "relief_m": "Height between the lowest and the highest point of a driving lane.",
-    "curvature_rad_m": "Mean curvature of the driving lanes, over their length, whichever way they bend.",
-    "curved_fraction": "Share of the driving lanes' length that bends more tightly than `curve_radius_m`.",
-    "intersections": "Places where driving lanes cross at more than `crossing_deg`; those within `junction_m` of each other are one.",
-    "branches": "Driving lanes with more than one exit; none if the source says nothing of exits.",
+    "curvature_rad_m": "Mean absolute curvature of the driving lanes, over their length.",
+    "curved_fraction": "Fraction of the driving lanes' length with a radius below `curve_radius_m`.",
+    "intersections": "Places where driving lanes cross at more than `crossing_deg`; places within `junction_m` count once.",
+    "branches": "Driving lanes with more than one exit; null if the source has no exits.",
     "speed_bumps": "Speed bumps.",
     "driveways": "Driveways.",
-    "streets": "Hashes of some of the places of its lanes: scenes that share them show the same streets (places.py).",
+    "streets": "Hashes of some places of the lanes: scenes that share them show the same streets (`geographic_split`).",
 }
 
 
@@ -93,16 +68,15 @@ def features(
     junction_m: float,
     streets: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Every column of `COLUMNS`, in its order.
+    """The columns of `COLUMNS`, in their order.
 
     Args:
-        raw: as a reader or a generator gave it.
-        moving_m: an object that comes farther than that from where it was first seen moves.
+        moving_m: an object that comes farther from its first position moves.
         chord_m: length over which curvature is measured.
-        curve_radius_m: lanes that bend more tightly are curves.
-        crossing_deg: lanes that meet at more than that cross.
+        curve_radius_m: largest radius of a curve.
+        crossing_deg: smallest angle of lanes that cross.
         junction_m: crossings that are nearer to each other are one intersection.
-        streets: numbers of `places.streets`.
+        streets: numbers of `geographic_split.find_streets`.
     """
     seen = [track for track in raw.tracks if track.valid.any()]
     found: dict[str, Any] = {"duration_s": float(raw.times[-1] - raw.times[0]) if len(raw.times) else 0.0}
@@ -119,7 +93,7 @@ def features(
 
 
 def _traffic(tracks: Sequence[Track], moving_m: float) -> dict[str, Any]:
-    """Counts by kind, and what moved how far and how fast."""
+    """Counts by kind, distances and speeds."""
     kind = np.array([track.kind for track in tracks], dtype=str)
     valid, xy, velocity = _stacked(tracks)
     first = xy[np.arange(len(tracks)), valid.argmax(axis=1)]
@@ -137,7 +111,7 @@ def _traffic(tracks: Sequence[Track], moving_m: float) -> dict[str, Any]:
 
 
 def _stacked(tracks: Sequence[Track]) -> tuple[Bool[np.ndarray, "O L"], Float[np.ndarray, "O L 2"], Float[np.ndarray, "O L 2"]]:
-    """Validity, places and velocities of all tracks."""
+    """Validity, positions and velocities of all tracks."""
     if not tracks:
         return np.zeros((0, 1), bool), np.zeros((0, 1, 2)), np.zeros((0, 1, 2))
     valid, xyz, velocity = (np.stack([getattr(track, name) for track in tracks]) for name in ("valid", "xyz", "velocity"))
@@ -145,7 +119,7 @@ def _stacked(tracks: Sequence[Track]) -> tuple[Bool[np.ndarray, "O L"], Float[np
 
 
 def _recorder(track: Track | None) -> dict[str, float | None]:
-    """What the recording car did."""
+    """Motion of the recording car."""
     if track is None or not track.valid.any():
         return dict.fromkeys(("sdc_distance_m", "sdc_mean_speed_m_s", "sdc_top_speed_m_s", "sdc_turn_deg"))
     speed = np.linalg.norm(track.velocity[track.valid], axis=1)
@@ -159,7 +133,7 @@ def _recorder(track: Track | None) -> dict[str, float | None]:
 
 
 def _overlaps(tracks: Sequence[Track], step: int) -> int:
-    """Pairs of boxes that share ground at a step, those on another storey left out."""
+    """Pairs of boxes of one level that overlap at a step."""
     if len(tracks) < 2:
         return 0
     place = np.array([track.xyz[step] for track in tracks])
@@ -167,7 +141,7 @@ def _overlaps(tracks: Sequence[Track], step: int) -> int:
     pairs = KDTree(place[:, :2]).query_pairs(float(np.hypot(*size.T).max()), output_type="ndarray")
     apart = np.linalg.norm(np.diff(place[pairs, :2], axis=1)[:, 0], axis=1)
     near = apart < np.hypot(*size.T)[pairs].sum(axis=1) / 2
-    level = np.abs(place[pairs[:, 0], 2] - place[pairs[:, 1], 2]) < STOREY_M
+    level = np.abs(place[pairs[:, 0], 2] - place[pairs[:, 1], 2]) < LEVEL_M
     pairs = pairs[near & level]
     boxes = {i: box_corners(place[i, :2], float(tracks[i].yaw[step]), *size[i]) for i in np.unique(pairs).tolist()}
     others = {i: pairs[pairs[:, 0] == i, 1].tolist() for i in np.unique(pairs[:, 0]).tolist()}
@@ -189,8 +163,8 @@ def _map(roads: Sequence[Polyline]) -> dict[str, Any]:
 
 
 def _bends(lanes: Sequence[Polyline], chord_m: float, curve_radius_m: float) -> dict[str, float]:
-    """How much driving lanes bend, from chord to chord; a lane's ends, where there is none before or after, count as the rest of it."""
-    samples = geographic_split.sample_along(lanes, spacing_m=chord_m, least=4)
+    """Curvature of driving lanes from chord to chord; the ends of a lane count as the rest of it."""
+    samples = geographic_split.sample_along(lanes, spacing_m=chord_m, min_points=4)
     way = samples.xyz[1:, :2] - samples.xyz[:-1, :2]
     heading = np.arctan2(way[:, 1], way[:, 0])
     turn = np.abs(wrap_angles(heading[1:] - heading[:-1]))
@@ -212,7 +186,7 @@ def _intersections(lanes: Sequence[Polyline], crossing_deg: float, junction_m: f
     samples = geographic_split.sample_along(lanes, spacing_m=CROSSING_M / 2)
     if not len(samples.xyz):
         return 0
-    cell = np.floor(samples.xyz / np.array([CROSSING_M, CROSSING_M, STOREY_M])).astype(np.int64)
+    cell = np.floor(samples.xyz / np.array([CROSSING_M, CROSSING_M, LEVEL_M])).astype(np.int64)
     cell -= cell.min(axis=0)
     side = cell.max(axis=0) + 1
     key = (cell[:, 2] * side[1] + cell[:, 1]) * side[0] + cell[:, 0]

@@ -1,13 +1,13 @@
-"""Which scenes show the same streets, and how to split scenes so that no street is on both sides.
+"""Finds scenes that show the same streets, and splits scenes so that no street is in two parts.
 
-A recording fleet drives the same streets again and again, so a split by file puts one street into training and test. Scenes overlap here if
-their driving lanes run through the same places in the same direction, in the coordinates that their dataset shares. Datasets put several
-cities on top of each other (WOMD's are up to 40 km wide and overlap), so a place is fine: a cell of the ground, its height and a direction.
-Formats that move every scene to a centre of its own, without saying from where, have lost what it takes.
+A recording fleet drives the same streets repeatedly, so a split by file puts one street into training and test. Two scenes overlap if
+their driving lanes run through the same places in the same direction, in the coordinates of their dataset. Cities of a dataset may have
+overlapping coordinates (WOMD's are up to 40 km wide), so a place is small: a cell of the ground, its height and a direction.
+Formats that move every scene to its own centre, without the offset, cannot be compared.
 
-A scene's places are too many to keep for every scene of a large bank. `streets` keeps one in so many, chosen by a hash of the place itself:
-two scenes keep the same ones of what they share (FracMinHash, Irber et al. 2022, bioRxiv 2022.01.11.475838), so the number that two
-scenes have in common is still proportional to the metres of lane that they share.
+The places of a scene are too many for the metadata of a large bank. `find_streets` keeps a fraction of them, chosen by a hash of the place:
+two scenes keep the same ones of their common places (FracMinHash, Irber et al. 2022, bioRxiv 2022.01.11.475838), so their number is
+proportional to the metres of common lane.
 """
 
 import zlib
@@ -24,7 +24,7 @@ from scenefactory_jax.core.instantiate import ConfigError, check_number
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
 from scenefactory_jax.core.types import DRIVABLE
 
-# what of a scene's metadata says in which frame its coordinates are: generated scenes have one each, some datasets one a city
+# metadata that identifies the frame of the coordinates: one per generated scene, in some datasets one per city
 FRAME = ("dataset", "city", "location", "map", "town", "seed", "index")
 BLOCK = 4096  # scenes whose overlaps with all others are counted at once: bounds memory, changes no result
 MULTIPLIERS = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0x27D4EB2F165667C5)  # odd: primes of xxHash
@@ -40,7 +40,7 @@ class Samples(NamedTuple):
 
 
 def lengths(lines: Sequence[np.ndarray]) -> Float[np.ndarray, " N"]:
-    """Length in the plane of each of many lines of points; zero of a line without points."""
+    """Length of each line in the plane; zero for a line without points."""
     arc, first = _arcs(lines)
     begin, end = first[:-1], first[1:]
     filled = end > begin
@@ -50,20 +50,19 @@ def lengths(lines: Sequence[np.ndarray]) -> Float[np.ndarray, " N"]:
 
 
 def _arcs(lines: Sequence[np.ndarray]) -> tuple[Float[np.ndarray, " P"], Int[np.ndarray, " N1"]]:
-    """Arc length at every point of lines laid end to end without the ways between them, and where each line begins."""
+    """Arc length at every point of concatenated lines, without the gaps between them, and the first point of each line."""
     first = np.cumsum([0, *map(len, lines)])
     if not first[-1]:
         return np.zeros(0), first
     points = np.concatenate([line[:, :2] for line in lines])
-    way = points[1:] - points[:-1]
-    length = np.hypot(way[:, 0], way[:, 1])
+    length = np.hypot(*(points[1:] - points[:-1]).T)
     ends = first[1:-1]
     length[ends[(ends > 0) & (ends < len(points))] - 1] = 0.0
     return np.concatenate([[0.0], np.cumsum(length)]), first
 
 
-def sample_along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1) -> Samples:
-    """Points in the middle of equal steps of about `spacing_m`, `least` a line or more, whatever the spacing of the source.
+def sample_along(lines: Sequence[Polyline], *, spacing_m: float, min_points: int = 1) -> Samples:
+    """Points in the middle of equal steps of about `spacing_m`, at least `min_points` a line.
 
     Lines without length give none.
     """
@@ -71,7 +70,7 @@ def sample_along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1)
     arc, first = _arcs([line.xyz for line in lines])
     begin, end = first[:-1], first[1:] - 1
     total = arc[end] - arc[begin]
-    count = np.where(total > 0, np.maximum(np.rint(total / spacing_m), least), 0).astype(int)
+    count = np.where(total > 0, np.maximum(np.rint(total / spacing_m), min_points), 0).astype(int)
     line = np.repeat(np.arange(len(lines)), count)
     if not len(line):
         return Samples(np.zeros((0, 3)), line, np.zeros(0), np.zeros(0))
@@ -80,8 +79,8 @@ def sample_along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1)
     step = (total / np.maximum(count, 1))[line]
     at = arc[begin][line] + (number + 0.5) * step
     left = np.clip(np.searchsorted(arc, at, side="right") - 1, 0, len(arc) - 2)
-    share = (at - arc[left]) / (arc[left + 1] - arc[left])
-    points = xyz[left] + share[:, None] * (xyz[left + 1] - xyz[left])
+    fraction = (at - arc[left]) / (arc[left + 1] - arc[left])
+    points = xyz[left] + fraction[:, None] * (xyz[left + 1] - xyz[left])
     row = np.arange(len(line))
     before, after = row - (number > 0), row + (number < count[line] - 1)
     chord = points[after, :2] - points[before, :2]
@@ -91,45 +90,45 @@ def sample_along(lines: Sequence[Polyline], *, spacing_m: float, least: int = 1)
 
 
 def find_streets(raw: RawScene, *, cell_m: float, height_m: float, headings: int, one_in: int) -> Int[np.ndarray, " K"]:
-    """The places of a scene's driving lanes, as ascending hashes of 32 bits: the same place has the same one in every scene.
+    """Places of a scene's driving lanes as ascending hashes of 32 bits; a place has the same hash in every scene.
 
     Args:
         cell_m: side of a place on the ground, in the frame that the scene's dataset shares (`RawScene.origin` is added).
         height_m: height of a place: bridges, and cities on top of each other, are different places.
-        headings: directions that are told apart.
-        one_in: how many places one that is kept stands for.
+        headings: number of directions.
+        one_in: places per place that is kept.
 
     Raises:
-        ConfigError: one that is not above 0.
+        ConfigError: a number that is not above 0.
     """
     for name, value in {"cell_m": cell_m, "height_m": height_m, "headings": headings, "one_in": one_in}.items():
         check_number(value, where=f"features.streets.{name}", above=0)
-    samples = sample_along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=cell_m / 2)  # no place is jumped over
-    # places are centred on round numbers: made-up roads lie on these, and should not fall between two places
+    samples = sample_along([line for line in raw.roads if line.kind in DRIVABLE], spacing_m=cell_m / 2)  # skips no place
+    # places are centred on round numbers: generated roads lie on these
     cells = np.rint((samples.xyz + np.asarray(raw.origin)) / np.array([cell_m, cell_m, height_m])).astype(np.int64)
-    towards = np.rint(samples.heading / (2 * np.pi) * headings).astype(np.int64) % headings
+    direction = np.rint(samples.heading / (2 * np.pi) * headings).astype(np.int64) % headings
     frame = "/".join(str(raw.metadata[key]) for key in FRAME if raw.metadata.get(key) is not None)
     mixed = np.full(len(cells), zlib.crc32(frame.encode()), np.uint64)
-    for value, multiplier in zip((*cells.T, towards), MULTIPLIERS, strict=True):
-        mixed = _scrambled(mixed ^ (value.astype(np.uint64) * np.uint64(multiplier)))
+    for value, multiplier in zip((*cells.T, direction), MULTIPLIERS, strict=True):
+        mixed = _scramble(mixed ^ (value.astype(np.uint64) * np.uint64(multiplier)))
     kept = mixed[mixed % np.uint64(one_in) == 0]
     return np.unique(kept >> np.uint64(32)).astype(np.int64)
 
 
-def _scrambled(value: np.ndarray) -> np.ndarray:
-    """Every bit of the result depends on every bit of the value (the finaliser of SplitMix64, Steele et al. 2014)."""
+def _scramble(value: np.ndarray) -> np.ndarray:
+    """A hash: the finaliser of SplitMix64 (Steele et al. 2014)."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return value ^ (value >> np.uint64(31))
 
 
-def find_groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *, least_shared: int) -> Int[np.ndarray, " N"]:
-    """The group of every scene: scenes that share streets, directly or through others, are in one.
+def find_groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *, min_shared_places: int) -> Int[np.ndarray, " N"]:
+    """The group of every scene: scenes that share streets, directly or through other scenes, are in one.
 
     Args:
-        places: `streets` of all scenes, end to end.
-        starts: where each scene's begin, and where the last one's end.
-        least_shared: kept places that two scenes must have in common; fewer is a crossing of two roads, or chance.
+        places: `find_streets` of all scenes, concatenated.
+        starts: first place of each scene, and the number of all places.
+        min_shared_places: common places of two scenes of one group; fewer may be a crossing of two roads, or chance.
     """
     count = len(starts) - 1
     column = pa.array(places).dictionary_encode().indices.to_numpy()
@@ -141,7 +140,7 @@ def find_groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *
     first = np.arange(count)  # scene of each scene's group so far
     for begin in range(0, count, BLOCK):
         common = (table[begin : begin + BLOCK] @ across).tocoo()
-        linked = common.data >= least_shared
+        linked = common.data >= min_shared_places
         one, other = np.concatenate([[common.row[linked] + begin, common.col[linked]], [np.arange(count), first]], axis=1)
         links = sparse.coo_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
         label = connected_components(links, directed=False)[1]
@@ -149,59 +148,48 @@ def find_groups(places: Int[np.ndarray, " K"], starts: Int[np.ndarray, " N1"], *
     return np.unique(first, return_inverse=True)[1].ravel()
 
 
-def assign_groups(group: Int[np.ndarray, " N"], shares: Mapping[str, float | int], *, seed: int) -> dict[str, Int[np.ndarray, " M"]]:
-    """Whole groups to parts: the largest first, each to the part that lacks most of its share; groups of one size in a random order.
+def assign_groups(group: Int[np.ndarray, " N"], fractions: Mapping[str, float | int], *, seed: int) -> dict[str, Int[np.ndarray, " M"]]:
+    """Assigns whole groups to parts: the largest first, each to the part that lacks most scenes; groups of one size in a random order.
 
     Args:
         group: of every scene.
-        shares: of the scenes, by part; they are divided by their sum.
+        fractions: of the scenes, by part; divided by their sum.
         seed: of the order.
 
     Returns:
         The rows of every part, ascending; together all rows, each once.
 
     Raises:
-        ConfigError: shares that are none, or a part that would stay empty because there are too few groups.
+        ConfigError: fewer than two parts, a fraction that is not above 0, or a part that would stay empty.
     """
-    weights = check_shares(shares)
+    if len(fractions) < 2:
+        raise ConfigError(f"split.fractions: expected two parts or more, such as {{train: 0.8, test: 0.2}}, got {dict(fractions)}")
+    for name, fraction in fractions.items():
+        check_number(fraction, where=f"split.fractions.{name}", above=0)
     size = np.bincount(group)
     order = np.random.default_rng(seed).permutation(len(size))
     order = order[np.argsort(-size[order], kind="stable")]
-    lacking = weights * len(group)
+    weights = np.array(list(fractions.values()), float)
+    lacking = weights / weights.sum() * len(group)
     part = np.zeros(len(size), int)
     for number in order:
         part[number] = np.argmax(lacking)
         lacking[part[number]] -= size[number]
-    rows = {name: np.flatnonzero(part[group] == index) for index, name in enumerate(shares)}
-    if empty := [name for name, found in rows.items() if not len(found)]:
+    rows = {name: np.flatnonzero(part[group] == index) for index, name in enumerate(fractions)}
+    if empty := [name for name, members in rows.items() if not len(members)]:
         sizes = ", ".join(map(str, np.sort(size)[::-1][:5]))
-        some = f"{len(group)} scenes in {len(size)} groups that cannot be divided (the largest: {sizes})"
-        more = "ask for more, raise split.least_shared, or take no heed of streets (split.by=scene)"
-        raise ConfigError(f"split.shares.{empty[0]}: {shares[empty[0]]} of {some} is none; {more}")
+        groups = f"{len(group)} scenes in {len(size)} groups that cannot be divided (the largest: {sizes})"
+        hint = "raise it, raise split.min_shared_places, or ignore streets (split.by=scene)"
+        raise ConfigError(f"split.fractions.{empty[0]}: {fractions[empty[0]]} of {groups} gives no scene; {hint}")
     return rows
 
 
-def check_shares(shares: Mapping[str, float | int]) -> Float[np.ndarray, " P"]:
-    """Shares that sum to 1.
-
-    Raises:
-        ConfigError: fewer than two parts, or a share that is not above 0.
-    """
-    if len(shares) < 2:
-        raise ConfigError(f"split.shares: {dict(shares)}; wanted are two parts or more, such as {{train: 0.8, test: 0.2}}")
-    for name, share in shares.items():
-        if not (share > 0 and np.isfinite(share)):
-            raise ConfigError(f"split.shares.{name}: {share!r}; wanted is a number above 0")
-    weights = np.array(list(shares.values()), float)
-    return weights / weights.sum()
-
-
 def find_leaks(group: Int[np.ndarray, " N"], parts: Mapping[str, Int[np.ndarray, " M"]]) -> dict[str, int]:
-    """Scenes of each part whose streets are on another part as well: what a split should not have."""
-    home = np.full(len(group), -1)
+    """Number of scenes of each part whose streets are in another part, too."""
+    part = np.full(len(group), -1)
     for index, rows in enumerate(parts.values()):
-        home[rows] = index
-    dealt = np.flatnonzero(home >= 0)
-    pairs = np.unique(np.stack([group[dealt], home[dealt]]), axis=1)
+        part[rows] = index
+    assigned = np.flatnonzero(part >= 0)
+    pairs = np.unique(np.stack([group[assigned], part[assigned]]), axis=1)
     split = np.bincount(pairs[0], minlength=group.max(initial=0) + 1) > 1
     return {name: int(split[group[rows]].sum()) for name, rows in parts.items()}

@@ -1,9 +1,10 @@
-"""What one does with banks of scenes: describe, choose, join, divide. Every result is a view: rows of other banks, nothing copied.
+"""Operations on banks of scenes: describe, select, split. A result is a view, rows of other banks; nothing is copied.
 
-Each operation returns what it made and an account of it, plain JSON values. `described` comes first: the metadata with every column of
-`features`, counted anew for scenes that were converted without.
+Each operation returns its result and an account of it in JSON values. `describe_scenes` comes first: the metadata with all columns of
+`features`.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -17,63 +18,64 @@ from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.data.bank import bank_reader as banks
 from scenefactory_jax.data.bank.bank_reader import Bank
 from scenefactory_jax.data.curation import filter_expressions, geographic_split
+from scenefactory_jax.data.curation.duplicates import find_recordings
 from scenefactory_jax.data.curation.features import COLUMNS
 
-NAMED = 5  # how many scenes a message names
+NAMED = 5  # scenes that a message names
 Account = dict[str, Any]
+Rows = Int[np.ndarray, " N"]
 
 
 class BankResult(NamedTuple):
-    """A bank, and how it came to be."""
+    """A bank, and the account of how it was made."""
 
     bank: Bank
     account: Account
 
 
 class BankParts(NamedTuple):
-    """Banks by name, and how they came to be."""
+    """Banks by name, and the account of how they were made."""
 
     banks: dict[str, Bank]
     account: Account
 
 
-def find_missing_columns(bank: Bank) -> Int[np.ndarray, " N"]:
-    """The scenes whose features nobody has counted."""
-    if "streets" not in bank.metadata.schema.names:  # never null where features were counted
+# ---- describe
+
+
+def find_undescribed_scenes(bank: Bank) -> Rows:
+    """The scenes without features in the metadata."""
+    if "streets" not in bank.metadata.schema.names:  # never null where features were computed
         return np.arange(len(bank))
     return np.flatnonzero(~bank.metadata.column("streets").is_valid().to_numpy(zero_copy_only=False))
 
 
 def describe_scenes(
-    bank: Bank, features: Callable[[RawScene], Mapping[str, Any]], *, on_scene: Callable[[int, int], None] | None = None
+    bank: Bank, features: Callable[[RawScene], Mapping[str, Any]], *, on_scene: Callable[[int, int], None] = lambda done, total: None
 ) -> pa.Table:
-    """The bank's metadata with all columns of `features`; scenes that were converted without them are read and counted.
+    """The bank's metadata with all columns of `features`, computed here for the scenes that lack them.
 
     Args:
         features: `features.features` bound to its numbers.
-        on_scene: called with (scenes done, scenes to do) after each that had to be read.
+        on_scene: called with (scenes done, scenes to do) after each scene that had to be read.
     """
-    table, missing = bank.metadata, find_missing_columns(bank)
-    if not len(missing):
-        return table
-    counted: dict[int, Mapping[str, Any]] = {}
+    table, missing = bank.metadata, find_undescribed_scenes(bank)
+    computed = {}
     for done, index in enumerate(missing.tolist(), start=1):
-        counted[index] = features(banks.read_raw(bank, index))
-        if on_scene is not None:
-            on_scene(done, len(missing))
-    for name in COLUMNS:
+        computed[index] = features(banks.read_raw(bank, index))
+        on_scene(done, len(missing))
+    for name in COLUMNS if computed else ():
         present = name in table.schema.names
         values = table.column(name).to_pylist() if present else [None] * len(table)
-        for index, found in counted.items():
-            values[index] = found[name]
+        for index, row in computed.items():
+            values[index] = row[name]
         column = pa.array(values)
-        place = table.schema.get_field_index(name)
-        table = table.set_column(place, name, column) if present else table.append_column(name, column)
+        table = table.set_column(table.schema.get_field_index(name), name, column) if present else table.append_column(name, column)
     return table
 
 
 def statistics(table: pa.Table, *, by: str | None) -> dict[str, Any]:
-    """Of every number its range, mean, median and sum over the scenes, and of every short text how often it occurs.
+    """Range, mean, median and sum of every numeric column, and the counts of every text.
 
     Args:
         table: metadata, one row a scene.
@@ -81,164 +83,207 @@ def statistics(table: pa.Table, *, by: str | None) -> dict[str, Any]:
 
     Returns:
         Value of `by` (or "all") -> {"scenes", "numbers": {column: {...}}, "texts": {column: {value: count}}}.
-
-    Raises:
-        ConfigError: no such column.
     """
     if by is None:
-        return {"all": _summary(table)}
-    column = _column(table, by, "info.by")
-    found = {}
+        return {"all": _summarise(table)}
+    column = _get_column(table, by, "info.by")
+    groups = {}
     for value in sorted(column.unique().to_pylist(), key=str):
         mask = column.is_null() if value is None else pc.equal(column, value)  # pyright: ignore[reportAttributeAccessIssue]
-        found[str(value)] = _summary(table.filter(mask))
-    return found
+        groups[str(value)] = _summarise(table.filter(mask))
+    return groups
 
 
-def _summary(table: pa.Table) -> dict[str, Any]:
-    """Statistics of the rows of one table; missing values are counted and left out."""
+def _summarise(table: pa.Table) -> dict[str, Any]:
+    """Statistics of one table; missing values are counted and left out."""
     numbers, texts = {}, {}
     for name, column in zip(table.schema.names, table.columns, strict=True):
-        if pa.types.is_null(column.type):  # nobody knows: no type either
+        if pa.types.is_null(column.type):
             numbers[name] = {"missing": len(column)}
         elif pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
             values = column.drop_null().to_numpy().astype(float)
-            found: dict[str, Any] = {"missing": column.null_count}
+            numbers[name] = {"missing": column.null_count}
             if len(values):
                 low, middle, high = np.percentile(values, [0, 50, 100]).tolist()
-                found |= {"min": low, "median": middle, "mean": float(values.mean()), "max": high, "sum": float(values.sum())}
-            numbers[name] = found
+                numbers[name] |= {"min": low, "median": middle, "mean": float(values.mean()), "max": high, "sum": float(values.sum())}
         elif pa.types.is_string(column.type) and name not in ("name", "source"):
-            counts = column.value_counts().to_pylist()
-            texts[name] = {str(one["values"]): one["counts"] for one in sorted(counts, key=lambda one: -one["counts"])}
+            counts = sorted(column.value_counts().to_pylist(), key=lambda entry: -entry["counts"])
+            texts[name] = {str(entry["values"]): entry["counts"] for entry in counts}
     return {"scenes": len(table), "numbers": numbers, "texts": texts}
 
 
-def filter(bank: Bank, table: pa.Table, expression: str) -> BankResult:
-    """The scenes for which a condition on their metadata is true (see `expressions`).
-
-    Raises:
-        ConfigError: a condition that cannot be read, or one that no scene meets.
-    """
-    rows = filter_expressions.rows(table, expression, where="filter")
-    if not len(rows):
-        raise ConfigError(f"filter: {expression!r}: none of {len(table)} scenes meets it; `op=info` shows the columns' ranges")
-    return BankResult(banks.view(bank, rows), {"filter": expression, "scenes": len(table), "kept": len(rows)})
+# ---- select
 
 
-def sample(bank: Bank, table: pa.Table, *, count: int | None, share: float | None, stratify: str | None, seed: int) -> BankResult:
-    """Some scenes at random, each at most once, in the bank's order.
+def select(
+    several: Sequence[Bank],
+    describe: Callable[[Bank], pa.Table],
+    *,
+    on_same_name: Literal["refuse", "first"],
+    dedupe: bool,
+    duplicates: Mapping[str, float],
+    filter: str | None,
+    sample: Mapping[str, Any],
+    seed: int,
+) -> BankResult:
+    """Joins banks, removes duplicate recordings, keeps the scenes that meet a condition, then samples; in this order.
 
     Args:
-        count: how many; or else
-        share: of the scenes.
-        stratify: a column of whose values each keeps its share of the scenes, to the nearest scene.
-        seed: the same one draws the same scenes.
+        several: banks, joined in their order.
+        describe: bank -> metadata with features; called only if a step reads features.
+        on_same_name: for scenes of one name in several banks: refuse them, or keep the first of each name.
+        dedupe: keep one scene of each recording; `duplicates` are the numbers of `duplicates.find_recordings`.
+        filter: a condition on the metadata (see `filter_expressions`); None keeps all scenes.
+        sample: {"count", "fraction", "stratify"}: see `sample_rows`; all None keeps all scenes.
+        seed: of the sample.
+
+    Returns:
+        The bank, and an account with an entry for each step.
 
     Raises:
-        ConfigError: both or neither of count and share, more than there are, or no such column.
+        ConfigError: a key that cannot be used, or a condition that no scene meets.
+        SceneError: scenes of one name.
+    """
+    bank, account = _join(several, on_same_name)
+    steps: dict[str, Callable[[Bank, pa.Table], tuple[Rows, Account]]] = {}
+    if dedupe:
+        steps["dedupe"] = functools.partial(_find_first_recordings, **duplicates)
+    if filter is not None:
+        steps["filter"] = functools.partial(_filter_rows, expression=filter)
+    if any(value is not None for value in sample.values()):
+        steps["sample"] = lambda _, table: (sample_rows(table, **sample, seed=seed), {**sample, "seed": seed})
+    needs_features = dedupe or filter is not None or sample["stratify"] is not None
+    table = describe(bank) if needs_features else bank.metadata
+    for name, find_rows in steps.items():
+        rows, details = find_rows(bank, table)
+        account[name] = {"scenes": len(bank), "kept": len(rows), **details}
+        bank, table = banks.view(bank, rows), table.take(rows)
+    return BankResult(bank, {"scenes": sum(map(len, several)), "kept": len(bank), **account})
+
+
+def _join(several: Sequence[Bank], on_same_name: Literal["refuse", "first"]) -> tuple[Bank, Account]:
+    """The scenes of several banks; names are compared only if there are several."""
+    if len(several) == 1:
+        return several[0], {}
+    joined = banks.join(several)
+    names = np.array(joined.names)
+    _, first = np.unique(names, return_index=True)
+    repeated = np.setdiff1d(np.arange(len(names)), first)
+    if len(repeated) and on_same_name == "refuse":
+        some = ", ".join(sorted(set(names[repeated].tolist()))[:NAMED])
+        raise SceneError(f"select.banks: {len(repeated)} scenes repeat a name: {some}; select.on_same_name=first keeps the first")
+    account = {"join": {"scenes": len(names), "kept": len(first), "banks": [len(bank) for bank in several]}}
+    return (banks.view(joined, np.sort(first)) if len(repeated) else joined), account
+
+
+def _find_first_recordings(bank: Bank, table: pa.Table, **thresholds: float) -> tuple[Rows, Account]:
+    group, compared = find_recordings(bank, table, **thresholds)
+    _, first, size = np.unique(group, return_index=True, return_counts=True)
+    names = np.array(bank.names)
+    groups = [names[group == number].tolist() for number in np.flatnonzero(size > 1)]
+    return np.sort(first), {"compared": compared, "groups": groups}
+
+
+def _filter_rows(bank: Bank, table: pa.Table, expression: str) -> tuple[Rows, Account]:
+    rows = filter_expressions.rows(table, expression, where="select.filter")
+    if not len(rows):
+        raise ConfigError(f"select.filter: {expression!r}: none of {len(table)} scenes meets it; `op=info` shows the columns' ranges")
+    return rows, {"expression": expression}
+
+
+def sample_rows(table: pa.Table, *, count: int | None, fraction: float | None, stratify: str | None, seed: int) -> Rows:
+    """Rows at random, each at most once, ascending.
+
+    Args:
+        count: number of rows; or else
+        fraction: of the rows.
+        stratify: a column; each of its values keeps its fraction of the rows, to the nearest row.
+        seed: the same seed samples the same rows.
+
+    Raises:
+        ConfigError: both or neither of count and fraction, more than there are, or no such column.
     """
     total = len(table)
-    if (count is None) == (share is None):
-        raise ConfigError(f"sample: count {count} and share {share}; give one of the two")
-    if share is not None and not 0 < share <= 1:
-        raise ConfigError(f"sample.share: {share}; valid: above 0, up to 1")
-    wanted = count if count is not None else round(share * total)  # pyright: ignore[reportOptionalOperand]
-    if not 1 <= wanted <= total:
-        raise ConfigError(f"sample.{'count' if share is None else 'share'}: {wanted} of {total} scenes; valid: 1 to {total}")
-    stratum = np.zeros(total, int) if stratify is None else _strata(table, stratify, "sample.stratify")
+    if (count is None) == (fraction is None):
+        raise ConfigError(f"select.sample: expected count or fraction, got count {count} and fraction {fraction}")
+    size = count if count is not None else round(fraction * total)  # pyright: ignore[reportOptionalOperand]
+    if not 1 <= size <= total:
+        key = "count" if fraction is None else "fraction"
+        raise ConfigError(f"select.sample.{key}: expected 1 to {total} scenes, got {size}")
+    stratum = np.zeros(total, int) if stratify is None else _find_strata(table, stratify, "select.sample.stratify")
     rng = np.random.default_rng(seed)
-    quotas = _quotas(np.bincount(stratum), wanted)
+    quotas = _compute_quotas(np.bincount(stratum), size)
     chosen = [rng.choice(np.flatnonzero(stratum == index), quota, replace=False) for index, quota in enumerate(quotas.tolist())]
-    rows = np.sort(np.concatenate(chosen))
-    account = {"seed": seed, "stratify": stratify, "scenes": total, "kept": len(rows)}
-    return BankResult(banks.view(bank, rows), account)
+    return np.sort(np.concatenate(chosen))
 
 
-def _quotas(sizes: Int[np.ndarray, " S"], wanted: int) -> Int[np.ndarray, " S"]:
-    """So many of each stratum, in proportion: the largest remainders are rounded up (Hamilton's method)."""
-    exact = sizes * wanted / sizes.sum()
+def _compute_quotas(sizes: Int[np.ndarray, " S"], total: int) -> Int[np.ndarray, " S"]:
+    """Rows of each stratum in proportion to its size: the largest remainders are rounded up (Hamilton's method)."""
+    exact = sizes * total / sizes.sum()
     quotas = np.floor(exact).astype(int)
-    quotas[np.argsort(quotas - exact, kind="stable")[: wanted - quotas.sum()]] += 1
+    quotas[np.argsort(quotas - exact, kind="stable")[: total - quotas.sum()]] += 1
     return quotas
 
 
-def split(
-    bank: Bank, table: pa.Table, *, shares: Mapping[str, float | int], by: Literal["scene", "streets"], least_shared: int, seed: int
-) -> BankParts:
-    """Parts of which every scene is in one.
-
-    Args:
-        shares: part -> its share of the scenes; divided by their sum.
-        by: "scene" deals scene by scene, "streets" whole groups of scenes that share streets, so that no street is on two parts.
-        least_shared: kept places of `features.streets` that two scenes must share to be on the same streets.
-        seed: of the order.
-
-    Returns:
-        The parts, and an account with their sizes, the sizes of the groups, and how many scenes of each part leak: show streets that
-        another part shows.
-
-    Raises:
-        ConfigError: shares that cannot be met.
-    """
-    groups = streets(table, least_shared=least_shared)
-    sizes = np.bincount(groups)
-    rows = geographic_split.assign_groups(groups if by == "streets" else np.arange(len(table)), shares, seed=seed)
-    account = {
-        "by": by,
-        "seed": seed,
-        "scenes": len(table),
-        "parts": {name: {"scenes": len(found), "share": len(found) / len(table)} for name, found in rows.items()},
-        "groups": len(sizes),
-        "groups_by_size": {str(size): int(number) for size, number in enumerate(np.bincount(sizes)) if number},
-        "leaks": geographic_split.find_leaks(groups, rows),
-    }
-    return BankParts({name: banks.view(bank, found) for name, found in rows.items()}, account)
+def _find_strata(table: pa.Table, name: str, where: str) -> Rows:
+    """The value of a column as a number, row by row; null is a value, too."""
+    column = _get_column(table, name, where)
+    if pa.types.is_nested(column.type):
+        raise ConfigError(f"{where}: expected a column of texts or numbers, got {name!r}, which holds lists")
+    encoded = column.combine_chunks().dictionary_encode(null_encoding="encode")
+    return encoded.indices.to_numpy(zero_copy_only=False).astype(int)
 
 
-def streets(table: pa.Table, *, least_shared: int) -> Int[np.ndarray, " N"]:
-    """The group of every scene: those that share streets are in one (see `places.groups`)."""
-    column = _column(table, "streets", "split").combine_chunks()
-    return geographic_split.find_groups(
-        column.flatten().to_numpy(), np.cumsum([0, *column.value_lengths().to_pylist()]), least_shared=least_shared
-    )
-
-
-def merge(several: Sequence[Bank], *, duplicates: Literal["refuse", "first"]) -> BankResult:
-    """All scenes of several banks, one bank after the other.
-
-    Args:
-        duplicates: what becomes of scenes of one name: "refuse" them all, or keep the "first".
-
-    Raises:
-        ConfigError: no banks.
-        SceneError: scenes of one name, naming them.
-    """
-    if not several:
-        raise ConfigError("merge.banks: []; give one bank or more beside scenes.path")
-    whole = banks.join(several)
-    names = np.array(whole.names)
-    _, first = np.unique(names, return_index=True)
-    account: Account = {"banks": [len(one) for one in several], "scenes": len(names), "kept": len(first)}
-    if len(first) == len(names):
-        return BankResult(whole, account)
-    again = np.setdiff1d(np.arange(len(names)), first)
-    if duplicates == "refuse":
-        some = ", ".join(sorted(set(names[again].tolist()))[:NAMED])
-        raise SceneError(f"merge: {len(again)} scenes have the name of another: {some}; merge.duplicates=first keeps the first of each")
-    return BankResult(banks.view(whole, np.sort(first)), account)
-
-
-def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
+def _get_column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
     if name not in table.schema.names:
         raise ConfigError(f"{where}: no column {name!r}; valid: {', '.join(sorted(table.schema.names))}")
     return table.column(name)
 
 
-def _strata(table: pa.Table, name: str, where: str) -> Int[np.ndarray, " N"]:
-    """Which value of a column each row has, as a number; missing ones are a value of their own."""
-    column = _column(table, name, where)
-    if pa.types.is_nested(column.type):
-        raise ConfigError(f"{where}: {name!r} holds lists; give a column of texts or numbers")
-    encoded = column.combine_chunks().dictionary_encode(null_encoding="encode")
-    return encoded.indices.to_numpy(zero_copy_only=False).astype(int)
+# ---- split
+
+
+def split(
+    bank: Bank,
+    table: pa.Table,
+    *,
+    fractions: Mapping[str, float | int],
+    by: Literal["scene", "streets"],
+    min_shared_places: int,
+    seed: int,
+) -> BankParts:
+    """Parts of which every scene is in one.
+
+    Args:
+        fractions: part -> its fraction of the scenes; divided by their sum.
+        by: "scene" assigns scene by scene, "streets" whole groups of scenes that share streets, so that no street is in two parts.
+        min_shared_places: places of `features.streets` that two scenes must share to be on the same streets.
+        seed: of the order.
+
+    Returns:
+        The parts, and an account with their sizes, the sizes of the groups, and the leaks: scenes of each part that show streets of
+        another part.
+
+    Raises:
+        ConfigError: fractions that cannot be met.
+    """
+    groups = find_street_groups(table, min_shared_places=min_shared_places)
+    sizes = np.bincount(groups)
+    parts = geographic_split.assign_groups(groups if by == "streets" else np.arange(len(table)), fractions, seed=seed)
+    account = {
+        "by": by,
+        "seed": seed,
+        "scenes": len(table),
+        "parts": {name: {"scenes": len(rows), "fraction": len(rows) / len(table)} for name, rows in parts.items()},
+        "groups": len(sizes),
+        "groups_by_size": {str(size): int(number) for size, number in enumerate(np.bincount(sizes)) if number},
+        "leaks": geographic_split.find_leaks(groups, parts),
+    }
+    return BankParts({name: banks.view(bank, rows) for name, rows in parts.items()}, account)
+
+
+def find_street_groups(table: pa.Table, *, min_shared_places: int) -> Rows:
+    """The group of every scene: scenes that share streets are in one (see `geographic_split.find_groups`)."""
+    column = _get_column(table, "streets", "split").combine_chunks()
+    starts = np.cumsum([0, *column.value_lengths().to_pylist()])
+    return geographic_split.find_groups(column.flatten().to_numpy(), starts, min_shared_places=min_shared_places)

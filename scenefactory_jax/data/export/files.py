@@ -9,11 +9,7 @@ from scenefactory_jax.core.raw_scene import RawScene, SceneError
 
 
 def write(path: Path | str, content: bytes) -> None:
-    """Writes or replaces a file.
-
-    Raises:
-        SceneError: the folder is missing or cannot be written.
-    """
+    """Writes or replaces a file; raises `SceneError` if the folder is missing or cannot be written."""
     try:
         with write_atomically(Path(path)) as part:
             part.write_bytes(content)
@@ -24,16 +20,13 @@ def write(path: Path | str, content: bytes) -> None:
 def write_scenes(
     scenes: Iterable[RawScene], folder: Path | str, refused: list[str], encode: Callable[[RawScene], tuple[str, bytes, Any]]
 ) -> dict[str, Any]:
-    """Writes a file for each scene, one at a time.
+    """Writes a file for each scene, one at a time; returns file name -> summary of each scene that was written.
 
     Args:
         scenes: to write.
         folder: is made if it does not exist.
         refused: gets a line for each scene that is left out: `encode` refuses it, or another scene has its file name.
         encode: scene -> file name, content and a summary.
-
-    Returns:
-        File name -> summary of each scene that was written.
 
     Raises:
         SceneError: a file or the folder cannot be written.

@@ -23,11 +23,7 @@ TYPES = (  # map elements -> the type's name
 
 
 def write(raw: RawScene, path: Path | str) -> None:
-    """Writes one scene to a JSON file.
-
-    Raises:
-        SceneError: a map element that the format does not have, a number that is not finite, or a file that cannot be written.
-    """
+    """Writes one scene to a JSON file; raises `SceneError` if it cannot be encoded or written."""
     files.write(path, encode_json(raw))
 
 

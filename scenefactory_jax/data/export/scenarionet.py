@@ -32,23 +32,23 @@ def write(raw: RawScene, path: Path | str) -> dict[str, Any]:
     Raises:
         SceneError: a map element that the format does not have, or a file that cannot be written.
     """
-    _, content, metadata = _encode(raw)
-    files.write(path, content)
-    return metadata
+    document = scenario(raw)
+    files.write(path, _pickle(document))
+    return document["metadata"]
 
 
 def write_all(scenes: Iterable[RawScene], folder: Path | str, refused: list[str]) -> int:
     """Writes a database: a pickle for each scene (see `files.write_scenes`), then summary and mapping; returns the number of scenes."""
-    summary = files.write_scenes(scenes, folder, refused, _encode)
-    files.write(Path(folder) / SUMMARY, _pickled(summary))
-    files.write(Path(folder) / MAPPING, _pickled(dict.fromkeys(summary, "")))
+
+    def encode(raw: RawScene) -> tuple[str, bytes, dict[str, Any]]:
+        document = scenario(raw)
+        metadata = document["metadata"]
+        return to_file_name(f"sd_{metadata['dataset']}_{metadata['id']}.pkl"), _pickle(document), metadata
+
+    summary = files.write_scenes(scenes, folder, refused, encode)
+    files.write(Path(folder) / SUMMARY, _pickle(summary))
+    files.write(Path(folder) / MAPPING, _pickle(dict.fromkeys(summary, "")))
     return len(summary)
-
-
-def _encode(raw: RawScene) -> tuple[str, bytes, dict[str, Any]]:
-    """The name that ScenarioNet gives a scenario's file, its content, and the scenario's metadata."""
-    document = scenario(raw)
-    return to_file_name(f"sd_{_dataset(raw)}_{_scenario_id(raw)}.pkl"), _pickled(document), document["metadata"]
 
 
 def scenario(raw: RawScene) -> dict[str, Any]:
@@ -57,66 +57,51 @@ def scenario(raw: RawScene) -> dict[str, Any]:
     Raises:
         SceneError: a map element that the format does not have.
     """
-    tokens = raw.metadata.get("tokens", {})
-    names = _names([track.id for track in raw.tracks], tokens.get("tracks", {}))
-    keys = _names([line.id for line in raw.roads], tokens.get("features", {}))
+    dataset, tokens = str(raw.metadata.get("dataset", "unknown")), raw.metadata.get("tokens", {})
+    dataset = next((name for name, known in DATASETS.items() if known == dataset), dataset)
+    names = _make_keys([track.id for track in raw.tracks], tokens.get("tracks", {}))
+    keys = _make_keys([line.id for line in raw.roads], tokens.get("features", {}))
     lanes = {line.id: key for line, key in zip(raw.roads, keys, strict=True)}
     roads = {line.id: line for line in raw.roads}
-    lights = {}
-    for light in raw.lights:
-        key = lanes.get(light.lane, str(light.lane))
-        lights[key] = _light(light, key, roads.get(light.lane), _dataset(raw))
-    tracks = {name: _track(track, name, _dataset(raw)) for name, track in zip(names, raw.tracks, strict=True)}
-    signs = _sign_lanes(raw.metadata.get("stop_sign_lanes", {}))
+    signs = raw.metadata.get("stop_sign_lanes", {})
+    if isinstance(signs, list):  # in older banks of WOMD's protos
+        signs = {str(record["sign"]): record["lanes"] for record in signs}
+    light_keys = [lanes.get(light.lane, str(light.lane)) for light in raw.lights]
+    lights = {key: _light(light, key, roads.get(light.lane), dataset) for key, light in zip(light_keys, raw.lights, strict=True)}
+    tracks = {name: _track(track, name, dataset) for name, track in zip(names, raw.tracks, strict=True)}
     features = {key: _feature(line, lanes, signs, raw.source) for key, line in zip(keys, raw.roads, strict=True)}
+    metadata = _metadata(raw, dataset, names, tracks) | {"number_summary": _count(tracks, lights, features)}
     return {
-        "id": _scenario_id(raw),
+        "id": metadata["id"],
         "version": VERSION,
         "length": len(raw.times),
-        "metadata": _metadata(raw, names, tracks, lights, features),
+        "metadata": metadata,
         "tracks": tracks,
         "dynamic_map_states": lights,
         "map_features": features,
     }
 
 
-def _dataset(raw: RawScene) -> str:
-    name = str(raw.metadata.get("dataset", "unknown"))
-    return next((theirs for theirs, ours in DATASETS.items() if ours == name), name)
-
-
-def _scenario_id(raw: RawScene) -> str:
-    return str(raw.metadata.get("scenario_id", raw.name))
-
-
-def _sign_lanes(found: Mapping[str, list[int]] | list[Mapping[str, Any]]) -> Mapping[str, list[int]]:
-    """The lanes of each stop sign by its id; older banks of WOMD's protos have a list of records."""
-    return {str(record["sign"]): record["lanes"] for record in found} if isinstance(found, list) else found
-
-
-def _names(ids: list[int], tokens: Mapping[str, int]) -> list[str]:
+def _make_keys(ids: list[int], tokens: Mapping[str, int]) -> list[str]:
     """Keys for ids: the texts of the source, or the numbers; an id that occurs again gets a suffix."""
     texts = {number: text for text, number in tokens.items()}
     count: Counter[str] = Counter()
-    names = []
+    keys = []
     for number in ids:
-        name = texts.get(number, str(number))
-        names.append(f"{name}_{count[name]}" if count[name] else name)
-        count[name] += 1
-    return names
+        key = texts.get(number, str(number))
+        keys.append(f"{key}_{count[key]}" if count[key] else key)
+        count[key] += 1
+    return keys
 
 
 def _track(track: Track, name: str, dataset: str) -> dict[str, Any]:
     """An object's states, with zeros at invalid steps, also of its size."""
     length, width, height = (np.where(track.valid, side, 0.0) for side in track.size)
-    kind, steps = track.kind.upper(), len(track.valid)
     state = {"position": track.xyz, "length": length, "width": width, "height": height, "heading": track.yaw}
     state |= {"velocity": track.velocity, "valid": track.valid}
-    return {
-        "type": kind,
-        "state": {key: np.ascontiguousarray(table) for key, table in state.items()},
-        "metadata": {"track_length": steps, "type": kind, "object_id": name, "dataset": dataset},
-    }
+    kind = track.kind.upper()
+    metadata = {"track_length": len(track.valid), "type": kind, "object_id": name, "dataset": dataset}
+    return {"type": kind, "state": {key: np.ascontiguousarray(table) for key, table in state.items()}, "metadata": metadata}
 
 
 def _feature(line: Polyline, lanes: Mapping[int, str], signs: Mapping[str, list[int]], source: str) -> dict[str, Any]:
@@ -147,18 +132,17 @@ def _light(light: Light, key: str, lane: Polyline | None, dataset: str) -> dict[
     return {"type": "TRAFFIC_LIGHT", "state": {"object_state": states}, "lane": key, "stop_point": np.array(stop), "metadata": metadata}
 
 
-def _metadata(raw: RawScene, names: list[str], tracks: dict[str, Any], lights: dict[str, Any], features: dict[str, Any]) -> dict[str, Any]:
+def _metadata(raw: RawScene, dataset: str, names: list[str], tracks: Mapping[str, Any]) -> dict[str, Any]:
     """Metadata for MetaDrive and ScenarioNet's filters, which do not read the rest."""
     by_id = {track.id: name for track, name in zip(raw.tracks, names, strict=True)}
     chosen = {key: [by_id[i] for i in raw.metadata.get(key, ()) if i in by_id] for key in ("objects_of_interest", "tracks_to_predict")}
-    index = {name: place for place, name in enumerate(names)}
     texts = {key: raw.metadata[key] for key in TEXTS if isinstance(raw.metadata.get(key), str)}
     sdc = {} if raw.sdc is None else {"sdc_id": names[raw.sdc], "sdc_track_index": raw.sdc}
-    summary = {name: _summary(name, track) for name, track in tracks.items()}
+    number = str(raw.metadata.get("scenario_id", raw.name))
     return texts | sdc | {
-        "id": _scenario_id(raw),
-        "scenario_id": _scenario_id(raw),
-        "dataset": _dataset(raw),
+        "id": number,
+        "scenario_id": number,
+        "dataset": dataset,
         "coordinate": "right-handed",
         "metadrive_processed": False,
         "ts": np.ascontiguousarray(raw.times),
@@ -166,33 +150,37 @@ def _metadata(raw: RawScene, names: list[str], tracks: dict[str, Any], lights: d
         "current_time_index": int(raw.current),
         "objects_of_interest": chosen["objects_of_interest"],
         "tracks_to_predict": {
-            name: {"track_index": index[name], "track_id": name, "difficulty": 0, "object_type": tracks[name]["type"]}
+            name: {"track_index": names.index(name), "track_id": name, "difficulty": 0, "object_type": tracks[name]["type"]}
             for name in chosen["tracks_to_predict"]
         },
-        "object_summary": summary,
-        "number_summary": _numbers(summary, lights, features),
+        "object_summary": {name: _summarize(name, track) for name, track in tracks.items()},
     }  # fmt: skip
 
 
-def _summary(name: str, track: Mapping[str, Any]) -> dict[str, Any]:
+def _summarize(name: str, track: Mapping[str, Any]) -> dict[str, Any]:
     """One object in the summary: valid steps and distance."""
     valid = track["state"]["valid"]
-    path = track["state"]["position"][valid, :2]
-    start = int(np.argmax(valid))
+    first_valid = valid[int(np.argmax(valid)) :]
     return {
         "type": track["type"],
         "object_id": name,
         "track_length": len(valid),
-        "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        "moving_distance": _distance(track),
         "valid_length": int(valid.sum()),
-        "continuous_valid_length": int(np.argmin(valid[start:])) if valid.any() and not valid[start:].all() else int(valid.sum()),
+        "continuous_valid_length": int(np.argmin(first_valid)) if valid.any() and not first_valid.all() else int(valid.sum()),
     }
 
 
-def _numbers(summary: Mapping[str, Any], lights: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, Any]:
+def _distance(track: Mapping[str, Any]) -> float:
+    """Length of the path over the valid steps (m)."""
+    path = track["state"]["position"][track["state"]["valid"], :2]
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
+def _count(tracks: Mapping[str, Any], lights: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, Any]:
     """Counts over the scenario, with ScenarioNet's names."""
-    kinds = Counter(entry["type"] for entry in summary.values())
-    moving = Counter(entry["type"] for entry in summary.values() if entry["moving_distance"] > MOVES_M)
+    kinds = Counter(track["type"] for track in tracks.values())
+    moving = Counter(track["type"] for track in tracks.values() if _distance(track) > MOVES_M)
     states = Counter(state for light in lights.values() for state in light["state"]["object_state"] if state is not None)
     lines = tuple(NAMES[kind] for kind in (5, *LINES))
     heights = [feature["polyline"][:, 2] for feature in features.values() if feature["type"] in lines and len(feature["polyline"])]
@@ -210,7 +198,7 @@ def _numbers(summary: Mapping[str, Any], lights: Mapping[str, Any], features: Ma
     }
 
 
-def _pickled(value: Any) -> bytes:
+def _pickle(value: Any) -> bytes:
     """The pickle with numpy 1's module names, which both numpy 1 and 2 read."""
     content = pickle.dumps(value, protocol=PROTOCOL)
     pieces, done = [], 0

@@ -22,6 +22,7 @@ MAGIC = b"PAR1"
 MAX_STEPS = 110
 SDC = "AV"
 SCORED = 2  # of `object_category`: scored tracks; the focal track is above
+CONSTANTS = ("scenario_id", "city", "focal_track_id", "num_timestamps", "start_timestamp", "end_timestamp")  # in every row
 MOTION = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
 COLUMNS = {  # -> what it is converted to
     "observed": pa.bool_(), "track_id": pa.string(), "object_type": pa.string(), "object_category": pa.int64(), "timestep": pa.int64(),
@@ -48,14 +49,12 @@ def read(
     columns = _read_columns(path, row_limit, file_limit_mb)
     if "other" not in sizes_m or any(len(size) != 3 for size in sizes_m.values()):
         raise SceneError(f"formats.argoverse2.sizes_m: expected type -> [length, width, height], with `other`, got {sizes_m!r}")
-    where = f"{path}: "
-    steps, step = int(_single(columns, "num_timestamps", where)), columns["timestep"]
+    scenario, city, focal, steps, start, end = (_single(columns, key, path) for key in CONSTANTS)
+    step = columns["timestep"]
     if not 0 < steps <= MAX_STEPS or step.min() < 0 or step.max() >= steps:
-        raise SceneError(f"{where}num_timestamps: expected at most {MAX_STEPS}, all in range, got {steps}, {step.min()} to {step.max()}")
-    scenario, city, focal = (str(_single(columns, key, where)) for key in ("scenario_id", "city", "focal_track_id"))
-    seconds = (float(_single(columns, "end_timestamp", where)) - float(_single(columns, "start_timestamp", where))) * 1e-9
+        raise SceneError(f"{path}: num_timestamps: expected at most {MAX_STEPS}, all in range, got {steps}, {step.min()} to {step.max()}")
     if not columns["observed"].any():
-        raise SceneError(f"{where}observed: expected an observed step, the last of which is the current step, got none")
+        raise SceneError(f"{path}: observed: expected an observed step, the last of which is the current step, got none")
     map_path = _find_map(path, scenario)
     roads, lanes = argoverse2_map.read_roads(map_path, point_spacing_m=point_spacing_m, cut_m=cut_m, file_limit_mb=file_limit_mb)
     names, owner = np.unique(columns["track_id"], return_inverse=True)
@@ -64,23 +63,23 @@ def read(
     tree = KDTree(ground[:, :2])
     tracks = []
     for place, name in enumerate(names):
-        rows = {key: columns[key][owner == place] for key in COLUMNS}
+        rows = {key: column[owner == place] for key, column in columns.items()}
         kind = str(rows["object_type"][0])
         size = sizes_m.get(kind, sizes_m["other"])
         plane = np.stack([rows["position_x"], rows["position_y"]], axis=1)
         xyz = np.column_stack([plane, ground[tree.query(plane)[1], 2] + float(size[2]) / 2])  # the box is on the nearest point of the map
-        tracks.append(_track(rows, xyz, ids[str(name)], KINDS.get(kind, "other"), size, steps, f"{where}track {name}"))
+        tracks.append(_track(rows, xyz, ids[name], KINDS.get(kind, "other"), size, int(steps), f"{path}: track {name}"))
     scored = names[np.unique(owner[columns["object_category"] >= SCORED])]
     yield RawScene(
         name=scenario,
         source=str(path),
         roads=roads,
         tracks=tuple(tracks),
-        times=np.linspace(0.0, seconds, steps),
+        times=np.linspace(0.0, (float(end) - float(start)) * 1e-9, steps),
         current=int(step[columns["observed"]].max()),
         sdc=list(names).index(SDC) if SDC in names else None,
         metadata={"dataset": "argoverse2", "format": "argoverse2", "scenario_id": scenario, "city": city, "focal_track": ids.get(focal)}
-        | {"tracks_to_predict": [ids[str(name)] for name in scored], "tokens": {"tracks": scene_parts.list_tokens(ids)}}
+        | {"tracks_to_predict": [ids[name] for name in scored], "tokens": {"tracks": scene_parts.list_tokens(ids)}}
         | lanes,
     )
 
@@ -115,21 +114,22 @@ def _read_columns(path: Path, row_limit: int, file_limit_mb: int) -> Columns:
     return columns
 
 
-def _single(columns: Columns, name: str, where: str) -> Any:
+def _single(columns: Columns, name: str, path: Path) -> Any:
     """The value that a column repeats in every row."""
-    found = np.unique(columns[name])
-    if len(found) != 1:
-        raise SceneError(f"{where}{name}: expected one value in all rows, got {len(found)}, such as {found[0]!r} and {found[1]!r}")
-    return found[0]
+    distinct = np.unique(columns[name])
+    if len(distinct) != 1:
+        raise SceneError(f"{path}: {name}: expected one value in all rows, got {distinct[0]!r} and {distinct[1]!r}")
+    return distinct[0]
 
 
 def _find_map(path: Path, scenario: str) -> Path:
     """The path of the scenario's map, by its id or, beside a file that was renamed, by the file's name."""
     names = (scenario, Path(path).stem.removeprefix("scenario_"))
     paths = [Path(path).with_name(f"log_map_archive_{name}.json") for name in names]
-    if found := next((candidate for candidate in paths if candidate.is_file()), None):
-        return found
-    raise SceneError(f"{path}: its map is missing: {paths[0]}")
+    existing = next((candidate for candidate in paths if candidate.is_file()), None)
+    if existing is None:
+        raise SceneError(f"{path}: its map is missing: {paths[0]}")
+    return existing
 
 
 def _track(rows: Columns, position: np.ndarray, number: int, kind: RoadUser, size: Sequence[float], steps: int, where: str) -> Track:
@@ -140,5 +140,4 @@ def _track(rows: Columns, position: np.ndarray, number: int, kind: RoadUser, siz
     xyz, yaw, velocity, valid = np.zeros((steps, 3)), np.zeros(steps), np.zeros((steps, 2)), np.zeros(steps, bool)
     xyz[step], yaw[step], valid[step] = position, rows["heading"], True
     velocity[step] = np.stack([rows["velocity_x"], rows["velocity_y"]], axis=1)
-    length, width, height = map(float, size)
-    return scene_parts.make_track(id=number, kind=kind, size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)
+    return scene_parts.make_track(where, id=number, kind=kind, size=size, position=xyz, heading=yaw, velocity=velocity, valid=valid)

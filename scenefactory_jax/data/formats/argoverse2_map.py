@@ -6,7 +6,7 @@ are joined before their outline becomes road edges. Where a lane crosses the out
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from scenefactory_jax.core.raw_scene import Polyline, SceneError
 from scenefactory_jax.core.types import CROSSWALK, EDGE_BOUNDARY, LANE_BIKE, LANE_STREET
 from scenefactory_jax.data.formats import file_content, polylines, values
-from scenefactory_jax.data.formats.scene_parts import AXES
+from scenefactory_jax.data.formats.values import AXES, Node
 
 SECTIONS = ("lane_segments", "drivable_areas", "pedestrian_crossings")
 LANES = {"VEHICLE": LANE_STREET, "BUS": LANE_STREET, "BIKE": LANE_BIKE}
@@ -43,40 +43,35 @@ def read_roads(
 
     The map was cut where an outline comes as near as `cut_m` to a lane's centre; see `formats` for the other numbers.
     """
-    document = file_content.load_json(path, file_limit_mb=file_limit_mb)
-    if not is_map(document):
-        raise SceneError(f"{path}: expected a map of Argoverse 2 with {', '.join(SECTIONS)}, got the keys {values.list_keys(document)}")
-    segments, areas, crossings = (
-        [
-            (values.expect(record, dict, f"{path}: {section}[{key!r}]"), f"{path}: {section}[{key!r}]")
-            for key, record in values.get(document, section, dict, f"{path}: ").items()
-        ]
-        for section in SECTIONS
-    )
-    borders = [{side: _line(record, f"{side}_lane_boundary", where) for side in SIDES} for record, where in segments]
+    document = Node(file_content.load_json(path, file_limit_mb=file_limit_mb), f"{path}: ")
+    if not is_map(document.value):
+        keys = values.list_keys(document.value)
+        raise SceneError(f"{path}: expected a map of Argoverse 2 with {', '.join(SECTIONS)}, got the keys {keys}")
+    segments, areas, crossings = (list(document[section].entries(dict).values()) for section in SECTIONS)
+    borders = [{side: _line(record[f"{side}_lane_boundary"]) for side in SIDES} for record in segments]
     centres = {
-        values.get(record, "id", int, where): centre(border["left"], border["right"], point_spacing_m)
-        for (record, where), border in zip(segments, borders, strict=True)
+        record["id"].expect(int): centre(border["left"], border["right"], point_spacing_m)
+        for record, border in zip(segments, borders, strict=True)
     }
-    lanes = [_lane(record, centres, where) for record, where in segments]
-    crosswalks = [_crossing(record, where) for record, where in crossings]
-    outlines = edges([_line(record, "area_boundary", where) for record, where in areas], list(centres.values()), cut_m, f"{path}: ")
+    lanes = [_lane(record, centres) for record in segments]
+    crosswalks = [_crossing(record) for record in crossings]
+    outlines = _edges([_line(record["area_boundary"]) for record in areas], list(centres.values()), cut_m, f"{path}: ")
     drawn = [*_marks(segments, borders), *((EDGE_BOUNDARY, xyz) for xyz in outlines)]
     start = max((line.id for line in (*lanes, *crosswalks)), default=0) + 1
     painted = [Polyline(kind, polylines.densify(xyz, point_spacing_m), start + place) for place, (kind, xyz) in enumerate(drawn)]
     groups = {
-        "intersection_lanes": [record["id"] for record, where in segments if values.get(record, "is_intersection", bool, where)],
-        "bus_lanes": [record["id"] for record, _ in segments if record["lane_type"] == "BUS"],
+        "intersection_lanes": [record["id"].value for record in segments if record["is_intersection"].expect(bool)],
+        "bus_lanes": [record["id"].value for record in segments if record["lane_type"].value == "BUS"],
     }
     return (*lanes, *painted, *crosswalks), groups
 
 
-def _line(record: dict[str, Any], key: str, where: str) -> Points:
+def _line(points: Node) -> Points:
     """A list of points."""
-    xyz = values.points(values.get(record, key, list, where), AXES, f"{where}.{key}")
-    values.check_finite(xyz, f"{where}.{key}", keys=AXES)
+    xyz = points.points()
+    values.check_finite(xyz, points.where, keys=AXES)
     if not len(xyz):
-        raise SceneError(f"{where}.{key}: expected points, got none")
+        raise SceneError(f"{points.where}: expected points, got none")
     return xyz
 
 
@@ -87,23 +82,24 @@ def centre(left: Points, right: Points, spacing_m: float) -> Points:
     return (polylines.resample(left, count) + polylines.resample(right, count)) / 2
 
 
-def _lane(record: dict[str, Any], centres: Mapping[int, Points], where: str) -> Polyline:
+def _lane(record: Node, centres: Mapping[int, Points]) -> Polyline:
     """A lane with its links and the neighbours of its direction."""
-    name = values.get(record, "lane_type", str, where)
-    if name not in LANES:
-        raise SceneError(f"{where}.lane_type: expected {', '.join(LANES)}, got {name!r}")
-    xyz = centres[record["id"]]
-    values.check_finite(xyz, f"{where}: centre")
-    links = {"entry": "predecessors", "exit": "successors"}
-    linked: dict[str, Any] = {
-        relation: tuple(values.expect(lane, int, f"{where}.{key}") for lane in values.get(record, key, list, where))
-        for relation, key in links.items()
-    }
+    kind, number = _choose(record["lane_type"], LANES), record["id"].value
+    values.check_finite(centres[number], f"{record.where}: centre")
+    beside = {}
     for side in SIDES:
-        other, key = record.get(f"{side}_neighbor_id"), f"{where}.{side}_neighbor_id"
-        near = other is not None and values.expect(other, int, key) in centres and _same_way(xyz, centres[other])
-        linked[side] = (other,) if near else ()
-    return Polyline(kind=LANES[name], xyz=xyz, id=record["id"], **linked)
+        other = record.get(f"{side}_neighbor_id", None)
+        near = other.value is not None and other.expect(int) in centres and _same_way(centres[number], centres[other.value])
+        beside[side] = (other.value,) if near else ()
+    entry, following = (tuple(record[key].integers()) for key in ("predecessors", "successors"))
+    return Polyline(kind=kind, xyz=centres[number], id=number, entry=entry, exit=following, **beside)
+
+
+def _choose(name: Node, options: Mapping[str, Any]) -> Any:
+    """The option of a name."""
+    if name.expect(str) not in options:
+        raise SceneError(f"{name.where}: expected {', '.join(options)}, got {name.value!r}")
+    return options[name.value]
 
 
 def _same_way(line: Points, other: Points) -> bool:
@@ -113,53 +109,41 @@ def _same_way(line: Points, other: Points) -> bool:
     return float((line[middle] - line[middle - 1])[:2] @ (other[near + 1] - other[near])[:2]) > 0
 
 
-def _marks(segments: list[tuple[dict[str, Any], str]], borders: list[dict[str, Points]]) -> list[tuple[int, Points]]:
+def _marks(segments: Sequence[Node], borders: Sequence[Mapping[str, Points]]) -> list[tuple[int, Points]]:
     """The painted boundaries with their kinds; a boundary of two lanes, in either direction, once."""
-    found: dict[tuple[tuple[float, ...], ...], tuple[int, Points]] = {}
-    for (record, where), border in zip(segments, borders, strict=True):
+    marks: dict[tuple[tuple[float, ...], ...], tuple[int, Points]] = {}
+    for record, border in zip(segments, borders, strict=True):
         for side in SIDES:
-            mark = values.get(record, f"{side}_lane_mark_type", str, where)
-            if mark not in MARKS:
-                raise SceneError(f"{where}.{side}_lane_mark_type: expected {', '.join(MARKS)}, got {mark!r}")
-            kind, points = MARKS[mark], tuple(map(tuple, border[side].tolist()))
+            kind, points = _choose(record[f"{side}_lane_mark_type"], MARKS), tuple(map(tuple, border[side].tolist()))
             if kind is not None:
-                found.setdefault(min(points, points[::-1]), (kind, border[side]))
-    return list(found.values())
+                marks.setdefault(min(points, points[::-1]), (kind, border[side]))
+    return list(marks.values())
 
 
-def _crossing(record: dict[str, Any], where: str) -> Polyline:
+def _crossing(record: Node) -> Polyline:
     """A crosswalk: its two edges as the outline of an area, whichever way each of them runs."""
-    first, second = (_line(record, key, where) for key in ("edge1", "edge2"))
+    first, second = _line(record["edge1"]), _line(record["edge2"])
     if (first[-1] - first[0]) @ (second[-1] - second[0]) > 0:
         second = second[::-1]
-    return Polyline(kind=CROSSWALK, xyz=np.concatenate([first, second]), id=values.get(record, "id", int, where))
+    return Polyline(kind=CROSSWALK, xyz=np.concatenate([first, second]), id=record["id"].expect(int))
 
 
-def edges(areas: list[Points], centres: list[Points], cut_m: float, where: str) -> list[Points]:
-    """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners.
-
-    Raises:
-        SceneError: shapely cannot draw an outline around the areas.
-    """
+def _edges(areas: list[Points], centres: list[Points], cut_m: float, where: str) -> list[Points]:
+    """The outline of all drivable areas together, without the pieces at which a lane leaves the map; heights are those of the corners."""
+    areas = [xyz for xyz in areas if len(xyz) > 2]
+    if not areas:
+        return []
     try:
-        return _outline(areas, centres, cut_m)
+        area = shapely.union_all([shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas])
+        lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
+        rings = [np.asarray(ring.coords) for ring in shapely.get_rings(shapely.get_parts(area))]
+        gaps = [np.asarray(shapely.distance(shapely.linestrings(np.stack([r[:-1], r[1:]], axis=1)), lanes)) < cut_m for r in rings]
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise SceneError(f"{where}drivable_areas: no outline can be drawn around them: {error}") from error
-
-
-def _outline(areas: list[Points], centres: list[Points], cut_m: float) -> list[Points]:
-    polygons = [shapely.make_valid(shapely.Polygon(xyz[:, :2])) for xyz in areas if len(xyz) > 2]
-    if not polygons:
-        return []
-    rings = [np.asarray(ring.coords) for ring in shapely.get_rings(shapely.get_parts(shapely.union_all(polygons)))]
-    lanes = shapely.union_all([shapely.LineString(xyz[:, :2]) for xyz in centres])
+    pieces = [piece for ring, cut in zip(rings, gaps, strict=True) for piece in _pieces(ring, cut)]
     corners = np.concatenate(areas)
     tree = KDTree(corners[:, :2])
-    found = []
-    for ring in rings:
-        cut = np.asarray(shapely.distance(shapely.linestrings(np.stack([ring[:-1], ring[1:]], axis=1)), lanes)) < cut_m
-        found += [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in _pieces(ring, cut)]
-    return found
+    return [np.column_stack([piece, corners[tree.query(piece)[1], 2]]) for piece in pieces]
 
 
 def _pieces(ring: Float[np.ndarray, "N 2"], cut: np.ndarray) -> list[Float[np.ndarray, "K 2"]]:

@@ -7,7 +7,7 @@ import lzma
 import zlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from io import BufferedIOBase, BufferedReader
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
@@ -75,20 +75,19 @@ def _read(path: Path, count: int) -> bytes:
     """Reads the first `count` bytes of the content."""
     name = None
     try:
-        with open(path, "rb") as stream:
-            name, opener = _find_compression(stream)
-            with opener(stream) as unpacked:
-                return read_bytes(unpacked, count)
+        name, opener = find_compression(path)
+        with opener(path, "rb") as stream:
+            return read_bytes(stream, count)
     except DAMAGE as error:
-        unreadable = f"cannot be read: {getattr(error, 'strerror', None) or error}"
-        damaged = f"begins as {name} but cannot be unpacked, damaged or cut short: {error}"
-        raise SceneError(f"{path}: {unreadable if name is None else damaged}") from error
+        fault = "cannot be read" if name is None else f"begins as {name} but cannot be unpacked, damaged or cut short"
+        raise SceneError(f"{path}: {fault}: {getattr(error, 'strerror', None) or error}") from error
 
 
-def _find_compression(stream: BufferedReader) -> tuple[str | None, Callable[[Any], Any]]:
-    """The name of the compression, by the first bytes, and the function that opens it."""
-    start = stream.peek(max(map(len, MAGIC)))
-    return next((entry for magic, entry in MAGIC.items() if start.startswith(magic)), (None, contextlib.nullcontext))
+def find_compression(path: Path) -> tuple[str | None, Callable[..., Any]]:
+    """The name of a file's compression, by its first bytes, and the function that opens its content."""
+    with open(path, "rb") as file:
+        start = file.read(max(map(len, MAGIC)))
+    return next((entry for magic, entry in MAGIC.items() if start.startswith(magic)), (None, open))
 
 
 def read_bytes(stream: BufferedIOBase, count: int) -> bytes:

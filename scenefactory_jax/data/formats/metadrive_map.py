@@ -18,22 +18,16 @@ SPACING_M = 1.0  # between the places along it
 
 
 def find_rims(lines: Sequence[Float[np.ndarray, "_ 3"]], lanes: Sequence[Float[np.ndarray, "_ 2"]]) -> list[bool]:
-    """Whether each line has a lane on one side at most, over more than half of its length.
-
-    Args:
-        lines: their points.
-        lanes: the outlines of all lanes.
-    """
+    """Whether each line has lanes, given by their outlines, on both sides over less than half of its length."""
     area = shapely.union_all([shapely.make_valid(shapely.Polygon(lane)) for lane in lanes if len(lane) > 2])
     shapely.prepare(area)
-    return [_is_rim(densify(line, SPACING_M)[:, :2], area) for line in lines]
-
-
-def _is_rim(points: Float[np.ndarray, "_ 2"], area: shapely.Geometry) -> bool:
-    """Whether less than half of a line's pieces have the area on both sides."""
-    along = np.diff(points, axis=0)
-    length = np.hypot(along[:, 0], along[:, 1])
-    along, middle = along[length > 0] / length[length > 0, None], ((points[1:] + points[:-1]) / 2)[length > 0]
-    aside = BESIDE_M * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    both = shapely.contains_xy(area, middle + aside) & shapely.contains_xy(area, middle - aside)
-    return bool(len(both)) and bool(both.mean() < 0.5)
+    rims = []
+    for line in lines:
+        points = densify(line, SPACING_M)[:, :2]
+        along, middle = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
+        length = np.hypot(along[:, 0], along[:, 1])
+        along, middle = along[length > 0] / length[length > 0, None], middle[length > 0]
+        aside = BESIDE_M * np.stack([-along[:, 1], along[:, 0]], axis=1)
+        both = shapely.contains_xy(area, middle + aside) & shapely.contains_xy(area, middle - aside)
+        rims.append(bool(len(both)) and bool(both.mean() < 0.5))
+    return rims

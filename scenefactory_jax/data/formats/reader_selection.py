@@ -61,14 +61,14 @@ def find(path: Path | str) -> list[Path]:
         raise SceneError(f"{path}: no such file or folder; give a scene file or a folder of them")
     if (path / BANK_INDEX).is_file():
         raise SceneError(f"{path}: a bank already; give the files that it was made from")
-    found: list[Path] = []
-    for folder, folders, names in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
+    files: list[Path] = []
+    for folder, folders, names in os.walk(path, onerror=lambda error: files.append(Path(error.filename))):
         folders[:] = [name for name in folders if not name.startswith(".")]
         if BANK_INDEX not in names:
-            found.extend(file for name in names if not name.startswith(".") and _is_regular(file := Path(folder, name)))
-    if not found:
+            files.extend(file for name in names if not name.startswith(".") and _is_regular(file := Path(folder, name)))
+    if not files:
         raise SceneError(f"{path}: an empty folder; give a scene file or a folder of them")
-    return sorted(found)
+    return sorted(files)
 
 
 def _is_regular(path: Path) -> bool:
@@ -119,18 +119,11 @@ def _explain(path: Path, refusals: Sequence[str]) -> str:
         head = file.read(HEAD)
     if not head:
         return "an empty file"
-    if name := _find_foreign_format(head):
-        return f"this is {name}: it is not read"
-    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"
-
-
-def _find_foreign_format(head: bytes) -> str | None:
-    """The name of a format without a reader, with an article where it needs one; None if it is not known."""
-    for start, name in STARTS.items():
-        if head.startswith(start):
-            return name
+    name = next((name for start, name in STARTS.items() if head.startswith(start)), None)
     text = head.decode("utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig", errors="ignore").lstrip()
     root = re.match(r"<(?:\w+:)?([\w.-]+)", BEFORE_ROOT.sub("", text).lstrip()) if text.startswith("<") else None
-    if root is None:
-        return None
-    return ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")
+    if name is None and root is not None:
+        name = ROOTS.get(root[1], f"XML of the root element {root[1][:40]!r}")
+    if name is not None:
+        return f"this is {name}: it is not read"
+    return f"unknown format: {'; '.join(refusals) or f'it begins with {head[:16]!r}'}"

@@ -11,72 +11,67 @@
 (MetaDrive's `waymo_utils.py` of those years.)
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from scenefactory_jax.core.raw_scene import SceneError
-from scenefactory_jax.data.formats import values
+from scenefactory_jax.data.formats.values import Node
+
+MAX_STATES = 1_000_000  # of all lights over all steps; 20 s of 100 lights have 20,000
 
 
-def convert_legacy(document: Mapping[Any, Any], where: str) -> dict[Any, Any]:
+def convert_legacy(document: Node) -> Node:
     """Converts a scenario into today's layout, with empty sections for those that it lacks."""
-    present = {key: value for key, value in document.items() if value is not None}
-    metadata = values.get({"metadata": {}} | present, "metadata", dict, where)
-    outside = {"ts": present.get("ts"), "sdc_id": present.get("sdc_track_index", present.get("sdc_index"))}
-    metadata = {key: value for key, value in outside.items() if value is not None} | metadata
-    tracks = values.expect(document["tracks"], dict, f"{where}tracks")
-    lights = present.get("dynamic_map_states", {})
-    if isinstance(lights, list):
-        lights = _by_lane(lights, f"{where}dynamic_map_states")
-    values.expect(lights, dict, f"{where}dynamic_map_states")
-    return present | {
-        "metadata": metadata,
-        "tracks": {key: _track(track, f"{where}tracks[{key!r}]") for key, track in tracks.items()},
-        "map_features": values.expect(present.get("map_features", present.get("map")), dict, f"{where}map_features"),
-        "dynamic_map_states": {key: _light(light, f"{where}dynamic_map_states[{key!r}]") for key, light in lights.items()},
+    outside = {"ts": document.get("ts", None).value, "sdc_id": document.get("sdc_track_index", document.value.get("sdc_index")).value}
+    tracks, lights = document["tracks"].entries(dict), document.get("dynamic_map_states", {})
+    if isinstance(lights.value, list):
+        lights = Node(_group_by_lane(lights), lights.where)
+    sections = {
+        "metadata": {key: value for key, value in outside.items() if value is not None} | document.get("metadata", {}).expect(dict),
+        "tracks": {key: _track(track) for key, track in tracks.items()},
+        "map_features": document.get("map_features", document.value.get("map")).expect(dict),
+        "dynamic_map_states": {key: _light(light) for key, light in lights.entries(dict).items()},
     }
+    return Node(document.value | sections, document.where)
 
 
-def _track(track: Any, where: str) -> dict[str, Any]:
+def _track(track: Node) -> dict[str, Any]:
     """A track with a `state`, and its size as three columns."""
-    values.expect(track, dict, where)
-    state = values.expect(track.get("state", track), dict, f"{where}.state")
+    state = track.get("state", track.value)
+    columns = {}
     if "size" in state:
-        sizes = values.table(state["size"], f"{where}.state.size", columns=(3,))
-        state = state | dict(zip(("length", "width", "height"), sizes.T, strict=True))
-    return track | {"state": state}
+        columns = dict(zip(("length", "width", "height"), state["size"].table(3).T, strict=True))
+    return track.value | {"state": state.value | columns}
 
 
-def _by_lane(steps: list[Any], where: str) -> dict[str, Any]:
+def _group_by_lane(steps: Node) -> dict[str, Any]:
     """Lights that are listed step by step, in today's layout."""
     lights: dict[str, Any] = {}
-    for step, records in enumerate(steps):
-        for record in values.expect(records, list, f"{where}[{step}]"):
-            values.expect(record, dict, f"{where}[{step}]")
-            lane = values.get(record, "lane", int, f"{where}[{step}]")
-            light = lights.setdefault(str(lane), {"lane": lane, "state": {"object_state": {}}, "stop_point": record.get("stop_point")})
-            light["state"]["object_state"][step] = record.get("state")
-    for light in lights.values():
-        states = light["state"]["object_state"]
-        light["state"]["object_state"] = [states.get(step) for step in range(len(steps))]
+    for step, records in steps.entries(list).items():
+        for record in records.entries(list).values():
+            lane = record["lane"].expect(int)
+            if str(lane) not in lights:
+                stop, states = record.get("stop_point", None).value, [None] * len(steps.value)
+                lights[str(lane)] = {"lane": lane, "state": {"object_state": states}, "stop_point": stop}
+            if len(lights) * len(steps.value) > MAX_STATES:
+                raise SceneError(f"{record.where}: expected at most {MAX_STATES} states of all lights, got more")
+            lights[str(lane)]["state"]["object_state"][step] = record.get("state", None).value
     return lights
 
 
-def _light(light: Any, where: str) -> dict[str, Any]:
+def _light(light: Node) -> dict[str, Any]:
     """A light with one lane and one stop point in place of arrays over the steps."""
-    values.expect(light, dict, where)
-    state = values.get(light, "state", dict, where)
+    state = light["state"]
     if "lane" not in state:
-        return light
-    states = values.array(state.get("object_state", ()), f"{where}.state.object_state")
-    lanes = values.column(state["lane"], f"{where}.state.lane", length=states.size)
-    stops = values.table(state.get("stop_point", ()), f"{where}.state.stop_point", columns=(2, 3))
-    steps = np.flatnonzero(lanes)
+        return light.value
+    states = state.get("object_state", ()).array()
+    lanes = state["lane"].column(states.size)
+    stops = state.get("stop_point", ()).table(2, 3)
     if states.ndim != 1 or len(stops) not in (0, len(states)):
-        raise SceneError(f"{where}.state: expected a state and a stop point for each step, got {states.shape} and {len(stops)}")
+        raise SceneError(f"{state.where}: expected a state and a stop point for each step, got {states.shape} and {len(stops)}")
     codes = [int(code) if lane else None for code, lane in zip(states, lanes, strict=True)]
+    steps = np.flatnonzero(lanes)
     first = int(steps[0]) if len(steps) else 0
-    modern = {"state": {"object_state": codes}, "stop_point": stops[first] if len(stops) else None}
-    return light | modern | ({"lane": int(lanes[first])} if len(steps) else {})
+    lane = {"lane": int(lanes[first])} if len(steps) else {}
+    return light.value | lane | {"state": {"object_state": codes}, "stop_point": stops[first] if len(stops) else None}

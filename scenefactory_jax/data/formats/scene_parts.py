@@ -1,20 +1,21 @@
-"""Parts of a raw scene in the form that all readers share: tracks, lights, times, and ids that are texts in the source."""
+"""Parts of a raw scene in the form that all readers share: tracks, lights, and ids that are texts in the source."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.raw_scene import Light, SceneError, Track
-from scenefactory_jax.core.scene_arrays import FULL_TURN, wrap_angles
+from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, RoadUser
-from scenefactory_jax.data.formats import values
+from scenefactory_jax.data.formats.values import AXES, check_finite
 
 INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")  # a text that converts to an integer of 64 bits and back
+WOMD_TYPES: tuple[RoadUser, ...] = ("other", *ROAD_USERS)  # Track.ObjectType: unset, vehicle, pedestrian, cyclist, other
+STATE = ("x", "y", "z", "yaw", "velocity_x", "velocity_y", "length", "width", "height")  # columns of a table of states
 KINDS: dict[str, RoadUser] = {kind: kind for kind in ROAD_USERS}
-AXES = ("x", "y", "z")
 
 
 def road_user(name: str) -> RoadUser:
@@ -23,41 +24,69 @@ def road_user(name: str) -> RoadUser:
 
 
 def make_track(
+    where: str,
     *,
     id: int,
     kind: RoadUser,
-    size: tuple[float, float, float],
-    xyz: Float[np.ndarray, "L 3"],
-    yaw: Float[np.ndarray, " L"],
+    size: Sequence[float],
+    position: Float[np.ndarray, "L 3"],
+    heading: Float[np.ndarray, " L"],
     velocity: Float[np.ndarray, "L 2"],
     valid: Bool[np.ndarray, " L"],
+    max_heading: float = np.inf,
 ) -> Track:
-    """A track with zeros at invalid steps, where a source may have any value, and a yaw in [-pi, pi)."""
-    mask = valid[:, None]
-    motion = {"xyz": np.where(mask, xyz, 0.0), "yaw": np.where(valid, wrap_angles(yaw), 0.0), "velocity": np.where(mask, velocity, 0.0)}
-    return Track(id=id, kind=kind, size=size, valid=valid, **motion)
+    """A track with zeros at invalid steps, where a source may have any value, and a yaw in [-pi, pi).
 
-
-def check_motion(
-    where: str, valid: Bool[np.ndarray, " L"], *, position: np.ndarray, velocity: np.ndarray, heading: np.ndarray, degrees: bool = False
-) -> None:
-    """Refuses a track whose motion at valid steps is not finite or has a heading of more than a turn in radians."""
+    Raises:
+        SceneError: motion at a valid step that is not finite, or a heading beyond `max_heading` (rad).
+    """
     for name, table in (("position", position), ("velocity", velocity), ("heading", heading)):
-        values.check_finite(table, f"{where}.{name}", rows=valid, keys=AXES)
+        check_finite(table, f"{where}.{name}", rows=valid, keys=AXES)
     turns = np.where(valid, np.abs(heading), 0.0)
-    if not degrees and turns.max(initial=0.0) > FULL_TURN:
+    if turns.max(initial=0.0) > max_heading:
         step = int(np.argmax(turns))
         raise SceneError(f"{where}.heading[{step}]: expected an angle in radians, got {heading[step]}")
+    length, width, height = map(float, size)
+    xyz, velocity = (np.where(valid[:, None], table, 0.0) for table in (position, velocity))
+    yaw = np.where(valid, wrap_angles(heading), 0.0)
+    return Track(id=id, kind=kind, size=(length, width, height), xyz=xyz, yaw=yaw, velocity=velocity, valid=valid)
+
+
+def check_times(times: Float[np.ndarray, " L"], where: str) -> None:
+    """Refuses a log without steps, and times that are not finite or do not increase, naming the first such time."""
+    if not len(times):
+        raise SceneError(f"{where}: expected at least one step, got none")
+    check_finite(times, where)
+    if (falls := np.flatnonzero(np.diff(times) <= 0)).size:
+        step = int(falls[0]) + 1
+        raise SceneError(f"{where}[{step}]: expected a time after {times[step - 1]} s, got {times[step]} s")
+
+
+def make_womd_tracks(
+    numbers: Float[np.ndarray, "A L 9"],
+    valid: Bool[np.ndarray, "A L"],
+    *,
+    ids: Sequence[int],
+    kinds: Sequence[int],
+    current: int,
+    where: str,
+) -> tuple[Track, ...]:
+    """The tracks of WOMD: columns STATE, with any values at invalid steps, and kinds, indices into WOMD_TYPES.
+
+    The size is that of the current step or, where it is invalid, of the first valid step.
+    """
+    tracks = []
+    for number, kind, table, mask in zip(ids, kinds, numbers, valid, strict=True):
+        step = current if mask[current] else np.argmax(mask)
+        size = table[step, 6:9].tolist() if mask[step] else (0.0, 0.0, 0.0)
+        motion = {"position": table[:, 0:3], "heading": table[:, 3], "velocity": table[:, 4:6]}
+        tracks.append(make_track(f"{where}track {number}", id=number, kind=WOMD_TYPES[kind], size=size, valid=mask, **motion))
+    return tuple(tracks)
 
 
 def make_light(lane: int, codes: Int[np.ndarray, " L"], stop: Float[np.ndarray, "3"] | None) -> Light:
     """The light of a lane from an index into LIGHT_STATES for each step; -1: no state at that step."""
     return Light(lane=lane, state=np.maximum(codes, 0), valid=codes >= 0, stop=stop)
-
-
-def even_times(steps: int, step_s: float) -> Float[np.ndarray, " L"]:
-    """Times of a log whose format has none."""
-    return step_s * np.arange(steps, dtype=np.float64)
 
 
 def to_xyz(table: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N 3"]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +9,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import OtherContent, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import RoadUser
 from scenefactory_jax.data.formats import file_content, scene_parts, values
+from scenefactory_jax.data.formats.values import Node
 
 MAX_STEPS = 9_999  # of an end: every agent has an array as long as the last; `scenes.check.max_steps` less the first step
 TYPES: dict[int, RoadUser] = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}  # WOMD's object types
@@ -27,29 +27,25 @@ def read(
         include_sdc: whether the recording car is an agent (the published loader leaves it out).
         all_vehicles: whether every agent is a vehicle (the published loader turns pedestrians and cyclists into cars).
     """
-    document = file_content.load_json(path, file_limit_mb=file_limit_mb)
-    road = document.get("road")
-    if not isinstance(road, dict) or "polylines" not in road:
-        raise OtherContent(f"{path}: expected SceneFactory JSON with 'road.polylines', got the keys {values.list_keys(document)}")
+    document = Node(file_content.load_json(path, file_limit_mb=file_limit_mb), f"{path}: ")
+    road = document.get("road", {})
+    if not isinstance(road.value, dict) or "polylines" not in road:
+        raise OtherContent(f"{path}: expected SceneFactory JSON with 'road.polylines', got the keys {values.list_keys(document.value)}")
     if len(size_m) != 3:
         raise SceneError(f"formats.scenefactory.size_m: expected [length, width, height], got {size_m!r}")
-    lines = values.get(road, "polylines", list, f"{path}: road")
-    agents = values.get(document, "agents", dict, f"{path}: ")
-    items = values.get(agents, "items", list, f"{path}: agents")
-    records = [(record, f"{path}: agents.items[{i}]") for i, record in enumerate(items)]
-    sdc = len(records) if include_sdc and agents.get("sdc") is not None else None
+    agents, meta = document["agents"], document.get("meta", {}).expect(dict)
+    records = list(agents["items"].entries(list).values())
+    sdc = len(records) if include_sdc and agents.get("sdc", None).value is not None else None
     if sdc is not None:
-        records.append((agents["sdc"], f"{path}: agents.sdc"))
-    ends = [_end(values.expect(record, dict, where), where) for record, where in records]
+        records.append(agents["sdc"])
+    ends = [_end(record.get("end", None)) for record in records]
     steps = 1 + max((step for step, _ in ends), default=0)
-    size = (float(size_m[0]), float(size_m[1]), float(size_m[2]))
-    meta = values.expect(document.get("meta") or {}, dict, f"{path}: meta")
     yield RawScene(
         name=Path(path).name,
         source=str(path),
-        roads=tuple(_polyline(record, i, f"{path}: road.polylines[{i}]") for i, record in enumerate(lines)),
-        tracks=tuple(_track(record, end, steps, size, all_vehicles, where) for (record, where), end in zip(records, ends, strict=True)),
-        times=scene_parts.even_times(steps, step_s),
+        roads=tuple(_polyline(record, i) for i, record in road["polylines"].entries(list).items()),
+        tracks=tuple(_track(record, end, steps, size_m, all_vehicles) for record, end in zip(records, ends, strict=True)),
+        times=step_s * np.arange(steps),
         current=0,
         sdc=sdc,
         metadata={"dataset": "WOMD", "format": "scenefactory"}
@@ -57,58 +53,53 @@ def read(
     )
 
 
-def _polyline(record: Any, index: int, where: str) -> Polyline:
+def _polyline(record: Node, index: int) -> Polyline:
     """One polyline; points may lack z."""
-    values.expect(record, dict, where)
-    rows = values.get(record, "xyz", list, where)
+    rows = record["xyz"].entries(list)
     xyz = np.zeros((len(rows), 3))
-    for place, row in enumerate(rows):
-        point = values.numbers(row, f"{where}.xyz[{place}]")
+    for place, row in rows.items():
+        point = row.numbers()
         if len(point) not in (2, 3):
-            raise SceneError(f"{where}.xyz[{place}]: expected [x, y] or [x, y, z], got {row!r}")
+            raise SceneError(f"{row.where}: expected [x, y] or [x, y, z], got {row.value!r}")
         xyz[place, : len(point)] = point
-    values.check_finite(xyz, f"{where}.xyz")
-    number = values.expect(record.get("id", index), int, f"{where}.id")
-    return Polyline(kind=values.get(record, "type", int, where), xyz=xyz, id=number)
+    values.check_finite(xyz, f"{record.where}.xyz")
+    return Polyline(kind=record["type"].expect(int), xyz=xyz, id=record.get("id", index).expect(int))
 
 
-def _pose(record: dict[str, Any], where: str) -> Pose:
+def _pose(record: Node) -> Pose:
     """A pose; z and yaw may be missing."""
-    complete = {"z": 0.0, "yaw": 0.0} | record
-    pose = np.array([values.get(complete, key, float, where) for key in ("x", "y", "z", "yaw")], np.float64)
-    values.check_finite(pose, where)
+    x, y = (record[key].expect(float) for key in ("x", "y"))
+    z, yaw = (record.get(key, 0.0).expect(float) for key in ("z", "yaw"))
+    pose = np.array([x, y, z, yaw], np.float64)
+    values.check_finite(pose, record.where)
     return pose
 
 
-def _end(record: dict[str, Any], where: str) -> tuple[int, Pose | None]:
+def _end(end: Node) -> tuple[int, Pose | None]:
     """Step and pose of an agent's end; 0 and None for an agent without an end, which stays at its start."""
-    end = record.get("end")
-    if end is None:
+    if end.value is None:
         return 0, None
-    values.expect(end, dict, f"{where}.end")
-    step = values.expect(end.get("t_idx", 0), int, f"{where}.end.t_idx")
-    if not 0 <= step < MAX_STEPS:
-        raise SceneError(f"{where}.end.t_idx: expected a step from 0 (the first future sample) to {MAX_STEPS - 1}, got {step}")
-    return step + 1, _pose(end, f"{where}.end")
+    step = end.get("t_idx", 0)
+    if not 0 <= step.expect(int) < MAX_STEPS:
+        raise SceneError(f"{step.where}: expected a step from 0 (the first future sample) to {MAX_STEPS - 1}, got {step.value}")
+    return step.value + 1, _pose(end)
 
 
-def _track(
-    record: dict[str, Any], end: tuple[int, Pose | None], steps: int, size: tuple[float, float, float], all_vehicles: bool, where: str
-) -> Track:
+def _track(record: Node, end: tuple[int, Pose | None], steps: int, size_m: list[float], all_vehicles: bool) -> Track:
     """An agent as a track that is valid at its start and at its end, with zero velocity, which the format does not have."""
     poses, valid = np.zeros((steps, 4)), np.zeros(steps, bool)
-    poses[0], valid[0] = _pose(values.get(record, "start", dict, where), f"{where}.start"), True
-    if end[1] is not None:
-        poses[end[0]], valid[end[0]] = end[1], True
-    kind = record.get("agent_type", "vehicle")
-    named = TYPES.get(kind, "other") if values.is_number(kind) else scene_parts.road_user(str(kind).lower().removeprefix("type_"))
-    number = values.get(record, "agent_id", float, where)  # a float in tf.Example
-    if not np.isfinite(number):
-        raise SceneError(f"{where}.agent_id: expected a finite number, got {number}")
+    for step, pose in ((0, _pose(record["start"])), end):
+        if pose is not None:
+            poses[step], valid[step] = pose, True
+    code, number = record.get("agent_type", "vehicle").value, record["agent_id"]  # a float in tf.Example
+    kind = TYPES.get(code, "other") if values.is_number(code) else scene_parts.road_user(str(code).lower().removeprefix("type_"))
+    if not np.isfinite(number.expect(float)):
+        raise SceneError(f"{number.where}: expected a finite number, got {number.value}")
+    length, width, height = map(float, size_m)
     return Track(
-        id=int(number),
-        kind="vehicle" if all_vehicles else named,
-        size=size,
+        id=int(number.value),
+        kind="vehicle" if all_vehicles else kind,
+        size=(length, width, height),
         xyz=poses[:, :3].copy(),
         yaw=poses[:, 3].copy(),
         velocity=np.zeros((steps, 2)),

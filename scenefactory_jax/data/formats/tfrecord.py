@@ -4,9 +4,7 @@ A record is its length (uint64), the masked CRC32C of these eight bytes (uint32)
 little endian; the file has no header (tensorflow.org/tutorials/load_data/tfrecord, "TFRecords format details").
 """
 
-import gzip
 import struct
-import zlib
 from collections.abc import Iterator
 from io import BufferedIOBase
 from pathlib import Path
@@ -15,11 +13,10 @@ from typing import NamedTuple
 import google_crc32c
 
 from scenefactory_jax.core.raw_scene import FormatMismatch, Reject, SceneError
-from scenefactory_jax.data.formats.file_content import read_bytes
+from scenefactory_jax.data.formats.file_content import DAMAGE, find_compression, read_bytes
 
 HEADER = struct.Struct("<QI")  # length of the data, masked checksum of the length
 FOOTER = struct.Struct("<I")  # masked checksum of the data
-GZIP = b"\x1f\x8b"
 
 
 class Record(NamedTuple):
@@ -45,7 +42,7 @@ class _Frame(NamedTuple):
 
 
 def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
-    """Reads the records of a file, plain or gzip, and yields a `Reject` for each that is damaged.
+    """Reads the records of a file, plain or compressed, and yields a `Reject` for each that is damaged.
 
     Reading goes on after a damaged record as long as its length can be trusted: the checksum of the length matches, or that of the data.
 
@@ -58,15 +55,15 @@ def read(path: Path, *, record_limit_mb: int) -> Iterator[Record | Reject]:
         SceneError: the file cannot be opened.
     """
     try:
-        stream, size = _open(Path(path))
+        stream = find_compression(path)[1](path, "rb")
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
     with stream:
         number = offset = 0
         while True:
             try:
-                frame = _read_frame(stream, None if size is None else size - offset, record_limit_mb)
-            except (OSError, EOFError, zlib.error) as error:
+                frame = _read_frame(stream, record_limit_mb)
+            except DAMAGE as error:
                 frame = _Frame(fault=f"damaged or cut short: {error}", known=number > 0, last=True)
             if number == 0 and (frame is None or not frame.known):
                 raise FormatMismatch(f"{path}: not a TFRecord: {'it is empty' if frame is None else frame.fault}")
@@ -85,38 +82,22 @@ def mask(data: bytes) -> int:
     return ((checksum >> 15 | checksum << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def _open(path: Path) -> tuple[BufferedIOBase, int | None]:
-    """The file, unpacked as it is read, and its size, which is not known of gzip."""
-    stream = path.open("rb")
-    if stream.read(len(GZIP)) == GZIP:
-        stream.close()
-        return gzip.open(path), None
-    stream.seek(0)
-    return stream, path.stat().st_size
-
-
-def _read_frame(stream: BufferedIOBase, left: int | None, limit_mb: int) -> _Frame | None:
-    """Reads the next frame of a file of which `left` bytes are left, if that is known; None at its end."""
+def _read_frame(stream: BufferedIOBase, limit_mb: int) -> _Frame | None:
+    """Reads the next frame of a file; None at its end."""
     header = read_bytes(stream, HEADER.size)
     if not header:
         return None
     if len(header) < HEADER.size:
         return _Frame(fault=f"truncated: {len(header)} bytes are left, but a header has {HEADER.size}", known=False, last=True)
     length, checksum = HEADER.unpack(header)
-    known = checksum == mask(header[:8])
-    lost = f"the checksum of its length ({length}) does not match, so the start of the next record is not known"
-    end = lambda fault: _Frame(fault=fault if known else lost, known=known, last=True)  # noqa: E731
-    if left is not None and length > (room := left - HEADER.size - FOOTER.size):
-        return end(f"truncated: it declares {length} bytes of data, and there can be {max(room, 0)} at most")
+    known, declared = checksum == mask(header[:8]), f"it declares {length} bytes of data"
+    lost = _Frame(fault="the checksum of its length does not match, so the start of the next record is not known", known=False, last=True)
     if length > limit_mb * 10**6:
-        return end(f"it declares {length} bytes of data; formats.womd.record_limit_mb is {limit_mb}")
-    data = read_bytes(stream, length)
-    footer = read_bytes(stream, FOOTER.size)
+        return _Frame(fault=f"{declared}; formats.womd.record_limit_mb is {limit_mb}", last=True) if known else lost
+    data, footer = read_bytes(stream, length), read_bytes(stream, FOOTER.size)
     if len(data) + len(footer) < length + FOOTER.size:
-        return end(f"truncated: it declares {length} bytes of data, and there are {len(data)}")
+        return _Frame(fault=f"truncated: {declared}, and there are {len(data)}", last=True) if known else lost
     intact = FOOTER.unpack(footer)[0] == mask(data)
     if known and intact:
         return _Frame(data)
-    if known or intact:
-        return _Frame(data, fault=f"the checksum of its {'data' if known else 'length'} does not match")
-    return end(lost)
+    return _Frame(data, fault=f"the checksum of its {'data' if known else 'length'} does not match") if known or intact else lost

@@ -1,5 +1,6 @@
 """The files of the Waymo Open Motion Dataset: TFRecords of Scenario protos or of tf.Examples, identified by their content."""
 
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,20 +20,18 @@ def read(path: Path, *, jump_m: float, record_limit_mb: int) -> Iterator[RawScen
         if isinstance(record, Reject):
             yield record
             continue
-        features = womd_example.parse(record.data)
-        scenario = womd_scenario.parse(record.data) if features is None else None
-        if features is None and scenario is None:
+        if features := womd_example.parse(record):
+            name, make = features.name, functools.partial(womd_example.make, features, jump_m=jump_m)
+        elif message := womd_scenario.parse(record):
+            name, make = womd_scenario.find_name(message), functools.partial(womd_scenario.make, message)
+        else:
             fault = f"{record.place}: neither a Scenario nor a tf.Example of the Waymo Open Motion Dataset"
             if record.number == 0:
                 raise OtherContent(f"{path}: {fault}")
             yield Reject(None, fault)
             continue
-        name = womd_scenario.find_name(scenario) if features is None else womd_example.find_name(features)
         try:
-            if features is None:
-                scene = womd_scenario.make(scenario, path=path, record=record)
-            else:
-                scene = womd_example.make(features, path=path, record=record, jump_m=jump_m)
+            scene = make(path=path, record=record)
         except SceneError as error:
             yield Reject(name, str(error))
         else:

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, SPEED_BUMP, STOP_SIGN
 from scenefactory_jax.data.formats import values, womd_schema
-from scenefactory_jax.data.formats.scene_parts import AXES, make_light
+from scenefactory_jax.data.formats.scene_parts import WOMD_TYPES, check_times, make_light, make_womd_tracks
 from scenefactory_jax.data.formats.tfrecord import Record
-from scenefactory_jax.data.formats.womd_common import OBJECT_TYPES, check_times, make_tracks
+from scenefactory_jax.data.formats.values import AXES
 
 Message = Any  # protobuf's classes are made at run time: type checkers know none of their fields
 
@@ -34,14 +34,14 @@ FEATURES = {
     "speed_bump": (range(SPEED_BUMP, SPEED_BUMP + 1), "polygon"),
     "driveway": (range(DRIVEWAY, DRIVEWAY + 1), "polygon"),
 }
-STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y", "length", "width", "height")  # as womd_common.STATE
+STATE = ("center_x", "center_y", "center_z", "heading", "velocity_x", "velocity_y", "length", "width", "height")  # as scene_parts.STATE
 PLANE = 2  # the first columns of AXES and of STATE: protobuf reads a missing number as zero, and positions in a log are not zero
 
 
-def parse(data: bytes) -> Message | None:
+def parse(record: Record) -> Message | None:
     """The Scenario in a record; None if it has none."""
     try:
-        message = womd_schema.Scenario.FromString(data)
+        message = womd_schema.Scenario.FromString(record.data)
     except DecodeError:
         return None
     return message if message.scenario_id and (message.tracks or message.map_features) else None
@@ -57,8 +57,7 @@ def make(message: Message, *, path: Path, record: Record) -> RawScene:
     where = f"{record.place}: "
     times = np.array(message.timestamps_seconds, np.float64)
     check_times(times, f"{where}timestamps_seconds")
-    if not message.HasField("current_time_index"):
-        raise SceneError(f"{where}current_time_index: missing")
+    _require(message, "current_time_index", where)
     current = values.check_index(message.current_time_index, range(len(times)), "step of the log", f"{where}current_time_index")
     tracks = _tracks(message.tracks, len(times), current, where)
     sdc = message.sdc_track_index if message.HasField("sdc_track_index") else None
@@ -80,6 +79,12 @@ def make(message: Message, *, path: Path, record: Record) -> RawScene:
     )
 
 
+def _require(message: Message, field: str, where: str) -> None:
+    """Refuses a message without the field; `where` ends with a separator."""
+    if not message.HasField(field):
+        raise SceneError(f"{where}{field}: missing")
+
+
 def _table(messages: Sequence[Message], fields: Sequence[str], name: Callable[[int], str]) -> Float[np.ndarray, "N D"]:
     """The numbers of many messages of one type, a row each; `name` gives the place of a row in the source."""
     flat = chain.from_iterable(map(attrgetter(*fields), messages))
@@ -87,10 +92,8 @@ def _table(messages: Sequence[Message], fields: Sequence[str], name: Callable[[i
     if not np.isfinite(table).all():
         row, column = np.argwhere(~np.isfinite(table))[0]
         raise SceneError(f"{name(row)}.{fields[column]}: expected a finite number, got {table[row, column]}")
-    if not table[:, :PLANE].all():
-        for row, column in np.argwhere(table[:, :PLANE] == 0):
-            if not messages[row].HasField(fields[column]):
-                raise SceneError(f"{name(row)}.{fields[column]}: missing")
+    for row, column in np.argwhere(table[:, :PLANE] == 0).tolist():
+        _require(messages[row], fields[column], f"{name(row)}.")
     return table
 
 
@@ -98,56 +101,42 @@ def _tracks(messages: Sequence[Message], steps: int, current: int, where: str) -
     """The objects."""
     for place, message in enumerate(messages):
         values.check_length(message.states, steps, f"{where}tracks[{place}].states")
-        if not message.HasField("id"):
-            raise SceneError(f"{where}tracks[{place}].id: missing")
-        values.check_index(message.object_type, OBJECT_TYPES, "type of object", f"{where}tracks[{place}].object_type")
+        _require(message, "id", f"{where}tracks[{place}].")
+        values.check_index(message.object_type, WOMD_TYPES, "type of object", f"{where}tracks[{place}].object_type")
     states = enumerate(chain.from_iterable(message.states for message in messages))
     by_row = {row: state for row, state in states if state.valid}
     rows = list(by_row)
     numbers, valid = np.zeros((len(messages) * steps, len(STATE))), np.zeros(len(messages) * steps, bool)
     numbers[rows] = _table(list(by_row.values()), STATE, lambda row: f"{where}tracks[{rows[row] // steps}].states[{rows[row] % steps}]")
     valid[rows] = True
-    return make_tracks(
-        numbers.reshape(len(messages), steps, len(STATE)),
-        valid.reshape(len(messages), steps),
-        ids=[message.id for message in messages],
-        kinds=[message.object_type for message in messages],
-        current=current,
-    )
+    numbers, valid = numbers.reshape(len(messages), steps, len(STATE)), valid.reshape(len(messages), steps)
+    ids, kinds = [message.id for message in messages], [message.object_type for message in messages]
+    return make_womd_tracks(numbers, valid, ids=ids, kinds=kinds, current=current, where=where)
 
 
 def _polyline(message: Message, where: str) -> Polyline | None:
-    """One map feature; None if its kind is newer than this reader."""
+    """One map feature; None if its kind is newer than this reader. A speed limit of 0 means unknown."""
     name = message.WhichOneof(womd_schema.CHOICE)
     if name is None:
         return None
-    if not message.HasField("id"):
-        raise SceneError(f"{where}.id: missing")
+    _require(message, "id", f"{where}.")
     feature, where = getattr(message, name), f"{where}.{name}"
     if name == "stop_sign":
-        if not feature.HasField("position"):
-            raise SceneError(f"{where}.position: missing")
+        _require(feature, "position", f"{where}.")
         return Polyline(kind=STOP_SIGN, xyz=_table([feature.position], AXES, lambda _: f"{where}.position"), id=message.id)
     elements, points = FEATURES[name]
     kind = elements[values.check_index(getattr(feature, "type", 0), elements, f"type of {name}", f"{where}.type")]
-    xyz = _table(getattr(feature, points), AXES, lambda row: f"{where}.{points}[{row}]")
-    line = Polyline(kind=kind, xyz=xyz, id=message.id)
-    return line if name != "lane" else _add_links(line, feature, where)
-
-
-def _add_links(line: Polyline, lane: Message, where: str) -> Polyline:
-    """A lane with its links and its speed limit; 0 means unknown."""
-    limit = lane.speed_limit_mph
+    line = Polyline(kind=kind, xyz=_table(getattr(feature, points), AXES, lambda row: f"{where}.{points}[{row}]"), id=message.id)
+    if name != "lane":
+        return line
+    limit = feature.speed_limit_mph
     if not (np.isfinite(limit) and limit >= 0):
         raise SceneError(f"{where}.speed_limit_mph: expected 0 (unknown) or more, got {limit}")
-    return replace(
-        line,
-        entry=tuple(lane.entry_lanes),
-        exit=tuple(lane.exit_lanes),
-        left=tuple(dict.fromkeys(neighbour.feature_id for neighbour in lane.left_neighbors)),  # the file has one per stretch
-        right=tuple(dict.fromkeys(neighbour.feature_id for neighbour in lane.right_neighbors)),
-        speed_limit=limit * MPH if limit else None,
+    left, right = (  # the file has a neighbour once per stretch
+        tuple(dict.fromkeys(neighbour.feature_id for neighbour in side)) for side in (feature.left_neighbors, feature.right_neighbors)
     )
+    entry, following = tuple(feature.entry_lanes), tuple(feature.exit_lanes)
+    return replace(line, entry=entry, exit=following, left=left, right=right, speed_limit=limit * MPH if limit else None)
 
 
 def _lights(moments: Sequence[Message], steps: int, where: str) -> tuple[Light, ...]:
@@ -158,19 +147,14 @@ def _lights(moments: Sequence[Message], steps: int, where: str) -> tuple[Light, 
     stops: dict[int, np.ndarray | None] = {}
     for step, moment in enumerate(moments):
         for i, signal in enumerate(moment.lane_states):
-            place = f"{where}dynamic_map_states[{step}].lane_states[{i}]"
-            if not signal.HasField("lane"):
-                raise SceneError(f"{place}.lane: missing")
-            state = values.check_index(signal.state, LIGHT_STATES, "state of a light", f"{place}.state")
+            place = f"{where}dynamic_map_states[{step}].lane_states[{i}]."
+            _require(signal, "lane", place)
             if signal.lane not in codes:
-                codes[signal.lane], stops[signal.lane] = np.full(steps, -1), _stop(signal, place)
-            codes[signal.lane][step] = state
+                codes[signal.lane] = np.full(steps, -1)
+                points = [signal.stop_point] if signal.HasField("stop_point") else []
+                stops[signal.lane] = next(iter(_table(points, AXES, lambda _, place=place: f"{place}stop_point")), None)
+            codes[signal.lane][step] = values.check_index(signal.state, LIGHT_STATES, "state of a light", f"{place}state")
     return tuple(make_light(lane, column, stops[lane]) for lane, column in codes.items())
-
-
-def _stop(signal: Message, where: str) -> Float[np.ndarray, "3"] | None:
-    """The stop point of a light, if the source has it."""
-    return _table([signal.stop_point], AXES, lambda _: f"{where}.stop_point")[0] if signal.HasField("stop_point") else None
 
 
 def _metadata(message: Message, tracks: Sequence[Track], where: str) -> dict[str, Any]:

@@ -25,7 +25,7 @@ SHOWN = 3  # reasons in a message
 
 @dataclass(frozen=True)
 class BatchLoader:
-    """Reads and packs single scenes of a source; the functions can be sent to another process."""
+    """Reads and packs single scenes of a source, possibly in other processes."""
 
     source: SceneSource
     check: Check
@@ -85,7 +85,7 @@ def measure(loader: BatchLoader, *, sample: int, headroom: float, given: Mapping
         if rows is None:
             rows = int(np.ceil(high * headroom)) if name in VARIABLE else high
             rows = round_rows(name, rows)
-        elif isinstance(rows, bool) or not isinstance(rows, int) or rows < (name != "traffic"):
+        elif rows < (name != "traffic"):
             raise ConfigError(f"stream.capacity.{name}: expected 1 or more (traffic: 0), or null to measure it, got {rows!r}")
         elif name in VARIABLE and name != "traffic" and rows < low:
             raise ConfigError(f"stream.capacity.{name}: {rows}; all {len(needs)} scenes of the sample need more: {low} to {high}")

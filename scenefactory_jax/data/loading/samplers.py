@@ -1,41 +1,42 @@
-"""Which scenes a stream brings next: curricula as functions of what is known of every scene.
+"""Samplers of a stream: choose the next scenes from the outcomes of all scenes so far.
 
-A sampler is an entry of a config, `(table, count, *, numbers...) -> indices`, and a pure function: what it may draw from is the table, its
-random numbers come from the run's `seed` and from how many scenes were drawn before. So a run that is resumed draws as an unbroken one.
+A sampler is a config entry, a pure function `(table, count, *, numbers...) -> indices`. Its random numbers come from the run's `seed` and
+the number of scenes drawn before, so that a resumed run draws the same scenes as an unbroken one.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.schema import Bounds
 
 Draws = Int[np.ndarray, " count"]
 
 
 @dataclass(frozen=True, eq=False)
 class SceneOutcomes:
-    """What is known of every scene; scene by scene."""
+    """Outcomes of every scene so far."""
 
-    draws: Int[np.ndarray, " N"]  # times that it was drawn
-    episodes: Float[np.ndarray, " N"]  # lives of agents that ended in it; old ones may count less
-    successes: Float[np.ndarray, " N"]  # goals reached in them
-    endless: bool  # there are scenes beyond the table, and it grows as they are drawn
+    draws: Int[np.ndarray, " N"]  # number of draws
+    episodes: Float[np.ndarray, " N"]  # ended episodes of agents; old ones may count less
+    successes: Float[np.ndarray, " N"]  # reached goals
+    endless: bool  # the table grows when scenes beyond it are drawn
 
 
 Sampler = Callable[[SceneOutcomes, int], Draws]
 
 
 def empty(scenes: int | None) -> SceneOutcomes:
-    """Nothing is known yet of so many scenes; None: of endlessly many."""
+    """The table of so many scenes before any draw; None: of an endless source."""
     count = scenes or 0
     return SceneOutcomes(np.zeros(count, int), np.zeros(count), np.zeros(count), endless=scenes is None)
 
 
 def count_draws(table: SceneOutcomes, indices: Draws) -> SceneOutcomes:
-    """The table after these draws; an endless one has grown by those beyond it."""
+    """The table after these draws; an endless one grows by those beyond it."""
     if table.endless:
         more = max(0, int(indices.max(initial=-1)) + 1 - len(table.draws))
         grown = {name: np.pad(getattr(table, name), (0, more)) for name in ("draws", "episodes", "successes")}
@@ -46,10 +47,10 @@ def count_draws(table: SceneOutcomes, indices: Draws) -> SceneOutcomes:
 
 
 def update_outcomes(table: SceneOutcomes, scenes: Draws, episodes: Draws, successes: Draws, *, memory: float) -> SceneOutcomes:
-    """The table after what happened in worlds of these scenes, where what was known before counts `memory` times as much."""
+    """The table after outcomes in worlds of these scenes; earlier outcomes of these scenes are multiplied by `memory`."""
     driven = episodes > 0
     rows, place = np.unique(scenes[driven], return_inverse=True)
-    found = {"episodes": episodes, "successes": np.minimum(successes, episodes)}  # where goals end nobody, the end of a life may lie ahead
+    found = {"episodes": episodes, "successes": np.minimum(successes, episodes)}  # goals may precede the end of an episode
     for name, counts in found.items():
         column = getattr(table, name).copy()
         column[rows] = memory * column[rows] + np.bincount(place, counts[driven], len(rows))
@@ -58,7 +59,7 @@ def update_outcomes(table: SceneOutcomes, scenes: Draws, episodes: Draws, succes
 
 
 def shuffled(table: SceneOutcomes, count: int, *, seed: int) -> Draws:
-    """Every scene once an epoch, in a new order each; endlessly many one after another."""
+    """Every scene once an epoch, each epoch in a new order; scenes of an endless source in their order."""
     before, scenes = int(table.draws.sum()), len(table.draws)
     if table.endless:
         return np.arange(before, before + count)
@@ -67,21 +68,16 @@ def shuffled(table: SceneOutcomes, count: int, *, seed: int) -> Draws:
     return order[before % scenes :][:count]
 
 
-def prioritize_failures(table: SceneOutcomes, count: int, *, seed: int, floor: float) -> Draws:
-    """Scenes in which agents fail come more often, and all scenes come again and again.
+def prioritize_failures(table: SceneOutcomes, count: int, *, seed: int, floor: Annotated[float, Bounds(above=0, max=1)]) -> Draws:
+    """Draws scenes in which agents fail more often, and every scene again and again.
 
-    A share `floor` of the draws are the scenes drawn least often so far (of endlessly many: new ones), in random order: nobody starves. The
-    others are scenes that were driven in, each with a probability that is proportional to the share of lives without success, estimated by
-    Laplace's rule of succession, and distinct. While there are too few of those, the first kind fills up.
+    A fraction `floor` of the draws are the scenes drawn least often so far (of an endless source: new ones), in random order. The
+    others are distinct scenes with outcomes, with probabilities proportional to the fraction of episodes without success (Laplace's rule of
+    succession). If there are too few of these, draws of the first kind replace them.
 
     Args:
-        floor: share of the draws, above 0 and up to 1; 1 ignores failures.
-
-    Raises:
-        ConfigError: a share outside of that.
+        floor: in (0, 1]; 1 ignores failures, at 0 some scenes would never be drawn.
     """
-    if not 0.0 < floor <= 1.0:
-        raise ConfigError(f"stream.sampler.floor: {floor}; wanted is a share above 0 and up to 1: at 0 scenes could starve")
     before = int(table.draws.sum())
     rng = np.random.default_rng((seed, before))
     driven = np.flatnonzero(table.episodes > 0)

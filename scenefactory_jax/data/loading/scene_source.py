@@ -1,4 +1,4 @@
-"""Scenes of a bank, of files in any known format or of a generator, behind one interface: `SceneSource`; and `Scenes`, loaded from one."""
+"""Opens scenes of a bank, of files or of a generator as a `SceneSource`, and loads them as `Scenes`."""
 
 import functools
 import itertools
@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from scenefactory_jax.core import sharding
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map
-from scenefactory_jax.core.raw_scene import RawScene, Reject, SceneError
+from scenefactory_jax.core.raw_scene import COMPANION, RawScene, Reject, SceneError
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
@@ -35,7 +35,7 @@ Pack = Callable[[RawScene], tuple[Any, Any]]
 
 @dataclass(frozen=True, eq=False)
 class SceneSource:
-    """Scenes in entries, which are read in any order: the scenes of a bank, files, or the indices of a generator."""
+    """Entries that can be read in any order: scenes of a bank, files, or indices of a generator."""
 
     kind: Literal["bank", "files", "generator"]
     description: str  # for messages
@@ -47,15 +47,11 @@ class SceneSource:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What a resumed run compares."""
+        """Values that a resumed run compares."""
         return {"kind": self.kind, "entries": self.count}
 
     def read(self, *, limit: int | None = None) -> Iterator[RawScene | Reject]:
-        """All scenes one after another, before checks and packing, and a reject in place of each that cannot be read.
-
-        Raises:
-            SceneError: a bank that is damaged.
-        """
+        """All scenes before checks and packing, and a reject in place of each that cannot be read; SceneError for a damaged bank."""
         entries = itertools.count() if self.count is None else range(self.count)
         return itertools.islice(itertools.chain.from_iterable(self.reader(index)() for index in entries), limit)
 
@@ -74,12 +70,7 @@ def _read_one(name: str, read: Read) -> RawScene:
 
 
 def open_source(config: Mapping[str, Any]) -> SceneSource:
-    """The source that a `scenes` config names: `path`, or the generator with `seed`.
-
-    Raises:
-        ConfigError: neither path nor generator, or an entry that cannot be built.
-        SceneError: no scenes at the path.
-    """
+    """The source of a `scenes` config: `path`, or the generator with `seed`."""
     path = config["path"]
     if path is None:
         return open_generator(make_generator(config), seed=config["seed"])
@@ -122,7 +113,7 @@ def _generate(generate: Callable[[int, int], RawScene], seed: int, index: int) -
 
 
 def read_file(path: Path, formats: Mapping[str, reader_selection.Reader]) -> Iterator[RawScene | Reject]:
-    """Reads the scenes of a file; whatever a reader raises is a reject, but for `ConfigError`."""
+    """Reads the scenes of a file; errors of a reader except `ConfigError` become rejects."""
     scenes = reader_selection.read(path, formats)
     while True:
         try:
@@ -138,18 +129,14 @@ def read_file(path: Path, formats: Mapping[str, reader_selection.Reader]) -> Ite
 
 
 def explain(error: Exception, source: str, scene: str | None = None) -> Reject:
-    """The reject of an error, which is named by its type if it is not a SceneError; the reason does not repeat the source."""
+    """The reject of an error; errors other than SceneError are named by their type."""
     reason = str(error).removeprefix(f"{source}: ")
     known = isinstance(error, SceneError)
     return Reject(scene, reason if known else f"{type(error).__name__}: {reason}", error.kind if known else None, source)
 
 
 def make_generator(config: Mapping[str, Any]) -> Callable[[int, int], RawScene]:
-    """The generator of a `scenes` config, bound to its numbers: (seed, index) -> scene.
-
-    Raises:
-        ConfigError: the config has neither a path nor a generator; or an entry that cannot be built.
-    """
+    """The generator of a `scenes` config, bound to its numbers: (seed, index) -> scene."""
     if "_target_" not in (config["generate"] or {}):  # an experiment may set numbers of a generator that `scenes=womd` does not have
         raise ConfigError("scenes.path: null; give a bank, a scene file or a folder of them, or scenes=streets")
     return instantiate(config["generate"], builtins="scenefactory_jax.data.generators.town.town_scene", where="scenes.generate")
@@ -163,15 +150,42 @@ def make_packing(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def read_scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[RawScene | str]:
+    """Reads the scenes of a `scenes` config, and in place of one that cannot be read the reason.
+
+    Args:
+        limit: most scenes and reasons; None: all, of a generator `count`.
+
+    Raises:
+        ConfigError: neither a path nor a generator.
+        SceneError: no such path, or a bank that is damaged.
+    """
+    source = open_source(config)
+    found = (one for one in source.read() if not (isinstance(one, Reject) and one.kind == COMPANION))
+    limit = config["count"] if limit is None and source.count is None else limit
+    for one in itertools.islice(found, limit):
+        yield ": ".join(filter(None, (one.source, one.scene, one.reason))) if isinstance(one, Reject) else one
+
+
+def read_checked_scenes(config: Mapping[str, Any], *, limit: int | None = None) -> Iterator[RawScene | str]:
+    """As `read_scenes`, repaired by the config's check; in place of a scene that it refuses the reason."""
+    check = make_packing(config)["check"]
+    for raw in read_scenes(config, limit=limit):
+        try:
+            yield raw if isinstance(raw, str) else check(raw)[0]
+        except SceneError as error:
+            yield str(error)
+
+
 # ---- packing
 
 
 def pack_scenes(source: SceneSource, indices: Iterable[int], *, check: Check, pack: Pack, workers: int = 1) -> list[Packed | Reject]:
-    """The scenes of entries checked and packed, in the order of the indices, and a reject in place of each that cannot be.
+    """The scenes of entries, checked and packed, and a reject in place of each that cannot be packed.
 
     Raises:
         ConfigError: a number that packing refuses.
-        SceneError: a bank that is damaged, or a process that died while it read one.
+        SceneError: a damaged bank, or a process that ended while it read one.
     """
     readers = [source.reader(index) for index in indices]
     work = functools.partial(_pack_entry, check=check, pack=pack)
@@ -189,7 +203,7 @@ def pack_scenes(source: SceneSource, indices: Iterable[int], *, check: Check, pa
 
 
 def _pack_entry(read: Read, *, check: Check, pack: Pack) -> list[Packed | Reject] | SceneError:
-    """The packed scenes of an entry; of a damaged bank the error, for the process that asked to raise."""
+    """The packed scenes of an entry; for a damaged bank the error, which the calling process raises."""
     found: list[Packed | Reject] = []
     try:
         for raw in read():
@@ -208,9 +222,7 @@ def _pack_scene(raw: RawScene, check: Check, pack: Pack) -> Packed | Reject:
         return explain(error, raw.source, raw.name)
 
 
-def pack_all(
-    source: SceneSource, *, check: Check, pack: Pack, workers: int = 1, count: int | None = None
-) -> tuple[list[Packed], Summary]:
+def pack_all(source: SceneSource, *, check: Check, pack: Pack, workers: int = 1, count: int | None = None) -> tuple[list[Packed], Summary]:
     """All scenes that can be packed, of an endless source the first `count`, and the summary. Raises as `pack_scenes`."""
     indices = range(source.count if source.count is not None else count or 0)
     found = pack_scenes(source, indices, check=check, pack=pack, workers=workers)
@@ -240,7 +252,7 @@ def load_training_scenes(config: Mapping[str, Any]) -> Scenes:
     """Loads the scenes of a `scenes` config: all of `path`, or `count` of the generator's; of these the sample `take`.
 
     Raises:
-        ConfigError: neither path nor generator, or not one usable scene, with the reasons.
+        ConfigError: neither path nor generator, or no usable scene, with the reasons.
         SceneError: no scenes at the path.
     """
     check_config(config)
@@ -260,11 +272,7 @@ def load_all_scenes(config: Mapping[str, Any]) -> Scenes:
 
 
 def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
-    """Samples `scenes.take.count` scenes, in the order in which they lie: of one seed, fewer are always a part of more.
-
-    Raises:
-        ConfigError: more than there are.
-    """
+    """Samples `scenes.take.count` scenes in their order; of one seed, a smaller sample is part of a larger one."""
     check_config(config)
     count, seed = config["take"]["count"], config["take"]["seed"]
     if count is None or count == len(scenes):
@@ -278,12 +286,7 @@ def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
 
 
 def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scenes:
-    """Loads scenes that training does not use: those at `path`, or those that `scenes.heldout` names.
-
-    Raises:
-        ConfigError: the config names none, or not one usable scene.
-        SceneError: no scenes at the path.
-    """
+    """Loads scenes that training does not use: those at `path`, or those of `scenes.heldout`."""
     check_config(config)
     heldout = config["heldout"]
     path = path if path is not None else heldout["path"]
@@ -295,19 +298,15 @@ def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scene
 
 
 def check_heldout(config: Mapping[str, Any]) -> None:
-    """Checks that held-out scenes exist and are not those of training, without reading them.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Checks that held-out scenes exist and are not those of training, without reading them; ConfigError if not."""
     check_config(config)
     path, trained = config["heldout"]["path"], config["path"]
     if path is not None and not Path(path).exists():
         raise ConfigError(f"scenes.heldout.path: {path}: no such file or folder; give held-out scenes, or null for none")
     if path is not None and trained is not None and Path(path).resolve() == Path(trained).resolve():
-        raise ConfigError(f"scenes.heldout.path: {path} is what is trained on; the scenes would not be held out")
+        raise ConfigError(f"scenes.heldout.path: expected other scenes than scenes.path, got {path}")
     if path is None and trained is None and config["heldout"]["seed"] == config["seed"]:
-        raise ConfigError(f"scenes.heldout.seed: {config['seed']} is the training seed; the scenes would not be held out")
+        raise ConfigError(f"scenes.heldout.seed: expected another seed than scenes.seed, got {config['seed']}")
 
 
 def has_heldout(config: Mapping[str, Any]) -> bool:
@@ -316,7 +315,7 @@ def has_heldout(config: Mapping[str, Any]) -> bool:
 
 
 def assign_scenes(scenes: Scenes, worlds: int, *, seed: int, mesh: Mesh | None = None) -> tuple[Scene, str]:
-    """Gives each world a scene: the list shuffled, again and again (SceneFactory's), placed on the device or sharded over a mesh.
+    """Assigns a scene to each world, from repeated shuffles of the list (as SceneFactory), and places them on the devices.
 
     Returns:
         Scenes along the first axis, and a line with the number of worlds per scene.

@@ -1,6 +1,6 @@
-"""Training on more scenes than memory holds: some worlds get other scenes before every iteration, loaded while the one before ran.
+"""Streams scenes through worlds, to train on more scenes than memory holds: some worlds get other scenes before every iteration.
 
-    with stream.flowing(config, mesh=None, before=None) as flow:
+    with stream.open_stream(config, mesh=None, before=None) as flow:
         scenes = flow.scenes()                                # for all worlds, on their devices
         for iteration in range(iterations):
             if iteration:
@@ -9,27 +9,30 @@
             flow.draw()                                       # while the devices work
             flow.note(*jax.device_get((state.scene_stats.episodes, state.scene_stats.successes)))
 
-What is drawn depends on what was noted, never on how fast it was loaded, and `state()` is all that it depends on: saved beside a train
-state, it makes a resumed run the unbroken one, bit for bit.
+The samples depend on the noted outcomes, never on the speed of loading, and `state()` holds all that they depend on: saved beside a train
+state, it makes a resumed run equal to an unbroken one, bit for bit.
 """
 
 import contextlib
+import functools
 import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from scenefactory_jax.core import sharding
-from scenefactory_jax.core.instantiate import ConfigError, check_fraction, check_number, instantiate
+from scenefactory_jax.core import schema, sharding
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel.task_map import open_pool
 from scenefactory_jax.core.safe_names import escape_for_terminal
+from scenefactory_jax.core.schema import Bounds, Count, Fraction, Positive, Seed
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading import batches, samplers
 from scenefactory_jax.data.loading.batches import Batch, BatchLoader
@@ -37,168 +40,139 @@ from scenefactory_jax.data.loading.scene_source import SceneSource, make_packing
 from scenefactory_jax.data.loading.scenes_config import check_config
 
 LOG = logging.getLogger(__name__)
-SHOWN = 10  # scenes left out that are told by name
+SHOWN = 10  # refused scenes that are reported by name
 
 
-class StreamSettings(NamedTuple):
-    """A `stream` entry of a config, checked; see conf/stream/base.yaml."""
+@dataclass(frozen=True)
+class StreamConfig:
+    """The group `stream`; see conf/stream/base.yaml."""
 
-    sampler: samplers.Sampler
-    swapped: int  # worlds, before every iteration
-    prefetch: int
-    workers: int
-    wait_s: float
-    memory: float
+    sampler: dict[str, Any]
+    swap_fraction: Fraction
+    prefetch: Count
+    workers: Seed
+    wait_s: Positive
+    memory: Fraction
     on_overflow: batches.OnOverflow
-    sample: int
-    headroom: float
-    memory_gib: float
-    capacity: Mapping[str, int | None]
-
-
-def make_settings(
-    *,
-    sampler: dict,
-    swap_fraction: float,
-    prefetch: int,
-    workers: int,
-    wait_s: float,
-    memory: float,
-    on_overflow: Literal["cut", "skip"],
-    sample: int,
-    headroom: float,
-    memory_gib: float,
-    capacity: dict,
-    seed: int,
-    worlds: int,
-    devices: int,
-) -> StreamSettings:
-    """Checks a `stream` entry.
-
-    Raises:
-        ConfigError: a number out of range, or worlds that do not divide among the devices, by name.
-    """
-    for name, value, least in (("prefetch", prefetch, 1), ("workers", workers, 0), ("sample", sample, 1), ("headroom", headroom, 1)):
-        check_number(value, where=f"stream.{name}", least=least)
-    check_fraction(swap_fraction, where="stream.swap_fraction")
-    check_fraction(memory, where="stream.memory")
-    check_number(wait_s, where="stream.wait_s", above=0)
-    check_number(memory_gib, where="stream.memory_gib", above=0)
-    if worlds % devices:
-        raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
-    swapped = min(worlds, int(np.ceil(swap_fraction * worlds / devices)) * devices)  # every device takes an equal part of the rows
-    bound = instantiate(sampler, builtins=samplers, where="stream.sampler", seed=seed)
-    return StreamSettings(bound, swapped, prefetch, workers, wait_s, memory, on_overflow, sample, headroom, memory_gib, capacity)
+    sample: Count
+    headroom: Annotated[float, Bounds(min=1)]
+    memory_gib: Positive
+    capacity: dict[str, int | None]
 
 
 class PlacedScenes(NamedTuple):
-    """A batch on its way to the devices."""
+    """A batch, and its scenes on the devices."""
 
     batch: Batch
     scenes: Scene
 
 
 class SceneStream:
-    """Scenes on their way into worlds, and what is known of them. Made by `flowing`."""
+    """Loads scenes ahead, swaps them into worlds and counts their outcomes. Made by `open_stream`."""
 
-    def __init__(self, source: SceneSource, entry: StreamSettings, load: Callable[[np.ndarray], Future], held: Mapping[str, Any]):
-        """`held` is what `state` told, or `_new`."""
-        self._source, self._entry, self._load = source, entry, load
-        self._table = samplers.SceneOutcomes(
-            np.asarray(held["draws"], int), np.asarray(held["episodes"], float), np.asarray(held["successes"], float), source.count is None
-        )
-        self._sizes, self._exchanges, self._counts = dict(held["sizes"]), held["exchanges"], dict(held["counts"])
-        self._placed = np.asarray(held["placed"], int)  # the scene of each world
-        self._record = np.asarray(held["record"], int)  # of each world since then: episodes, successes
-        self._waiting = deque((np.asarray(drawn, int), load(np.asarray(drawn, int))) for drawn in held["waiting"])
-        self._waited_s, self._told = 0.0, set()
-        self.swapped = entry.swapped  # worlds an exchange
+    def __init__(
+        self,
+        source: SceneSource,
+        settings: StreamConfig,
+        sampler: samplers.Sampler,
+        swapped: int,
+        load: Callable[[np.ndarray], Future[PlacedScenes]],
+        state: Mapping[str, Any],
+    ):
+        """`swapped`: worlds that get other scenes at once; `state`: of `state()`, or `_make_state`."""
+        self.swapped = swapped
+        self._source, self._settings, self._sampler, self._load = source, settings, sampler, load
+        columns = {name: np.asarray(state[name], kind) for name, kind in (("draws", int), ("episodes", float), ("successes", float))}
+        self._table = samplers.SceneOutcomes(**columns, endless=source.count is None)
+        self._sizes, self._exchanges, self._counts = dict(state["sizes"]), state["exchanges"], dict(state["counts"])
+        self._placed = np.asarray(state["placed"], int)  # the scene of each world
+        self._record = np.asarray(state["record"], int)  # episodes and successes of each world since its scene was placed
+        self._waiting = deque((indices, load(indices)) for indices in (np.asarray(part, int) for part in state["waiting"]))
+        self._waited_s, self._reported = 0.0, set()
 
     def scenes(self) -> Scene:
-        """Those of all worlds, on their devices. At the start of a run they are drawn, and the next ones with them."""
-        if self._table.draws.any():  # they were accounted for when they were drawn
+        """The scenes of all worlds, on their devices; at the start of a run they are sampled here."""
+        if self._table.draws.any():
             return self._load(self._placed).result().scenes
-        taken = self._take(self._load(self._drawn(len(self._placed))))
-        self._placed = taken.batch.indices
+        placed = self._receive(self._load(self._sample(len(self._placed))))
+        self._placed = placed.batch.indices
         self.draw()
-        return taken.scenes
+        return placed.scenes
 
     def exchange(self, swap: Callable[..., tuple[Any, Scene]], state: Any, scenes: Scene) -> tuple[Any, Scene]:
-        """Put the next scenes into the worlds whose own have been there longest, by a trainer's `swap`, which takes both donated.
+        """Puts the next scenes into the worlds whose scenes are oldest, by a trainer's `swap`, which takes state and scenes donated.
 
         Raises:
-            SceneError: not one of the next scenes can be used.
-            RuntimeError: what else went wrong in loading them, with a scene's name; or that they did not come in time.
+            SceneError: none of the next scenes can be used.
+            RuntimeError: another error of loading, with a scene's name; or no scenes within `stream.wait_s`.
         """
-        if not self._entry.swapped:
+        if not self.swapped:
             return state, scenes
-        count, swapped = len(self._placed), self._entry.swapped
-        worlds = (self._exchanges * swapped + np.arange(swapped)) % count
-        _, future = self._waiting[0]
-        taken = self._take(future)
+        worlds = (self._exchanges * self.swapped + np.arange(self.swapped)) % len(self._placed)
+        placed = self._receive(self._waiting[0][1])
         self._waiting.popleft()
-        self._table = samplers.update_outcomes(self._table, self._placed[worlds], *self._record[:, worlds], memory=self._entry.memory)
-        self._placed[worlds], self._record[:, worlds] = taken.batch.indices, 0
+        memory = self._settings.memory
+        self._table = samplers.update_outcomes(self._table, self._placed[worlds], *self._record[:, worlds], memory=memory)
+        self._placed[worlds], self._record[:, worlds] = placed.batch.indices, 0
         self._exchanges += 1
-        return swap(state, scenes, worlds, taken.scenes)
+        return swap(state, scenes, worlds, placed.scenes)
 
     def draw(self) -> None:
-        """Draw what is to be on its way, and begin to load it."""
-        while self._entry.swapped and len(self._waiting) < self._entry.prefetch:
-            drawn = self._drawn(self._entry.swapped)
-            self._waiting.append((drawn, self._load(drawn)))
+        """Samples scenes until `prefetch` exchanges are prepared, and begins to load them."""
+        while self.swapped and len(self._waiting) < self._settings.prefetch:
+            indices = self._sample(self.swapped)
+            self._waiting.append((indices, self._load(indices)))
 
     def note(self, episodes: np.ndarray, successes: np.ndarray) -> dict[str, float | int]:
-        """Take note of what became of the worlds' agents; the row of numbers is for the run's metrics."""
+        """Records the outcomes of the worlds' agents; returns numbers for the run's metrics."""
         self._record = np.stack([episodes, successes]).astype(int)
         waited, self._waited_s = self._waited_s, 0.0
         counts = {f"stream/{name}": count for name, count in self._counts.items()}
         return {"stream/scenes": int((self._table.draws > 0).sum()), **counts, "stream/wait_s": waited}
 
     def state(self) -> dict[str, Any]:
-        """All that the next draws depend on, as JSON values."""
+        """All that the next samples depend on, as JSON values."""
         return {
             "source": self._source.identity,
             "sizes": self._sizes,
             "exchanges": self._exchanges,
             "placed": self._placed.tolist(),
             "record": self._record.tolist(),
-            "waiting": [drawn.tolist() for drawn, _ in self._waiting],
+            "waiting": [indices.tolist() for indices, _ in self._waiting],
             "counts": self._counts,
             **{name: getattr(self._table, name).tolist() for name in ("draws", "episodes", "successes")},
         }
 
-    def _drawn(self, count: int) -> np.ndarray:
-        """The sampler's next scenes; it sees the worlds that are running, too."""
-        table = samplers.update_outcomes(self._table, self._placed, *self._record, memory=self._entry.memory)
-        indices = np.asarray(self._entry.sampler(table, count))
-        last = None if self._source.count is None else self._source.count - 1
-        wrong = indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any()
-        if wrong or (last is not None and (indices > last).any()):
-            raise ConfigError(f"stream.sampler: it drew {indices!r}; wanted are {count} whole numbers from 0 to {last or 'anywhere'}")
+    def _sample(self, count: int) -> np.ndarray:
+        """The sampler's next scenes; the outcomes include those of the running worlds."""
+        table = samplers.update_outcomes(self._table, self._placed, *self._record, memory=self._settings.memory)
+        indices = np.asarray(self._sampler(table, count))
+        limit = np.inf if self._source.count is None else self._source.count
+        if indices.shape != (count,) or indices.dtype.kind not in "iu" or (indices < 0).any() or (indices >= limit).any():
+            raise ConfigError(f"stream.sampler: expected {count} integers >= 0 and < {limit:g}, got {indices!r}")
         self._table = samplers.count_draws(self._table, indices)
         return indices
 
-    def _take(self, future: Future) -> PlacedScenes:
-        """What was loaded, and the account of it."""
-        begun = time.monotonic()
+    def _receive(self, future: Future[PlacedScenes]) -> PlacedScenes:
+        """Waits for loaded scenes and counts those that were cut or refused."""
+        begin = time.monotonic()
         try:
-            taken: PlacedScenes = future.result(timeout=self._entry.wait_s)
+            placed = future.result(timeout=self._settings.wait_s)
         except Late:
-            wait = f"stream.wait_s: no scenes after {self._entry.wait_s:g} s"
+            wait = f"stream.wait_s: no scenes after {self._settings.wait_s:g} s"
             raise RuntimeError(f"{wait} from {self._source.description}; raise it, or stream.workers") from None
-        self._waited_s += time.monotonic() - begun
-        self._counts["cut"] += taken.batch.cut
-        self._counts["refused"] += len(taken.batch.refused)
-        for name, reason in taken.batch.refused.items():
-            if name not in self._told and len(self._told) < SHOWN:
-                self._told.add(name)
+        self._waited_s += time.monotonic() - begin
+        self._counts["cut"] += placed.batch.cut
+        self._counts["refused"] += len(placed.batch.refused)
+        for name, reason in placed.batch.refused.items():
+            if name not in self._reported and len(self._reported) < SHOWN:
+                self._reported.add(name)
                 LOG.info(escape_for_terminal(f"left out {name}: {reason}"))
-        return taken
+        return placed
 
 
-def _new(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
-    """The state of a stream that has not begun."""
+def _make_state(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> dict[str, Any]:
+    """The state of a stream at its start."""
     table = samplers.empty(source.count)
     return {
         "source": source.identity,
@@ -214,41 +188,44 @@ def _new(source: SceneSource, sizes: Mapping[str, int], worlds: int) -> dict[str
 
 @contextlib.contextmanager
 def open_stream(config: Mapping[str, Any], *, mesh: Mesh | None, before: Mapping[str, Any] | None) -> Iterator[SceneStream]:
-    """The stream of a config, from its beginning or from a `state` of before; its threads and processes end with the context.
+    """The stream of a config, from its start or from the state `before`; its threads and processes end with the context.
 
     Raises:
-        ConfigError: a key that does not fit, sizes that make no sense, or a state that belongs to other scenes.
+        ConfigError: a key that cannot be used, or a state of other scenes.
         SceneError: scenes that cannot be read, with reasons.
     """
     check_config(config["scenes"])
+    settings = schema.read(config["stream"], StreamConfig, where="stream")
+    worlds, devices = config["worlds"], 1 if mesh is None else mesh.size
+    if worlds % devices:
+        raise ConfigError(f"worlds: {worlds} do not divide among {devices} devices")
     if (count := config["scenes"]["take"]["count"]) is not None:
-        raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=sample` makes a smaller bank")
+        raise ConfigError(f"scenes.take.count: {count}; a stream samples from all scenes: `scenes op=select` makes a smaller bank")
+    sampler = instantiate(settings.sampler, builtins=samplers, where="stream.sampler", seed=config["seed"])
+    swapped = min(worlds, int(np.ceil(settings.swap_fraction * worlds / devices)) * devices)  # an equal part on every device
     source = open_source(config["scenes"])
-    context = {"seed": config["seed"], "worlds": config["worlds"], "devices": 1 if mesh is None else mesh.size}
-    entry: StreamSettings = instantiate({"_target_": "make_settings", **config["stream"]}, builtins=__name__, where="stream", **context)()
     if before is not None and before["source"] != source.identity:
-        raise ConfigError(f"resume=true: the run streamed {_count(before['source'])}; now there are {_count(source.identity)}")
+        raise ConfigError(f"resume=true: the run streamed {_format(before['source'])}; now there are {_format(source.identity)}")
     with contextlib.ExitStack() as stack:
         thread = ThreadPoolExecutor(1, thread_name_prefix="stream")
         stack.callback(thread.shutdown, wait=True, cancel_futures=True)
-        task_map = stack.enter_context(open_pool(entry.workers))
+        task_map = stack.enter_context(open_pool(settings.workers))
         loader = BatchLoader(source, **make_packing(config["scenes"]), grid=config["scenes"]["road_grid"], task_map=task_map)
         if before is None:
-            sizes = batches.measure(loader, sample=entry.sample, headroom=entry.headroom, given=entry.capacity, seed=config["seed"])
-        else:
-            sizes = before["sizes"]
-        batches.require_memory(sizes, config["worlds"] + entry.prefetch * entry.swapped, gib=entry.memory_gib)
+            measure = functools.partial(batches.measure, loader, sample=settings.sample, headroom=settings.headroom)
+            before = _make_state(source, measure(given=settings.capacity, seed=config["seed"]), worlds)
+        sizes = before["sizes"]
+        batches.require_memory(sizes, worlds + settings.prefetch * swapped, gib=settings.memory_gib)
 
         def load(indices: np.ndarray) -> PlacedScenes:
-            batch = batches.load(loader, indices, sizes, on_overflow=entry.on_overflow)
+            batch = batches.load(loader, indices, sizes, on_overflow=settings.on_overflow)
             return PlacedScenes(batch, jax.block_until_ready(sharding.place_on_devices(batch.scene, mesh)))
 
-        held = _new(source, sizes, config["worlds"]) if before is None else before
-        what = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
-        LOG.info(f"stream of {source.description}: {entry.swapped} of {config['worlds']} worlds an iteration, each of {what}")
-        yield SceneStream(source, entry, lambda indices: thread.submit(load, indices), held)
+        rows = ", ".join(f"{rows} {name}" for name, rows in sizes.items())
+        LOG.info(f"stream of {source.description}: {swapped} of {worlds} worlds an iteration, each of {rows}")
+        yield SceneStream(source, settings, sampler, swapped, lambda indices: thread.submit(load, indices), before)
 
 
-def _count(identity: Mapping[str, Any]) -> str:
+def _format(identity: Mapping[str, Any]) -> str:
     kind, entries = identity["kind"], identity["entries"]
     return "scenes of a generator" if kind == "generator" else f"{entries} {'files' if kind == 'files' else 'scenes of a bank'}"

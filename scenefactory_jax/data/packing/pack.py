@@ -1,18 +1,18 @@
-"""RawScene -> Scene: which part of the map, which cars and who else, in float32 metres around the scene's centre.
+"""RawScene -> Scene: a square of the map, agents and background traffic, in float32 metres around the scene's centre.
 
-Nothing disappears silently: the report counts what was kept and what was dropped, by reason.
+The report counts what was kept and what was dropped, by reason.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Unpackable
 from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths, stack_tracks, wrap_angles
+from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns
@@ -28,7 +28,7 @@ CUTS: tuple[str, ...] = ("outside_box", "gap", "degenerate")
 
 @dataclass(frozen=True)
 class PackReport:
-    """The account of one packed scene, and what of its source the tensors do not hold."""
+    """Counts of one packed scene, and what the tensors do not hold of its source."""
 
     name: str
     source: str
@@ -38,25 +38,33 @@ class PackReport:
     current: int  # index in the packed log of the step at which the cars start
     track_ids: tuple[int, ...]  # of the agents, slot by slot
     agents_kept: int
-    agents_dropped: dict[str, int]  # reason -> count, every reason of DROPS
-    traffic_kept: int  # everybody who is no agent is counted here or in the next
-    traffic_dropped: dict[str, int]  # reason -> count, every reason of TRAFFIC_DROPS
+    agents_dropped: dict[str, int]  # reason of DROPS -> count
+    traffic_kept: int  # a track is an agent, or counted here or in the next
+    traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
     segments_kept: int
-    segments_cut: dict[str, int]  # reason -> count, every reason of CUTS
+    segments_cut: dict[str, int]  # reason of CUTS -> count
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
     repairs: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
 
 
 class Packed(NamedTuple):
-    """A scene of its own size, and its account."""
+    """A scene of its own size, and its report."""
 
     scene: Scene
     report: PackReport
 
 
+class BoxSet(NamedTuple):
+    """Oriented boxes in the plane."""
+
+    centre: Float[np.ndarray, "N 2"]
+    yaw: Float[np.ndarray, " N"]
+    size: Float[np.ndarray, "N 2"]  # length and width
+
+
 def prepare(raw: RawScene, *, check: Callable[..., Any], pack: Callable[..., Any]) -> Packed:
-    """Check, then pack: both bound to their numbers. The report holds what the check repaired.
+    """Checks, then packs a scene, with functions that are bound to their numbers. The report holds what the check repaired.
 
     Raises:
         SceneError: a scene that cannot be used, by name.
@@ -69,23 +77,22 @@ def prepare(raw: RawScene, *, check: Callable[..., Any], pack: Callable[..., Any
 def pack(
     raw: RawScene,
     *,
-    scene_size_m: float,
+    scene_size_m: Positive,
     centre: Literal["sdc", "mean"],
     gap_m: float,
     agents: int,
     min_travel_m: float,
-    car_size_m: list[float] | None,
+    car_size_m: Annotated[list[float], Bounds(above=0)] | None,
     start_speed: Literal["logged", "zero"],
     log_from: Literal["start", "current"],
     require_agents: bool,
-    traffic: int,
+    traffic: Annotated[int, Bounds(min=0)],
     min_traffic_size_m: float,
-    outline_m: float,
+    outline_m: Positive,
 ) -> tuple[Scene, PackReport]:
-    """The scene as the graph sees it, of its own size: numpy leaves, no padding but absent agent slots.
+    """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
     Args:
-        raw: a checked scene.
         scene_size_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
         centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
         gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (SceneFactory).
@@ -94,26 +101,27 @@ def pack(
         car_size_m: length and width of every car; null: as logged.
         start_speed: "logged": along the heading, never backwards; "zero".
         log_from: first step of the packed log: the recording's first, or the current one.
-        traffic: most of those who are no agents and in the box at some step from the current one on, nearest to an agent's start first.
-        min_traffic_size_m: shortest and narrowest that they may be.
+        traffic: maximum number of other tracks that are in the box at some step from the current one on, nearest to an agent's start first.
+        min_traffic_size_m: minimum of their length and width.
         outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
-        ConfigError: a number that makes no sense.
     """
-    _check(scene_size_m, car_size_m, traffic, outline_m)
-    (origin, centred_on), half = _centre(raw, centre), scene_size_m / 2
+    (origin, centred_on), half = _find_centre(raw, centre), scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
-    _require_lane(raw, road, f"{half:g} m of {np.round(origin, 2).tolist()} ({centred_on}); cut: {cut}")
-    logs = _around(stack_tracks(raw.tracks, len(raw.times)), origin)
-    chosen, dropped = _choose(raw, logs, half, min_travel_m, agents, car_size_m)
+    logs = stack_tracks(raw.tracks, len(raw.times))
+    logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
+    chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, agents, car_size_m)
     if require_agents and not chosen:
-        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_reasons(dropped)}")
+        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
+        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
-    leaves |= _log(chosen, logs, raw, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
-    beside, traffic_dropped = _others(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
+    leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
+    leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
+    beside, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
+    leaves |= beside
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -131,41 +139,13 @@ def pack(
         relief_m=relief,
         metadata=dict(raw.metadata),
     )
-    return _scene(leaves | beside), report
+    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
 
 
-def _scene(leaves: dict[str, np.ndarray]) -> Scene:
-    """The struct of these columns, in their types."""
-    return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()})
-
-
-def _check(scene_size_m: float, car_size_m: list[float] | None, traffic: int, outline_m: float) -> None:
-    """Refuse numbers that make no sense."""
-    check_number(scene_size_m, where="scenes.pack.scene_size_m", above=0)
-    check_number(outline_m, where="scenes.pack.outline_m", above=0)
-    if car_size_m is not None and not (len(car_size_m) == 2 and min(car_size_m) > 0):
-        raise ConfigError(f"scenes.pack.car_size_m: {car_size_m}; wanted are length and width, both above 0, or null")
-    check_number(traffic, where="scenes.pack.traffic", least=0)
-
-
-def _around(logs: Logs, origin: Float[np.ndarray, "3"]) -> Logs:
-    """The same tracks, in the plane around the scene's centre."""
-    return logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
-
-
-def _require_lane(raw: RawScene, road: dict[str, np.ndarray], place: str) -> None:
-    if not np.isin(road["road.kind"], DRIVABLE).any():
-        raise Unpackable("no_lane_in_box", f"{raw.source}: roads: no driving lane within {place}")
-
-
-def _reasons(dropped: dict[str, int]) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
-
-
-def _centre(raw: RawScene, wanted: str) -> tuple[Float[np.ndarray, "3"], str]:
-    """Where the scene's zero lies, and what it was taken from."""
+def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
+    """The origin of the packed scene, and what it was taken from."""
     reason = ""
-    if wanted == "sdc":
+    if centre == "sdc":
         if raw.sdc is None:
             reason = ": the source names no sdc"
         elif not raw.tracks[raw.sdc].valid[raw.current]:
@@ -180,7 +160,7 @@ def _segments(
 ) -> tuple[dict[str, np.ndarray], dict[str, int], float]:
     """Columns of `road` in storage order, the count of segments cut by reason, and the heights' range."""
     order = sorted((i for i, line in enumerate(raw.roads) if len(line.xyz) >= 2), key=lambda i: raw.roads[i].kind)  # stable
-    xyz, bounds = join_lines([_outlined(raw.roads[i], outline_m) for i in order])
+    xyz, bounds = join_lines([_close_outline(raw.roads[i], outline_m) for i in order])
     kind = np.array([raw.roads[i].kind for i in order], int)
     x, y = xyz[:, 0] - origin[0], xyz[:, 1] - origin[1]
     along_x, along_y = np.diff(x), np.diff(y)
@@ -191,28 +171,30 @@ def _segments(
     inside = within[1:] & within[:-1]
     outline = np.repeat(np.isin(kind, POLYGONS), np.diff(bounds))[:-1]
     degenerate, gap = length <= DEGENERATE_M, (length > gap_m) & ~outline
-    kept = joints & inside & ~degenerate & ~gap
     masks = (~inside, inside & gap, inside & degenerate)
     cut = {reason: int((joints & mask).sum()) for reason, mask in zip(CUTS, masks, strict=True)}
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(joints & inside & ~degenerate & ~gap)
     line = np.repeat(np.arange(len(order)), np.diff(bounds))[rows]
     arc = np.zeros(len(length))
     for number in np.flatnonzero(np.bincount(line)).tolist():  # sums start anew with each line
         span = slice(bounds[number], bounds[number + 1] - 1)
         np.cumsum(length[span], out=arc[span])
-    own = length[rows]
     road = {
-        "midpoint": np.stack([(x[rows + 1] + x[rows]) / 2, (y[rows + 1] + y[rows]) / 2], axis=1),
-        "direction": np.stack([along_x[rows] / own, along_y[rows] / own], axis=1),
-        "half_length": own / 2,
-        "arc": arc[rows] - own / 2,
-        "kind": kind[line],
-        "polyline": np.array(order)[line],
+        "road.midpoint": np.stack([(x[rows + 1] + x[rows]) / 2, (y[rows + 1] + y[rows]) / 2], axis=1),
+        "road.direction": np.stack([along_x[rows] / length[rows], along_y[rows] / length[rows]], axis=1),
+        "road.half_length": length[rows] / 2,
+        "road.arc": arc[rows] - length[rows] / 2,
+        "road.kind": kind[line],
+        "road.polyline": np.array(order)[line],
+        "road.valid": np.ones(len(rows), bool),
     }
-    return _road(road), cut, float(np.ptp(xyz[rows + 1, 2])) if len(rows) else 0.0
+    if not np.isin(kind[line], DRIVABLE).any():
+        place = f"{half:g} m of {np.round(origin, 2).tolist()}"
+        raise Unpackable("no_lane_in_box", f"{raw.source}: roads: no driving lane within {place}; cut: {cut}")
+    return road, cut, float(np.ptp(xyz[rows + 1, 2])) if len(rows) else 0.0
 
 
-def _outlined(line: Polyline, outline_m: float) -> Polyline:
+def _close_outline(line: Polyline, outline_m: float) -> Polyline:
     """A polygon with its side from the last point to the first, in segments of at most `outline_m`; other lines as they are."""
     if line.kind not in POLYGONS:
         return line
@@ -222,19 +204,15 @@ def _outlined(line: Polyline, outline_m: float) -> Polyline:
     return replace(line, xyz=densify(xyz, outline_m))
 
 
-def _road(leaves: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns of `road`, all of them valid."""
-    road = {f"road.{name}": leaf.astype(columns.COLUMNS[f"road.{name}"].dtype) for name, leaf in leaves.items()}
-    return road | {"road.valid": np.ones(len(road["road.kind"]), bool)}
-
-
-def _choose(
+def _choose_agents(
     raw: RawScene, logs: Logs, half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None
 ) -> tuple[list[int], dict[str, int]]:
     """Indices of the tracks that become agents, nearest to the centre first, and the others counted by reason."""
+    if car_size_m is not None and len(car_size_m) != 2:
+        raise ConfigError(f"scenes.pack.car_size_m: expected [length, width] or null, got {car_size_m}")
     current = raw.current
-    everybody, last = np.arange(len(logs.valid)), logs.valid.shape[1] - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
-    start, goal = logs.xyz[:, current, :2], logs.xyz[everybody, last, :2]
+    tracks, last = np.arange(len(logs.valid)), logs.valid.shape[1] - 1 - np.argmax(logs.valid[:, ::-1], axis=1)
+    start, goal = logs.xyz[:, current, :2], logs.xyz[tracks, last, :2]
     objections = {
         "not_a_vehicle": np.array([track.kind != "vehicle" for track in raw.tracks], bool),
         "absent_at_start": ~logs.valid[:, current],
@@ -242,19 +220,18 @@ def _choose(
         "goal_outside_box": np.abs(goal).max(axis=1) > half,
         "too_short": np.hypot(*(goal - start).T) <= min_travel_m,
     }
-    dropped, candidates = dict.fromkeys(DROPS, 0), np.ones(len(everybody), bool)
+    dropped, candidates = dict.fromkeys(DROPS, 0), np.ones(len(tracks), bool)
     for reason, objection in objections.items():  # the first one counts
         dropped[reason] = int((candidates & objection).sum())
         candidates &= ~objection
     rows = np.flatnonzero(candidates)
     rows = rows[np.argsort(np.hypot(*start[rows].T), kind="stable")]
     size = np.tile(car_size_m, (len(rows), 1)) if car_size_m else logs.size[rows, :2]
-    boxes = box_corners(start[rows], logs.yaw[rows, current], size[:, 0], size[:, 1])
-    near = _near(start[rows], size, start[rows], size)
+    boxes = BoxSet(start[rows], logs.yaw[rows, current], size)
+    touching = _find_overlaps(boxes, boxes)
     kept: list[int] = []
     for candidate in range(len(rows)):
-        rivals = [other for other in kept if near[candidate, other]]
-        if rivals and overlaps(boxes[candidate], boxes[rivals]).any():
+        if touching[candidate, kept].any():
             dropped["overlaps"] += 1
         elif len(kept) == slots:
             dropped["over_capacity"] += 1
@@ -263,12 +240,48 @@ def _choose(
     return rows[kept].tolist(), dropped
 
 
-def _near(
-    one: Float[np.ndarray, "N 2"], size: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], others_size: Float[np.ndarray, "M 2"]
-) -> Bool[np.ndarray, "N M"]:
-    """Whether the circles around boxes touch: boxes apart from that need no test."""
-    reach = segment_lengths(size)[:, None] / 2 + segment_lengths(others_size) / 2
-    return segment_lengths(one[:, None] - other) <= reach + DEGENERATE_M
+def _traffic(
+    raw: RawScene, logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], half: float, first: int, limit: int, min_size_m: float
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Columns of `traffic_log`, nearest to an agent's start (without agents: to the centre) first, and the other tracks by reason.
+
+    A box that overlaps an agent's at the start is left out: the contact would throw both apart.
+    """
+    current = raw.current
+    starts = BoxSet(*(leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size")))
+    rest = np.setdiff1d(np.arange(len(logs.valid)), agents)
+    valid, path = logs.valid[rest, current:], logs.xyz[rest, current:, :2]
+    inside = valid & (np.abs(path) <= half).all(axis=2)
+    absent, outside = ~valid.any(axis=1), ~inside.any(axis=1)
+    boxes = BoxSet(path[:, 0], logs.yaw[rest, current], np.maximum(logs.size[rest, :2], min_size_m))
+    touching = valid[:, 0] & ~outside & _find_overlaps(boxes, starts).any(axis=1)
+    kept = np.flatnonzero(~outside & ~touching)
+    places = starts.centre if len(starts.centre) else np.zeros((1, 2))
+    along_x, along_y = (path[kept, :, axis, None] - places[:, axis] for axis in (0, 1))
+    squared = (along_x * along_x + along_y * along_y).min(axis=2)
+    distance = np.sqrt(np.where(inside[kept], squared, np.inf).min(axis=1, initial=np.inf))
+    order = rest[kept[np.argsort(distance, kind="stable")]].tolist()
+    chosen = order[:limit]
+    dropped = {
+        "absent_from_start_on": int(absent.sum()),
+        "outside_box": int((outside & ~absent).sum()),
+        "overlaps_agent": int(touching.sum()),
+        "over_capacity": max(len(order) - limit, 0),
+    }
+    rows = _recording("traffic_log", chosen, logs, first, len(chosen))
+    rows["traffic_log.size"] = np.maximum(logs.size[chosen, :2], min_size_m)
+    rows["traffic_log.kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
+    return rows, dropped
+
+
+def _find_overlaps(boxes: BoxSet, others: BoxSet) -> Bool[np.ndarray, "N M"]:
+    """Whether each box shares area with each of the others; only boxes whose circumscribed circles touch are tested."""
+    reach = segment_lengths(boxes.size)[:, None] / 2 + segment_lengths(others.size) / 2
+    touching = segment_lengths(boxes.centre[:, None] - others.centre) <= reach + DEGENERATE_M
+    first, second = np.nonzero(touching)
+    corners, other_corners = (box_corners(box.centre, box.yaw, box.size[:, 0], box.size[:, 1]) for box in (boxes, others))
+    touching[first, second] = overlaps(corners[first], other_corners[second])
+    return touching
 
 
 def box_corners(
@@ -287,10 +300,10 @@ def box_corners(
 def overlaps(box: Float[np.ndarray, "*#N 4 2"], others: Float[np.ndarray, "N 4 2"]) -> Bool[np.ndarray, " N"]:
     """Whether a box, or each of as many, shares area with each of the others: no side separates them (separating axis theorem)."""
     separated = np.zeros(len(others), bool)
-    own = np.broadcast_to(box, others.shape)
-    for sides in (own, others):
+    boxes = np.broadcast_to(box, others.shape)
+    for sides in (boxes, others):
         axes = sides[:, 1:3] - sides[:, 0:2]  # two neighbouring sides: their directions are the normals of all four
-        first, second = np.einsum("nad,npd->nap", axes, own), np.einsum("nad,npd->nap", axes, others)
+        first, second = np.einsum("nad,npd->nap", axes, boxes), np.einsum("nad,npd->nap", axes, others)
         separated |= ((first.max(2) <= second.min(2)) | (second.max(2) <= first.min(2))).any(axis=1)
     return ~separated
 
@@ -298,7 +311,7 @@ def overlaps(box: Float[np.ndarray, "*#N 4 2"], others: Float[np.ndarray, "N 4 2
 def _agents(
     chosen: list[int], logs: Logs, current: int, slots: int, car_size_m: list[float] | None, start_speed: str
 ) -> dict[str, np.ndarray]:
-    """Columns of `agents`. Absent slots hold zeros, and a size so that nobody divides by zero."""
+    """Columns of `agents`. Absent slots hold zeros, and a positive size, because sizes are divisors."""
     rows = {name: np.zeros((slots, 2)) for name in ("position", "goal")}
     rows |= {name: np.zeros(slots) for name in ("yaw", "speed", "route_length")}
     sizes = np.tile(car_size_m, (len(chosen), 1)) if car_size_m else logs.size[chosen, :2]
@@ -315,14 +328,8 @@ def _agents(
     return {f"agents.{name}": leaf for name, leaf in (rows | {"size": size, "present": present}).items()}
 
 
-def _log(chosen: list[int], logs: Logs, raw: RawScene, first: int, slots: int) -> dict[str, np.ndarray]:
-    """Columns of `log`."""
-    step = np.median(np.diff(raw.times)) if len(raw.times) > 1 else 1.0
-    return {f"log.{name}": leaf for name, leaf in _recording(chosen, logs, first, slots).items()} | {"log.dt": np.asarray(step)}
-
-
-def _recording(chosen: list[int], logs: Logs, first: int, slots: int) -> dict[str, np.ndarray]:
-    """What tracks did from a step on, in so many slots: zeros where the recording has nothing."""
+def _recording(part: str, chosen: list[int], logs: Logs, first: int, slots: int) -> dict[str, np.ndarray]:
+    """Columns of `log` or `traffic_log`: tracks from a step on, with zeros at invalid steps and in slots behind the last."""
     valid = logs.valid[chosen, first:]
     rows = {
         "position": np.where(valid[..., None], logs.xyz[chosen, first:, :2], 0.0),
@@ -330,48 +337,7 @@ def _recording(chosen: list[int], logs: Logs, first: int, slots: int) -> dict[st
         "yaw": np.where(valid, wrap_angles(logs.yaw[chosen, first:]), 0.0),
         "valid": valid,
     }
-    return {name: np.concatenate([leaf, np.zeros((slots - len(chosen), *leaf.shape[1:]), leaf.dtype)]) for name, leaf in rows.items()}
-
-
-def _choose_others(
-    logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], current: int, half: float, limit: int, least: float
-) -> tuple[list[int], dict[str, int]]:
-    """Indices of the tracks that become others, nearest to an agent's start (without agents: to the centre) first, and the rest by reason.
-
-    Whose box overlaps an agent's at the start is left out: the two would burst apart.
-    """
-    place, yaw, size = (leaves[f"agents.{name}"][leaves["agents.present"]] for name in ("position", "yaw", "size"))
-    boxes, starts = box_corners(place, yaw, size[:, 0], size[:, 1]), place if len(place) else np.zeros((1, 2))
-    rest = np.setdiff1d(np.arange(len(logs.valid)), agents)
-    now, path = logs.valid[rest, current:], logs.xyz[rest, current:, :2]
-    inside = now & (np.abs(path) <= half).all(axis=2)
-    own = np.maximum(logs.size[rest, :2], least)
-    absent, outside = ~now.any(axis=1), ~inside.any(axis=1)
-    touching = np.zeros(len(rest), bool)
-    near = _near(path[:, 0], own, place, size) & (now[:, 0] & ~outside)[:, None]
-    for row in np.flatnonzero(near.any(axis=1)).tolist():
-        box = box_corners(path[row, 0], logs.yaw[rest[row], current], own[row, 0], own[row, 1])
-        touching[row] = overlaps(box, boxes[near[row]]).any()
-    kept = np.flatnonzero(~outside & ~touching)
-    aside, ahead = (path[kept, :, axis, None] - starts[:, axis] for axis in (0, 1))
-    squared = (aside * aside + ahead * ahead).min(axis=2)
-    distance = np.sqrt(np.where(inside[kept], squared, np.inf).min(axis=1, initial=np.inf))
-    order = rest[kept[np.argsort(distance, kind="stable")]].tolist()
-    dropped = {
-        "absent_from_start_on": int(absent.sum()),
-        "outside_box": int((outside & ~absent).sum()),
-        "overlaps_agent": int(touching.sum()),
-        "over_capacity": max(len(order) - limit, 0),
+    return {
+        f"{part}.{name}": np.concatenate([leaf, np.zeros((slots - len(chosen), *leaf.shape[1:]), leaf.dtype)])
+        for name, leaf in rows.items()
     }
-    return order[:limit], dropped
-
-
-def _others(
-    raw: RawScene, logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], half: float, first: int, limit: int, least: float
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Columns of `traffic_log`, and who was left out, by reason."""
-    chosen, dropped = _choose_others(logs, agents, leaves, raw.current, half, limit, least)
-    rows = _recording(chosen, logs, first, len(chosen))
-    rows["size"] = np.maximum(logs.size[chosen, :2], least)
-    rows["kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
-    return {f"traffic_log.{name}": leaf for name, leaf in rows.items()}, dropped

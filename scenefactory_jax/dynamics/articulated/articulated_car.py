@@ -6,7 +6,7 @@ positions, velocities and the solver's warm start, in MuJoCo's order.
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from scenefactory_jax.dynamics.articulated import actuators, closed_form_step, e
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
+from scenefactory_jax.dynamics.articulated.closed_form_step import StepInput
 from scenefactory_jax.dynamics.articulated.constants import CarConstants, compute_rest_pose, derive_constants
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT, CarParameters, Solver, check_stability, read_parameters
 from scenefactory_jax.dynamics.articulated.tyres import (
@@ -87,7 +88,7 @@ def make(
     Args:
         car: values of `CarParameters`.
         solver: values of `Solver`.
-        contact: values of `collision.make`; its height is the car's.
+        contact: values of `ContactLaw`.
         abs: whether the brakes have an anti-lock controller (`tyres.compute_tyre_forces`).
         randomization: null: all cars are the reference car. An entry whose target, such as `car_parameter_sampler`, returns a function
             (key, scene) -> parameters with an agent axis, called at every start without recompilation. It may declare `car` and
@@ -243,12 +244,12 @@ def physics_step(
     tyre = compute_tyre_forces(car, state, patch, carry.tyres, mu, drive, brake, **switches)
     forces = actuators.compute_applied_forces(car, state, command.steer, push)
     forces = jax.tree.map(jnp.add, forces, compute_generalized_forces(state, patch, tyre, drive))
-    joints = carry.qpos, carry.qvel, carry.qacc_warmstart
+    inputs, joints = StepInput(constants, state, patch, forces), (carry.qpos, carry.qvel, carry.qacc_warmstart)
     if compiled.mjx_car is None:
         iterations, dt = compiled.solver.iterations, compiled.physics_dt
-        after = closed_form_step.step(constants, state, patch, forces, *joints, iterations=iterations, physics_dt=dt)
+        after = closed_form_step.step(inputs, *joints, iterations=iterations, physics_dt=dt)
     else:
-        after = mjx_backend.step(compiled.mjx_car, fields, state, forces, *joints)
+        after = mjx_backend.step(compiled.mjx_car, fields, inputs, *joints)
     qpos, qvel, acceleration, normal = after
     return CarCarry(qpos, qvel, acceleration, compute_outputs(patch, tyre, normal, mu))
 

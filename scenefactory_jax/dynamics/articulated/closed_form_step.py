@@ -4,6 +4,8 @@ MJX computes the same in stages for any tree of bodies (`mjx_backend`), with gat
 scalars that XLA fuses into few loops.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,11 +18,17 @@ from scenefactory_jax.dynamics.articulated.state import CarState
 from scenefactory_jax.dynamics.articulated.tyres import Patch
 
 
+class StepInput(NamedTuple):
+    """Inputs of one car in one physics step, for both solvers."""
+
+    constants: CarConstants
+    state: CarState  # `from_mujoco` of position and velocity
+    patch: Patch
+    forces: Forces  # that MuJoCo's model lacks: tyres and actuators
+
+
 def step(
-    constants: CarConstants,
-    state: CarState,
-    patch: Patch,
-    forces: Forces,
+    inputs: StepInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
@@ -31,13 +39,10 @@ def step(
     """Computes position, velocity and acceleration after the step, and the normal forces of the tyres, N.
 
     Args:
-        constants: of this car.
-        state: `from_mujoco` of position and velocity.
-        forces: that MuJoCo's model lacks: tyres and actuators.
         qpos, qvel: in MuJoCo's order.
         start: initial acceleration of the solver: that of the previous step.
     """
-    problem = make_contact_problem(constants, state, patch, forces, physics_dt=physics_dt)
+    state, problem = inputs.state, make_contact_problem(inputs, physics_dt=physics_dt)
     initial = contact_solver.Acceleration(*states.unflatten(start, state))
     solution, normal = contact_solver.solve_contacts(problem, initial, iterations=iterations)
     acceleration = states.flatten(solution.base, solution.wheel, state)
@@ -45,10 +50,9 @@ def step(
     return *moved, acceleration, normal
 
 
-def make_contact_problem(
-    constants: CarConstants, state: CarState, patch: Patch, forces: Forces, *, physics_dt: float
-) -> contact_solver.Problem:
+def make_contact_problem(inputs: StepInput, *, physics_dt: float) -> contact_solver.Problem:
     """Computes MuJoCo's convex problem of this step, in the car's axes."""
+    constants, state, patch, forces = inputs
     drift = equations_of_motion.compute_bias_acceleration(state)
     base, across, wheel = equations_of_motion.compute_mass_matrix(constants.car, state)
     springs = actuators.compute_suspension_forces(constants.car, state)

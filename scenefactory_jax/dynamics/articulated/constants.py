@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.dynamics.articulated import contact_solver, equations_of_motion
 from scenefactory_jax.dynamics.articulated import state as states
-from scenefactory_jax.dynamics.articulated.parameters import GRAVITY, CarParameters
+from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.dynamics.articulated.vector import sum_wheels
 
 

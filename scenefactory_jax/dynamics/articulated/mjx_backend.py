@@ -5,6 +5,8 @@
 The engine computes the equations of motion, the suspension and the tyres' normal forces; all other forces are applied as generalised forces.
 """
 
+import contextlib
+import io
 from typing import NamedTuple
 
 import jax
@@ -12,15 +14,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that its optional Warp backend is missing
+    from mujoco import mjx
 
 from scenefactory_jax.dynamics.articulated import equations_of_motion
 from scenefactory_jax.dynamics.articulated import state as states
+from scenefactory_jax.dynamics.articulated.closed_form_step import StepInput
 from scenefactory_jax.dynamics.articulated.constants import CarConstants
-from scenefactory_jax.dynamics.articulated.equations_of_motion import Forces
 from scenefactory_jax.dynamics.articulated.model import ModelAddresses, find_addresses
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, LEFT
-from scenefactory_jax.dynamics.articulated.state import CarState
 
 
 class MjxCar(NamedTuple):
@@ -68,8 +71,7 @@ def fit_model(mjx_car: MjxCar, constants: CarConstants) -> dict[str, Array]:
 def step(
     mjx_car: MjxCar,
     fields: dict[str, Array],
-    state: CarState,
-    forces: Forces,
+    inputs: StepInput,
     qpos: Float[Array, "17"],
     qvel: Float[Array, "16"],
     start: Float[Array, "16"],
@@ -79,6 +81,7 @@ def step(
     Args:
         fields: `fit_model` of a car that differs from the compiled one, else empty.
     """
+    forces, state = inputs.forces, inputs.state
     applied = states.flatten([*forces.force, *forces.torque], [forces.suspension, forces.spin, forces.steer], state)
     data = mjx_car.data.replace(qpos=qpos, qvel=qvel, qfrc_applied=applied, qacc_warmstart=start)
     data = mjx.step(mjx_car.model.replace(**fields), data)

@@ -93,14 +93,14 @@ class ModelAddresses(NamedTuple):
     spin_v: np.ndarray
 
 
-def find_addresses(model: mujoco.MjModel) -> ModelAddresses:
-    """Looks the indices up by name."""
+def find_addresses(model: mujoco.MjModel, *, prefix: str = "") -> ModelAddresses:
+    """Looks the indices up by name; `prefix` is that of one car among several."""
 
-    def find(lookup: Any, prefix: str, attribute: str, wheels: Sequence[str] = WHEELS) -> np.ndarray:
-        return np.array([np.atleast_1d(getattr(lookup(f"{prefix}_{wheel}"), attribute))[0] for wheel in wheels])
+    def find(lookup: Any, part: str, attribute: str, wheels: Sequence[str] = WHEELS) -> np.ndarray:
+        return np.array([np.atleast_1d(getattr(lookup(f"{prefix}{part}_{wheel}"), attribute))[0] for wheel in wheels])
 
     return ModelAddresses(
-        chassis=model.body("chassis").id,
+        chassis=model.body(f"{prefix}chassis").id,
         wheel=find(model.body, "wheel", "id"),
         tyre=find(model.geom, "tyre", "id"),
         suspension=find(model.joint, "suspension", "id"),

@@ -1,7 +1,7 @@
 """Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent.
 
 A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them, and the observation is the dictionary of their results. A
-group of one's own has a dotted target. The policy encodes vectors and sets by their type, so that a new group needs no other change.
+group from another module has a dotted target. The policy encodes vectors and sets by their type, so that a new group needs no other change.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,23 +19,8 @@ from scenefactory_jax.env.observations.neighbour_sets import closest_approach, n
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.state_vectors import ego, weather, yaw_rate_and_steer
 
-__all__ = [
-    "ANY",
-    "FRACTION",
-    "LENGTH",
-    "SIGNED",
-    "Group",
-    "bound_observation",
-    "closest_approach",
-    "ego",
-    "lane",
-    "make",
-    "neighbours",
-    "observe",
-    "road",
-    "weather",
-    "yaw_rate_and_steer",
-]
+__all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
+__all__ += ["closest_approach", "ego", "lane", "neighbours", "road", "weather", "yaw_rate_and_steer"]  # groups
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | SetObservation]
 

@@ -25,10 +25,10 @@ def neighbours(
     """The nearest other active cars and boxes: x, y, length, width, yaw, speed, TTC clamped to its scale (1 if they never meet)."""
     motion, users, order, mask, pairs = _find_nearest(scene, state, count, circles)
     time = jnp.minimum(pairs.ttc / ttc_scale_s, 1.0)
-    place = to_frame(users.position[order] - motion.position[:, None, :2], motion.yaw[:, None]) / distance_scale_m
+    position = to_frame(users.position[order] - motion.position[:, None, :2], motion.yaw[:, None]) / distance_scale_m
     yaw = wrap_angle(users.yaw[order] - motion.yaw[:, None]) / jnp.pi
     speed = safe_norm(users.velocity)[order] / speed_scale_mps
-    columns = [place, users.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
+    columns = [position, users.size[order] / distance_scale_m, yaw[..., None], speed[..., None], time[..., None]]
     return _pad(jnp.concatenate(columns, axis=-1), mask, count)
 
 

@@ -1,45 +1,38 @@
-"""A policy that learns nothing: it holds a speed on the circle that leads through its goal. What it reaches needs no learning."""
+"""Pure pursuit: a rule-based policy that holds a speed on the circle through its goal. A baseline for learnt policies."""
 
 import math
+from typing import Annotated
 
 import jax.numpy as jnp
 
-from scenefactory_jax.core.instantiate import ConfigError, check_number
+from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import Policy
 
 
 def make(
     *,
-    wheelbase_m: float,
-    steering_limit_rad: float,
-    speed_mps: float,
-    speed_band_mps: float,
-    goal_scale_m: float,
-    speed_scale_mps: float,
+    wheelbase_m: Positive,
+    steering_limit_rad: Annotated[float, Bounds(above=0, below=math.pi / 2)],
+    speed_mps: Positive,
+    speed_band_mps: Positive,
+    goal_scale_m: Positive,
+    speed_scale_mps: Positive,
 ) -> Policy:
-    """Pure pursuit of the goal itself (Coulter 1992, "Implementation of the pure pursuit path tracking algorithm"): no lane, nobody else.
+    """Pure pursuit of the goal (Coulter 1992, "Implementation of the pure pursuit path tracking algorithm"), without lanes and other cars.
 
-    A circle that starts along the car's axis and leads through a point at distance d and bearing b has the curvature 2 sin(b) / d; a goal
-    behind the car takes the wheel as far as it goes. A throttle below zero brakes where the controls are `one_pedal`.
+    A circle that starts along the car's axis and leads through a point at distance d and bearing b has the curvature 2 sin(b) / d. For a
+    goal behind the car the steering is at its limit. A throttle below zero brakes where the actions are `one_pedal`. The policy has no
+    parameters, and its values are zero.
 
     Args:
-        wheelbase_m: of the cars that it drives, with `steering_limit_rad`, the angle of the front wheels at an action of one.
-        speed_mps: that it holds.
-        speed_band_mps: so far from that speed the pedal is down all the way.
-        goal_scale_m: `observations.ego.distance_scale_m`: what the observed goal was divided by.
-        speed_scale_mps: `observations.ego.speed_scale_mps`, likewise.
-
-    Returns:
-        A policy without parameters that matter: it reads none, so it can be judged in place of any other. Its values are zero.
+        wheelbase_m: of the cars, with `steering_limit_rad`, the angle of the front wheels at an action of one.
+        speed_mps: to hold.
+        speed_band_mps: difference to that speed at which the throttle is at its limit.
+        goal_scale_m, speed_scale_mps: `observations.ego.distance_scale_m` and `observations.ego.speed_scale_mps`.
 
     Raises:
-        ConfigError: a number that is not positive; at `apply`, an observation without `ego`.
+        ConfigError: at `apply`, an observation without `ego`.
     """
-    numbers = {"wheelbase_m": wheelbase_m, "speed_mps": speed_mps, "speed_band_mps": speed_band_mps}
-    numbers |= {"goal_scale_m": goal_scale_m, "speed_scale_mps": speed_scale_mps}
-    for name, value in numbers.items():
-        check_number(value, where=f"policy.{name}", above=0.0)
-    check_number(steering_limit_rad, where="policy.steering_limit_rad", above=0.0, below=math.pi / 2)
 
     def init(key, observation):
         return {}
@@ -47,7 +40,7 @@ def make(
     def apply(parameters, observation):
         if "ego" not in observation:
             has = ", ".join(sorted(observation)) or "none"
-            raise ConfigError(f"policy: a seeker needs the group `ego` of the observation; it has: {has}")
+            raise ConfigError(f"policy: pure pursuit needs the observation group `ego`; the observation has: {has}")
         ego = observation["ego"]
         sine, cosine, distance_m = ego[..., 2], ego[..., 3], jnp.maximum(goal_scale_m * ego[..., 4], 1.0)
         bend = jnp.arctan(wheelbase_m * 2.0 * sine / distance_m)

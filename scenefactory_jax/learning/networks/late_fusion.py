@@ -11,7 +11,9 @@ encoders of two layers run as one kernel (`set_kernel`), which is tested against
 Differences from the published code, which follow the paper instead: no LayerNorm, no extra 64 to 64 layer before the heads.
 """
 
+import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -20,23 +22,34 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pallas import on_gpu
+from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation, Policy, SetObservation
 from scenefactory_jax.learning.networks import set_kernel
-
-ACTIONS = 3  # throttle, steer, brake
 
 # Increasing, and zero at zero: only so may rows be pooled before the activation, and an empty set be zeros on both sides of it
 ACTIVATIONS = {"elu": jax.nn.elu, "relu": jax.nn.relu, "tanh": jnp.tanh}
 
 
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """Widths of all layers, and how they compute; see `make`."""
+
+    vector: tuple[int, ...]
+    rows: tuple[tuple[str, tuple[int, ...]], ...]  # set, widths
+    rows_default: tuple[int, ...]
+    trunk: tuple[int, ...]
+    activation: str
+    dtype: str
+    kernels: bool
+
+
 def make(
     *,
-    vector: list[int],
-    rows: dict[str, list[int] | None],
-    rows_default: list[int],
-    trunk: list[int],
+    vector: list[Count],
+    rows: dict[str, list[Count] | None],
+    rows_default: list[Count],
+    trunk: list[Count],
     activation: Literal["elu", "relu", "tanh"],
     mean_init: list[float],
     log_std_init: float,
@@ -60,31 +73,21 @@ def make(
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
 
     Raises:
-        ConfigError: a width below one; at `init`, an observation without groups, or widths for a set that it does not have.
+        ConfigError: at `init`, an observation without groups, or widths for a set that it does not have.
     """
-    chosen = {group: widths for group, widths in rows.items() if widths is not None}
-    named = {"vector": vector, "rows_default": rows_default, "trunk": trunk}
-    for name, widths in {**named, **{f"rows.{group}": widths for group, widths in chosen.items()}}.items():
-        if not widths or min(widths) < 1:
-            raise ConfigError(f"policy.{name}: expected a list of integers >= 1, got {list(widths)}")
-    if len(mean_init) != ACTIONS:
-        raise ConfigError(f"policy.mean_init: expected {ACTIONS} numbers, throttle, steer and brake, got {list(mean_init)}")
-    network = ActorCritic(
-        vector=tuple(vector),
-        rows=tuple((name, tuple(widths)) for name, widths in sorted(chosen.items())),
-        rows_default=tuple(rows_default),
-        trunk=tuple(trunk),
-        activation=activation,
-        mean_init=tuple(float(x) for x in mean_init),
-        log_std_init=float(log_std_init),
-        actor_head_scale=float(actor_head_scale),
-        dtype=dtype,
-        kernels=kernels,
-    )
+    named = {name: tuple(sizes) for name, sizes in sorted(rows.items()) if sizes is not None}
+    each = {"vector": vector, "rows_default": rows_default, "trunk": trunk} | {f"rows.{name}": sizes for name, sizes in named.items()}
+    for name, sizes in each.items():
+        if not sizes:
+            raise ConfigError(f"policy.{name}: expected one width or more, got []")
+    if len(mean_init) != 3:
+        raise ConfigError(f"policy.mean_init: expected 3 numbers, throttle, steer and brake, got {mean_init}")
+    architecture = Architecture(tuple(vector), tuple(named.items()), tuple(rows_default), tuple(trunk), activation, dtype, kernels)
+    network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
-        if unknown := sorted(set(chosen) - set(groups)):
+        if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
         if not observation:
             raise ConfigError("policy: the observation has no group; add one to `observations`")
@@ -96,76 +99,54 @@ def make(
 class ActorCritic(nn.Module):
     """Both towers and the log standard deviation: observation -> (mean, log_std, value)."""
 
-    vector: tuple[int, ...]
-    rows: tuple[tuple[str, tuple[int, ...]], ...]
-    rows_default: tuple[int, ...]
-    trunk: tuple[int, ...]
-    activation: str
+    architecture: Architecture
     mean_init: tuple[float, ...]
     log_std_init: float
     actor_head_scale: float
-    dtype: str
-    kernels: bool
 
     @nn.compact
     def __call__(self, observation: Observation) -> tuple[Float[Array, "*batch 3"], Float[Array, " 3"], Float[Array, "*batch"]]:
-        shared = {name: getattr(self, name) for name in ("vector", "rows", "rows_default", "trunk", "activation", "dtype", "kernels")}
-        mean = Tower(**shared, head_bias=self.mean_init, head_scale=self.actor_head_scale, name="actor")(observation)
-        value = Tower(**shared, head_bias=(0.0,), head_scale=1.0, name="critic")(observation)
-        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (ACTIONS,), jnp.float32)
+        mean = Tower(self.architecture, head_bias=self.mean_init, head_scale=self.actor_head_scale, name="actor")(observation)
+        value = Tower(self.architecture, head_bias=(0.0,), head_scale=1.0, name="critic")(observation)
+        log_std = self.param("log_std", nn.initializers.constant(self.log_std_init), (len(self.mean_init),), jnp.float32)
         return mean, log_std, value[..., 0]
 
 
 class Tower(nn.Module):
     """Encoders, fusion, trunk and a linear head."""
 
-    vector: tuple[int, ...]
-    rows: tuple[tuple[str, tuple[int, ...]], ...]
-    rows_default: tuple[int, ...]
-    trunk: tuple[int, ...]
-    activation: str
-    dtype: str
-    kernels: bool
+    architecture: Architecture
     head_bias: tuple[float, ...]
     head_scale: float
 
     @nn.compact
     def __call__(self, observation: Observation) -> Float[Array, "*batch outputs"]:
-        activate = ACTIVATIONS[self.activation]
-        widths = dict(self.rows)
+        architecture, rows = self.architecture, dict(self.architecture.rows)
+        activate = ACTIVATIONS[architecture.activation]
         vectors = [group for _, group in sorted(observation.items()) if not isinstance(group, SetObservation)]
-        fused = []
-        if vectors:
-            layers = Layers(self.vector, self.activation, self.dtype, self.kernels, name="vector")
-            fused.append(activate(layers(jnp.concatenate(vectors, axis=-1))))
+        fused = [activate(Layers(architecture, architecture.vector, name="vector")(jnp.concatenate(vectors, axis=-1)))] if vectors else []
         for name, group in sorted(observation.items()):
             if isinstance(group, SetObservation):
-                layers = Layers(widths.get(name, self.rows_default), self.activation, self.dtype, self.kernels, name=f"{name}_rows")
+                layers = Layers(architecture, rows.get(name, architecture.rows_default), name=f"{name}_rows")
                 fused.append(activate(layers(group.features, group.mask)))
-        trunk = Layers(self.trunk, self.activation, self.dtype, self.kernels, name="trunk")
-        x = activate(trunk(jnp.concatenate(fused, axis=-1).astype(self.dtype)))
+        x = activate(Layers(architecture, architecture.trunk, name="trunk")(jnp.concatenate(fused, axis=-1).astype(architecture.dtype)))
         kernel, bias = nn.initializers.orthogonal(self.head_scale), lambda *_: jnp.array(self.head_bias, jnp.float32)
-        head = nn.Dense(len(self.head_bias), kernel_init=kernel, bias_init=bias, dtype=jnp.float32, name="head")
-        return head(x)
+        return nn.Dense(len(self.head_bias), kernel_init=kernel, bias_init=bias, dtype=jnp.float32, name="head")(x)
 
 
 class Layers(nn.Module):
     """Dense layers with activations between them and none after the last; with a mask, max-pooled over the rows."""
 
+    architecture: Architecture
     widths: tuple[int, ...]
-    activation: str
-    dtype: str
-    kernels: bool
 
     @nn.compact
     def __call__(self, x: Float[Array, "..."], mask: Bool[Array, "..."] | None = None) -> Float[Array, "..."]:
-        weights, inputs = [], x.shape[-1]
-        for index, width in enumerate(self.widths):
-            weights.append(Affine(inputs, width, name=f"layer_{index}")())
-            inputs = width
+        widths, kind = (x.shape[-1], *self.widths), self.architecture
+        weights = [Affine(*pair, name=f"layer_{index}")() for index, pair in enumerate(itertools.pairwise(widths))]
         if mask is None:
-            return affine(self.activation, self.dtype, weights, x)
-        return encode_set(self.activation, self.dtype, self.kernels, weights, x, mask)
+            return affine(kind.activation, kind.dtype, weights, x)
+        return encode_set(kind.activation, kind.dtype, kind.kernels, weights, x, mask)
 
 
 class Affine(nn.Module):
@@ -226,9 +207,9 @@ def _encode_forward(activation: str, dtype: str, kernels: bool, weights: list, x
     return pooled, (weights, x, winner, jnp.any(mask, axis=-1)[..., None])
 
 
-def _encode_backward(activation: str, dtype: str, kernels: bool, kept: tuple, cotangent: Array) -> tuple[list, Array, None]:
-    weights, x, winner, shown = kept
-    cotangent = jnp.where(shown, cotangent, 0.0)
+def _encode_backward(activation: str, dtype: str, kernels: bool, residuals: tuple, cotangent: Array) -> tuple[list, Array, None]:
+    weights, x, winner, has_rows = residuals
+    cotangent = jnp.where(has_rows, cotangent, 0.0)
 
     def at_winners(weights: list, x: Array) -> Array:
         rows = jnp.take_along_axis(x, winner[..., None], axis=-2)  # [..., G, F]: the winner of each channel

@@ -1,8 +1,8 @@
-"""Triton kernels, through Pallas, of `late_fusion.encode_set` for two layers: what lies between rows and pooled set stays on the chip.
+"""Triton kernels, through Pallas, of `late_fusion.encode_set` for two layers: values between rows and pooled set stay on the chip.
 
 Plain JAX writes the hidden and output values of every row to memory and reads them back: 270 kB for a set of 350 rows, of 7 kB. Here one
-program walks over the rows of one set and keeps the largest value of every channel, with the row that it came from; it stops behind the
-last row that the mask shows, so that an empty set costs next to nothing. The gradient walks over the winners alone.
+program loops over the rows of one set and keeps the largest value of every channel, with its row; it stops behind the last valid row. The
+gradient loops over the winners alone.
 
 Arithmetic is that of plain JAX on the same GPU: products of float32 numbers in TF32, of bfloat16 numbers as they are, sums in float32.
 """
@@ -21,17 +21,17 @@ from scenefactory_jax.core import pallas
 
 Weights = list[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 
-INPUTS = 16  # columns of a row on the chip: its features, a one that the bias takes, zeros; the least that the matrix units take
-CHANNELS = 32  # of an output tile; one width for all of them keeps one layout, so that hidden values are worked out once
-ROWS, FEW = 64, 32  # a program takes at a time; where a set has no more rows than that
-MOST = 128  # channels: more do not fit into the registers
+INPUTS = 16  # columns of a row on the chip: its features, a one for the bias, zeros; the minimum of the matrix units
+CHANNELS = 32  # of an output tile; one width for all of them keeps one layout, so that hidden values are computed once
+ROWS, FEW = 64, 32  # of a block; in sets with no more rows than `FEW`
+MAX_CHANNELS = 128  # more do not fit into the registers
 LOG2_E = 1.4426950408889634
 
 
 def fits(weights: Weights) -> bool:
-    """Whether the kernels are made for such layers: two, of 32, 64, 96 or 128 channels, behind fewer than 16 features."""
+    """Whether the kernels can compute these layers: two, of 32, 64, 96 or 128 channels, behind fewer than 16 features."""
     widths = [kernel.shape[1] for kernel, _ in weights]
-    return len(widths) == 2 and weights[0][0].shape[0] < INPUTS and all(0 < w <= MOST and w % CHANNELS == 0 for w in widths)
+    return len(widths) == 2 and weights[0][0].shape[0] < INPUTS and all(0 < w <= MAX_CHANNELS and w % CHANNELS == 0 for w in widths)
 
 
 def encode(
@@ -45,10 +45,10 @@ def encode(
     stages: int = 1,
     interpret: bool = False,
 ) -> tuple[Float[Array, "*batch G"], Int[Array, "*batch G"]]:
-    """Largest value of each channel over the rows that the mask shows, and the first row that has it; zeros for an empty set.
+    """Computes the largest value of each channel over the rows of the mask, and the first row with it; zeros for an empty set.
 
     Args:
-        dtype: of what the second layer multiplies.
+        dtype: of the products of the second layer.
         warps, stages: of a program, see Triton.
         interpret: run on any device, slowly.
     """
@@ -81,17 +81,17 @@ def _encode(last, x, mask, first, second, second_bias, pooled, winner, *, activa
 
     def block(index, best):
         at = index * rows + lanes
-        seen = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
-        table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=seen[:, None] & (columns < features)[None, :], other=ones)
+        valid = plgpu.load(mask.at[at], mask=at < width, other=0) != 0
+        table = plgpu.load(x.at[at[:, None], columns[None, :]], mask=valid[:, None] & (columns < features)[None, :], other=ones)
         inner = [activate(_product(table, first[:, pl.ds(start, length)])).astype(second.dtype) for start, length in hidden]
-        found = []
+        results = []
         for (start, length), (value, where) in zip(out, best, strict=True):
             parts = [_product(part, second[pl.ds(k, w), pl.ds(start, length)]) for part, (k, w) in zip(inner, hidden, strict=True)]
-            here = jnp.where(seen[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
-            largest, half = jnp.max(here, axis=1), jnp.argmax(here, axis=1).astype(jnp.int32)
+            values = jnp.where(valid[:, None], functools.reduce(jnp.add, parts), -jnp.inf).reshape(*split, length)
+            largest, half = jnp.max(values, axis=1), jnp.argmax(values, axis=1).astype(jnp.int32)
             better = largest > value
-            found.append((jnp.where(better, largest, value), jnp.where(better, 2 * index + half, where)))
-        return found
+            results.append((jnp.where(better, largest, value), jnp.where(better, 2 * index + half, where)))
+        return results
 
     shape = (rows // 16, 8)
     begin = [(jnp.full((*shape, length), -jnp.inf, jnp.float32), jnp.zeros((*shape, length), jnp.int32)) for _, length in out]
@@ -116,11 +116,11 @@ def gradient(
     warps: int = 4,
     interpret: bool = False,
 ) -> Weights:
-    """Gradient of the weights through the row that each channel took.
+    """Computes the gradient of the weights through the winning row of each channel.
 
     Args:
-        cotangent: of the pooled channels; zero for an empty set. Sets behind the last one that has any are not looked at.
-        programs: among which the sets are dealt out, for each tile of channels; their sums are added up afterwards.
+        cotangent: of the pooled channels; zero for an empty set. Sets behind the last one that is not zero are not read.
+        programs: that share the sets, for each tile of channels; their sums are added up afterwards.
     """
     (first, first_bias), (second, _) = weights
     width, features = x.shape[-2:]
@@ -159,53 +159,53 @@ def _gradient(last, x, winner, cotangent, first, second, outer, inner, *, activa
     mine = base + jnp.arange(CHANNELS)
     ones, known = _ones(CHANNELS, features), jnp.broadcast_to((columns < features)[None, :], (CHANNELS, INPUTS))
 
-    def one(index, sums):
-        at = program + index * programs  # the first sets may have rows where later ones are empty: everybody gets some of both
+    def add(index, sums):
+        at = program + index * programs  # the first sets may have rows where later ones are empty: each program gets some of both
         pull, row = cotangent[at, mine], winner[at, mine]
         table = plgpu.load(x.at[at, row[:, None], columns[None, :]], mask=known, other=ones)
-        found = []
+        results = []
         for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
             before = _product(table, first[:, pl.ds(start, length)])
             after = activate(before)
             steep = pull[:, None] * second[pl.ds(base, CHANNELS), pl.ds(start, length)] * slope(before, after)
             wide += pull[:, None] * after.astype(dtype).astype(jnp.float32)
-            found.append((wide, narrow + _product(table, steep, along=0)))
-        return found
+            results.append((wide, narrow + _product(table, steep, along=0)))
+        return results
 
     begin = [(jnp.zeros((CHANNELS, length), jnp.float32), jnp.zeros((INPUTS, length), jnp.float32)) for _, length in parts]
-    sums = jax.lax.fori_loop(0, pl.cdiv(last[0] - program, programs), one, begin)
+    sums = jax.lax.fori_loop(0, pl.cdiv(last[0] - program, programs), add, begin)
     for (start, length), (wide, narrow) in zip(parts, sums, strict=True):
         outer[:, pl.ds(start, length)] = wide
         inner[:, pl.ds(start, length)] = narrow
 
 
 def tiles(width: int, most: int) -> list[tuple[int, int]]:
-    """A width as starts and lengths, powers of two, the largest first: 96 -> (0, 64), (64, 32)."""
-    found, start = [], 0
+    """Divides a width into starts and lengths, powers of two, the largest first: 96 -> (0, 64), (64, 32)."""
+    results, start = [], 0
     while start < width:
         length = min(most, 1 << ((width - start).bit_length() - 1))
-        found.append((start, length))
+        results.append((start, length))
         start += length
-    return found
+    return results
 
 
 def _ones(rows: int, features: int) -> Array:
-    """What a row holds beside its features: a one that the bias takes."""
+    """Columns of a row beside its features: a one, for the bias."""
     return jnp.broadcast_to(jnp.where(jnp.arange(INPUTS) == features, 1.0, 0.0)[None, :], (rows, INPUTS))
 
 
 def _product(a: Array, b: Array, *, along: int = 1) -> Array:
-    """Of two matrices on the matrix units, over an axis of the first and the rows of the second, summed up in float32."""
+    """Multiplies matrices on the matrix units, over an axis of the first and the rows of the second; sums are float32."""
     return jax.lax.dot_general(a, b, (((along,), (0,)), ((), ())), preferred_element_type=jnp.float32)
 
 
 def _with_bias(kernel: Array, bias: Array) -> Array:
-    """The first layer as one matrix for rows that hold a one behind their features."""
+    """The first layer as one matrix, for rows with a one behind their features."""
     return jnp.concatenate([kernel, bias[None], jnp.zeros((INPUTS - 1 - len(kernel), kernel.shape[1]), kernel.dtype)])
 
 
 def _activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]]:
-    """Name -> the function, and its slope from what went in and what came out."""
+    """Name -> the function, and its slope from its input and output."""
     exp2 = jnp.exp2 if interpret else _exp2
     return {
         "elu": (lambda x: jnp.where(x > 0.0, x, exp2(LOG2_E * x) - 1.0), lambda x, y: jnp.where(x > 0.0, 1.0, y + 1.0)),
@@ -215,7 +215,7 @@ def _activations(interpret: bool) -> dict[str, tuple[Callable[[Any], Any], Calla
 
 
 def _exp2(x: Array) -> Array:
-    """The hardware's 2^x, to 2 ulp; `jnp.exp2` and `jnp.expm1` are library functions of 10 and 30 instructions."""
+    """Computes 2^x by the hardware, to 2 ulp; `jnp.exp2` and `jnp.expm1` are library functions of 10 and 30 instructions."""
     [result] = plgpu.elementwise_inline_asm(
         "ex2.approx.ftz.f32 $0, $1;", args=[x], constraints="=f,f", pack=1, result_shape_dtypes=[jax.ShapeDtypeStruct(x.shape, x.dtype)]
     )

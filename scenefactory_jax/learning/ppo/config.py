@@ -13,20 +13,14 @@ class PPOConfig:
     horizon: Count  # actions of a rollout, of `actions.action_repeat` control steps each
     epochs: Count  # passes over a rollout
     minibatches: Count  # gradient steps of a pass
-    sample_fraction: Annotated[
-        float, Bounds(above=0, max=1)
-    ]  # of a rollout's samples in a pass, active agents first
-    shards: (
-        int | None
-    )  # groups of worlds whose samples are shuffled separately; None: one a device
+    sample_fraction: Annotated[float, Bounds(above=0, max=1)]  # of a rollout's samples in a pass, active agents first
+    shards: int | None  # groups of worlds whose samples are shuffled separately; None: one a device
     permutation: Literal["once", "each_epoch"]  # of samples to minibatches: once a rollout (RSL-RL) or in each pass
     learning_rate: float  # of Adam, at the beginning
     desired_kl: Positive | None  # nats; the learning rate follows the KL divergence between its bounds; None: it is constant
     learning_rate_min: Positive
     learning_rate_max: float
-    learning_rate_half_life: (
-        Positive | None
-    )  # iterations that halve learning_rate_max; None: constant
+    learning_rate_half_life: Positive | None  # iterations that halve learning_rate_max; None: constant
     gamma: Fraction  # discount of an action
     gae_lambda: Fraction
     clip_eps: Positive  # bound of the probability ratio

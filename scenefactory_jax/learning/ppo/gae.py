@@ -1,6 +1,7 @@
 """Generalized advantage estimation for agents that terminate, worlds that reach the time limit and empty slots."""
 
-from brax.training.agents.ppo.losses import compute_gae as brax_gae
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
@@ -15,7 +16,7 @@ def compute_gae(
     gamma: float,
     gae_lambda: float,
 ) -> tuple[Float[Array, "T *slots"], Float[Array, "T *slots"]]:
-    """Computes advantages and returns (Schulman et al. 2016, equation 16) with Brax's recursion over time.
+    """Computes advantages and lambda-returns, the critic's targets (Schulman et al. 2016, equation 16).
 
     Args:
         reward: of the step; used only where `active`.
@@ -26,19 +27,17 @@ def compute_gae(
         truncated: the world reached the time limit in the step. The next value is not observed, so the advantage is zero and the return is
             the step's own value, as in Brax; such samples should carry no weight. An agent that an event ended in the world's last step is
             terminated, not truncated.
-
-    Returns:
-        (advantage, return), where return = advantage + value: the lambda-return, the critic's target. Brax's own advantages lack one factor
-        lambda (r + gamma V_lambda(next) - V, the V-trace form); equation 16 is computed here from its returns.
     """
     cut = terminated | ~active
-    returns, _ = brax_gae(
-        truncation=(truncated & ~cut).astype(value.dtype),
-        termination=cut.astype(value.dtype),
-        rewards=reward * active,
-        values=value,
-        bootstrap_value=last_value,
-        lambda_=gae_lambda,  # pyright: ignore[reportArgumentType]
-        discount=gamma,
-    )
+    follows, observed = 1.0 - cut.astype(value.dtype), 1.0 - (truncated & ~cut).astype(value.dtype)
+    next_value = jnp.concatenate([value[1:], last_value[None]])
+    delta = (reward * active + gamma * follows * next_value - value) * observed
+
+    def step(advantage: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        delta, follows, observed = now
+        advantage = delta + gamma * follows * observed * gae_lambda * advantage
+        return advantage, advantage
+
+    advantage = jax.lax.scan(step, jnp.zeros_like(last_value), (delta, follows, observed), reverse=True)[1]
+    returns = jax.lax.stop_gradient(advantage + value)
     return returns - value, returns

@@ -17,7 +17,7 @@ def minibatch_size(config: PPOConfig, shape: tuple[int, ...], *, groups: int = 1
         groups: of worlds, each of which gives every minibatch an equal part.
 
     Raises:
-        ConfigError: the rollout (`sample_fraction` 1) does not divide into the minibatches, or a minibatch would be empty.
+        ConfigError: a rollout that does not divide into the minibatches, where all of it is used; or an empty minibatch.
     """
     worlds, agents = shape
     samples = config.horizon * worlds * agents
@@ -61,6 +61,6 @@ def split_minibatches(
 
 def count_left_out(weight: Float[Array, " N"], *, size: int, groups: int, axis: str | None) -> Float[Array, ""]:
     """Computes the fraction of the samples with weight that minibatches with `size` samples in all leave out."""
-    held = weight.reshape(groups, -1).sum(axis=1)
-    total, used = sharding.sum_over_devices((held.sum(), jnp.minimum(held, size // groups).sum()), axis)
+    active = weight.reshape(groups, -1).sum(axis=1)
+    total, used = sharding.sum_over_devices((active.sum(), jnp.minimum(active, size // groups).sum()), axis)
     return (total - used) / jnp.maximum(total, 1.0)

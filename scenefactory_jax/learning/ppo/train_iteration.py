@@ -28,7 +28,7 @@ from scenefactory_jax.learning.trainer import Metrics, Trainer, TrainState
 
 @dataclasses.dataclass(frozen=True)
 class PPO:
-    """What stays the same in all iterations."""
+    """The constants of all iterations."""
 
     env: Env
     policy: Policy
@@ -99,9 +99,8 @@ def update_epochs(
 ) -> tuple[Any, optax.OptState, Metrics]:
     """Passes over the batch `epochs` times, in minibatches of `size` samples.
 
-    Returns:
-        Parameters, optimizer state, and metrics: means of the loss's metrics over the minibatches that changed the parameters; `skipped`:
-        minibatches whose loss or gradient was not finite; `left_out`: fraction of the samples with weight that no minibatch holds.
+    The metrics are means of the loss's metrics over the minibatches that changed the parameters; `skipped`: minibatches whose loss or
+    gradient was not finite; `left_out`: fraction of the samples with weight that no minibatch holds.
     """
     config = ppo.config
     update = functools.partial(update_minibatch, ppo, batch, log_std_old, max_learning_rate(config, train_state.iteration))
@@ -180,9 +179,6 @@ def make_trainer(env: Env, policy: Policy, config: PPOConfig, *, episode_steps: 
         episode_steps: control steps of an episode.
         mesh: of devices with the axis `sharding.AXIS`, that share the worlds; None: one device. With the same `shards` any number of
             devices learns the same, up to rounding.
-
-    Raises:
-        ConfigError: `shards` is not a multiple of the devices; at `init`, samples that the minibatches do not divide.
     """
     axis, devices = (None, 1) if mesh is None else (sharding.AXIS, mesh.size)
     shards = devices if config.shards is None else config.shards

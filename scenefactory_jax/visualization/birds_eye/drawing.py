@@ -1,12 +1,11 @@
 """Elements of figures and videos from above: window on the plane, road strokes, car shapes, event marks, colours."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
+from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road
 
 Colour = tuple[int, int, int]
@@ -62,24 +61,19 @@ def check(trajectory: Trajectory) -> None:
     t, a = trajectory.active.shape
     if t == 0:
         raise TrajectoryError(f"trajectory {trajectory.title!r}: expected at least one step")
-    goal = (t, a, 2) if np.ndim(trajectory.goal) == 3 else (a, 2)
-    agents = {"position": (t, a, 2), "yaw": (t, a), "speed": (t, a), "size": (a, 2), "goal": goal, "present": (a,)}
-    _check_shapes(trajectory, agents, where="trajectory")
     if unknown := [name for name in trajectory.events if name not in MARKS]:
         raise TrajectoryError(f"trajectory.events: expected some of {', '.join(MARKS)}, got {unknown[0]!r}")
-    for name, new in trajectory.events.items():
-        if np.shape(new) != (t, a):
-            raise TrajectoryError(f"trajectory.events.{name}: expected shape {(t, a)}, got {np.shape(new)}")
-    if trajectory.traffic is not None:
-        n = trajectory.traffic.present.shape[1]
-        boxes = {"position": (t, n, 2), "yaw": (t, n), "size": (t, n, 2), "present": (t, n)}
-        _check_shapes(trajectory.traffic, boxes, where="trajectory.traffic")
-
-
-def _check_shapes(columns: Trajectory | TrafficBoxes, shapes: Mapping[str, tuple[int, ...]], *, where: str) -> None:
-    for name, shape in shapes.items():
-        if np.shape(getattr(columns, name)) != shape:
-            raise TrajectoryError(f"{where}.{name}: expected shape {shape}, got {np.shape(getattr(columns, name))}")
+    goal = (t, a, 2) if np.ndim(trajectory.goal) == 3 else (a, 2)
+    shapes = {"position": (t, a, 2), "yaw": (t, a), "speed": (t, a), "size": (a, 2), "goal": goal, "present": (a,)}
+    arrays = {name: (getattr(trajectory, name), shape) for name, shape in shapes.items()}
+    arrays |= {f"events.{name}": (new, (t, a)) for name, new in trajectory.events.items()}
+    if (traffic := trajectory.traffic) is not None:
+        n = traffic.present.shape[1]
+        shapes = {"position": (t, n, 2), "yaw": (t, n), "size": (t, n, 2), "present": (t, n)}
+        arrays |= {f"traffic.{name}": (getattr(traffic, name), shape) for name, shape in shapes.items()}
+    for name, (array, shape) in arrays.items():
+        if np.shape(array) != shape:
+            raise TrajectoryError(f"trajectory.{name}: expected shape {shape}, got {np.shape(array)}")
 
 
 def sanitize_trajectory(trajectory: Trajectory) -> Trajectory:
@@ -123,9 +117,9 @@ def fit_view(points: Num[np.ndarray, "n 2"], *, margin: float, smallest: float) 
 
 def shown_points(trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
     """Points that a picture of the trajectory contains: positions of active agents, and their goals."""
-    shown = trajectory.active & trajectory.present
+    active = trajectory.active & trajectory.present
     goals = np.broadcast_to(trajectory.goal, trajectory.position.shape)
-    points = np.concatenate([trajectory.position[shown], goals[shown]])
+    points = np.concatenate([trajectory.position[active], goals[active]])
     return points if len(points) else np.zeros((1, 2), np.float32)
 
 
@@ -205,16 +199,15 @@ def strokes(road: Road) -> list[Stroke]:
     midpoint, direction = np.asarray(road.midpoint, float)[valid], np.asarray(road.direction, float)[valid]
     result = []
     for kinds, colour, width, thinnest, dashed in _LOOKS:
-        rows = np.isin(kind, kinds)
-        if not rows.any():
+        rows = np.flatnonzero(np.isin(kind, kinds))
+        if not len(rows):
             continue
         start, stop = -half[rows].astype(float), half[rows].astype(float)
-        owner = np.arange(rows.sum())
         if dashed:
-            owner, start, stop = _dashes(arc[rows].astype(float), half[rows].astype(float))
-        middle, along = midpoint[rows][owner], direction[rows][owner]
-        lines = np.stack([middle + start[:, None] * along, middle + stop[:, None] * along], axis=1)
-        result.append(Stroke(lines, colour, width, thinnest))
+            owner, start, stop = _dashes(arc[rows].astype(float), stop)
+            rows = rows[owner]
+        ends = [midpoint[rows] + offset[:, None] * direction[rows] for offset in (start, stop)]
+        result.append(Stroke(np.stack(ends, axis=1), colour, width, thinnest))
     return result
 
 
@@ -222,9 +215,8 @@ def _dashes(arc: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     """(segment, from, to) of each dash, measured along its segment from its midpoint."""
     dashes = []
     for segment, (middle, reach) in enumerate(zip(arc, half, strict=True)):
-        for number in np.arange(np.floor((middle - reach) / _PERIOD), np.floor((middle + reach) / _PERIOD) + 1):
-            low, high = max(number * _PERIOD, middle - reach), min(number * _PERIOD + _DASH, middle + reach)
-            if high > low:
-                dashes.append((segment, low - middle, high - middle))
+        numbers = np.arange(np.floor((middle - reach) / _PERIOD), np.floor((middle + reach) / _PERIOD) + 1)
+        low, high = np.maximum(numbers * _PERIOD - middle, -reach), np.minimum(numbers * _PERIOD + _DASH - middle, reach)
+        dashes += [(segment, start, stop) for start, stop in zip(low, high, strict=True) if stop > start]
     owner, start, stop = np.array(dashes, float).reshape(-1, 3).T
     return owner.astype(int), start, stop

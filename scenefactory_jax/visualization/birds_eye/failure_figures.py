@@ -20,7 +20,7 @@ FAILED: Colour = (208, 28, 40)
 PARTNER: Colour = (0, 90, 181)
 CAR: Colour = (150, 156, 163)
 GOAL: Colour = (0, 138, 82)
-_NEAR_M, _INCHES = 32.0, 3.1
+_DETAIL_M, _INCHES = 32.0, 3.1
 
 
 class Case(NamedTuple):
@@ -31,42 +31,31 @@ class Case(NamedTuple):
     hit: int | None
 
 
+@matplotlib.rc_context(STYLE)
 def failures_figure(cases: Sequence[Case], *, before_s: float | int) -> Figure:
     """Draws a column per failure: above the complete trajectory and the goal, below the surroundings at the time of the failure.
 
     Args:
-        cases: failures of one kind.
+        cases: failures of one type.
         before_s: seconds of the other cars' trajectories before the failure.
-
-    Raises:
-        TrajectoryError: arrays that do not belong together.
     """
-    kind = FAILURE_TYPES[cases[0].failure.kind]
-    with matplotlib.rc_context(STYLE):
-        rows = 1 if len(cases) > 2 else 2 if len(cases) > 1 else 3  # of the legend
-        head = 0.14 * max(_title(case.failure).count("\n") + 1 for case in cases) + 0.22
-        height = 2 * _INCHES + head + 0.08 + 0.18 * rows
-        figure = Figure(figsize=(_INCHES * len(cases), height))
-        figure.text(0.01 / len(cases), 1 - 0.04 / height, kind.label, fontsize=9, fontweight="bold", va="top")
-        for column, case in enumerate(cases):
-            case = case._replace(trajectory=drawing.sanitize_trajectory(case.trajectory))
-            for row, window in enumerate((_find_whole_window(case), _find_near_window(case))):
-                width, tall = 1 / len(cases), _INCHES / height
-                place = ((column + 0.01) * width, 1 - head / height - (row + 0.99) * tall, 0.98 * width, 0.98 * tall)
-                axes = figure.add_axes(place)
-                _draw(axes, case, window, before_s=before_s, whole=row == 0)
-                if row == 0:
-                    axes.set_title(_title(case.failure), fontsize=7.5, fontweight="normal", loc="left", pad=3)
-        hollow = {"markerfacecolor": "none", "linestyle": "none", "markersize": 8}
-        handles = [
-            Line2D([], [], color=rgb(FAILED), linewidth=2.2, label="its trajectory (dashed: afterwards)"),
-            Line2D([], [], color=rgb(INK), marker="s", label="area below", **hollow),
-            Line2D([], [], color=rgb(GOAL), marker="o", label="its goal", **hollow),
-            Line2D([], [], color=rgb(CAR), linewidth=1.2, label="other cars"),
-        ]
-        if any(case.hit is not None for case in cases):
-            handles.insert(2, Line2D([], [], color=rgb(PARTNER), linewidth=1.6, label="collision partner"))
-        figure.legend(handles=handles, loc="lower center", ncols=-(-len(handles) // rows), fontsize=7.5, handletextpad=0.5, borderpad=0.0)
+    figure = Figure(figsize=(_INCHES * len(cases), 2 * _INCHES + 1.0), layout="constrained")
+    figure.suptitle(FAILURE_TYPES[cases[0].failure.kind].label, fontsize=9, fontweight="bold", x=0.01, ha="left")
+    for case, (above, below) in zip(cases, figure.subplots(2, len(cases), squeeze=False).T, strict=True):
+        case = case._replace(trajectory=drawing.sanitize_trajectory(case.trajectory))
+        _draw(above, case, _find_overview_window(case), before_s=before_s, overview=True)
+        _draw(below, case, _find_detail_window(case), before_s=before_s, overview=False)
+        above.set_title(_title(case.failure), fontsize=7.5, fontweight="normal", loc="left", pad=3)
+    hollow = {"markerfacecolor": "none", "linestyle": "none", "markersize": 8}
+    handles = [
+        Line2D([], [], color=rgb(FAILED), linewidth=2.2, label="its trajectory (dashed: afterwards)"),
+        Line2D([], [], color=rgb(INK), marker="s", label="area below", **hollow),
+        Line2D([], [], color=rgb(GOAL), marker="o", label="its goal", **hollow),
+        Line2D([], [], color=rgb(CAR), linewidth=1.2, label="other cars"),
+    ]
+    if any(case.hit is not None for case in cases):
+        handles.insert(2, Line2D([], [], color=rgb(PARTNER), linewidth=1.6, label="collision partner"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(2 * len(cases), len(handles)), fontsize=7.5, handletextpad=0.5)
     return figure
 
 
@@ -79,7 +68,7 @@ def _title(failure: Failure) -> str:
     return f"{name} · car {failure.agent}\n{line}" + (f"\nalso {flags}" if flags else "")
 
 
-def _find_whole_window(case: Case) -> tuple[float, float, float]:
+def _find_overview_window(case: Case) -> tuple[float, float, float]:
     """The square that shows the car's trajectory, its goal and the place of the failure."""
     agent, trajectory = case.failure.agent, case.trajectory
     track = trajectory.position[trajectory.active[:, agent], agent]
@@ -87,9 +76,9 @@ def _find_whole_window(case: Case) -> tuple[float, float, float]:
     return drawing.fit_view(points, margin=9.0, smallest=50.0)
 
 
-def _find_near_window(case: Case) -> tuple[float, float, float]:
+def _find_detail_window(case: Case) -> tuple[float, float, float]:
     x, y = case.failure.position
-    return x - _NEAR_M / 2, y - _NEAR_M / 2, _NEAR_M
+    return x - _DETAIL_M / 2, y - _DETAIL_M / 2, _DETAIL_M
 
 
 def _find_step(case: Case) -> int:
@@ -97,7 +86,7 @@ def _find_step(case: Case) -> int:
     return int(np.clip(round(case.failure.moment_s * case.trajectory.control_hz) - 1, 0, len(case.trajectory.active) - 1))
 
 
-def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float | int, whole: bool) -> None:
+def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float | int, overview: bool) -> None:
     trajectory, step, agent = case.trajectory, _find_step(case), case.failure.agent
     figures.draw_road(axes, trajectory.scene, window, inches=_INCHES)
     axes.set(xticks=[], yticks=[])
@@ -112,12 +101,12 @@ def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_
             _draw_track(axes, trajectory, driven, other, since, step, colour, linewidth=width)
             figures.draw_car(axes, trajectory.position[step, other], float(trajectory.yaw[step, other]), trajectory.size[other], colour)
     _draw_track(axes, trajectory, driven, agent, step, len(driven) - 1, FAILED, linewidth=1.1, linestyle=(0, (3, 2)))
-    _draw_track(axes, trajectory, driven, agent, 0, step, FAILED, linewidth=2.2 if whole else 1.6)
+    _draw_track(axes, trajectory, driven, agent, 0, step, FAILED, linewidth=2.2 if overview else 1.6)
     figures.draw_car(axes, trajectory.position[step, agent], float(trajectory.yaw[step, agent]), trajectory.size[agent], FAILED)
     x, y = (float(value) for value in drawing.goal_at(trajectory, step)[agent])
     axes.add_patch(Circle((x, y), trajectory.goal_radius_m, fill=False, edgecolor=rgb(GOAL), linewidth=1.8, zorder=6))
-    if whole:
-        left, bottom, side = _find_near_window(case)
+    if overview:
+        left, bottom, side = _find_detail_window(case)
         look = {"fill": False, "edgecolor": rgb(INK), "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 7}
         axes.add_patch(Rectangle((left, bottom), side, side, **look))
 
@@ -134,9 +123,7 @@ def _draw_traffic(axes: Axes, case: Case, step: int) -> None:
         axes.add_patch(Polygon(box, fill=False, edgecolor=rgb(PARTNER), linewidth=1.6, zorder=5))
 
 
-def _draw_track(
-    axes: Axes, trajectory: Trajectory, driven: np.ndarray, agent: int, first: int, last: int, colour: Colour, **look
-) -> None:  # fmt: skip
+def _draw_track(axes: Axes, trajectory: Trajectory, driven: np.ndarray, agent: int, first: int, last: int, colour: Colour, **look) -> None:
     """A car's trajectory between two steps, with a gap at each respawn."""
     steps = np.flatnonzero(driven[first + 1 : last + 1, agent]) + first + 1
     for run in np.split(steps, np.flatnonzero(np.diff(steps) > 1) + 1) if len(steps) else ():

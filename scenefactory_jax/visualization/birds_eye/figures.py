@@ -26,6 +26,7 @@ _ROAD = (  # of the legend: label, colour, width
 )  # fmt: skip
 
 
+@matplotlib.rc_context(STYLE)
 def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", all_road: bool = False) -> Figure:
     """Draws a scene at its start: road, cars, goals of the same colour and number, logged traffic.
 
@@ -39,19 +40,19 @@ def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", a
     points = np.concatenate([start[present], goal[present]])
     if all_road or not len(present):
         points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
-    with matplotlib.rc_context(STYLE):
-        figure, axes, scale = _make_axes(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
-        traffic = traffic_shapes.shapes_at_start(scene)
-        draw_traffic(axes, traffic)
-        for agent in present.tolist():
-            look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
-            axes.plot(*np.stack([start[agent], goal[agent]]).T, color=rgb(drawing.colour_of(agent)), **look)
-            _draw_goal(axes, goal[agent], agent, goal_radius_m, scale)
-            draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), drawing.colour_of(agent))
-        _add_legend(figure, [], car="start", scene=scene, road=True, traffic=bool(traffic))
+    figure, axes, scale = _make_axes(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
+    traffic = traffic_shapes.shapes_at_start(scene)
+    draw_traffic(axes, traffic)
+    for agent in present.tolist():
+        look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
+        axes.plot(*np.stack([start[agent], goal[agent]]).T, color=rgb(drawing.colour_of(agent)), **look)
+        _draw_goal(axes, goal[agent], agent, goal_radius_m, scale)
+        draw_car(axes, start[agent], float(agents.yaw[agent]), np.asarray(agents.size[agent]), drawing.colour_of(agent))
+    _add_legend(figure, [], car="start", scene=scene, road=True, traffic=bool(traffic))
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: float | int) -> Figure:
     """Draws many scenes at their starts as small squares, each at its own scale.
 
@@ -62,25 +63,25 @@ def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: 
     """
     across = max(min(columns, len(scenes)), 1)
     down = max(-(-len(scenes) // across), 1)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(across * inches, down * (inches + 0.22)))
-        grid = figure.subplots(down, across, squeeze=False)
-        figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=1 - 0.2 / figure.get_figheight(), wspace=0.04, hspace=0.22 / inches)
-        for axes in grid.flat:
-            axes.set_axis_off()
-        for axes, (name, scene) in zip(grid.flat, scenes, strict=False):
-            points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
-            window = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
-            draw_road(axes, scene, window, inches=inches)
-            draw_traffic(axes, traffic_shapes.shapes_at_start(scene), linewidth=0.15)
-            agents = scene.agents
-            for agent in np.flatnonzero(np.asarray(agents.present)).tolist():
-                box, _ = drawing.car_shape(np.asarray(agents.position[agent]), float(agents.yaw[agent]), np.asarray(agents.size[agent]))
-                axes.add_patch(Polygon(box, facecolor=rgb(drawing.colour_of(agent)), edgecolor="none", zorder=3))
-            axes.set_title(name if len(name) <= 28 else f"...{name[-25:]}", fontsize=6, pad=2)
+    figure = Figure(figsize=(across * inches, down * (inches + 0.22)))
+    grid = figure.subplots(down, across, squeeze=False)
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=1 - 0.2 / figure.get_figheight(), wspace=0.04, hspace=0.22 / inches)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, (name, scene) in zip(grid.flat, scenes, strict=False):
+        points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
+        window = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
+        draw_road(axes, scene, window, inches=inches)
+        draw_traffic(axes, traffic_shapes.shapes_at_start(scene), linewidth=0.15)
+        agents = scene.agents
+        for agent in np.flatnonzero(np.asarray(agents.present)).tolist():
+            box, _ = drawing.car_shape(np.asarray(agents.position[agent]), float(agents.yaw[agent]), np.asarray(agents.size[agent]))
+            axes.add_patch(Polygon(box, facecolor=rgb(drawing.colour_of(agent)), edgecolor="none", zorder=3))
+        axes.set_title(name if len(name) <= 28 else f"...{name[-25:]}", fontsize=6, pad=2)
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def trajectory_figure(trajectory: Trajectory) -> Figure:
     """Draws the trajectories of an episode's cars from outlined start to filled end, their goals, and events.
 
@@ -90,27 +91,26 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     trajectory = drawing.sanitize_trajectory(trajectory)
     driven, traffic = drawing.is_moving(trajectory), trajectory.traffic
     boxes = [] if traffic is None else list(traffic_shapes.shapes(traffic, 0, traffic_shapes.find_parked(traffic)))
-    with matplotlib.rc_context(STYLE):
-        view = drawing.fit_view(drawing.shown_points(trajectory), margin=12.0, smallest=50.0)
-        title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
-        figure, axes, scale = _make_axes(trajectory.scene, view, title=title)
-        draw_traffic(axes, boxes)
-        for agent in np.flatnonzero(trajectory.present).tolist():
-            steps, active = np.flatnonzero(driven[:, agent]), np.flatnonzero(trajectory.active[:, agent])
-            track, colour = trajectory.position[:, agent], drawing.colour_of(agent)
-            segments = np.stack([track[steps - 1], track[steps]], axis=1)
-            look = {"linewidths": 1.6, "capstyle": "round", "zorder": 3}
-            axes.add_collection(LineCollection(list(segments), colors=[rgb(colour)], **look))
-            for step, hollow in ((active[0], True), (steps[-1] if len(steps) else active[-1], False)) if len(active) else ():
-                draw_car(axes, track[step], float(trajectory.yaw[step, agent]), trajectory.size[agent], colour, hollow=hollow)
-            goal = drawing.goal_at(trajectory, int(active[-1]) if len(active) else 0)[agent]
-            _draw_goal(axes, goal, agent, trajectory.goal_radius_m, scale)
-        events = {name: new & trajectory.present for name, new in trajectory.events.items() if name != "goal_reached"}
-        events = {name: events[name] for name in MARKS if name in events and events[name].any()}
-        for name, new in events.items():
-            look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
-            axes.plot(*trajectory.position[new].T, color=rgb(MARKS[name].colour), **look)
-        _add_legend(figure, events, car="end (start: outline)", scene=trajectory.scene, road=False, traffic=bool(boxes))
+    view = drawing.fit_view(drawing.shown_points(trajectory), margin=12.0, smallest=50.0)
+    title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
+    figure, axes, scale = _make_axes(trajectory.scene, view, title=title)
+    draw_traffic(axes, boxes)
+    for agent in np.flatnonzero(trajectory.present).tolist():
+        steps, active = np.flatnonzero(driven[:, agent]), np.flatnonzero(trajectory.active[:, agent])
+        track, colour = trajectory.position[:, agent], drawing.colour_of(agent)
+        segments = np.stack([track[steps - 1], track[steps]], axis=1)
+        look = {"linewidths": 1.6, "capstyle": "round", "zorder": 3}
+        axes.add_collection(LineCollection(list(segments), colors=[rgb(colour)], **look))
+        for step, hollow in ((active[0], True), (steps[-1] if len(steps) else active[-1], False)) if len(active) else ():
+            draw_car(axes, track[step], float(trajectory.yaw[step, agent]), trajectory.size[agent], colour, hollow=hollow)
+        goal = drawing.goal_at(trajectory, int(active[-1]) if len(active) else 0)[agent]
+        _draw_goal(axes, goal, agent, trajectory.goal_radius_m, scale)
+    events = {name: new & trajectory.present for name, new in trajectory.events.items() if name != "goal_reached"}
+    events = {name: events[name] for name in MARKS if name in events and events[name].any()}
+    for name, new in events.items():
+        look = {"marker": MARKS[name].marker, "markersize": 10, "markeredgecolor": "white", "linestyle": "none", "zorder": 6}
+        axes.plot(*trajectory.position[new].T, color=rgb(MARKS[name].colour), **look)
+    _add_legend(figure, events, car="end (start: outline)", scene=trajectory.scene, road=False, traffic=bool(boxes))
     return figure
 
 

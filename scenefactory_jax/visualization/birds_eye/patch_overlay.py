@@ -9,7 +9,7 @@ from scenefactory_jax.core.types import SURFACES, Weather
 from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, INK, Colour, Stroke, blend
 
 WATER: Colour = (52, 118, 196)
-# surface -> colour and name; the asphalts are told apart by their water alone
+# surface -> colour and name; the asphalts differ by their water alone
 GROUNDS: dict[str, tuple[Colour, str]] = {
     "GRAVEL": ((176, 148, 112), "gravel"),
     "SNOW": ((255, 255, 255), "snow"),
@@ -30,13 +30,13 @@ class Area(NamedTuple):
 
 def areas(weather: Weather) -> list[Area]:
     """The present patches of one world's weather, bottom first, with the films of this moment."""
-    patches, found = weather.patches, []
+    patches, result = weather.patches, []
     for row in np.flatnonzero(np.asarray(patches.present)):
         film = float(patches.film_mm[row] + patches.open_road_film_fraction[row] * weather.film_mm)
         colour, label = colour_area(SURFACES[int(patches.surface[row])], film)
         pieces = outline(np.asarray(patches.vertices[row], float), float(patches.radius[row]), closed=bool(patches.closed[row]))
-        found.append(Area(pieces, colour, blend(INK, colour, 0.3), label))
-    return found
+        result.append(Area(pieces, colour, blend(INK, colour, 0.3), label))
+    return result
 
 
 def colour_area(surface: str, film_mm: float) -> tuple[Colour, str]:

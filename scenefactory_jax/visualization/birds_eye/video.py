@@ -21,6 +21,7 @@ from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS,
 from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
 from scenefactory_jax.visualization.video_file import VideoError
 
+SETTINGS = ("fps", "stride", "columns", "panel", "trail_s")  # of `write`
 _FINE = 2  # pictures are drawn at this many times their size and reduced
 _FLASH_S, _FADE_S = 1.2, 0.6  # duration of an event's flash, and of a finished car's fading
 _GAP = 14  # pixels between panels
@@ -81,8 +82,9 @@ def frames(
             raise VideoError(f"{name}: expected a number >= {smallest}, got {value}")
     if not trajectories:
         raise VideoError("trajectories: expected at least one recorded world")
+    speed = fps * stride / trajectories[0].control_hz
     panels = [_prepare(trajectory, panel) for trajectory in trajectories]
-    return _draw_sheets(panels, fps=fps, stride=stride, columns=min(columns, len(panels)), side=panel, trail_s=trail_s)
+    return _draw_sheets(panels, stride=stride, columns=min(columns, len(panels)), side=panel, trail_s=trail_s, speed=speed)
 
 
 def draw_frame(trajectory: Trajectory, step: int, *, window: tuple[float, float, float], panel: int) -> UInt8[np.ndarray, "N N 3"]:
@@ -104,16 +106,14 @@ def shown_steps(length: int, stride: int) -> list[int]:
     return steps if steps[-1] == length - 1 else [*steps, length - 1]
 
 
-def _draw_sheets(
-    panels: list[_Panel], *, fps: float | int, stride: int, columns: int, side: int, trail_s: float | int
-) -> Iterator[np.ndarray]:
+def _draw_sheets(panels: list[_Panel], *, stride: int, columns: int, side: int, trail_s: float, speed: float) -> Iterator[np.ndarray]:
     """Pastes panels on a sheet, frame by frame."""
     bar = _bar(side)
     across, down = side + _GAP, side + 2 * bar + _GAP
     width, height = columns * across + _GAP, math.ceil(len(panels) / columns) * down + _GAP + bar
     sheet = Image.new("RGB", (width + width % 2, height + height % 2), WHITE)
     corners = [(_GAP + (i % columns) * across, _GAP + (i // columns) * down) for i in range(len(panels))]
-    _draw_legend(sheet, height - bar, side, speed=fps * stride / panels[0].trajectory.control_hz)
+    _draw_legend(sheet, height - bar, side, speed=speed)
     for panel, (left, top) in zip(panels, corners, strict=True):
         _draw_header(sheet, left, top, side, panel.trajectory)
     for step in shown_steps(max(len(panel.driven) for panel in panels), stride):

@@ -16,7 +16,7 @@ from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.mujoco import scene_model
-from scenefactory_jax.visualization.recorded_episodes import cut_world
+from scenefactory_jax.visualization.recorded_episodes import cut_world, find_shown_steps
 
 FADE_S = 0.6  # a finished car disappears within this time
 VEHICLE_M, PERSON_M = 1.5, 1.75  # heights of traffic: wider, and narrower than a metre
@@ -45,15 +45,14 @@ def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTr
         car: parameters of the cars. Without recorded joints, cars stand level on wheels that roll without slip.
     """
     scene, shots, active, hz = cut_world(recording, index)
-    steps, agents = np.arange(len(active))[:, None], np.arange(active.shape[1])
-    last = np.maximum.accumulate(np.where(active, steps, -1), axis=0)
-    row = np.where(last < 0, np.argmax(active, axis=0), last)  # the last active step, before that the first
+    steps, agents, row = np.arange(len(active))[:, None], np.arange(active.shape[1]), find_shown_steps(active)
     if shots.joints is None:
         spin = np.cumsum(np.nan_to_num(shots.speed) * active, axis=0) / hz / car.wheel_radius
         joints = scene_model.set_posture(car, shots.position, shots.yaw, shots.steer, spin)
     else:
         joints = np.asarray(shots.joints, float)
-    opacity = np.where(last < 0, 0.0, np.clip(1.0 - (steps - last) / (FADE_S * hz), 0.0, 1.0))
+    begun = np.maximum.accumulate(active, axis=0)
+    opacity = np.where(begun, np.clip(1.0 - (steps - row) / (FADE_S * hz), 0.0, 1.0), 0.0)
     yaw, goal = shots.yaw[row, agents], shots.goal[row, agents]
     return ActorTrajectories(scene, joints[row, agents], yaw, active, opacity, goal, TrafficBoxes.from_boxes(shots.traffic), hz)
 

@@ -51,15 +51,14 @@ class FilmSettings:
 
 def write(
     path: Path | str, recording: Recording, *, car: CarParameters, settings: FilmSettings, camera: Camera, goal_radius_m: float | int,
-    slot: int | None = None, world: int = 0,
+    slot: int | None = None,
 ) -> Path:  # fmt: skip
     """Writes one moment as `.png`, or the episode as `.gif` or `.mp4` (extra `video`).
 
     Args:
-        recording: of one or several worlds, see `env.rollout.record`.
+        recording: of one or several worlds, see `env.rollout.record`; the first one is shown.
         car: parameters of the drawn cars, and of the recorded joints.
         slot: of the car that the camera follows; None: the car with the longest trajectory.
-        world: index of the shown world.
 
     Raises:
         VideoError: another suffix, a number out of range, an empty slot, or no ffmpeg for an .mp4.
@@ -70,7 +69,7 @@ def write(
         raise VideoError(f"{path}: expected the suffix {', '.join(SUFFIXES)}, got {path.suffix!r}")
     if path.suffix != ".png":
         video_file.check(path, fps=settings.fps)
-    shown = actors.make_actors(jax.device_get(recording), world, car)
+    shown = actors.make_actors(jax.device_get(recording), 0, car)
     slot = choose_slot(shown, slot)
     last = int(np.flatnonzero(shown.active[:, slot])[-1])  # a film from behind ends one second after the followed car
     length = len(shown.yaw) if settings.view == "bird" else min(last + 1 + round(shown.hz), len(shown.yaw))
@@ -92,11 +91,7 @@ def frames(
     world: ActorTrajectories, steps: Sequence[int], *, car: CarParameters, settings: FilmSettings, camera: Camera,
     goal_radius_m: float | int, slot: int,
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:  # fmt: skip
-    """Draws the pictures of some steps; view `both` has the chase camera on the left and the view from above on the right.
-
-    Raises:
-        OpenGLError: see `write`.
-    """
+    """Draws the pictures of some steps; view `both` has the chase camera on the left and the view from above on the right."""
     built = scene_model.build(world.scene, car)
     data, width, height = mujoco.MjData(built.model), settings.width, settings.height
     heading = smooth(np.unwrap(world.yaw[:, slot]), lag=camera.lag_s * world.hz)

@@ -1,6 +1,5 @@
 """Builds the surfaces of a road for pictures: asphalt under the lanes, paint, kerbs, and patches of the weather."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,16 +7,15 @@ import shapely
 from jaxtyping import Float, Int
 from shapely import ops
 
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, SPEED_BUMP, Road, Scene
+from scenefactory_jax.core.types import Road, Scene
 from scenefactory_jax.visualization.birds_eye import patch_overlay
 from scenefactory_jax.visualization.birds_eye.drawing import rgb
-from scenefactory_jax.visualization.mujoco import world_mjcf
+from scenefactory_jax.visualization.mujoco.world_mjcf import WHITE, YELLOW
+from scenefactory_jax.visualization.road_lines import LAYERS, STRAIGHT_M, join_segments
 
-STRAIGHT_M = 0.03
 LANE_M, CLOSING_M = 2.0, 1.5  # half the width of a lane, and of a gap between lanes that is filled
 DASH_M, GAP_M = 3.0, 4.5  # of broken lines
 Colour = tuple[float, float, float, float]
-WHITE, YELLOW = world_mjcf.WHITE, world_mjcf.YELLOW
 
 
 class Surface(NamedTuple):
@@ -29,10 +27,9 @@ class Surface(NamedTuple):
     colour: Colour
 
 
-class Layer(NamedTuple):
-    """Shape and colour of the surface of some kinds of lines."""
+class LayerLook(NamedTuple):
+    """Shape and colour of the surface of a layer's lines."""
 
-    kinds: tuple[int, ...]
     half_m: float  # half the width of the line
     height_m: float
     colour: Colour
@@ -40,50 +37,46 @@ class Layer(NamedTuple):
     area: bool = False  # closed lines are filled
 
 
-LAYERS: dict[str, Layer] = {
-    "driveway": Layer((DRIVEWAY,), 0.1, 0.012, (0.30, 0.30, 0.32, 1.0), area=True),
-    "bike": Layer((LANE_BIKE,), 0.9, 0.016, (0.24, 0.33, 0.27, 1.0)),
-    "crosswalk": Layer((CROSSWALK,), 0.1, 0.020, (0.62, 0.62, 0.60, 1.0), area=True),
-    "bump": Layer((SPEED_BUMP,), 0.2, 0.05, (0.80, 0.55, 0.20, 1.0), area=True),
-    "white": Layer((7, 8), 0.07, 0.03, WHITE),
-    "white-broken": Layer((6,), 0.07, 0.03, WHITE, broken=True),
-    "yellow": Layer((11, 12), 0.07, 0.03, YELLOW),
-    "yellow-broken": Layer((9, 10, 13), 0.07, 0.03, YELLOW, broken=True),
-    "kerb": Layer(EDGES, 0.10, 0.14, (0.66, 0.65, 0.62, 1.0)),
+LOOKS = {  # of layers; lanes are the asphalt
+    "driveway": LayerLook(0.1, 0.012, (0.30, 0.30, 0.32, 1.0), area=True),
+    "bike": LayerLook(0.9, 0.016, (0.24, 0.33, 0.27, 1.0)),
+    "crosswalk": LayerLook(0.1, 0.020, (0.62, 0.62, 0.60, 1.0), area=True),
+    "bump": LayerLook(0.2, 0.05, (0.80, 0.55, 0.20, 1.0), area=True),
+    "white": LayerLook(0.07, 0.03, WHITE),
+    "white-broken": LayerLook(0.07, 0.03, WHITE, broken=True),
+    "yellow": LayerLook(0.07, 0.03, YELLOW),
+    "yellow-broken": LayerLook(0.07, 0.03, YELLOW, broken=True),
+    "edge": LayerLook(0.10, 0.14, (0.66, 0.65, 0.62, 1.0)),
 }
 ASPHALT, ASPHALT_M, PATCH_M = (0.20, 0.21, 0.23, 1.0), 0.008, 0.014
 
 
 def find_surfaces(scene: Scene) -> list[Surface]:
     """Surfaces of one world on the host."""
-    lines = [
-        (shapely.simplify(shapely.LineString(points), STRAIGHT_M), kind) for points, kind in world_mjcf.join_segments(scene.road, None)
-    ]
-    lanes = [line.buffer(LANE_M, quad_segs=4) for line, kind in lines if kind in (*DRIVABLE, LANE_BIKE)]
-    asphalt = shapely.union_all(lanes).buffer(CLOSING_M, quad_segs=3).buffer(-CLOSING_M, quad_segs=3) if lanes else None
-    found = [] if asphalt is None else [prism("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]
-    for name, layer in LAYERS.items():
-        shapes = [_shape(line, layer) for line, kind in lines if kind in layer.kinds]
-        if shapes:
-            found.append(prism(name, shapely.union_all(shapes), layer.height_m, layer.colour))
+    lines = [(shapely.LineString(points), kind) for points, kind in join_segments(scene.road)]
+    lanes = [line.buffer(LANE_M, quad_segs=4) for line, kind in lines if kind in (*LAYERS["lane"], *LAYERS["bike"])]
+    asphalt = shapely.union_all(lanes).buffer(CLOSING_M, quad_segs=3).buffer(-CLOSING_M, quad_segs=3)
+    surfaces = [prism("asphalt", shapely.simplify(asphalt, STRAIGHT_M), ASPHALT_M, ASPHALT)]
+    for name, look in LOOKS.items():
+        shapes = [_shape(line, look) for line, kind in lines if kind in LAYERS[name]]
+        surfaces.append(prism(name, shapely.union_all(shapes), look.height_m, look.colour))
     for number, area in enumerate(patch_overlay.areas(scene.weather)):
-        whole = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
-        colour = (*rgb(area.colour), 0.75)
-        found.append(prism(f"patch{number}", whole, PATCH_M + 0.001 * number, colour))
-    return [surface for surface in found if len(surface.faces)]
+        patch = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
+        surfaces.append(prism(f"patch{number}", patch, PATCH_M + 0.001 * number, (*rgb(area.colour), 0.75)))
+    return [surface for surface in surfaces if len(surface.faces)]
 
 
-def _shape(line: shapely.LineString, layer: Layer) -> shapely.Geometry:
-    if layer.area and len(line.coords) > 3 and shapely.get_point(line, 0).distance(shapely.get_point(line, -1)) < 0.1:
+def _shape(line: shapely.LineString, look: LayerLook) -> shapely.Geometry:
+    if look.area and len(line.coords) > 3 and shapely.get_point(line, 0).distance(shapely.get_point(line, -1)) < 0.1:
         return shapely.Polygon(line).buffer(0)
-    if not layer.broken:
-        return line.buffer(layer.half_m, cap_style="flat", join_style="mitre")
+    if not look.broken:
+        return line.buffer(look.half_m, cap_style="flat", join_style="mitre")
     begins = np.arange(0.0, line.length, DASH_M + GAP_M)
     dashes = [ops.substring(line, begin, begin + DASH_M) for begin in begins]
-    return shapely.union_all([dash.buffer(layer.half_m, cap_style="flat") for dash in dashes])
+    return shapely.union_all([dash.buffer(look.half_m, cap_style="flat") for dash in dashes])
 
 
-def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[float]) -> Surface:
+def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Colour) -> Surface:
     """Extrudes polygons from the ground: tops face up, walls face outwards, no bottoms."""
     vertices: list[Float[np.ndarray, "n 3"]] = [np.zeros((0, 3))]
     faces: list[Int[np.ndarray, "n 3"]] = [np.zeros((0, 3), int)]
@@ -91,13 +84,13 @@ def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[
     for polygon in shapely.get_parts(shape):
         if polygon.geom_type != "Polygon" or polygon.area < 1e-4:
             continue
-        whole = shapely.orient_polygons(polygon)  # exterior counter-clockwise, holes clockwise
-        tops = [_face_up(np.asarray(triangle.exterior.coords)[:3]) for triangle in shapely.constrained_delaunay_triangles(whole).geoms]
-        corners = np.concatenate(tops)
+        polygon = shapely.orient_polygons(polygon)  # exterior counter-clockwise, holes clockwise
+        triangles = shapely.orient_polygons(shapely.constrained_delaunay_triangles(polygon))
+        corners = np.concatenate([shapely.get_coordinates(triangle)[:3] for triangle in triangles.geoms])
         vertices.append(np.c_[corners, np.full(len(corners), height_m)])
         faces.append(count + np.arange(len(corners)).reshape(-1, 3))
         count += len(corners)
-        for ring in (whole.exterior, *whole.interiors):
+        for ring in (polygon.exterior, *polygon.interiors):
             points = np.asarray(ring.coords)
             here, there = points[:-1], points[1:]
             low, high = np.zeros(len(here)), np.full(len(here), height_m)
@@ -105,12 +98,7 @@ def prism(name: str, shape: shapely.Geometry, height_m: float, colour: Sequence[
             corner = count + np.arange(len(here))[:, None] + len(here) * np.array([0, 1, 2, 0, 2, 3])
             faces.append(corner.reshape(-1, 3))
             count += 4 * len(here)
-    return Surface(name, np.concatenate(vertices), np.concatenate(faces), (colour[0], colour[1], colour[2], colour[3]))
-
-
-def _face_up(triangle: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "3 2"]:
-    (ax, ay), (bx, by) = triangle[1] - triangle[0], triangle[2] - triangle[0]
-    return triangle if ax * by > ay * bx else triangle[::-1]
+    return Surface(name, np.concatenate(vertices), np.concatenate(faces), colour)
 
 
 def extent(road: Road) -> tuple[Float[np.ndarray, "2"], float]:

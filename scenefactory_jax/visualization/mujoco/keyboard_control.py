@@ -57,19 +57,19 @@ class Controls(NamedTuple):
 
 
 def move_controls(
-    now: Controls, pressed: Set[str], held: Set[str], *, speed: float, response: KeyboardResponse, dt: float
+    now: Controls, pressed: Set[str], keys_down: Set[str], *, speed: float, response: KeyboardResponse, dt: float
 ) -> Controls:  # fmt: skip
     """Computes pedals and steering wheel one control step later.
 
     Args:
         pressed: commands of the keys that went down since the last step.
-        held: commands of the keys that are known to be down.
+        keys_down: commands of the keys that are known to be down.
         speed: of the car, m/s; the steering range shrinks with it.
         dt: of the step, s.
     """
     down = {name: left - dt for name, left in now.down.items() if left > dt}
     down |= {name: response.tap_s for name in pressed if name in PEDALS}
-    on = held | set(down)
+    on = keys_down | set(down)
     target = (("left" in on) - ("right" in on)) / (1.0 + (speed / response.half_steer_mps) ** 2)
     turn_s = response.turn_s if target and target * now.steer >= 0.0 else response.centre_s
     pedals = {
@@ -141,12 +141,12 @@ def start(world: World, *, seed: int) -> Drive:
     return Drive(state, observation, None, 0.0, start_key, key, Controls(), paused=False, chasing=True, resets=0, steps=0)
 
 
-def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, response: KeyboardResponse) -> Drive:
+def advance(world: World, drive: Drive, pressed: Set[str], keys_down: Set[str], *, response: KeyboardResponse) -> Drive:
     """Computes one control step, unless paused. The command `reset`, an inactive car and a car off the map restart the drive.
 
     Args:
         pressed: commands (fields of `Keys`) of the keys that went down since the last call.
-        held: commands of the keys that are down.
+        keys_down: commands of the keys that are down.
     """
     drive = drive._replace(paused=drive.paused ^ ("pause" in pressed), chasing=drive.chasing ^ ("camera" in pressed))
     if "reset" in pressed or drive.road_distance_m > world.off_map_m or not bool(drive.state.active[world.car]):
@@ -156,7 +156,7 @@ def advance(world: World, drive: Drive, pressed: Set[str], held: Set[str], *, re
     if drive.paused:
         return drive
     speed = 0.0 if drive.shot is None else float(drive.shot.speed[world.car])
-    controls = move_controls(drive.controls, pressed, held, speed=speed, response=response, dt=world.dt)
+    controls = move_controls(drive.controls, pressed, keys_down, speed=speed, response=response, dt=world.dt)
     action = jnp.array([controls.throttle, controls.steer, controls.brake], jnp.float32)
     key, step_key = jax.random.split(drive.key)
     state, observation, shot, distance = world.step(drive.state, drive.observation, step_key, action)

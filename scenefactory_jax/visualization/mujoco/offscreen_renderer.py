@@ -28,11 +28,7 @@ class OpenGLError(ValueError):
 
 
 def check() -> None:
-    """Draws an empty picture.
-
-    Raises:
-        OpenGLError: see `make_painter`.
-    """
+    """Draws an empty picture; errors as of `make_painter`."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with make_painter(model, mujoco.MjData(model), width=8, height=8) as paint:
         paint(mujoco.MjvCamera(), lambda scene: None)

@@ -87,8 +87,8 @@ class Keyboard:
             pressed.add(self.codes.get(self.presses.get(), ""))
         if self.window is None:
             return pressed, set()
-        held = {command for code, command in self.codes.items() if command in PEDALS and glfw.get_key(self.window, code) == glfw.PRESS}
-        return pressed, held
+        keys_down = {command for code, command in self.codes.items() if command in PEDALS and glfw.get_key(self.window, code) == glfw.PRESS}
+        return pressed, keys_down
 
 
 def drive(

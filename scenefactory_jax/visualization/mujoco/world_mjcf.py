@@ -2,19 +2,17 @@
 # pyright: reportAttributeAccessIssue=false
 # mujoco is an extension module without stubs
 
-import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
-import shapely
-from jaxtyping import Float
 
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Road, Scene
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Scene
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
+from scenefactory_jax.visualization.road_lines import STRAIGHT_M, join_segments
 
 WHITE, YELLOW = (0.95, 0.95, 0.95, 1.0), (0.95, 0.75, 0.15, 1.0)
 PAINT = dict.fromkeys(LINES[:3], WHITE) | dict.fromkeys(LINES[3:], YELLOW)  # WOMD: 6-8 white, 9-13 yellow
@@ -27,9 +25,7 @@ COLOURS = PAINT | {
     DRIVEWAY: (0.55, 0.45, 0.60, 1.0),
 }
 GREY = (0.5, 0.5, 0.5, 1.0)
-JOINED_M = 1e-3  # float32 ends of neighbouring segments differ by less
 LINE_HALF_M, LINE_M, TRAFFIC_M = 0.05, 0.02, 1.5  # half width and height of lines, height of traffic
-STRAIGHT_M = 0.05  # neighbouring segments become one box where that moves no point farther
 VISUAL = {"contype": 0, "conaffinity": 0}
 
 
@@ -87,24 +83,6 @@ def build_world(
         half = np.r_[np.asarray(boxes.size, float)[row] / 2, TRAFFIC_M / 2]
         _add_box(model, np.asarray(boxes.position, float)[row], float(boxes.yaw[row]), half, GREY, name=f"traffic{row}")
     return model
-
-
-def join_segments(road: Road, tolerance_m: float | None) -> Iterator[tuple[Float[np.ndarray, "N 2"], int]]:
-    """Joins valid segments into polylines, simplified within a tolerance (Douglas-Peucker); yields points and kind."""
-    valid = np.asarray(road.valid)
-    midpoint, direction = np.asarray(road.midpoint, np.float64)[valid], np.asarray(road.direction, np.float64)[valid]
-    half = direction * np.asarray(road.half_length, np.float64)[valid, None]
-    kind, polyline = np.asarray(road.kind)[valid], np.asarray(road.polyline)[valid]
-    first, last = midpoint - half, midpoint + half
-    joined = (polyline[1:] == polyline[:-1]) & (np.abs(first[1:] - last[:-1]).max(axis=1, initial=0.0) < JOINED_M)
-    breaks = np.concatenate([[0], np.flatnonzero(~joined) + 1, [len(kind)]])
-    for begin, end in itertools.pairwise(breaks.tolist()):
-        if begin == end:
-            continue
-        points = np.concatenate([first[begin:end], last[end - 1 : end]])
-        if tolerance_m is not None:
-            points = np.asarray(shapely.LineString(points).simplify(tolerance_m, preserve_topology=False).coords)
-        yield points, int(kind[begin])
 
 
 def _build_ground(scene_size_m: float | int) -> mujoco.MjSpec:

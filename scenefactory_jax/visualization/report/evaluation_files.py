@@ -1,15 +1,15 @@
-"""The folder of an evaluation: tables of agents, figures, video, pictures of failures and report.md."""
+"""Writes the folder of an evaluation: tables of agents, figures, video, pictures of failures and report.md."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from scenefactory_jax.core.trajectory import Trajectory
-from scenefactory_jax.evaluation import circumstances, episode_records, failures, statistics
+from scenefactory_jax.evaluation import circumstances, episode_records, statistics
 from scenefactory_jax.evaluation.protocols import Evaluated
-from scenefactory_jax.evaluation.records import begin_folder, write_records
+from scenefactory_jax.evaluation.records import Records, begin_folder, write_records
 from scenefactory_jax.evaluation.statistics import Estimate
 from scenefactory_jax.loggers import metrics_csv
 from scenefactory_jax.visualization.birds_eye import figures, video
@@ -31,104 +31,99 @@ def write(
     *,
     config: Mapping[str, Any],
     run: Path,
-    asked: Mapping[str, Any],
+    request: Mapping[str, Any],
     settings: Mapping[str, Any],
     versions: Mapping[str, str],
-    commands: Sequence[str],
+    command: str,
 ) -> Result:
     """Writes records, figures, video, pictures of failures and report.md of an evaluation to `out`, while its episodes run.
 
     Files of an earlier evaluation are removed once the first episodes have run.
 
     Args:
-        evaluated: see `protocols.evaluate_protocols`.
-        config: of the evaluated environment, resolved.
+        config: of the evaluated environment.
         run: folder of the run, for its learning curves.
-        asked: run, scenes (None: the run's own held-out ones), overrides, protocol, protocols and trust, as they were named.
+        request: run, scenes (None: the run's own held-out ones), overrides, protocol, protocols and trust of the command.
         settings: of the evaluation, with `video`, `failures`, `bootstrap` and `seed`.
+        command: repeats the evaluation.
     """
     out.mkdir(parents=True, exist_ok=True)
+    episodes = circumstances.describe(config)
     records, trajectories, pictures = {}, [], {}
-    for one in evaluated:
+    for evaluation in evaluated:
+        label, recording = evaluation.label, evaluation.recording
         if not records:
-            noted = {**asked, "episodes": circumstances.describe(config)}
-            begin_folder(out, {**noted, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
-        records[one.label] = one.records
-        write_records(out / _agents_file(one.label), one.records)
-        if one.recording is None or one.policy != "trained":
+            begin_folder(out, {**request, "episodes": episodes, **{key: settings[key] for key in ("seed", "repeats", "untrained")}})
+        records[label] = evaluation.records
+        write_records(out / _agents_file(label), evaluation.records)
+        if recording is None or evaluation.policy != "trained":
             continue
         if settings["video"]["enable"] and not trajectories:
-            trajectories = _filmed_worlds(config, one.recording, settings["video"])
+            steps = round(settings["video"]["seconds"] * float(config["timing"]["control_hz"]))
+            worlds = range(min(settings["video"]["worlds"], len(recording.names)))
+            trajectories = [episode_records.trajectory(recording, world, steps=steps) for world in worlds]
         if settings["failures"]["pictures"]["enable"]:
-            pictures[one.label] = failure_pictures.draw(out, one.label, one.records, one.recording, settings)
-    resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
-    summary = {label: statistics.summarise(rows, **resampling) for label, rows in records.items()}
+            pictures[label] = failure_pictures.draw(out, label, evaluation.records, recording, settings)
+    summary = {name: statistics.summarise(rows, bootstrap=settings["bootstrap"], seed=settings["seed"]) for name, rows in records.items()}
     metrics = metrics_csv.read(run)
-    baselines = {name: f"{name}, untrained" for name in summary if f"{name}, untrained" in summary}
     files = {f"Agents, {name}": out / _agents_file(name) for name in records}
     files["Failures, ranked"] = failure_pictures.write(out, records, pictures)
     if metrics:
         files["Metrics of the training"] = run / metrics_csv.FILE
     report = evaluation_report.write(
         out,
-        title=title(config["name"], asked),
-        summary=summary,
+        title=format_title(config["name"], request),
         records=records,
+        summary=summary,
+        settings=settings,
         config=config,
         versions=versions,
-        **resampling,
-        baselines=baselines,
-        figures=_figures(out, metrics, records, summary, baselines, trajectories),
-        videos=_videos(out, trajectories, settings["video"]),
-        failed=pictures,
-        kinds=failures.list_thresholds(settings["failures"]),
+        episodes={"Protocol": f"`{request['protocol']}`", **episodes},
+        command=command,
+        figures=_draw_figures(out, metrics, records, summary, trajectories),
+        videos=_write_video(out, trajectories, settings["video"]) if trajectories else {},
+        failure_pictures=pictures,
         files=files,
-        commands=commands,
-        episodes={"Protocol": f"`{asked['protocol']}`", **circumstances.describe(config)},
     )
     return Result(out, records, summary, report)
+
+
+def format_title(name: str, request: Mapping[str, Any]) -> str:
+    """Formats the heading; only the run's own held-out scenes are called scenes not seen in training."""
+    if request["scenes"] is not None:
+        return f"{name}: evaluation on {Path(request['scenes']).name}"
+    changed = any(override.startswith("scenes") for override in request["overrides"])
+    return f"{name}: evaluation on {'other scenes' if changed else 'scenes not seen in training'}"
 
 
 def _agents_file(label: str) -> str:
     return f"agents-{label.replace(', ', '-')}.csv"
 
 
-def _filmed_worlds(config: Mapping[str, Any], recording: episode_records.Recording, settings: Mapping[str, Any]) -> list[Trajectory]:
-    """The first worlds, as long as the video is."""
-    steps = round(settings["seconds"] * float(config["timing"]["control_hz"]))
-    worlds = min(settings["worlds"], len(recording.names))
-    return [episode_records.trajectory(recording, index, steps=steps) for index in range(worlds)]
-
-
-def title(name: str, asked: Mapping[str, Any]) -> str:
-    """The heading, which says of no other scenes than the run's own held-out ones that training never saw them."""
-    changed = any(override.startswith("scenes") for override in asked["overrides"])
-    own = "other scenes" if changed else "scenes not seen in training"
-    return f"{name}: evaluation on {own if asked['scenes'] is None else Path(asked['scenes']).name}"
-
-
-def _figures(out: Path, metrics, records, summary, baselines, trajectories) -> dict[str, Path]:
+def _draw_figures(
+    out: Path,
+    metrics: list[dict[str, float]],
+    records: Mapping[str, Records],
+    summary: Mapping[str, Mapping[str, Estimate]],
+    trajectories: list[Trajectory],
+) -> dict[str, Path]:
     """Caption -> picture."""
-    found = {}
-    for name, baseline in baselines.items():
-        figure = plots.comparison_figure(summary[baseline], summary[name], names=("untrained", "trained"))
-        found[f"Untrained and trained, {name}"] = plots.save(figure, out / f"comparison-{name}.png")
+    drawn = {}
+    for name in summary:
+        if (baseline := name + evaluation_report.UNTRAINED) in summary:
+            figure = plots.rates_figure({"untrained": summary[baseline], "trained": summary[name]})
+            drawn[f"Untrained and trained, {name}"] = figure, f"comparison-{name}"
     if metrics:
-        found["Training"] = plots.save(plots.learning_figure(metrics), out / "learning.png")
+        drawn["Training"] = plots.learning_figure(metrics), "learning"
     first = next(iter(records))
-    found[f"How agents ended in each scene, {first}"] = plots.save(plots.outcome_figure(records[first]), out / "outcomes.png")
-    found["Surrogate safety"] = plots.save(plots.safety_figure(records), out / "safety.png")
+    drawn[f"How agents ended in each scene, {first}"] = plots.outcome_figure(records[first]), "outcomes"
+    drawn["Surrogate safety"] = plots.safety_figure(records), "safety"
     if trajectories:
-        figure = figures.trajectory_figure(trajectories[0])
-        found[f"Ways driven, {trajectories[0].title}"] = plots.save(figure, out / "trajectories.png")
-    return found
+        drawn[f"Trajectories, {trajectories[0].title}"] = figures.trajectory_figure(trajectories[0]), "trajectories"
+    return {caption: plots.save(figure, out / f"{name}.png") for caption, (figure, name) in drawn.items()}
 
 
-def _videos(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any]) -> dict[str, Path]:
-    if not trajectories:
-        return {}
-    path = out / f"video{settings['suffix']}"
-    look = {key: settings[key] for key in ("fps", "stride", "columns", "panel", "trail_s")}
-    video.write(path, trajectories, **look)
+def _write_video(out: Path, trajectories: list[Trajectory], settings: Mapping[str, Any]) -> dict[str, Path]:
+    path = video.write(out / f"video{settings['suffix']}", trajectories, **{key: settings[key] for key in video.SETTINGS})
     speed = settings["fps"] * settings["stride"] / trajectories[0].control_hz
     return {f"Deterministic policy, {speed:g} x real time": path}

@@ -1,5 +1,6 @@
-"""What an evaluation leaves of its failures: pictures of the worst of each kind, and a file with all of them."""
+"""Writes the failures of an evaluation: pictures of the worst of each type, and a file with all of them."""
 
+import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,51 +13,47 @@ from scenefactory_jax.visualization.birds_eye import video
 from scenefactory_jax.visualization.birds_eye.failure_figures import Case, failures_figure
 from scenefactory_jax.visualization.report import plots
 
-FILE = "failures.json"
-_AFTER_S = 2.0  # a film goes on for that long
+_AFTER_S = 2.0  # of a film, after the failure
 
 
 def draw(
     out: Path, label: str, records: episode_records.Records, recording: episode_records.Recording, settings: Mapping[str, Any]
 ) -> dict[str, Path]:
-    """Draw the worst of every kind that occurred; returns kind -> picture, and "film" -> film if the settings want one."""
-    numbers, found, stem = settings["failures"]["pictures"], failures.rank_failures(records), label.replace(", ", "-")
-    worlds: dict[int, Trajectory] = {}
+    """Draws the worst failures of every type that occurred; returns type -> picture, and "film" -> film if the settings ask for one."""
+    numbers, stem = settings["failures"]["pictures"], label.replace(", ", "-")
+    ranked = failures.rank_failures(records)
+    trajectory = functools.cache(functools.partial(episode_records.trajectory, recording))
 
     def case(failure: Failure) -> Case:
-        if failure.world not in worlds:
-            worlds[failure.world] = episode_records.trajectory(recording, failure.world)
-        met = failure.kind in ("at_fault", "struck")
-        return Case(failure, worlds[failure.world], int(records["collision_partner"][failure.row]) if met else None)
+        partner = int(records["collision_partner"][failure.row]) if failure.kind in ("at_fault", "struck") else None
+        return Case(failure, trajectory(failure.world), partner)
 
     paths = {}
-    for kind, ranked in found.items():
-        cases = [case(failure) for failure in failures.find_worst_failures(ranked, numbers["panels"])]
+    for kind, worst in ranked.items():
+        cases = [case(failure) for failure in failures.find_worst_failures(worst, numbers["panels"])]
         figure = failures_figure(cases, before_s=numbers["before_s"])
         paths[kind] = plots.save(figure, out / f"failures-{stem}-{kind}.png", dpi=120)
-    if numbers["video"] and found:
-        look = {key: settings["video"][key] for key in ("fps", "stride", "columns", "panel", "trail_s")}
-        films = [_film(case(ranked[0]), before_s=numbers["before_s"]) for ranked in found.values()]
-        paths["film"] = video.write(out / f"failures-{stem}{settings['video']['suffix']}", films, **look)
+    if numbers["video"] and ranked:
+        films = [_clip(worst[0], trajectory(worst[0].world), before_s=numbers["before_s"]) for worst in ranked.values()]
+        path = out / f"failures-{stem}{settings['video']['suffix']}"
+        paths["film"] = video.write(path, films, **{key: settings["video"][key] for key in video.SETTINGS})
     return paths
 
 
-def _film(case: Case, *, before_s: float) -> Trajectory:
+def _clip(failure: Failure, trajectory: Trajectory, *, before_s: float) -> Trajectory:
     """The seconds around a failure."""
-    failure, whole = case.failure, case.trajectory
-    middle, hz = failure.moment_s * whole.control_hz, whole.control_hz
-    first, last = max(round(middle - before_s * hz), 0), round(middle + _AFTER_S * hz)
-    title = f"{FAILURE_TYPES[failure.kind].label}: car {failure.agent}, {whole.title}"
-    return whole.clip(first, last)._replace(title=title)
+    first, last = (round((failure.moment_s + offset) * trajectory.control_hz) for offset in (-before_s, _AFTER_S))
+    title = f"{FAILURE_TYPES[failure.kind].label}: car {failure.agent}, {trajectory.title}"
+    return trajectory.clip(max(first, 0), last)._replace(title=title)
 
 
 def write(out: Path, records: Mapping[str, episode_records.Records], pictures: Mapping[str, Mapping[str, Path]]) -> Path:
-    """Write `failures.json`: name of the records -> counts, shares, scenes, ranked failures and pictures by kind."""
-    found = {label: failures.as_json(rows) for label, rows in records.items()}
+    """Writes failures.json: name of the records -> counts, fractions, scenes, ranked failures and pictures by type."""
+    content = {label: failures.as_json(rows) for label, rows in records.items()}
     for label, paths in pictures.items():
-        for kind, path in paths.items():
-            if kind in found[label]["types"]:
-                found[label]["types"][kind]["picture"] = path.name
-    path = out / FILE
-    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        for kind, entry in content[label]["types"].items():
+            if kind in paths:
+                entry["picture"] = paths[kind].name
+    path = out / "failures.json"
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return path

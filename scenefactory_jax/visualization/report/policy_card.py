@@ -1,12 +1,11 @@
-"""The card of a policy that is handed on: what it is, how it was trained, how it was judged."""
+"""The card of an exported policy: what it is, how it was trained, and its scores."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from scenefactory_jax.core import markdown
-from scenefactory_jax.evaluation import statistics
-from scenefactory_jax.evaluation.metrics import agent_metrics
-from scenefactory_jax.visualization.report import evaluation_report, tables
+from scenefactory_jax.visualization.report import document, tables
+from scenefactory_jax.visualization.report.tables import Summary
 
 SHOWN = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate")
 
@@ -18,38 +17,39 @@ def format_card(
     config: Mapping[str, Any],
     versions: Mapping[str, str],
     training: Sequence[Mapping[str, float]],
-    judged: Mapping[str, Mapping[str, Mapping[str, statistics.Estimate]]],
+    scores: Mapping[str, Mapping[str, Summary]],
     episodes: Mapping[str, Mapping[str, str]],
     outside: Sequence[str],
 ) -> str:
-    """The card as Markdown.
+    """Formats the card as Markdown.
 
     Args:
-        name: of the policy.
-        about: a paragraph of whoever hands it on: what it is for, and what not.
-        config: it was trained with.
-        versions: of packages and device, and the commit, of the training.
-        training: rows of its metrics, first to last; none: the training left no record.
-        judged: what was driven -> protocol -> `tables.summarise` of its records.
-        episodes: what was driven -> what decided its episodes, "Starts" -> "as recorded, from rest".
+        about: what the policy is for, and what not.
+        config, versions, training: of the training; `training` are the rows of its metrics, empty without a record.
+        scores: evaluation -> protocol -> `statistics.summarise` of its records.
+        episodes: evaluation -> what decided its episodes, "Starts" -> "as recorded, from rest".
         outside: functions that the config names and the package does not have.
     """
-    parts = [f"# {name}", about or "", "## Training", markdown.format_table(["", ""], _training(config, versions, training))]
-    if judged:
-        parts += ["## Scores", *_scores(judged), _episodes(episodes)]
-    learnt = "`checkpoints/policy.npz` what was learnt (its digest: `checkpoints/SHA256SUMS`)"
-    parts += ["## Files", f"`config.yaml` has every setting of the training, {learnt}. {_code(outside)}"]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    described = {what: "; ".join(f"{label.lower()}: {text}" for label, text in rows.items()) for what, rows in episodes.items() if rows}
+    text = document.join(
+        f"# {name}",
+        about or "",
+        document.section("Training", markdown.format_table(["", ""], _training(config, versions, training))),
+        document.section("Scores", *_scores(scores), "\n".join(f"- **{what}**: {text}." for what, text in described.items())),
+        "## Files",
+        "`config.yaml` has every setting of the training, `checkpoints/policy.npz` the parameters. "
+        + _describe_code(outside),
+    )
+    return text + "\n"
 
 
-def _code(outside: Sequence[str]) -> str:
-    """Which code runs when the policy is loaded."""
+def _describe_code(outside: Sequence[str]) -> str:
+    """The code that runs when the policy is loaded."""
     if not outside:
         return "The config names functions of scenefactory_jax alone: loading the policy runs no other code."
-    named = ", ".join(f"`{target}`" for target in outside)
     return (
-        f"The config names functions outside of scenefactory_jax: {named}. They are not in this folder. Whoever loads the policy needs them"
-        " on the Python path, and allows them by `trust=true` (in Python `trust=True`): read them first."
+        f"The config names functions outside of scenefactory_jax: {', '.join(f'`{target}`' for target in outside)}. They are not in this "
+        "folder. Loading the policy needs them on the Python path, and `trust=true` (in Python `trust=True`): read them first."
     )
 
 
@@ -66,20 +66,15 @@ def _training(config: Mapping[str, Any], versions: Mapping[str, str], training: 
     return rows + [[name, str(version)] for name, version in versions.items()]
 
 
-def _episodes(episodes: Mapping[str, Mapping[str, str]]) -> str:
-    """Starts, weather and the rest of each that was driven."""
-    told = {what: "; ".join(f"{label.lower()}: {words}" for label, words in found.items()) for what, found in episodes.items() if found}
-    return "\n".join(f"- **{what}**: {words}." for what, words in told.items())
-
-
-def _scores(judged: Mapping[str, Mapping[str, Mapping[str, statistics.Estimate]]]) -> list[str]:
-    """A table, what its marks mean, and what the protocols are."""
-    placed = {(what, protocol): summary for what, protocols in judged.items() for protocol, summary in protocols.items()}
-    found = {place: {metric: summary[metric] for metric in SHOWN} for place, summary in placed.items()}
-    rows = [[*place, shown["success_rate"].count, *map(tables.format_estimate, shown.values())] for place, shown in found.items()]
-    table = markdown.format_table(["Driven", "Protocol", "n", *(agent_metrics.METRICS[metric].label for metric in SHOWN)], rows)
-    rules = [
-        f"- **{name}**: {text}." for name, text in evaluation_report.PROTOCOLS.items() if any(name == protocol for _, protocol in found)
-    ]
-    notes = evaluation_report.marks({" ".join(place): shown for place, shown in found.items()})
-    return [table, f"{notes} No interval holds seeds of training: this is one policy.", "\n".join(rules)]
+def _scores(scores: Mapping[str, Mapping[str, Summary]]) -> list[str]:
+    """A table, the meaning of its marks, and the protocols."""
+    if not scores:
+        return []
+    summaries = {
+        (evaluation, protocol): {name: summary[name] for name in SHOWN}
+        for evaluation, protocols in scores.items() for protocol, summary in protocols.items()
+    }  # fmt: skip
+    rows = [([*place, summary["success_rate"].count], summary) for place, summary in summaries.items()]
+    notes = f"{tables.explain_marks(summaries.values())} No interval holds seeds of training: this is one policy."
+    protocols = tables.define_protocols({protocol for _, protocol in summaries})
+    return [tables.format_rows(["Driven", "Protocol", "n"], rows, SHOWN), notes, protocols]

@@ -1,4 +1,4 @@
-"""compare.md and its figure, from the result of `compare` alone."""
+"""Writes compare.md and its figure, from the result of `compare` alone."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,75 +10,62 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from scenefactory_jax.core import markdown
-from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
-from scenefactory_jax.evaluation.statistics import Estimate
-from scenefactory_jax.visualization.report import plots, tables
+from scenefactory_jax.visualization.report import document, plots, tables
 
 Result = Mapping[str, Any]
 INTERVALS = "Intervals resample seeds of training, scenes and agents; those of a single seed hold scenes and agents alone."
 
 
 def write(folder: Path, result: Result) -> Path:
-    """Write `folder`/compare.md and compare.png, and return the report's path."""
-    settings = result["settings"]
-    picture = plots.save(figure(result), folder / "compare.png")
-    words = (
+    """Writes `folder`/compare.md and compare.png, and returns the path of the report."""
+    settings, groups = result["settings"], result["groups"]
+    curves = plots.save(figure(groups, settings["metrics"]), folder / "compare.png")
+    text = (
         f"Means over seeds, smallest and largest seed in brackets; metrics of the last {100 * settings['last']:g} % of the iterations. In "
         "the figure lines are means over seeds and bands reach from the smallest to the largest seed, each a running mean of "
         f"{settings['window']} iterations. Runs of one group are cut to the length of the shortest."
     )
-    lines = ["# Runs compared", f"`{result['command']}`", words, table(result), f"![Learning curves]({picture.name})"]
-    for name in dict.fromkeys(name for group in result["groups"].values() for name in group["evaluated"]):
-        shown = {label: _summary(group["evaluated"][name]) for label, group in result["groups"].items() if name in group["evaluated"]}
-        lines += [f"## Evaluation at the end, {name}", tables.format_summaries(shown), INTERVALS]
-    path = folder / "compare.md"
-    path.write_text("\n\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    parts = ["# Runs compared", f"`{result['command']}`", text, table(result), f"![Learning curves]({curves.name})"]
+    for name in dict.fromkeys(name for group in groups.values() for name in group["evaluated"]):
+        evaluated = {label: group["evaluated"][name] for label, group in groups.items() if name in group["evaluated"]}
+        summaries = {label: tables.read_estimates(values) for label, values in evaluated.items()}
+        parts += [f"## Evaluation at the end, {name}", tables.format_summaries(summaries), INTERVALS]
+    return document.write(folder / "compare.md", *parts)
 
 
 def table(result: Result) -> str:
-    """A row for each group: what differs, how long it ran, and its metrics at the end."""
+    """Formats a row for each group: what differs, its duration, and its metrics at the end."""
     metrics = result["settings"]["metrics"]
     rows = []
     for label, group in result["groups"].items():
-        steps = f"{group['steps'][-1] / 1e6:.1f} M"
-        spent = [_spread(group["minutes"], ".1f"), _spread(group["casps"], ",.0f")]
+        durations = [f"{group['steps'][-1] / 1e6:.1f} M", _spread(group["minutes"], ".1f"), _spread(group["casps"], ",.0f")]
         ends = [_spread(group["last"][name], ".3g") for name in metrics]
-        rows.append([label, len(group["seeds"]), group["iterations"], steps, *spent, *ends])
+        rows.append([label, len(group["seeds"]), group["iterations"], *durations, *ends])
     return markdown.format_table(["Runs", "Seeds", "Iterations", "Agent steps", "Minutes", "Steps/s", *metrics], rows)
 
 
 def _spread(values: list[float], form: str) -> str:
-    """Mean, and the smallest and largest of several."""
-    middle = format(float(np.mean(values)), form)
-    return middle if len(values) == 1 else f"{middle} [{format(min(values), form)}, {format(max(values), form)}]"
+    """Mean, and the smallest and largest of several values."""
+    mean, low, high = (format(float(value), form) for value in (np.mean(values), min(values), max(values)))
+    return mean if len(values) == 1 else f"{mean} [{low}, {high}]"
 
 
-def _summary(evaluated: Mapping[str, Mapping[str, Any]]) -> dict[str, Estimate]:
-    return {name: Estimate(**estimate) for name, estimate in evaluated.items() if name in METRICS}
+@matplotlib.rc_context(plots.STYLE)
+def figure(groups: Mapping[str, Mapping[str, Any]], metrics: Mapping[str, str] | list[str]) -> Figure:
+    """Draws one panel a metric, over agent steps.
 
-
-def figure(result: Result) -> Figure:
-    """One panel a metric, over agent steps."""
-    metrics = result["settings"]["metrics"]
-    columns = min(2, len(metrics))
-    with matplotlib.rc_context(plots.STYLE):
-        whole = Figure(figsize=(5.6 * columns, 2.5 * -(-len(metrics) // columns) + 0.6), layout="constrained")
-        panels = whole.subplots(-(-len(metrics) // columns), columns, squeeze=False).ravel()
-        for axes, name in zip(panels, metrics, strict=False):
-            for colour, (label, group) in zip(_colours(len(result["groups"])), result["groups"].items(), strict=True):
-                seeds = np.array(group["curves"][name], float)
-                axes.plot(group["steps"], seeds.mean(axis=0), color=colour, label=f"{label} ({len(seeds)} seeds)")
-                axes.fill_between(group["steps"], seeds.min(axis=0), seeds.max(axis=0), color=colour, alpha=0.18, linewidth=0)
-            axes.set_title(name)
-            axes.set_xlabel("agent steps")
-            axes.xaxis.set_major_formatter(EngFormatter())
-        for axes in panels[len(metrics) :]:
-            axes.remove()
-        handles, labels = panels[0].get_legend_handles_labels()
-        whole.legend(handles, labels, loc="outside upper left", ncols=1)
-    return whole
-
-
-def _colours(count: int) -> list[str]:
-    return [plots.COLOURS[i % len(plots.COLOURS)] for i in range(count)]
+    Args:
+        groups: label -> `steps` and `curves`, a mapping metric -> values of each seed.
+        metrics: columns of the curves, or column -> title.
+    """
+    titles = metrics if isinstance(metrics, Mapping) else dict(zip(metrics, metrics, strict=True))
+    drawn, panels = plots.make_grid(len(titles), columns=2, size=(5.6, 2.5), extra=0.6)
+    for axes, (name, title) in zip(panels, titles.items(), strict=True):
+        for index, (label, group) in enumerate(groups.items()):
+            colour, seeds = plots.COLOURS[index % len(plots.COLOURS)], np.array(group["curves"][name], float)
+            axes.plot(group["steps"], seeds.mean(axis=0), color=colour, label=f"{label} ({len(seeds)} seeds)")
+            axes.fill_between(group["steps"], seeds.min(axis=0), seeds.max(axis=0), color=colour, alpha=0.18, linewidth=0)
+        axes.set(title=title, xlabel="agent steps")
+        axes.xaxis.set_major_formatter(EngFormatter())
+    plots.add_legend(drawn)
+    return drawn

@@ -1,8 +1,9 @@
 """quality.md: what rules found on a set of scenes, their thresholds, and a picture of examples for each rule."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -14,7 +15,7 @@ from scenefactory_jax.core import markdown
 from scenefactory_jax.core.raw_scene import RawScene, Track
 from scenefactory_jax.core.safe_names import escape_for_terminal
 from scenefactory_jax.core.types import DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES
-from scenefactory_jax.data.curation.quality_gate import Finding
+from scenefactory_jax.data.curation.quality_gate import Example, Finding, QualityRules, QualitySummary
 from scenefactory_jax.visualization.birds_eye import drawing
 from scenefactory_jax.visualization.birds_eye.drawing import Colour
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING
@@ -34,81 +35,48 @@ _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float], ...] = (
 _SIDE_INCHES, _COLUMNS, _WRAP = 3.4, 5, 44
 
 
-class Example(NamedTuple):
-    """A finding to draw, and the scene that it is in."""
-
-    raw: RawScene
-    finding: Finding
-
-
-class Count(NamedTuple):
-    """How often a rule found something."""
-
-    findings: int
-    scenes: int
-    objects: int
-
-
 def write(
-    folder: Path,
-    *,
-    scenes: int,
-    counts: Mapping[str, Count],
-    entries: Mapping[str, Mapping[str, Any]],
-    examples: Mapping[str, Sequence[Example]],
-    reject: Sequence[str],
-    drop: Sequence[str],
-    refused: int,
-    dropped: int,
-    unread: Sequence[str],
-    window_m: float,
-    command: str,
+    folder: Path, summary: QualitySummary, quality: QualityRules, *, entries: Mapping[str, Any], window_m: float, command: str
 ) -> Path:
-    """Write `folder`/quality.md with a picture for each rule that found something, and return its path.
+    """Writes `folder`/quality.md with a picture for each rule that found something; returns its path.
 
     Args:
-        scenes: how many were judged.
-        counts: rule -> how often.
         entries: rule -> its entry of the config, for the thresholds.
-        examples: rule -> what to draw.
-        reject, drop: rules that refuse a scene or leave objects out.
-        refused, dropped: scenes and objects that they did.
-        unread: scenes that could not be read, with the reasons.
-        window_m: least side of a picture.
-        command: what gives these numbers again.
+        window_m: smallest side of a picture.
+        command: that repeats the report.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    effect = lambda name: "refuses" if name in reject else "drops" if name in drop else "notes"  # noqa: E731
-    rows = [[name, *count, f"{100 * count.scenes / scenes:.0f} %", effect(name)] for name, count in counts.items()]
-    numbers = [[name, _numbers(entry)] for name, entry in entries.items()]
+    effect = lambda name: "refuses" if name in quality.reject else "drops" if name in quality.drop else "notes"  # noqa: E731
+    rows = [[name, *count, f"{100 * count.scenes / summary.scenes:.0f} %", effect(name)] for name, count in summary.counts.items()]
+    numbers = [[name, _format_numbers(entries[name])] for name in quality.rules]
     parts = [
         "# Quality of scenes",
         f"`{command}`",
-        f"{scenes} scenes judged by {len(counts)} rules: {refused} refused, {dropped} objects left out of the rest.",
-        markdown.format_table(["Rule", "Findings", "Scenes", "Objects", "Share of scenes", "Effect"], rows),
+        f"{summary.scenes} scenes, {len(quality.rules)} rules: {summary.refused} scenes refused, {summary.dropped} objects left out.",
+        markdown.format_table(["Rule", "Findings", "Scenes", "Objects", "Fraction of scenes", "Effect"], rows),
         "## Thresholds",
         markdown.format_table(["Rule", "Numbers"], numbers),
         "## Examples",
         "Red: the place, and the lanes or edges in question. Blue: the vehicle in question and its logged path. Grey boxes: other vehicles "
         "at that step. Thin grey outlines: driveways.",
     ]
-    for name, chosen in examples.items():
+    for name, chosen in summary.examples.items():
         if chosen:
             with matplotlib.rc_context(plots.STYLE):
                 picture = plots.save(figure(chosen, window_m=window_m), folder / f"{name}.png", dpi=110)
             lines = [f"- {escape_for_terminal(example.raw.name)}: {example.finding.message}" for example in chosen]
             parts += [f"### {name}", f"![{name}]({picture.name})", "\n".join(lines)]
-    if unread:
-        parts += ["## Not read", "\n".join(f"- {escape_for_terminal(line)}" for line in unread)]
+    if summary.unread:
+        parts += ["## Not read", "\n".join(f"- {escape_for_terminal(line)}" for line in summary.unread)]
     path = folder / "quality.md"
     path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
 
 
-def _numbers(entry: Mapping[str, Any]) -> str:
+def _format_numbers(entry: Mapping[str, Any]) -> str:
     """The numbers of an entry; those of other groups by name only."""
-    own = {key: value for key, value in entry.items() if key != "_target_"}
-    return ", ".join(f"{key}: (see lanes)" if isinstance(value, Mapping) else f"{key}: {value}" for key, value in own.items()) or "none"
+    numbers = {key: "(see lanes)" if isinstance(value, Mapping) else value for key, value in entry.items() if key != "_target_"}
+    return ", ".join(f"{key}: {value}" for key, value in numbers.items()) or "none"
 
 
 def figure(examples: Sequence[Example], *, window_m: float) -> Figure:
@@ -147,7 +115,8 @@ def _draw(axes: Axes, example: Example, window_m: float) -> None:
         look = {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgecolor": _rgb(MARK), "markeredgewidth": 1.6}
         axes.plot(*finding.xyz[:2], **look)
     label = {"transform": axes.transAxes, "fontsize": 6.5, "bbox": {"facecolor": "white", "alpha": 0.8, "linewidth": 0}, "zorder": 5}
-    axes.text(0.02, 0.98, _wrapped(f"{escape_for_terminal(raw.name)}\n{finding.message}"), va="top", **label)
+    title = [part for line in (escape_for_terminal(raw.name), finding.message) for part in textwrap.wrap(line, _WRAP)]
+    axes.text(0.02, 0.98, "\n".join(title), va="top", **label)
     axes.text(0.02, 0.02, f"{side:.0f} m, step {step}", **label)
 
 
@@ -171,18 +140,6 @@ def _draw_boxes(axes: Axes, tracks: Sequence[Track], step: int, colour: Colour) 
 def _closed(points: np.ndarray, kind: int) -> np.ndarray:
     """A driveway is the outline of a polygon."""
     return np.concatenate([points, points[:1]]) if kind == DRIVEWAY else points
-
-
-def _wrapped(text: str) -> str:
-    """Lines short enough for a small picture."""
-    lines = []
-    for line in text.split("\n"):
-        lines.append("")
-        for word in line.split():
-            if len(lines[-1]) + len(word) > _WRAP:
-                lines.append("")
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
 
 
 def _rgb(colour: Colour) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""sysid.md: what the fit found, how well it is known, and how each car drives what it has not been fitted to; from `result.json` alone."""
+"""Writes sysid.md, from `result.json` alone: fitted parameters, their uncertainty, and the errors of each car on held-out manoeuvres."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefactory_jax.core import markdown
-from scenefactory_jax.visualization.report import plots
+from scenefactory_jax.visualization.report import document, plots
 from scenefactory_jax.visualization.report import sysid_figures as figures
 from scenefactory_jax.visualization.report.verdicts import Verdict, table
 
@@ -19,42 +19,47 @@ PUBLISHED = {  # SceneFactory, arXiv:2605.08528, Table 8: candidates and best lo
     "refinement": (65, 150.204),
     "brake_preservation": (49, 3.6938),
 }
-MEASURES = {key: what[0].upper() + what[1:] for key, what in figures.MEASURES.items()}
+PICTURES = {  # name -> caption and figure
+    "search": ("Loss over the generations of each stage", figures.search),
+    "slices": ("The loss along each parameter alone, the others as fitted", figures.slices),
+    "heldout": ("Errors of every held-out manoeuvre", figures.spread),
+    "paths": ("Teacher and cars, one manoeuvre a row", figures.paths),
+}
+MEASURES = {key: label[0].upper() + label[1:] for key, label in figures.MEASURES.items()}
 
 
 def write(folder: Path, result: Result, targets: Mapping[str, float]) -> Path:
-    """Write `folder`/sysid.md and its figures, and return its path."""
-    lines = ["# System identification of the articulated car", _made(result), "## Verdicts", table(verdicts(result, targets))]
-    lines += ["## Stages", *_stages(result), _picture(folder, "search", "Loss over the generations of each stage", figures.search(result))]
-    lines += ["## Parameters", *_parameters(result)]
-    lines += [_picture(folder, "slices", "The loss along each parameter alone, the others as fitted", figures.slices(result))]
-    lines += ["## Manoeuvres kept out of the fit", *_families(result, "heldout")]
-    lines += [_picture(folder, "heldout", "Errors of every held-out manoeuvre", figures.spread(result)), _misses(result, targets)]
-    fitted = [name for name in result["cars"]["fitted"] if name != "heldout"]
-    lines += ["## Manoeuvres of the fit", *(part for name in fitted for part in _families(result, name))]
-    lines += [_picture(folder, "paths", "Teacher and cars, one manoeuvre a row", figures.paths(result))]
-    path = folder / "sysid.md"
-    path.write_text("\n\n".join(line for line in lines if line) + "\n", encoding="utf-8")
-    return path
+    """Writes `folder`/sysid.md and its figures, and returns its path."""
+    drawn = {name: plots.save(draw(result), folder / f"{name}.png", dpi=100) for name, (_, draw) in PICTURES.items()}
+    pictures = {name: document.picture(folder, path, PICTURES[name][0]) for name, path in drawn.items()}
+    fitted = [part for name in result["cars"]["fitted"] if name != "heldout" for part in _families(result, name)]
+    heldout = [*_families(result, "heldout"), pictures["heldout"], _misses(result, targets)]
+    return document.write(
+        folder / "sysid.md",
+        "# System identification of the articulated car",
+        _overview(result),
+        document.section("Verdicts", table(verdicts(result, targets))),
+        document.section("Stages", *_stages(result), pictures["search"]),
+        document.section("Parameters", *_parameters(result), pictures["slices"]),
+        document.section("Manoeuvres kept out of the fit", *heldout),
+        document.section("Manoeuvres of the fit", *fitted, pictures["paths"]),
+    )
 
 
 def verdicts(result: Result, targets: Mapping[str, float]) -> list[Verdict]:
-    """The fitted car on what it was not fitted to, the time, and parameters at their bounds."""
-    found = []
-    own = result["cars"]["fitted"]["heldout"]
-    for key, what in MEASURES.items():
-        values = np.abs(own[key])
-        middle, count = float(np.nanmedian(values)), int(np.isfinite(values).sum())
-        aim = f"< {100 * targets[key]:g} %"
-        found.append(Verdict(f"Held out: {what}, median of {count}", aim, f"{100 * middle:.2g} %", middle < targets[key]))
-    refined = result["refined"]
-    bound = [name for name, stuck in zip(result["space"]["names"], refined["at_bound"], strict=True) if stuck]
+    """Compares with the targets: the fitted car's errors on held-out manoeuvres, parameters at their bounds, and the duration."""
+    found, errors = [], result["cars"]["fitted"]["heldout"]
+    for key, label in MEASURES.items():
+        values, target = np.abs(errors[key]), targets[key]
+        median, count = float(np.nanmedian(values)), int(np.isfinite(values).sum())
+        found.append(Verdict(f"Held out: {label}, median of {count}", f"< {100 * target:g} %", f"{100 * median:.2g} %", median < target))
+    bound = [name for name, stuck in zip(result["space"]["names"], result["refined"]["at_bound"], strict=True) if stuck]
     found.append(Verdict("Parameters at a bound of their range", "0", ", ".join(bound) or "0", not bound))
-    minutes, most = result["seconds"] / 60, targets["minutes"]
-    return [*found, Verdict("Whole fit, compilation included", f"< {most:g} min", f"{minutes:.1f} min", minutes < most)]
+    minutes, limit = result["seconds"] / 60, targets["minutes"]
+    return [*found, Verdict("Whole fit, compilation included", f"< {limit:g} min", f"{minutes:.1f} min", minutes < limit)]
 
 
-def _made(result: Result) -> str:
+def _overview(result: Result) -> str:
     versions, count = result["versions"], sum(stage["evaluations"] for stage in result["stages"]) + result["refined"]["evaluations"]
     counted = ", ".join(f"{name} {number}" for name, number in result["manoeuvres"].items())
     return (
@@ -62,10 +67,6 @@ def _made(result: Result) -> str:
         f"{result['seconds'] / 60:.1f} minutes. Manoeuvres: {counted}. The teacher is CommonRoad's multi-body car with our car's masses "
         "(`scenefactory_jax/sysid/multibody_model.py`); every manoeuvre is replayed open loop."
     )
-
-
-def _picture(folder: Path, name: str, caption: str, figure: Any) -> str:
-    return f"![{caption}]({plots.save(figure, folder / f'{name}.png', dpi=100).name})\n\n*{caption}*"
 
 
 def _stages(result: Result) -> list[str]:
@@ -78,11 +79,11 @@ def _stages(result: Result) -> list[str]:
     refined = result["refined"]
     rows.append(["least squares", f"{refined['start_loss']:.4g}", f"{refined['loss']:.4g}", refined["evaluations"], "", "", "", ""])
     header = ["Stage", "Loss at its start", "at its end", "Candidates", "Seconds", "a second", "Published loss", "candidates"]
-    words = (
+    text = (
         "Losses are means over a stage's manoeuvres and compare within a column only: the published teacher was another one, and its yaw "
         "rates were in degrees against radians. The first stage's seconds hold the compilation."
     )
-    return [words, markdown.format_table(header, rows)]
+    return [text, markdown.format_table(header, rows)]
 
 
 def _parameters(result: Result) -> list[str]:
@@ -94,40 +95,37 @@ def _parameters(result: Result) -> list[str]:
         rows.append([name, f"{space['low'][i]:g} to {space['high'][i]:g}", f"{space['start'][i]:.4g}", f"{refined['best'][i]:.5g}",
                      f"{refined['deviation'][i]:.2g}", f"{space['names'][partner]} {refined['correlation'][i][partner]:+.2f}",
                      "**yes**" if refined["at_bound"][i] else ""])  # fmt: skip
-    words = (
+    text = (
         "Standard deviations and correlations are those of the linearised problem at the end, with the residuals' own size as noise: "
         "they say what these manoeuvres tell, not what is true of a real car."
     )
     header = ["Parameter", "Range", "Before", "Fitted", "Standard deviation", "Most correlated with", "At a bound"]
-    return [words, markdown.format_table(header, rows)]
+    return [text, markdown.format_table(header, rows)]
 
 
 def _families(result: Result, suite: str) -> list[str]:
-    """Medians by family, every car beside the others."""
-    cars = {name: known[suite] for name, known in result["cars"].items()}
-    first = next(iter(cars.values()))
-    families = list(dict.fromkeys(first["family"]))
+    """Medians by family, the cars side by side."""
+    cars = {name: suites[suite] for name, suites in result["cars"].items()}
+    families = np.array(next(iter(cars.values()))["family"])
     rows = []
-    for family in [*families, "all"]:
-        rows_of = [i for i, own in enumerate(first["family"]) if family in (own, "all")]
-        cells: list[object] = [family, len(rows_of)]
-        for key in MEASURES:
-            cells += [_median(np.array(known[key], float)[rows_of]) for known in cars.values()]
-        rows.append(cells)
-    header = ["Family", "n", *(f"{what}: {name}" for what in MEASURES.values() for name in cars)]
+    for family in [*dict.fromkeys(families.tolist()), "all"]:
+        chosen = (families == family) | (family == "all")
+        medians = [_median(np.array(car[key], float)[chosen]) for key in MEASURES for car in cars.values()]
+        rows.append([family, int(chosen.sum()), *medians])
+    header = ["Family", "n", *(f"{label}: {name}" for label in MEASURES.values() for name in cars)]
     return [f"Medians, {suite}. Stopping distances are absolute differences.", markdown.format_table(header, rows)]
 
 
 def _misses(result: Result, targets: Mapping[str, float]) -> str:
-    """Families kept out of the fit whose own median misses a target, and what a better tyre would need."""
-    own = result["cars"]["fitted"]["heldout"]
-    families = np.array(own["family"])
+    """Held-out families whose median misses a target, and the cause."""
+    errors = result["cars"]["fitted"]["heldout"]
+    families = np.array(errors["family"])
     misses = []
-    for family in dict.fromkeys(own["family"]):
-        for key, what in figures.MEASURES.items():
-            values = np.abs(np.array(own[key], float)[families == family])
+    for family in dict.fromkeys(families.tolist()):
+        for key, label in figures.MEASURES.items():
+            values = np.abs(np.array(errors[key], float)[families == family])
             if np.isfinite(values).any() and np.nanmedian(values) >= targets[key]:
-                misses.append(f"{family} ({what}, {_median(values)})")
+                misses.append(f"{family} ({label}, {_median(values)})")
     if not misses:
         return "No family's own median misses a target."
     return (

@@ -1,12 +1,29 @@
-"""Estimates as text and as Markdown tables."""
+"""Estimates as text and as Markdown tables, and the definitions below these tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from scenefactory_jax.core import markdown
 from scenefactory_jax.evaluation.metrics.agent_metrics import FRACTION, METRICS
 from scenefactory_jax.evaluation.statistics import AGENTS, NEWCOMBE, WILSON, Estimate
 
+Summary = Mapping[str, Estimate]  # metric -> estimate
+
+PROTOCOLS = {
+    "strict": "any event (goal, collision, crash, road edge) ends the agent",
+    "goal_only": "events are counted but only the goal ends an agent, so an agent may collide and still reach its goal",
+}
 MARKS = {WILSON: "†", NEWCOMBE: "†", AGENTS: "‡"}  # of intervals that are no bootstrap over scenes
+_NOTES = {
+    WILSON: "†: Wilson score interval over agents, where a rate does not vary between scenes (all, none, or one scene only).",
+    NEWCOMBE: "†: Newcombe's score interval over agents, where a difference does not vary between scenes.",
+    AGENTS: "‡: bootstrap over agents, where only one scene counts or a mean does not vary between scenes.",
+}
+
+
+def read_estimates(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Estimate]:
+    """Converts estimates of a JSON file; metrics that do not exist any more are left out."""
+    return {name: Estimate(**value) for name, value in values.items() if name in METRICS}
 
 
 def format_estimate(estimate: Estimate, *, signed: bool = False) -> str:
@@ -24,7 +41,7 @@ def format_estimate(estimate: Estimate, *, signed: bool = False) -> str:
     return f"{number(estimate.value)} {unit}{interval}{MARKS.get(estimate.method, '')}"
 
 
-def format_summaries(summaries: Mapping[str, Mapping[str, Estimate]], *, signed: Sequence[str] = ()) -> str:
+def format_summaries(summaries: Mapping[str, Summary], *, signed: Sequence[str] = ()) -> str:
     """Formats a table with metrics down, the names of `summaries` across, and `value [95 % interval] (n)` in the cells.
 
     Args:
@@ -35,5 +52,43 @@ def format_summaries(summaries: Mapping[str, Mapping[str, Estimate]], *, signed:
         estimate = summaries[heading].get(name)
         return "" if estimate is None else f"{format_estimate(estimate, signed=heading in signed)} (n = {estimate.count})"
 
-    shown = {name: metric for name, metric in METRICS.items() if any(name in column for column in summaries.values())}
-    return markdown.format_table(["Metric", *summaries], [[m.label, *(cell(h, name) for h in summaries)] for name, m in shown.items()])
+    rows = [[METRICS[name].label, *(cell(heading, name) for heading in summaries)] for name in find_metrics(summaries.values())]
+    return markdown.format_table(["Metric", *summaries], rows)
+
+
+def format_rows(
+    header: Sequence[str], rows: Iterable[tuple[Sequence[object], Summary]], metrics: Iterable[str], *, signed: bool = False
+) -> str:
+    """Formats a table with metrics across: each row has leading cells, under `header`, and a summary."""
+    rows = list(rows)
+    names = [name for name in metrics if any(name in summary for _, summary in rows)]
+    cells = [
+        [*leading, *(format_estimate(summary[name], signed=signed) if name in summary else "" for name in names)]
+        for leading, summary in rows
+    ]
+    return markdown.format_table([*header, *(METRICS[name].label for name in names)], cells)
+
+
+def find_metrics(summaries: Iterable[Summary]) -> list[str]:
+    """Returns the metrics that any of the summaries has, in the order of `METRICS`."""
+    names = set().union(*summaries)
+    return [name for name in METRICS if name in names]
+
+
+def define_metrics(names: Iterable[str]) -> str:
+    """Formats the definitions of metrics, a line each."""
+    return "\n".join(f"- **{METRICS[name].label}**: {METRICS[name].definition}" for name in names)
+
+
+def define_protocols(names: Iterable[str]) -> str:
+    """Formats the definitions of the protocols among names, a line each."""
+    return "\n".join(f"- **{name}**: {PROTOCOLS[name]}." for name in PROTOCOLS if name in names)
+
+
+def explain_marks(summaries: Iterable[Summary]) -> str:
+    """Formats what n, the intervals and the marks behind them mean; of the marks, those that occur."""
+    methods = {estimate.method for summary in summaries for estimate in summary.values()}
+    notes = [note for method, note in _NOTES.items() if method in methods]
+    if notes:
+        notes.append("Marked intervals take the agents of a scene for independent, so they may be too narrow.")
+    return " ".join(["n: agents that enter a number. Intervals: bootstrap over scenes.", *notes])

@@ -21,48 +21,23 @@ from scenefactory_jax.visualization.web.term_styles import term_looks
 if TYPE_CHECKING:
     from IPython.display import HTML
 
-SCRIPTS = ("data.js", "state.js", "view.js", "map.js", "marks.js", "plots.js", "rewards.js", "charts.js", "legend.js", "address.js")
-SCRIPTS += ("page.js",)  # it starts the page
+SCRIPTS = ("data.js", "state.js", "view.js", "road.js", "map.js", "charts.js", "rewards.js", "page.js")  # the last one starts the page
 
 
 class ReplayError(ValueError):
     """A recording that cannot be shown; the message names the argument and what would be valid."""
 
 
-def write(
-    path: Path | str,
-    recording: Recording,
-    *,
-    names: Sequence[str] = (),
-    posts: Sequence[RoadPosts] = (),
-    title: str = "replay",
-    goal_radius_m: float | int,
-) -> Path:
-    """Writes the page, about 0.1 to 1 MB per world.
-
-    Args:
-        recording: of one or several worlds, see `env.rollout.record`.
-        names: of the worlds; empty: numbers.
-        posts: lights and stop signs of the worlds (`road_posts.find_posts`); empty: not shown.
-        title: of the page.
-        goal_radius_m: of the goals' circles.
-
-    Raises:
-        ReplayError: another number of names or posts than of worlds, or an empty recording.
-    """
-    text = document(recording, names=names, posts=posts, title=title, goal_radius_m=goal_radius_m)
-    path = Path(path)
+def write(path: Path | str, recording: Recording, **options: Any) -> Path:
+    """Writes the page, about 0.1 to 1 MB per world; options and errors as of `document`."""
+    text, path = document(recording, **options), Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def show(recording: Recording, *, height: int = 720, **options: Any) -> "HTML":
-    """The page inline in a notebook, `height` pixels high; the other options are those of `write`.
-
-    Raises:
-        ReplayError: see `write`.
-    """
+    """The page inline in a notebook, `height` pixels high; other options and errors as of `document`."""
     from IPython.display import HTML
 
     page = html.escape(document(recording, **options), quote=True)
@@ -78,26 +53,35 @@ def document(
     title: str = "replay",
     goal_radius_m: float | int,
 ) -> str:
-    """The page as text; arguments and errors as `write`."""
+    """The page as text.
+
+    Args:
+        recording: of one or several worlds, see `env.rollout.record`.
+        names: of the worlds; empty: numbers.
+        posts: lights and stop signs of the worlds (`road_posts.find_posts`); empty: not shown.
+        title: of the page.
+        goal_radius_m: of the goals' circles.
+
+    Raises:
+        ReplayError: another number of names or posts than of worlds, or an empty recording.
+    """
     recording = jax.device_get(recording)
     count, steps = recording.shots.time_s.shape if recording.shots.time_s.ndim == 2 else (0, 0)
     if not count or not steps:
         raise ReplayError(f"recording: expected worlds along the first axis, of at least one step, got {count} worlds of {steps} steps")
-    for what, given in (("names", names), ("posts", posts)):
-        if given and len(given) != count:
-            raise ReplayError(f"{what}: expected {count}, one per world, or none, got {len(given)}")
-    worlds = [
-        replay_data.world(recording, index, name=names[index] if names else f"world {index}", posts=posts[index] if posts else RoadPosts())
-        for index in range(count)
-    ]
+    for key, values in (("names", names), ("posts", posts)):
+        if values and len(values) != count:
+            raise ReplayError(f"{key}: expected {count}, one per world, or none, got {len(values)}")
+    names, posts = names or [f"world {index}" for index in range(count)], posts or [RoadPosts()] * count
+    worlds = [replay_data.world(recording, index, name=names[index], posts=posts[index]) for index in range(count)]
     head = {
         "title": title,
-        "goal_radius": goal_radius_m,
+        "goal_radius_m": goal_radius_m,
         "colours": [list(colour) for colour in AGENTS],
         "marks": {name: {"label": mark.label, "colour": list(mark.colour)} for name, mark in MARKS.items()},
         "terms": {name: look._asdict() for name, look in term_looks(recording.shots.terms).items()},
-        "ttc_most": replay_data.MAX_TTC_S,
-        "worlds": [one for one, _ in worlds],
+        "max_ttc_s": replay_data.MAX_TTC_S,
+        "worlds": [world for world, _ in worlds],
     }
     arrays = "\n".join(f'<script type="text/plain" class="arrays">{text}</script>' for _, text in worlds)
     parts = {

@@ -1,4 +1,4 @@
-"""How reward terms look in every page and figure: one colour and one pattern for each, by the term's name."""
+"""Colour and pattern of each reward term in pages and figures."""
 
 import zlib
 from collections.abc import Iterable
@@ -49,11 +49,11 @@ OWN = tuple(TermLook(hue, pattern) for pattern in ("dotted", "crossed") for hue 
 def term_looks(names: Iterable[str]) -> dict[str, TermLook]:
     """The look of each term.
 
-    A term of one's own takes the look of `OWN` at the CRC-32 of its name, or the next one that is free: it looks the same wherever it is
-    shown, as long as no two names of one set meet.
+    A term that is not in `TERMS` takes the look of `OWN` at the CRC-32 of its name, or the next free one: it looks the same in all
+    figures, unless two such names collide.
     """
-    names, own = list(names), dict[str, TermLook]()
+    names, looks = list(names), dict(TERMS)
     for name in sorted(set(names) - TERMS.keys()):
         first = zlib.crc32(name.encode()) % len(OWN)
-        own[name] = next((look for look in (*OWN[first:], *OWN[:first]) if look not in own.values()), OWN[first])
-    return {name: TERMS.get(name) or own[name] for name in names}
+        looks[name] = next((look for look in (*OWN[first:], *OWN[:first]) if look not in looks.values()), OWN[first])
+    return {name: looks[name] for name in names}

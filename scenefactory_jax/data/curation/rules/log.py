@@ -1,4 +1,4 @@
-"""Rules on the log as a whole: its times, the car that recorded it, and who stands where at its start."""
+"""Rules on the log as a whole: times, recording car, ids, and vehicles that overlap at its start."""
 
 from collections import Counter
 
@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from scenefactory_jax.core.raw_scene import RawScene, Track
-from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
+from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.data.packing.pack import box_corners
 
 
@@ -25,7 +25,7 @@ def times(raw: RawScene, *, tolerance_fraction: float) -> list[Finding]:
 
 
 def sdc(raw: RawScene, *, without: list[str]) -> list[Finding]:
-    """The car that recorded the log is not named, or not there at the current step.
+    """The car that recorded the log is missing, or not valid at the current step.
 
     Args:
         without: datasets that have no such car.
@@ -42,7 +42,7 @@ def sdc(raw: RawScene, *, without: list[str]) -> list[Finding]:
 
 
 def track_ids(raw: RawScene) -> list[Finding]:
-    """Ids that several tracks have: what names an object by its id may mean the wrong one."""
+    """Ids of several tracks: an id must name one object."""
     counts = Counter(track.id for track in raw.tracks)
     return [
         Finding(f"{number} tracks have the id {identity}", float(number), 1.0, objects=(identity,))
@@ -52,7 +52,7 @@ def track_ids(raw: RawScene) -> list[Finding]:
 
 
 def overlapping_starts(raw: RawScene, *, min_overlap_fraction: float) -> list[Finding]:
-    """Vehicles whose boxes lie in each other at the current step, by a fraction of the smaller box."""
+    """Vehicles whose boxes overlap at the current step, by a fraction of the smaller box."""
     tracks = [track for track in raw.tracks if track.kind == "vehicle" and track.valid[raw.current]]
     now = raw.current
     boxes = np.array([shapely.Polygon(box_corners(t.xyz[now, :2], float(t.yaw[now]), *t.size[:2])) for t in tracks], dtype=object)
@@ -68,7 +68,7 @@ def overlapping_starts(raw: RawScene, *, min_overlap_fraction: float) -> list[Fi
             ids = (tracks[first].id, tracks[second].id)
             place = (tracks[first].xyz[now] + tracks[second].xyz[now]) / 2
             message = f"vehicles {ids[0]} and {ids[1]} share {100 * part:.0f} % of the smaller box at the current step"
-            found.append(Finding(message, float(part), min_overlap_fraction, describe_point(place), now, ids))
+            found.append(Finding(message, float(part), min_overlap_fraction, place, now, ids))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Rules on the map: levels that a plane cannot hold, lanes that no car can follow, and maps that are not there."""
+"""Rules on the map: several levels, lanes that no car can follow, and missing maps."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scenefactory_jax.core.raw_scene import Polyline, RawScene
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import DRIVABLE, EDGES
-from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
+from scenefactory_jax.data.curation.quality_gate import Finding
 
 
 def levels(raw: RawScene, *, rise_m: float) -> list[Finding]:
@@ -41,43 +41,38 @@ def levels(raw: RawScene, *, rise_m: float) -> list[Finding]:
 
 
 def _height(xyz: Float[np.ndarray, "N 3"], place: Float[np.ndarray, "2"]) -> float:
-    """Height of a line where it passes a place of the plane."""
+    """Height of a line at a point of the plane."""
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1))])
     return float(np.interp(shapely.line_locate_point(shapely.LineString(xyz[:, :2]), shapely.Point(place)), arc, xyz[:, 2]))
 
 
 def short_lanes(raw: RawScene, *, min_length_m: float) -> list[Finding]:
-    """Lanes for cars that are hardly any length, down to single points."""
+    """Driving lanes that are shorter, down to single points."""
     found = []
     for line in raw.roads:
         if line.kind in DRIVABLE:
             length = float(np.linalg.norm(np.diff(line.xyz[:, :2], axis=0), axis=1).sum())
             if length < min_length_m:
-                place = describe_point(line.xyz[0]) if len(line.xyz) else None
+                place = line.xyz[0] if len(line.xyz) else None
                 found.append(Finding(f"lane {line.id} is {length:.2f} m long", length, min_length_m, place, roads=(line.id,)))
     return found
 
 
 def kinks(raw: RawScene, *, turn_deg: float, min_step_m: float) -> list[Finding]:
-    """Lanes whose direction changes by more at a single point.
-
-    Args:
-        turn_deg: allowed.
-        min_step_m: between points; nearer ones have no direction that means anything.
-    """
+    """Lanes whose direction changes by more than `turn_deg` at a point; steps shorter than `min_step_m` are ignored."""
     found = []
     for line in _long(raw):
         step = np.diff(line.xyz[:, :2], axis=0)
         long = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) >= min_step_m)
         turn = np.rad2deg(_turns(step[long]))
         if len(turn) and (value := float(turn.max())) > turn_deg:
-            place = describe_point(line.xyz[long[int(np.argmax(turn)) + 1]])
+            place = line.xyz[long[int(np.argmax(turn)) + 1]]
             found.append(Finding(f"lane {line.id} turns by {value:.0f} degrees at a point", value, turn_deg, place, roads=(line.id,)))
     return found
 
 
 def tight_turns(raw: RawScene, *, radius_m: float, piece_m: float) -> list[Finding]:
-    """Lanes that turn with a smaller radius, measured on pieces long enough for single points not to count."""
+    """Lanes that turn with a smaller radius, measured on pieces of `piece_m`, so that single points do not count."""
     found = []
     for line in _long(raw):
         step = np.linalg.norm(np.diff(line.xyz[:, :2], axis=0), axis=1)
@@ -93,7 +88,7 @@ def tight_turns(raw: RawScene, *, radius_m: float, piece_m: float) -> list[Findi
         length = np.linalg.norm(chord[1:], axis=1)
         radius = np.divide(length, 2 * sine, out=np.full(len(sine), np.inf), where=sine > 0)
         if (value := float(radius.min())) < radius_m:
-            place = describe_point(points[int(np.argmin(radius)) + 1])
+            place = points[int(np.argmin(radius)) + 1]
             found.append(Finding(f"lane {line.id} turns with a radius of {value:.1f} m", value, radius_m, place, roads=(line.id,)))
     return found
 
@@ -114,7 +109,7 @@ def self_crossings(raw: RawScene) -> list[Finding]:
 
 
 def missing_map(raw: RawScene, *, lanes: int, edges: int) -> list[Finding]:
-    """Fewer lanes for cars, or fewer road edges."""
+    """Fewer driving lanes, or fewer road edges."""
     found = []
     for name, kinds, least in (("lanes for cars", DRIVABLE, lanes), ("road edges", EDGES, edges)):
         count = sum(line.kind in kinds and len(line.xyz) > 1 for line in raw.roads)
@@ -124,7 +119,7 @@ def missing_map(raw: RawScene, *, lanes: int, edges: int) -> list[Finding]:
 
 
 def small_map(raw: RawScene, *, beyond_m: float) -> list[Finding]:
-    """Vehicles that the log takes farther beyond the hull of the map."""
+    """Vehicles whose logged positions are farther outside of the map's hull."""
     points = [line.xyz[:, :2] for line in raw.roads if len(line.xyz)]
     tracks = [track for track in raw.tracks if track.kind == "vehicle" and track.valid.any()]
     if not points or not tracks:
@@ -140,12 +135,12 @@ def small_map(raw: RawScene, *, beyond_m: float) -> list[Finding]:
         away = shapely.distance(hull, shapely.points(track.xyz[steps, :2]))
         value, step = float(away.max()), int(steps[np.argmax(away)])
         message = f"vehicle {track.id} is {value:.0f} m beyond the map at step {step}"
-        found.append(Finding(message, value, beyond_m, describe_point(track.xyz[step]), step, (track.id,)))
+        found.append(Finding(message, value, beyond_m, track.xyz[step], step, (track.id,)))
     return found
 
 
 def _long(raw: RawScene) -> Iterator[Polyline]:
-    """Lanes for cars with two points and more."""
+    """Driving lanes with two points or more."""
     return (line for line in raw.roads if line.kind in DRIVABLE and len(line.xyz) > 1)
 
 

@@ -1,4 +1,4 @@
-"""Rules on where vehicles go: goals that no lane leads to, and road edges that logged cars drive across."""
+"""Rules on the paths of vehicles: goals that no route reaches, and road edges that logged paths cross."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ import shapely
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import Polyline, RawScene, Track
 from scenefactory_jax.core.types import DRIVEWAY, EDGES
-from scenefactory_jax.data.curation.quality_gate import Finding, Point, describe_point
+from scenefactory_jax.data.curation.quality_gate import Finding
 from scenefactory_jax.roadgraph import lane_graph, routes
 
 
@@ -18,7 +18,7 @@ class Crossing(NamedTuple):
 
     track: Track
     edge: Polyline
-    xyz: Point
+    xyz: tuple[float, float, float]
     step: int
     driveway_m: float  # to the nearest driveway
 
@@ -26,10 +26,10 @@ class Crossing(NamedTuple):
 def unreachable(
     raw: RawScene, *, min_travel_m: float, topology: Mapping[str, Any], network: Mapping[str, Any], search: Mapping[str, Any]
 ) -> list[Finding]:
-    """Vehicles whose last logged place no route over lanes reaches from where they are at the current step.
+    """Vehicles whose last logged position no route over lanes reaches from their current position.
 
     Args:
-        min_travel_m: vehicles that get less far are not looked at: most are parked, beside any lane.
+        min_travel_m: vehicles that travel less are ignored: most are parked.
         topology, network, search: entries of `lanes` in the config.
     """
     movers = [(track, last) for track, last in _movers(raw, min_travel_m) if track.valid[raw.current]]
@@ -45,17 +45,17 @@ def unreachable(
             continue
         distance = float(np.linalg.norm(goal[:2] - start[:2]))
         message = f"vehicle {track.id}: no route over lanes to its goal {distance:.0f} m away"
-        found.append(Finding(message, distance, min_travel_m, describe_point(goal), last, (track.id,)))
+        found.append(Finding(message, distance, min_travel_m, goal, last, (track.id,)))
     return found
 
 
 def crossed_edges(raw: RawScene, *, min_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
-    """Vehicles whose logged centre crosses a road edge away from any driveway, so that its own path is no way to drive.
+    """Vehicles whose logged centre crosses a road edge away from any driveway.
 
     Args:
-        min_travel_m: vehicles that get less far are not looked at.
+        min_travel_m: vehicles that travel less are ignored.
         rise_m: an edge at another height belongs to another level.
-        driveway_m: crossings nearer to a driveway speak against the edge (`edges_across_driveways`).
+        driveway_m: crossings nearer to a driveway are findings of `edges_across_driveways`.
     """
     found = {}
     for crossing in _crossings(raw, min_travel_m, rise_m):
@@ -67,7 +67,7 @@ def crossed_edges(raw: RawScene, *, min_travel_m: float, rise_m: float, driveway
 
 
 def edges_across_driveways(raw: RawScene, *, min_travel_m: float, rise_m: float, driveway_m: float) -> list[Finding]:
-    """Road edges that run on across a driveway where logged vehicles cross them: the label is wrong, not the driver.
+    """Road edges across a driveway that logged vehicles use: wrong labels.
 
     Args:
         min_travel_m, rise_m: see `crossed_edges`.
@@ -86,7 +86,7 @@ def edges_across_driveways(raw: RawScene, *, min_travel_m: float, rise_m: float,
 
 
 def _movers(raw: RawScene, min_travel_m: float) -> Iterator[tuple[Track, int]]:
-    """Vehicles that end far enough from where the current step or, later, their log begins; and the last step of each."""
+    """Vehicles whose last position is far enough from their first one at or after the current step, and their last steps."""
     for track in raw.tracks:
         steps = np.flatnonzero(track.valid[raw.current :]) + raw.current
         if track.kind == "vehicle" and len(steps) > 1:
@@ -96,7 +96,7 @@ def _movers(raw: RawScene, min_travel_m: float) -> Iterator[tuple[Track, int]]:
 
 
 def _crossings(raw: RawScene, min_travel_m: float, rise_m: float) -> Iterator[Crossing]:
-    """Every place at which a mover's path crosses a road edge of its own level, track by track."""
+    """Crossings of vehicles' paths and road edges of the same level, track by track."""
     tracks = [track for track, _ in _movers(raw, min_travel_m)]
     edges = [line for line in raw.roads if line.kind in EDGES and len(line.xyz) > 1]
     if not tracks or not edges:

@@ -1,4 +1,4 @@
-"""Rules on the tracks of vehicles: errors of perception, which a simulation would replay. At most one finding a track and rule."""
+"""Rules on the tracks of vehicles: errors of perception. At most one finding a track and rule."""
 
 from collections.abc import Callable, Iterator
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from scenefactory_jax.core.raw_scene import RawScene, Track
 from scenefactory_jax.core.scene_arrays import wrap_angles
-from scenefactory_jax.data.curation.quality_gate import Finding, describe_point
+from scenefactory_jax.data.curation.quality_gate import Finding
 
 Excess = tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"]]  # steps, and what was measured there
 
@@ -24,7 +24,7 @@ def speed(raw: RawScene, *, max_speed_m_s: float) -> list[Finding]:
 
 
 def acceleration(raw: RawScene, *, max_acceleration_m_s2: float, over_s: float) -> list[Finding]:
-    """Logged speeds that change faster than a car can, over a time long enough for the noise of single steps to fade."""
+    """Logged speeds that change faster, measured over `over_s` to average the noise of single steps."""
     stride = max(1, round(over_s / _step_s(raw)))
 
     def measure(track: Track) -> Excess:
@@ -36,7 +36,7 @@ def acceleration(raw: RawScene, *, max_acceleration_m_s2: float, over_s: float) 
 
 
 def yaw_rate(raw: RawScene, *, max_yaw_rate_rad_s: float) -> list[Finding]:
-    """Headings of neighbouring steps that imply a faster turn, such as a box that is turned round."""
+    """Headings of neighbouring steps that imply a faster turn, such as a reversed box."""
 
     def measure(track: Track) -> Excess:
         steps = _neighbours(track)
@@ -47,7 +47,7 @@ def yaw_rate(raw: RawScene, *, max_yaw_rate_rad_s: float) -> list[Finding]:
 
 
 def jumps(raw: RawScene, *, off_m: float, drift_m_s: float) -> list[Finding]:
-    """Places that are not where the place before and the velocities lead, also across a gap.
+    """Positions that differ from the one before plus velocity, also across a gap.
 
     Args:
         off_m: allowed between two steps.
@@ -55,11 +55,11 @@ def jumps(raw: RawScene, *, off_m: float, drift_m_s: float) -> list[Finding]:
     """
 
     def measure(track: Track) -> Excess:
-        seen = np.flatnonzero(track.valid)
-        before, after = seen[:-1], seen[1:]
+        steps = np.flatnonzero(track.valid)
+        before, after = steps[:-1], steps[1:]
         time = raw.times[after] - raw.times[before]
-        led = (track.velocity[before] + track.velocity[after]) / 2 * time[:, None]
-        off = np.linalg.norm(track.xyz[after, :2] - track.xyz[before, :2] - led, axis=1)
+        expected = (track.velocity[before] + track.velocity[after]) / 2 * time[:, None]
+        off = np.linalg.norm(track.xyz[after, :2] - track.xyz[before, :2] - expected, axis=1)
         gap = np.where(after - before > 1, time, 0.0)
         return after, off - drift_m_s * gap
 
@@ -67,11 +67,11 @@ def jumps(raw: RawScene, *, off_m: float, drift_m_s: float) -> list[Finding]:
 
 
 def frozen(raw: RawScene, *, steps: int, speed_m_s: float) -> list[Finding]:
-    """A track that stays exactly in place although its velocity says that it moves.
+    """Tracks that keep exactly one position although their velocity is not zero.
 
     Args:
-        steps: in a row that are allowed.
-        speed_m_s: least velocity that counts as moving.
+        steps: allowed in a row.
+        speed_m_s: smallest speed that counts as moving.
     """
 
     def measure(track: Track) -> Excess:
@@ -87,23 +87,23 @@ def frozen(raw: RawScene, *, steps: int, speed_m_s: float) -> list[Finding]:
 
 
 def flicker(raw: RawScene, *, gaps: int) -> list[Finding]:
-    """A track that vanishes and comes back more often."""
+    """Tracks with more gaps."""
 
     def measure(track: Track) -> Excess:
-        seen = np.flatnonzero(track.valid)
-        back = seen[1:][np.diff(seen) > 1]
-        return back, np.arange(1.0, len(back) + 1)
+        steps = np.flatnonzero(track.valid)
+        returns = steps[1:][np.diff(steps) > 1]
+        return returns, np.arange(1.0, len(returns) + 1)
 
     return _worst(raw, measure, float(gaps), "vanishes and comes back {:.0f} times")
 
 
 def length(raw: RawScene, *, range_m: list[float]) -> list[Finding]:
-    """Vehicles longer or shorter than vehicles are."""
+    """Vehicles of a length outside of a range."""
     return _sizes(raw, 0, "long", range_m)
 
 
 def width(raw: RawScene, *, range_m: list[float]) -> list[Finding]:
-    """Vehicles wider or narrower than vehicles are."""
+    """Vehicles of a width outside of a range."""
     return _sizes(raw, 1, "wide", range_m)
 
 
@@ -113,9 +113,7 @@ def _sizes(raw: RawScene, axis: int, word: str, range_m: list[float]) -> list[Fi
         value, step = track.size[axis], int(np.argmax(track.valid))
         if not range_m[0] <= value <= range_m[1]:
             limit = range_m[0] if value < range_m[0] else range_m[1]
-            found.append(
-                Finding(f"vehicle {track.id} is {value:.2f} m {word}", value, limit, describe_point(track.xyz[step]), step, (track.id,))
-            )
+            found.append(Finding(f"vehicle {track.id} is {value:.2f} m {word}", value, limit, track.xyz[step], step, (track.id,)))
     return found
 
 
@@ -128,7 +126,7 @@ def _worst(raw: RawScene, measure: Callable[[Track], Excess], limit: float, word
             step = int(steps[np.argmax(values)])
             more = int((values > limit).sum())
             message = f"vehicle {track.id} {words.format(value)} at step {step}" + (f" ({more} steps in all)" if more > 1 else "")
-            found.append(Finding(message, value, limit, describe_point(track.xyz[step]), step, (track.id,)))
+            found.append(Finding(message, value, limit, track.xyz[step], step, (track.id,)))
     return found
 
 
@@ -137,7 +135,7 @@ def _vehicles(raw: RawScene) -> Iterator[Track]:
 
 
 def _neighbours(track: Track) -> Int[np.ndarray, " K"]:
-    """Steps that are valid and followed by one that is."""
+    """Valid steps that precede a valid step."""
     return np.flatnonzero(track.valid[1:] & track.valid[:-1])
 
 

@@ -1,30 +1,34 @@
-"""Builds the network of a street plan: a block for every node, a road for every edge."""
+"""Draws the road network of a town: a motorway, or streets with a block for every node of a plan and a road for every edge."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Fraction
-from scenefactory_jax.data.generators.curves import heading, wrap_angle
-from scenefactory_jax.data.generators.town.intersections import OPPOSITE, Arm, Control
-from scenefactory_jax.data.generators.town.road_network import Block, Joint, Network, Port, assemble
-from scenefactory_jax.data.generators.town.road_segments import Pose, RoadDimensions, connect_ports
-from scenefactory_jax.data.generators.town.street_plan import Edge, Plan
+from scenefactory_jax.data.generators.curves import heading
+from scenefactory_jax.data.generators.town.intersections import OPPOSITE, Arm, Control, turn_angle
+from scenefactory_jax.data.generators.town.road_network import BROKEN_YELLOW, Network, Port, Pose, Street
+from scenefactory_jax.data.generators.town.road_segments import RoadDimensions, connect_ports
+from scenefactory_jax.data.generators.town.street_plan import Edge, Plan, StreetClass
 
+PACKAGE = "scenefactory_jax.data.generators.town"
+WHERE = "generate.network"
 MIN_ROAD_M = 10.0
 CORNER_M = 30.0  # from a corner of a street to the start of its bend
 
 
-class BlockMakers(NamedTuple):
-    """Functions that build the blocks of nodes, bound to their numbers."""
+@dataclass(frozen=True)
+class Blocks:
+    """Entries of the blocks at the nodes of a plan."""
 
-    intersection: Callable[..., Block]
-    driveway: Callable[..., Block]
-    roundabout: Callable[..., Block]
-    parking_lot: Callable[..., Block]
+    intersection: Mapping[str, Any]  # (rng, network, centre, arms, control) -> ports
+    driveway: Mapping[str, Any]  # as intersection
+    roundabout: Mapping[str, Any]  # as intersection
+    parking_lot: Mapping[str, Any]  # (rng, network, place, yaw, street) -> ports
 
 
 @dataclass(frozen=True)
@@ -44,85 +48,127 @@ class JunctionNumbers:
             raise ConfigError("signal_fraction: expected one number or more, got []")
 
 
+def draw_network(
+    rng: np.random.Generator,
+    reach: float,
+    kind: str | None,
+    *,
+    plans: dict[str, Mapping[str, Any] | None],
+    motorway: Mapping[str, Any],
+    motorway_fraction: Fraction,
+    streets: dict[str, StreetClass | None],
+    driveway: dict[str, float],
+    lots: Mapping[str, Any],
+    roads: RoadDimensions,
+    junctions: JunctionNumbers,
+    blocks: Blocks,
+) -> tuple[str, Network] | None:
+    """Draws a network and returns its kind with it; None if the drawn plan cannot be built.
+
+    Args:
+        kind: name of a plan, or "motorway"; None: drawn.
+        plans: entries of `(rng, reach, classes) -> Plan`, or None.
+        motorway: entry of `(rng) -> Network`.
+        lots: entry of `(rng, plan, reach, street) -> Plan`.
+    """
+    names = [name for name, entry in plans.items() if entry is not None]
+    classes = {rank: street_class for rank, street_class in enumerate(streets.values(), start=1) if street_class is not None}
+    for key, entries in (("plans", names), ("streets", classes)):
+        if not entries:
+            raise ConfigError(f"{WHERE}.{key}: expected one entry or more, got none")
+    if kind is not None and kind not in (*names, "motorway"):
+        raise ConfigError(f"generate.kinds: expected names among {', '.join((*names, 'motorway'))}, got {kind!r}")
+    make = lambda entry, module, key: instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"{WHERE}.{key}")  # noqa: E731
+    layouts = {name: make(plans[name], "street_plan", f"plans.{name}") for name in names}
+    builders = {
+        name: make(entry, "parking_lot" if name == "parking_lot" else "intersections", f"blocks.{name}")
+        for name, entry in vars(blocks).items()
+    }
+    add_lots, build_motorway = make(lots, "street_plan", "lots"), make(motorway, "motorway", "motorway")
+    if kind == "motorway" or (kind is None and rng.random() < motorway_fraction):
+        return "motorway", build_motorway(rng)
+    kind = kind or str(rng.choice(names))
+    lane = Street(1, driveway["lane_width_m"], 0.0, driveway["speed_limit_mps"], 0, 0.0, 0.0, BROKEN_YELLOW)
+    plan = layouts[kind](rng, reach, classes)
+    network = None if plan is None else build_network(rng, add_lots(rng, plan, reach, lane), builders, roads, junctions)
+    return None if network is None else (kind, network)
+
+
 def build_network(
-    rng: np.random.Generator, plan: Plan, makers: BlockMakers, dimensions: RoadDimensions, numbers: JunctionNumbers
+    rng: np.random.Generator, plan: Plan, builders: dict[str, Callable[..., list[Port]]], roads: RoadDimensions, junctions: JunctionNumbers
 ) -> Network | None:
     """Builds a plan; None if two nodes are too close for their blocks, or a street would have to change two lanes."""
-    blocks: list[Block] = []
-    ends: dict[tuple[int, int], tuple[int, int] | Port] = {}  # (node, edge) -> (block, port), or a port where the road leaves the town
+    network = Network()
+    ports: dict[tuple[int, int], Port] = {}  # by node and edge
     for index, node in enumerate(plan.nodes):
-        edges = sorted(plan.edges_at(index), key=lambda edge: _yaw(plan, edge, index) % (2 * np.pi))
-        street, yaw = plan.edges[edges[0]].street, _yaw(plan, edges[0], index)
+        edges = sorted(plan.edges_at(index), key=lambda edge: plan.yaw(edge, index) % (2 * np.pi))
+        street, yaw = plan.edges[edges[0]].street, plan.yaw(edges[0], index)
         if node.kind == "outlet":
-            no_lanes = ((),) * street.lanes
-            ends[index, edges[0]] = Port(node.place, yaw, street, no_lanes, no_lanes)
-            continue
-        block = (
-            makers.parking_lot(rng, node.place, yaw, street) if node.kind == "lot" else _junction(rng, plan, index, edges, makers, numbers)
-        )
-        ends |= {(index, edge): (len(blocks), port) for port, edge in enumerate(edges)}
-        blocks.append(block)
-    joints: list[Joint] = []
+            no_lanes = [[]] * street.lanes
+            ends = [Port(node.place, yaw, street, no_lanes, no_lanes, [], [])]
+        elif node.kind == "lot":
+            ends = builders["parking_lot"](rng, network, node.place, yaw, street)
+        else:
+            ends = _build_junction(rng, network, plan, index, edges, builders, junctions)
+        ports |= {(index, edge): port for edge, port in zip(edges, ends, strict=True)}
     for number, edge in enumerate(plan.edges):
-        near, far = (ends[node, number] for node in (edge.a, edge.b))
-        first, second = (end if isinstance(end, Port) else blocks[end[0]].ports[end[1]] for end in (near, far))
+        first, second = ports[edge.a, number], ports[edge.b, number]
         corners = _corners(first, second, edge)
         changes = [abs(len(a.leaving) - len(b.entering)) for a, b in ((first, second), (second, first))]
         if corners is None or max(changes) > 1:
             return None
-        joints += [(end, (len(blocks), port)) for port, end in enumerate((near, far)) if not isinstance(end, Port)]
-        blocks.append(connect_ports(first, second, corners, dimensions))
-    return assemble(blocks, joints)
+        connect_ports(network, first, second, corners, roads)
+    return network
 
 
-def _yaw(plan: Plan, edge: int, node: int) -> float:
-    """Direction in which an edge leaves a node."""
-    places = plan.edges[edge].places(plan.nodes)
-    if plan.edges[edge].b == node:
-        places = places[::-1]
-    ahead = places[1] - places[0]
-    return float(np.arctan2(ahead[1], ahead[0]))
-
-
-def _junction(rng: np.random.Generator, plan: Plan, index: int, edges: list[int], makers: BlockMakers, numbers: JunctionNumbers) -> Block:
+def _build_junction(
+    rng: np.random.Generator,
+    network: Network,
+    plan: Plan,
+    index: int,
+    edges: list[int],
+    builders: dict[str, Callable[..., list[Port]]],
+    junctions: JunctionNumbers,
+) -> list[Port]:
     """Builds the block of a node where streets meet."""
-    node, skew = plan.nodes[index], float(np.radians(numbers.skew_deg))
+    node, skew = plan.nodes[index], float(np.radians(junctions.skew_deg))
     arms = []
     for edge in edges:
         street, turn = plan.edges[edge].street, rng.uniform(-skew, skew)
-        arms.append(Arm(_yaw(plan, edge, index) + turn, street, street.lanes, street.lanes))
+        arms.append(Arm(plan.yaw(edge, index) + turn, street, street.lanes, street.lanes))
     if node.kind == "driveway":
-        return makers.driveway(rng, node.place, arms, "yield")
+        return builders["driveway"](rng, network, node.place, arms, "yield")
     narrow = max(arm.leaving for arm in arms) <= 2 and max(arm.street.rank for arm in arms) > 0
-    if node.kind == "roundabout" or (narrow and rng.random() < numbers.roundabout_fraction):
-        return makers.roundabout(rng, node.place, [arm._replace(leaving=1, entering=1) for arm in arms], "yield")
-    control = _draw_control(rng, arms, numbers)
+    if node.kind == "roundabout" or (narrow and rng.random() < junctions.roundabout_fraction):
+        arms = [arm._replace(leaving=1, entering=1) for arm in arms]
+        return builders["roundabout"](rng, network, node.place, arms, "yield")
+    control = _draw_control(rng, arms, junctions)
     if control == "signal":
         lengths = [plan.edges[edge].length(plan.nodes) for edge in edges]
-        arms = [_add_lanes(rng, arms, a, length, numbers) for a, length in enumerate(lengths)]
-    return makers.intersection(rng, node.place, arms, control)
+        arms = [_add_lanes(rng, arms, a, length, junctions) for a, length in enumerate(lengths)]
+    return builders["intersection"](rng, network, node.place, arms, control)
 
 
-def _draw_control(rng: np.random.Generator, arms: list[Arm], numbers: JunctionNumbers) -> Control:
+def _draw_control(rng: np.random.Generator, arms: list[Arm], junctions: JunctionNumbers) -> Control:
     """Draws lights or stop signs: lights are likelier where large streets meet; equal streets have stop signs on all arms."""
     ranks = sorted(arm.street.rank for arm in arms)
     second = ranks[-2] if len(arms) < 4 else ranks[1]
-    if rng.random() < numbers.signal_fraction[min(second, len(numbers.signal_fraction) - 1)]:
+    if rng.random() < junctions.signal_fraction[min(second, len(junctions.signal_fraction) - 1)]:
         return "signal"
-    return "all_way_stop" if ranks[0] == ranks[-1] or rng.random() < numbers.all_way_fraction else "two_way_stop"
+    return "all_way_stop" if ranks[0] == ranks[-1] or rng.random() < junctions.all_way_fraction else "two_way_stop"
 
 
-def _add_lanes(rng: np.random.Generator, arms: list[Arm], index: int, length: float, numbers: JunctionNumbers) -> Arm:
+def _add_lanes(rng: np.random.Generator, arms: list[Arm], index: int, length: float, junctions: JunctionNumbers) -> Arm:
     """Draws a turning lane on the way in and an additional lane on the way out for an arm that is long enough.
 
     A turning lane needs an arm on its side and an arm straight ahead.
     """
     arm = arms[index]
-    has_bay, drops = rng.random() < numbers.bay_fraction, rng.random() < numbers.drop_fraction
-    if length < numbers.bay_room_m:
+    has_bay, drops = rng.random() < junctions.bay_fraction, rng.random() < junctions.drop_fraction
+    if length < junctions.bay_room_m:
         return arm
     arm = arm._replace(leaving=arm.leaving + int(drops))
-    turns = [wrap_angle(other.yaw - arm.yaw - np.pi) for i, other in enumerate(arms) if i != index]
+    turns = [turn_angle(arm, other) for i, other in enumerate(arms) if i != index]
     sides = [side for side, sign in (("left", 1.0), ("right", -1.0)) if any(sign * turn > np.pi - OPPOSITE + 0.2 for turn in turns)]
     if not has_bay or not sides or min(abs(turn) for turn in turns) > 0.5:
         return arm

@@ -4,9 +4,9 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
+from scenefactory_jax.core.schema import CountRange, Range
 from scenefactory_jax.data.generators.curves import Points, arc_length, interpolate, right_normals
-from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count
-from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, ParkingSpace
+from scenefactory_jax.data.generators.town.road_network import ON_ROAD, Network, Pose
 
 CAR_M = 5.0  # from the kerb to the middle of a parked car
 MIN_SPACING_M = 8.0  # between the middles of two parked cars
@@ -19,32 +19,22 @@ def draw_driveways(
     kerbs: list[Points],
     surface: shapely.Geometry,
     *,
-    count: list[int],
-    width_m: list[float],
-    depth_m: list[float],
+    count: CountRange,
+    width_m: Range,
+    depth_m: Range,
     junction_m: float,
-) -> tuple[list[Points], list[ParkingSpace]]:
-    """Draws outlines at random places of the kerbs and their parking spaces, fewer where there is no room.
-
-    Args:
-        count: range of the number of places that are drawn.
-        width_m: range of the size along the kerb.
-        depth_m: range of the size away from it.
-        junction_m: minimum distance of a driveway from the lanes of a junction.
-    """
-    check_range(count, "driveways.count")
+) -> tuple[list[Points], list[Pose]]:
+    """Draws outlines at random places of the kerbs and their parking spaces, fewer where there is no room."""
     outlines: list[Points] = []
-    spots: list[ParkingSpace] = []
-    if not kerbs:
-        return outlines, spots
+    spots: list[Pose] = []
     turns = [lane.points[::4] for lane in network.lanes if lane.rank != ON_ROAD]
     turns = KDTree(np.concatenate(turns)) if turns else None
     places, normals = [arc_length(kerb) for kerb in kerbs], [right_normals(kerb) for kerb in kerbs]
     lengths = np.array([place[-1] for place in places])
-    for _ in range(draw_count(rng, count)):
+    for _ in range(int(rng.integers(*count, endpoint=True)) if kerbs else 0):
         chosen = int(rng.choice(len(kerbs), p=lengths / lengths.sum()))
         kerb, place = kerbs[chosen], places[chosen]
-        width, depth, at = draw(rng, width_m, "driveways.width_m"), draw(rng, depth_m, "driveways.depth_m"), rng.uniform(0.0, place[-1])
+        width, depth, at = rng.uniform(*width_m), rng.uniform(*depth_m), rng.uniform(0.0, place[-1])
         if width > min(at, place[-1] - at):
             continue
         out = interpolate(at, place, normals[chosen])
@@ -55,10 +45,9 @@ def draw_driveways(
         middle = entry + CAR_M * out
         if turns is not None and turns.query(entry)[0] < junction_m:
             continue
-        taken = any(np.linalg.norm(middle - spot.place) < MIN_SPACING_M for spot in spots)
+        taken = any(np.linalg.norm(middle - spot) < MIN_SPACING_M for spot, _ in spots)
         ground = shapely.Polygon(outline + 0.2 * out), shapely.Point(middle).buffer(CLEARANCE_M)
-        if taken or any(area.intersects(surface) for area in ground):
-            continue
-        outlines.append(np.concatenate([outline, outline[:1]]))
-        spots.append(ParkingSpace(middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
+        if not taken and not any(area.intersects(surface) for area in ground):
+            outlines.append(np.concatenate([outline, outline[:1]]))
+            spots.append((middle, float(np.arctan2(out[1], out[0])) + np.pi * float(rng.integers(2))))
     return outlines, spots

@@ -16,12 +16,6 @@ def boundary(
 ) -> tuple[list[Points], list[Points], shapely.Geometry]:
     """Computes road edges within the square of half side `reach`, with the paved surface on their left.
 
-    Args:
-        rounding_m: radius of the smallest corner; narrower gaps between areas are paved.
-        island_m2: minimum area of a gap that is not paved; the islands of the network are never paved.
-        block_m2: minimum area of a gap whose edge is an outer edge, as around a block of houses.
-        spacing_m: maximum length of an edge segment.
-
     Returns:
         Outer edges, edges of islands and medians, and the surface.
     """
@@ -31,12 +25,11 @@ def boundary(
     for part in getattr(paved, "geoms", [paved]):
         gaps = [ring for ring in part.interiors if shapely.Polygon(ring).area >= island_m2]
         solid.append(orient(shapely.Polygon(part.exterior, gaps)))
-    outer = [piece for part in solid for piece in _cut_ring(part.exterior, reach, spacing_m)]
-    inner = []
-    for ring in (ring for part in solid for ring in part.interiors):
-        (outer if shapely.Polygon(ring).area > block_m2 else inner).extend(_cut_ring(ring, reach, spacing_m))
-    for island in network.islands:
-        inner += _cut_ring(orient(island, -1.0).exterior, reach, spacing_m)
+    gaps = [ring for part in solid for ring in part.interiors]
+    rings = [part.exterior for part in solid] + [ring for ring in gaps if shapely.Polygon(ring).area > block_m2]
+    island_rings = [ring for ring in gaps if shapely.Polygon(ring).area <= block_m2]
+    island_rings += [orient(island, -1.0).exterior for island in network.islands]
+    outer, inner = ([piece for ring in group for piece in _cut_ring(ring, reach, spacing_m)] for group in (rings, island_rings))
     surface = shapely.difference(shapely.MultiPolygon(solid), shapely.union_all(network.islands))
     return outer, inner, surface
 

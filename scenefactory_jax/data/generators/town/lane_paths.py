@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.data.generators.curves import Points, arc_length, cut, interpolate, join, right_normals, smoothstep
-from scenefactory_jax.data.generators.ranges import draw
 from scenefactory_jax.data.generators.town.road_network import CHANGING, WALKING, Network
 
 STEP_M = 0.5  # between the points of a path
@@ -22,7 +21,7 @@ class Path(NamedTuple):
     speed: Float[np.ndarray, " N"]  # maximum, m/s
     rank: Float[np.ndarray, " N"]  # right of way
     gates: tuple[tuple[float, int], ...]  # (place, gate): where a light, a sign or a crosswalk can stop the road user
-    lanes: tuple[int, ...]
+    lanes: tuple[int, ...]  # of the network, in driving order
 
     @property
     def length(self) -> float:
@@ -76,17 +75,14 @@ def draw_path(
     length: float,
     *,
     lane_change_fraction: float,
-    lane_change_m: list[float],
+    lane_change_m: tuple[float, float],
 ) -> list[PathPiece]:
-    """Draws a path of a length from a place on a lane: an exit at every fork, and lane changes.
+    """Draws a path of a length from a place on a lane: an exit at every fork, and lane changes of a length within a range.
 
-    Args:
-        lane_change_fraction: probability of a lane change on a lane that is long enough.
-        lane_change_m: range of the length of a lane change.
+    `lane_change_fraction` is the probability of a lane change on a lane that is long enough.
     """
     pieces: list[PathPiece] = []
-    left = length
-    control: int | None = None
+    left, control = length, None
     while True:
         current = network.lanes[lane]
         place = arc_length(current.points)
@@ -94,7 +90,7 @@ def draw_path(
         room = float(place[-1]) - begin - LANE_END_M
         if beside and room > lane_change_m[0] and rng.random() < lane_change_fraction:
             target = int(rng.choice(beside))
-            over = min(draw(rng, lane_change_m, "traffic.driving.lane_change_m"), room)
+            over = min(rng.uniform(*lane_change_m), room)
             start = begin + float(rng.uniform(0.0, room - over))
             change, begin = _change_lane(network, lane, target, begin, start, start + over, control)
             pieces += change
@@ -130,11 +126,8 @@ def offset_path(pieces: list[PathPiece], right: float) -> list[PathPiece]:
     """Shifts a path to its right."""
     points = join([piece.points for piece in pieces])
     shifted = points + right * right_normals(points)
-    result, start = [], 0
-    for piece in pieces:
-        result.append(piece._replace(points=shifted[start : start + len(piece.points)]))
-        start += len(piece.points) - 1
-    return result
+    ends = np.cumsum([len(piece.points) - 1 for piece in pieces])
+    return [piece._replace(points=shifted[end + 1 - len(piece.points) : end + 1]) for piece, end in zip(pieces, ends, strict=True)]
 
 
 def walk(points: Points, speed: float, *, crosswalk: tuple[float, int] | None) -> Path:

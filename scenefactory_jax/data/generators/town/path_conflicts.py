@@ -9,17 +9,11 @@ from scipy.spatial import KDTree
 
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M, Path
 
-STRIDE = 2  # points of a path per row of the table
+STRIDE = 2  # points of a path per row of the projections
 ROW_M = STRIDE * STEP_M
 SIDE_M = 0.35  # minimum gap between two road users that pass each other
 ALONG_COS = 0.7  # minimum cosine between two paths that run together
-
-
-class PathProjections(NamedTuple):
-    """Projections of all paths onto each other."""
-
-    place: Float[np.ndarray, "N N S"]  # [i, j, row]: place on path j of a row of path i; NaN where path j is not near
-    rows: Int[np.ndarray, " N"]  # of each path
+LEAD_M = 1.0  # into a zone, where the lanes are those that meet
 
 
 class Zones(NamedTuple):
@@ -35,40 +29,40 @@ class Zones(NamedTuple):
     rank: Float[np.ndarray, " Z"]  # right of way of the first less that of the second
 
 
-def find_conflicts(paths: list[Path], width: Float[np.ndarray, " N"]) -> tuple[PathProjections, Zones]:
-    """Projects all paths onto each other; two paths meet where road users of the given widths would touch."""
+def project_paths(paths: list[Path], width: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N N S"]:
+    """Projects all paths onto each other, where road users of the given widths would touch.
+
+    Returns:
+        [i, j, row]: place on path j of a row of path i; NaN where path j is not near.
+    """
     count = len(paths)
     thinned = [path.points[::STRIDE] for path in paths]
-    rows = np.array([len(points) for points in thinned])
-    path_of = np.repeat(np.arange(count), rows)
-    row = np.concatenate([np.arange(n) for n in rows])
+    path_of = np.repeat(np.arange(count), [len(points) for points in thinned])
+    row = np.concatenate([np.arange(len(points)) for points in thinned])
     points = np.concatenate(thinned)
     pairs = KDTree(points).query_pairs(float(width.max()) + SIDE_M, output_type="ndarray")
     pairs = pairs[path_of[pairs[:, 0]] != path_of[pairs[:, 1]]]
     limit = (width[path_of[pairs[:, 0]]] + width[path_of[pairs[:, 1]]]) / 2 + SIDE_M
     pairs = pairs[((points[pairs[:, 0]] - points[pairs[:, 1]]) ** 2).sum(axis=1) < limit**2]
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    max_rows = int(rows.max())
-    key = (path_of[both[:, 0]] * count + path_of[both[:, 1]]) * max_rows + row[both[:, 0]]
-    size = count * count * max_rows
-    hits = np.bincount(key, minlength=size)
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    shape = (count, count, int(row.max()) + 1)
+    key = np.ravel_multi_index((path_of[one], path_of[other], row[one]), shape)
+    hits = np.bincount(key, minlength=np.prod(shape))
     with np.errstate(invalid="ignore"):  # the projection is the mean of the near points, which lie around it
-        place = (ROW_M * np.bincount(key, weights=row[both[:, 1]], minlength=size) / hits).reshape(count, count, max_rows)
-    return PathProjections(place, rows), _find_zones(paths, place)
+        return (ROW_M * np.bincount(key, weights=row[other], minlength=len(hits)) / hits).reshape(shape)
 
 
-def _find_zones(paths: list[Path], place: Float[np.ndarray, "N N S"]) -> Zones:
-    """Finds runs of rows that have a projection."""
+def find_zones(paths: list[Path], place: Float[np.ndarray, "N N S"]) -> Zones:
+    """Finds the zones: runs of rows that have a projection."""
     padded = np.pad(np.isfinite(place), ((0, 0), (0, 0), (1, 1)))
     first, second, begin = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, :-2])
     end = np.nonzero(padded[:, :, 1:-1] & ~padded[:, :, 2:])[2]
     a, b = place[first, second, begin], place[first, second, end]
-    rank, yaw = (stack_columns(columns) for columns in ([path.rank for path in paths], [path.yaw for path in paths]))
+    rank, yaw = stack_columns([path.rank for path in paths]), stack_columns([path.yaw for path in paths])
     at = lambda table, path, metres: table[path, np.clip((metres / STEP_M).astype(int), 0, table.shape[1] - 1)]  # noqa: E731
     middle = (begin + end) // 2
     turn = at(yaw, first, middle * ROW_M) - at(yaw, second, place[first, second, middle])
-    lead = 1.0  # m into the zone, where the lanes are those that meet
-    difference = at(rank, first, begin * ROW_M + lead) - at(rank, second, np.minimum(a, b) + lead)
+    difference = at(rank, first, begin * ROW_M + LEAD_M) - at(rank, second, np.minimum(a, b) + LEAD_M)
     return Zones(first, second, begin * ROW_M, end * ROW_M, np.minimum(a, b), np.maximum(a, b), np.cos(turn) > ALONG_COS, difference)
 
 

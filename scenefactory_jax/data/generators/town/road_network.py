@@ -1,11 +1,11 @@
-"""Blocks of lanes with ports, and the road network of joined blocks.
+"""Road network of a town: lanes with their links, and the ports at which blocks and roads meet.
 
-Coordinates are metres on flat ground around the middle of the town, with right-hand traffic. Two ports can be joined if they have the same
-place and street and opposite yaws. Every lane that ends at a slot of one port then leads into the lanes that begin there at the other.
+Coordinates are metres on flat ground around the middle of the town, with right-hand traffic.
 """
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,9 @@ from jaxtyping import Float
 from scenefactory_jax.core.types import LANE_STREET
 from scenefactory_jax.data.generators.curves import Points
 
+Place = Float[np.ndarray, " 2"]
+Pose = tuple[Place, float]  # place, yaw
+Slots = Sequence[Sequence[int]]  # lanes at each slot of a port; slots are counted from the middle of the road outward
 BROKEN_WHITE, SOLID_WHITE, BROKEN_YELLOW, SOLID_YELLOW, DOUBLE_YELLOW = 6, 7, 9, 11, 12  # WOMD map element ids
 WALKING, ON_ROAD, MERGING, CHANGING = 90, 60, 20, 5  # right of way outside of junctions: the higher rank goes first
 
@@ -44,21 +47,14 @@ class Lane(NamedTuple):
     control: int | None = None  # index into the stops: cars wait at the start of the lane
 
 
-class Line(NamedTuple):
-    """A painted line."""
-
-    kind: int
-    points: Points
-
-
 class Stop(NamedTuple):
     """A light or a sign at the start of the lanes whose `control` is its index."""
 
     kind: str  # "signal", "stop"
     arm: int  # of its junction
-    post: Float[np.ndarray, " 2"]  # of the sign, beside the road
+    post: Place  # of the sign, beside the road
+    junction: int
     protected: bool = False  # a turn without oncoming traffic: its light is an arrow
-    junction: int = 0  # block
 
 
 class Crosswalk(NamedTuple):
@@ -67,105 +63,67 @@ class Crosswalk(NamedTuple):
     outline: Float[np.ndarray, "4 2"]
     ends: Float[np.ndarray, "2 2"]
     arm: int  # of its junction that it crosses
-    junction: int = 0  # block
-
-
-class ParkingSpace(NamedTuple):
-    """Place of one parked car."""
-
-    place: Float[np.ndarray, " 2"]
-    yaw: float
+    junction: int
 
 
 class Port(NamedTuple):
-    """End of a block where it can be joined to another. Slots are counted from the middle of the road outward."""
+    """End of a block, from which a road leads on."""
 
-    place: Float[np.ndarray, " 2"]  # middle of the road
+    place: Place  # middle of the road
     yaw: float  # out of the block
     street: Street
-    leaving: tuple[tuple[int, ...], ...]  # lanes of the block that end at each slot
-    entering: tuple[tuple[int, ...], ...]  # lanes of the block that begin at each slot
-    cycles_leaving: tuple[int, ...] = ()
-    cycles_entering: tuple[int, ...] = ()
-    side: str = "right"  # on which a road to this port gains or drops a lane
+    leaving: list[list[int]]  # lanes of the block that end at each slot
+    entering: list[list[int]]  # lanes of the block that begin at each slot
+    cycles_leaving: list[int]
+    cycles_entering: list[int]
+    side: str = "right"  # on which a road to this port gains a lane
     controlled: bool = False  # traffic stops or gives way before it enters
 
 
-class Block(NamedTuple):
-    """A piece of a town, with its lanes numbered from 0."""
+@dataclass
+class Network:
+    """Road network that its blocks are added to. A lane without entry or exit ends where the road leaves the town."""
 
-    kind: str
-    lanes: Sequence[Lane]
-    follows: Sequence[tuple[int, int]] = ()  # lane, its successor
-    beside: Sequence[tuple[int, int]] = ()  # lane, its right neighbour; cars may change between them
-    lines: Sequence[Line] = ()
-    areas: Sequence[shapely.Geometry] = ()  # paved
-    islands: Sequence[shapely.Polygon] = ()  # not paved, within the areas
-    stops: Sequence[Stop] = ()
-    crosswalks: Sequence[Crosswalk] = ()
-    spots: Sequence[ParkingSpace] = ()
-    ports: Sequence[Port] = ()
-    phases: Sequence[frozenset[int]] = ()  # arms that have green together, in the order of the phases
+    lanes: list[Lane] = field(default_factory=list)
+    entries: list[list[int]] = field(default_factory=list)  # the lanes that lead into each lane
+    exits: list[list[int]] = field(default_factory=list)
+    left: list[list[int]] = field(default_factory=list)  # the lanes into which a car may change from each lane
+    right: list[list[int]] = field(default_factory=list)
+    lines: list[tuple[int, Points]] = field(default_factory=list)  # painted: kind, points
+    areas: list[shapely.Geometry] = field(default_factory=list)  # paved
+    islands: list[shapely.Polygon] = field(default_factory=list)  # not paved, within the areas
+    stops: list[Stop] = field(default_factory=list)
+    crosswalks: list[Crosswalk] = field(default_factory=list)
+    spots: list[Pose] = field(default_factory=list)  # of parked cars
+    phases: dict[int, list[frozenset[int]]] = field(default_factory=dict)  # junction with lights -> arms that have green together
+    blocks: list[str] = field(default_factory=list)  # kinds of all blocks
 
+    def add_block(self, kind: str) -> int:
+        """Adds a block and returns its index."""
+        self.blocks.append(kind)
+        return len(self.blocks) - 1
 
-class Network(NamedTuple):
-    """Joined blocks with all lanes numbered. A lane without entry or exit ends where the road leaves the town."""
+    def add_lane(self, lane: Lane) -> int:
+        """Adds a lane and returns its index."""
+        self.lanes.append(lane)
+        for links in (self.entries, self.exits, self.left, self.right):
+            links.append([])
+        return len(self.lanes) - 1
 
-    lanes: list[Lane]
-    exits: list[tuple[int, ...]]
-    left: list[tuple[int, ...]]
-    right: list[tuple[int, ...]]
-    lines: list[Line]
-    areas: list[shapely.Geometry]
-    islands: list[shapely.Polygon]
-    stops: list[Stop]
-    crosswalks: list[Crosswalk]
-    spots: list[ParkingSpace]
-    phases: dict[int, Sequence[frozenset[int]]]  # junction -> phases
-    kinds: list[str]  # of all blocks
+    def link(self, lane: int, follower: int) -> None:
+        """Leads a lane into another."""
+        self.exits[lane].append(follower)
+        self.entries[follower].append(lane)
 
-    @property
-    def entries(self) -> list[tuple[int, ...]]:
-        """The lanes that lead into each lane."""
-        return _group([(follower, lane) for lane, exits in enumerate(self.exits) for follower in exits], len(self.lanes))
+    def link_slots(self, lanes: Slots, followers: Slots) -> None:
+        """Leads the lanes at every slot into those that begin there."""
+        for slot, next_slot in zip(lanes, followers, strict=True):
+            for lane in slot:
+                for follower in next_slot:
+                    self.link(lane, follower)
 
-
-Joint = tuple[tuple[int, int], tuple[int, int]]  # (block, port) and (block, port)
-
-
-def assemble(blocks: Sequence[Block], joints: Sequence[Joint]) -> Network:
-    """Joins blocks at their ports and numbers all lanes and stops."""
-    base = list(itertools.accumulate((len(block.lanes) for block in blocks), initial=0))
-    stop_base = list(itertools.accumulate((len(block.stops) for block in blocks), initial=0))
-    lanes, pairs, beside = [], [], []
-    for index, block in enumerate(blocks):
-        lanes += [lane if lane.control is None else lane._replace(control=lane.control + stop_base[index]) for lane in block.lanes]
-        pairs += [(a + base[index], b + base[index]) for a, b in block.follows]
-        beside += [(a + base[index], b + base[index]) for a, b in block.beside]
-    for (a, i), (b, j) in joints:
-        ends = ((a, blocks[a].ports[i]), (b, blocks[b].ports[j]))
-        for (first, from_port), (second, to_port) in (ends, ends[::-1]):
-            slots = zip((*from_port.leaving, from_port.cycles_leaving), (*to_port.entering, to_port.cycles_entering), strict=True)
-            pairs += [(x + base[first], y + base[second]) for xs, ys in slots for x in xs for y in ys]
-    return Network(
-        lanes=lanes,
-        exits=_group(pairs, len(lanes)),
-        left=_group([(right, left) for left, right in beside], len(lanes)),
-        right=_group(beside, len(lanes)),
-        lines=[line for block in blocks for line in block.lines],
-        areas=[area for block in blocks for area in block.areas],
-        islands=[island for block in blocks for island in block.islands],
-        stops=[stop._replace(junction=index) for index, block in enumerate(blocks) for stop in block.stops],
-        crosswalks=[walk._replace(junction=index) for index, block in enumerate(blocks) for walk in block.crosswalks],
-        spots=[spot for block in blocks for spot in block.spots],
-        phases={index: block.phases for index, block in enumerate(blocks) if block.phases},
-        kinds=[block.kind for block in blocks],
-    )
-
-
-def _group(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, ...]]:
-    """Collects the second numbers of all pairs by the first."""
-    groups: list[list[int]] = [[] for _ in range(count)]
-    for key, value in pairs:
-        groups[key].append(value)
-    return [tuple(group) for group in groups]
+    def put_side_by_side(self, lanes: Sequence[int]) -> None:
+        """Makes lanes neighbours, from left to right; cars may change between them."""
+        for left, right in itertools.pairwise(lanes):
+            self.right[left].append(right)
+            self.left[right].append(left)

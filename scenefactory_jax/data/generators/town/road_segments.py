@@ -9,38 +9,14 @@ import shapely
 from jaxtyping import Float
 
 from scenefactory_jax.core.types import LANE_BIKE, LANE_STREET
-from scenefactory_jax.data.generators.curves import (
-    FINE_M,
-    Curve,
-    Points,
-    arc_length,
-    connect,
-    interpolate,
-    join,
-    smoothstep,
-    tangents,
-    wrap_angle,
-)
-from scenefactory_jax.data.generators.town.road_network import (
-    BROKEN_WHITE,
-    MERGING,
-    ON_ROAD,
-    SOLID_WHITE,
-    SOLID_YELLOW,
-    Block,
-    Lane,
-    Line,
-    ParkingSpace,
-    Port,
-    Street,
-)
+from scenefactory_jax.data.generators import curves
+from scenefactory_jax.data.generators.curves import FINE_M, Curve, Points, smoothstep, wrap_angle
+from scenefactory_jax.data.generators.town import road_network
+from scenefactory_jax.data.generators.town.road_network import BROKEN_WHITE, SOLID_WHITE, SOLID_YELLOW, Lane, Network, Port, Pose, Street
 
 CURVE_RAD = np.radians(20.0)  # a road with a larger range of yaw is a curve
 MIN_LANE_M = 6.0  # length of a lane before and behind a taper
 MIN_PARKING_ROAD_M = 40.0  # length of a road with parking spaces
-
-Pose = tuple[Float[np.ndarray, " 2"], float]
-
 
 @dataclass(frozen=True)
 class RoadDimensions:
@@ -56,69 +32,42 @@ class RoadDimensions:
 
 
 class Carriageway(NamedTuple):
-    """One direction of a road. `start` and `end` are the lanes at the slots of its two ends."""
+    """Lanes at the slots of the start and of the end of one direction of a road, and its bicycle lane."""
 
-    lanes: list[Lane]
-    follows: list[tuple[int, int]]
-    beside: list[tuple[int, int]]
-    lines: list[Line]
-    area: shapely.Polygon
-    spots: list[ParkingSpace]
     start: list[int]
     end: list[int]
-    cycles: tuple[int, ...]
+    cycles: list[int]
 
 
-def connect_ports(first: Port, second: Port, via: list[Pose], numbers: RoadDimensions) -> Block:
-    """Builds the road between two ports. Its port 0 faces the first, its port 1 the second.
+def connect_ports(network: Network, first: Port, second: Port, via: list[Pose], dimensions: RoadDimensions) -> None:
+    """Builds the road between two ports.
 
     Args:
         via: poses of the middle line where bends begin and end, in the order from the first port to the second.
     """
-    street = first.street
-    points, yaw = _middle_line(first, second, via)
-    ahead, back = (
-        build_carriageway(curve, len(a.leaving), len(b.entering), street, numbers, side=b.side, controlled=b.controlled)
-        for curve, a, b in (((points, yaw), first, second), ((points[::-1], yaw[::-1] + np.pi), second, first))
-    )
-    lines = [Line(street.centre_line, points)] if street.median == 0 else []
-    kind = "curve" if np.ptp(yaw) > CURVE_RAD else "straight"
+    street, (points, yaw) = first.street, _middle_line(first, second, via)
     changes = [len(b.entering) - len(a.leaving) for a, b in ((first, second), (second, first))]
-    kind = "lane_drop" if min(changes) < 0 else "lane_gain" if max(changes) > 0 else kind
-    block = combine(kind, [ahead, back])
-    islands = [_median(points, street, numbers)] if street.median > 2 * numbers.shoulder_m + 0.5 else []
-    return block._replace(lines=[*block.lines, *lines], islands=islands, ports=_ports(first, second, ahead, back))
-
-
-def combine(kind: str, ways: list[Carriageway]) -> Block:
-    """Combines carriageways to one block without ports."""
-    base, lanes, follows, beside = 0, [], [], []
-    for way in ways:
-        follows += [(a + base, b + base) for a, b in way.follows]
-        beside += [(a + base, b + base) for a, b in way.beside]
-        lanes += way.lanes
-        base += len(way.lanes)
-    lines = [line for way in ways for line in way.lines]
-    return Block(kind, lanes, follows, beside, lines, [way.area for way in ways], spots=[spot for way in ways for spot in way.spots])
-
-
-def _ports(first: Port, second: Port, ahead: Carriageway, back: Carriageway) -> list[Port]:
-    """Computes the ports of the road, which face those it connects; the lanes of `back` are numbered after those of `ahead`."""
-    base = len(ahead.lanes)
-    starts, back_starts = tuple((i,) for i in ahead.start), tuple((i + base,) for i in back.start)
-    ends, back_ends = tuple((i,) for i in ahead.end), tuple((i + base,) for i in back.end)
-    cycles, back_cycles = ahead.cycles, tuple(i + base for i in back.cycles)
-    return [
-        Port(first.place, first.yaw + np.pi, first.street, back_ends, starts, back_cycles, cycles),
-        Port(second.place, second.yaw + np.pi, first.street, ends, back_starts, cycles, back_cycles),
-    ]
+    kind = "curve" if np.ptp(yaw) > CURVE_RAD else "straight"
+    network.add_block("lane_drop" if min(changes) < 0 else "lane_gain" if max(changes) > 0 else kind)
+    for curve, a, b in (((points, yaw), first, second), ((points[::-1], yaw[::-1] + np.pi), second, first)):
+        way = build_carriageway(
+            network, curve, len(a.leaving), len(b.entering), street, dimensions, side=b.side, controlled=b.controlled
+        )
+        network.link_slots([*a.leaving, a.cycles_leaving], [*([lane] for lane in way.start), way.cycles])
+        network.link_slots([*([lane] for lane in way.end), way.cycles], [*b.entering, b.cycles_entering])
+    if street.median == 0:
+        network.lines.append((street.centre_line, points))
+    if street.median > 2 * dimensions.shoulder_m + 0.5:
+        half = street.median / 2 - dimensions.shoulder_m
+        trim = max(2, round((half + 1.0) / FINE_M))
+        network.islands.append(shapely.LineString(points[trim:-trim]).simplify(0.02).buffer(half, quad_segs=4))
 
 
 def _middle_line(first: Port, second: Port, via: list[Pose]) -> Curve:
     """Computes the middle line of the road and its yaw: smooth between the two ports and through every corner."""
     poses = [(first.place, first.yaw), *via, (second.place, second.yaw + np.pi)]
-    points = join([connect(a, a_yaw, b, b_yaw) for (a, a_yaw), (b, b_yaw) in itertools.pairwise(poses)])
-    yaw = tangents(points)
+    points = curves.join([curves.connect(a, a_yaw, b, b_yaw) for (a, a_yaw), (b, b_yaw) in itertools.pairwise(poses)])
+    yaw = curves.tangents(points)
     yaw[0] += wrap_angle(first.yaw - float(yaw[0]))
     yaw[-1] += wrap_angle(second.yaw + np.pi - float(yaw[-1]))
     return points, yaw
@@ -130,15 +79,8 @@ def shift_line(curve: Curve, right: float | Float[np.ndarray, " N"]) -> Points:
     return points + np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1) * np.broadcast_to(right, len(points))[:, None]
 
 
-def _median(points: Points, street: Street, numbers: RoadDimensions) -> shapely.Polygon:
-    """Computes the strip between the directions, rounded at its ends."""
-    half = street.median / 2 - numbers.shoulder_m
-    trim = max(2, round((half + 1.0) / FINE_M))
-    return shapely.LineString(points[trim:-trim]).simplify(0.02).buffer(half, quad_segs=4)
-
-
 def build_carriageway(
-    curve: Curve, before: int, behind: int, street: Street, numbers: RoadDimensions, *, side: str, controlled: bool
+    network: Network, curve: Curve, before: int, behind: int, street: Street, dimensions: RoadDimensions, *, side: str, controlled: bool
 ) -> Carriageway:
     """Builds one direction of a road on the right of a curve.
 
@@ -147,48 +89,56 @@ def build_carriageway(
         side: on which a lane is gained; lanes are dropped on the right.
         controlled: solid lines before the end.
     """
-    place = arc_length(curve[0])
-    length = float(place[-1])
-    i, j = (int(np.searchsorted(place, at)) for at in _taper(before, behind, length, numbers))
+    place = curves.arc_length(curve[0])
+    i, j = (int(np.searchsorted(place, at)) for at in _taper(before, behind, float(place[-1]), dimensions))
     ease = smoothstep((place - place[i]) / (place[j] - place[i]))
-    count = before + (behind - before) * ease  # lanes, with fractions in the taper
     offset = lambda slot: street.median / 2 + (slot + 0.5) * street.width  # noqa: E731
-    lanes: list[Lane] = []
-    follows: list[tuple[int, int]] = []
 
-    def add(rows: slice, right: np.ndarray | float, rank: int = ON_ROAD) -> int:
+    def add(rows: slice, right: np.ndarray | float, rank: int = road_network.ON_ROAD) -> int:
         points = shift_line((curve[0][rows], curve[1][rows]), np.broadcast_to(right, place.shape)[rows])
-        lanes.append(Lane(points, street.width, street.limit, rank, street.kind))
-        return len(lanes) - 1
+        return network.add_lane(Lane(points, street.width, street.limit, rank, street.kind))
 
     if before == behind:
         sections = [(slice(None), before)]
         start = end = [add(slice(None), offset(slot)) for slot in range(before)]
-        beside = [*itertools.pairwise(start)]
     else:
         sections = [(slice(0, i + 1), before), (slice(j, None), behind)]
-        start, end = ([add(rows, offset(slot)) for slot in range(lane_count)] for rows, lane_count in sections)
+        start, end = ([add(rows, offset(slot)) for slot in range(count)] for rows, count in sections)
         for a, b in _pair_slots(before, behind, side):
-            rank = MERGING if behind < before and a == before - 1 else ON_ROAD
+            rank = road_network.MERGING if behind < before and a == before - 1 else road_network.ON_ROAD
             lane = add(slice(i, j + 1), offset(a) + (offset(b) - offset(a)) * ease, rank)
-            follows += [(start[a], lane), (lane, end[b])]
-        beside = [*itertools.pairwise(start), *itertools.pairwise(end)]
-    outer = street.median / 2 + street.width * count
-    cycles = (len(lanes),) if street.bike else ()
+            network.link(start[a], lane)
+            network.link(lane, end[b])
+        network.put_side_by_side(end)
+    network.put_side_by_side(start)
+    outer = street.median / 2 + street.width * (before + (behind - before) * ease)
+    cycles = []
     if street.bike:
-        lanes.append(Lane(shift_line(curve, outer + street.bike / 2), street.bike, street.limit, ON_ROAD, LANE_BIKE))
-    parking = _parking_width(place, street, numbers)
-    area = _paved_area(curve, outer + street.bike + parking + numbers.shoulder_m)
-    spots = _parking_spaces(curve, place, outer + street.bike + parking / 2, numbers) if parking.any() else []
-    lines = _lines(curve, place, sections, outer, street, numbers, controlled=controlled)
-    return Carriageway(lanes, follows, beside, lines, area, spots, start, end, cycles)
+        points = shift_line(curve, outer + street.bike / 2)
+        cycles.append(network.add_lane(Lane(points, street.bike, street.limit, road_network.ON_ROAD, LANE_BIKE)))
+    parking = _parking_width(place, street, dimensions)
+    network.areas.append(_paved_area(curve, outer + street.bike + parking + dimensions.shoulder_m))
+    if parking.any():
+        network.spots += _parking_spaces(curve, place, outer + street.bike + parking / 2, dimensions)
+    solid = place[-1] - (dimensions.solid_m if controlled else 0.0)
+    for rows, count in sections:
+        for slot in range(1, count):
+            points = shift_line((curve[0][rows], curve[1][rows]), street.median / 2 + slot * street.width)
+            split = int(np.searchsorted(place[rows], solid))
+            parts = ((BROKEN_WHITE, points[: split + 1]), (SOLID_WHITE, points[split:]))
+            network.lines += [(kind, part) for kind, part in parts if len(part) > 4]
+    if street.median:
+        network.lines.append((SOLID_YELLOW, shift_line(curve, street.median / 2)))
+    if street.bike or street.kind != LANE_STREET:
+        network.lines.append((SOLID_WHITE, shift_line(curve, outer)))
+    return Carriageway(start, end, cycles)
 
 
-def _taper(before: int, behind: int, length: float, numbers: RoadDimensions) -> tuple[float, float]:
+def _taper(before: int, behind: int, length: float, dimensions: RoadDimensions) -> tuple[float, float]:
     """Computes where a taper begins and ends: near the end of the road for a gained lane, near its start for a dropped one."""
     room = max(length - 2 * MIN_LANE_M, 2.0)
-    taper = min(numbers.taper_m, 0.8 * room)
-    begin = length - numbers.bay_m - taper if behind > before else numbers.hold_m
+    taper = min(dimensions.taper_m, 0.8 * room)
+    begin = length - dimensions.bay_m - taper if behind > before else dimensions.hold_m
     begin = float(np.clip(begin, MIN_LANE_M, max(MIN_LANE_M, length - MIN_LANE_M - taper)))
     return begin, begin + taper
 
@@ -202,54 +152,27 @@ def _pair_slots(before: int, behind: int, side: str) -> list[tuple[int, int]]:
     return [*((slot, slot) for slot in range(before)), (before - 1, before)]
 
 
-def _parking_width(place: Float[np.ndarray, " N"], street: Street, numbers: RoadDimensions) -> Float[np.ndarray, " N"]:
+def _parking_width(place: Float[np.ndarray, " N"], street: Street, dimensions: RoadDimensions) -> Float[np.ndarray, " N"]:
     """Computes the width of the parking strip along the road, zero near its ends."""
     if not street.parking or place[-1] <= MIN_PARKING_ROAD_M:
         return np.zeros_like(place)
     near = np.minimum(place, place[-1] - place)
-    return street.parking * np.clip((near - numbers.spot_margin_m + 3.0) / 3.0, 0.0, 1.0)
+    return street.parking * np.clip((near - dimensions.spot_margin_m + 3.0) / 3.0, 0.0, 1.0)
 
 
 def _paved_area(curve: Curve, outer: Float[np.ndarray, " N"]) -> shapely.Polygon:
     """Computes the paved surface from the middle of the road to the kerb."""
     rows = np.unique(np.append(np.arange(0, len(outer), 4), len(outer) - 1))
     thinned = curve[0][rows], curve[1][rows]
-    kerb = shift_line(thinned, outer[rows])
     inner = shift_line(thinned, -0.05)  # so that the areas of both directions overlap
-    return shapely.Polygon(np.concatenate([inner, kerb[::-1]]))
+    return shapely.Polygon(np.concatenate([inner, shift_line(thinned, outer[rows])[::-1]]))
 
 
 def _parking_spaces(
-    curve: Curve, place: Float[np.ndarray, " N"], beside: Float[np.ndarray, " N"], numbers: RoadDimensions
-) -> list[ParkingSpace]:
+    curve: Curve, place: Float[np.ndarray, " N"], beside: Float[np.ndarray, " N"], dimensions: RoadDimensions
+) -> list[Pose]:
     """Lists kerbside parking spaces in a row."""
-    margin = numbers.spot_margin_m + numbers.spot_m / 2
-    at = np.arange(margin, place[-1] - numbers.spot_margin_m - numbers.spot_m / 2, numbers.spot_m)
-    places = interpolate(at, place, shift_line(curve, beside))
-    return [ParkingSpace(spot, float(yaw)) for spot, yaw in zip(places, np.interp(at, place, curve[1]), strict=True)]
-
-
-def _lines(
-    curve: Curve,
-    place: Float[np.ndarray, " N"],
-    sections: list[tuple[slice, int]],
-    outer: Float[np.ndarray, " N"],
-    street: Street,
-    numbers: RoadDimensions,
-    *,
-    controlled: bool,
-) -> list[Line]:
-    """Lists broken lines between lanes, solid before a stop, and solid ones beside a median and a bicycle lane."""
-    lines = []
-    solid = place[-1] - (numbers.solid_m if controlled else 0.0)
-    for rows, count in sections:
-        for slot in range(1, count):
-            points = shift_line((curve[0][rows], curve[1][rows]), street.median / 2 + slot * street.width)
-            split = int(np.searchsorted(place[rows], solid))
-            parts = ((BROKEN_WHITE, points[: split + 1]), (SOLID_WHITE, points[split:]))
-            lines += [Line(kind, part) for kind, part in parts if len(part) > 4]
-    if street.median:
-        lines.append(Line(SOLID_YELLOW, shift_line(curve, street.median / 2)))
-    if street.bike or street.kind != LANE_STREET:
-        lines.append(Line(SOLID_WHITE, shift_line(curve, outer)))
-    return lines
+    margin = dimensions.spot_margin_m + dimensions.spot_m / 2
+    at = np.arange(margin, place[-1] - dimensions.spot_margin_m - dimensions.spot_m / 2, dimensions.spot_m)
+    places = curves.interpolate(at, place, shift_line(curve, beside))
+    return [(spot, float(yaw)) for spot, yaw in zip(places, np.interp(at, place, curve[1]), strict=True)]

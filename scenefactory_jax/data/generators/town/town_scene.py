@@ -1,6 +1,7 @@
 """Generates a random town in the form of a logged scene."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,22 +14,13 @@ from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVEWAY, EDGE_BOUNDARY, EDGE_MEDIAN, STOP_SIGN
 from scenefactory_jax.data.generators.curves import Points, heading, resample
 from scenefactory_jax.data.generators.town.road_network import Network
-from scenefactory_jax.data.generators.town.traffic import TownUser, add_warmup, measure_travel
+from scenefactory_jax.data.generators.town.road_users import TownUser
+from scenefactory_jax.data.generators.town.traffic import add_warmup
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 
 PACKAGE = "scenefactory_jax.data.generators.town"
 MAX_REDRAWS = 40  # towns that are drawn until one can be built and has enough moving cars
 MAX_TRAFFIC_REDRAWS = 3  # on one network
-
-
-class TownParts(NamedTuple):
-    """Functions that build a town, bound to their numbers; see `generate`."""
-
-    network: Callable[..., tuple[str, Network] | None]
-    kerbs: Callable[..., tuple[list[Points], list[Points], object]]
-    driveways: Callable[..., tuple[list[Points], list]]
-    gates: Callable[..., Gates]
-    traffic: Callable[..., list[TownUser]]
 
 
 class Log(NamedTuple):
@@ -41,19 +33,6 @@ class Log(NamedTuple):
     sensor_range_m: float
     min_travel_m: float  # of a moving car, from the current step on
     min_cars: int  # moving cars within the sensor range
-
-
-class Town(NamedTuple):
-    """A road network with its surroundings and its traffic."""
-
-    kind: str
-    network: Network
-    outer: list[Points]
-    islands: list[Points]
-    driveways: list[Points]
-    gates: Gates
-    users: list[TownUser]
-    sdc: int  # index into users
 
 
 def generate(
@@ -79,20 +58,14 @@ def generate(
     """Generates scene `index` of the series `seed`: a road network, traffic lights and simulated traffic.
 
     The scene depends on seed, index and numbers alone. Coordinates are metres around the middle of the town; `sdc` is a moving car near it.
+    The numbers are described in `conf/scenes/town.yaml`.
 
     Args:
-        kinds: plans of `network.plans`, or "motorway", that take turns; None: drawn.
-        reach_m: half the side of the square with kerbs; roads go on beyond it.
         network: entry of the roads, `(rng, reach, kind) -> (kind, Network)`, or None if the drawn plan cannot be built.
         kerbs: entry of the road edges, `(network, reach) -> outer, islands, surface`.
         driveways: entry of the private driveways, `(rng, network, kerbs, surface) -> outlines, spots`.
         traffic_lights: entry of the lights, `(rng, network, times) -> Gates`.
-        traffic: entry of the road users, `(rng, network, kerbs, surface, reach, times, gates) -> users`, with the range `cars`.
-        lane_spacing_m, line_spacing_m: distance between the points of lanes, and of painted lines.
-        log_steps, log_current, log_dt: steps of the log, the step at which a simulation starts, and the time step.
-        warmup_s: simulated time before the log.
-        max_sdc_distance_m: maximum distance of `sdc` from the middle at the current step, along each axis.
-        sensor_range_m: distance from `sdc` within which road users are logged.
+        traffic: entry of the road users, `(rng, network, kerbs, surface, reach, times, gates) -> users`, with `cars` and `travel_m`.
 
     Raises:
         ConfigError: an unknown key or a number out of range.
@@ -102,37 +75,60 @@ def generate(
         raise ConfigError(f"generate: expected seed and index >= 0, got {seed} and {index}")
     if not 0 <= log_current < log_steps - 1:
         raise ConfigError(f"generate.log_current: expected 0 .. log_steps - 2 = {log_steps - 2}, got {log_current}")
-    modules = {"network": "network_choice"}  # of other entries: of the same name
-    entries = {"network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
-    parts = TownParts(
-        *(instantiate(entry, builtins=f"{PACKAGE}.{modules.get(key, key)}", where=f"generate.{key}") for key, entry in entries.items())
-    )
+    entries = {"build_network": network, "kerbs": kerbs, "driveways": driveways, "traffic_lights": traffic_lights, "traffic": traffic}
+    parts = [
+        instantiate(entry, builtins=f"{PACKAGE}.{module}", where=f"generate.{module.removeprefix('build_')}")
+        for module, entry in entries.items()
+    ]
     times = log_dt * np.arange(log_steps)
     log = Log(times, log_current, warmup_s, max_sdc_distance_m, sensor_range_m, traffic["travel_m"][0], traffic["cars"][0])
     kind = kinds[index % len(kinds)] if kinds else None
     for redraw in range(MAX_REDRAWS):
-        town = _draw_town(np.random.default_rng(np.random.SeedSequence((seed, index, redraw))), kind, reach_m, parts, log)
-        if town is not None:
-            return _to_scene(town, log, seed, index, lane_spacing_m, line_spacing_m)
+        rng = np.random.default_rng(np.random.SeedSequence((seed, index, redraw)))
+        scene = _draw_scene(rng, kind, reach_m, parts, log, lane_spacing_m, line_spacing_m)
+        if scene is not None:
+            name, source = f"{scene.name}-{seed}-{index:06d}", f"generator, seed {seed}, index {index}"
+            return replace(scene, name=name, source=source, metadata=scene.metadata | {"seed": seed, "index": index})
     raise SceneError(f"generate.traffic.cars: {MAX_REDRAWS} towns had fewer than {log.min_cars} moving cars; give a lower minimum")
 
 
-def _draw_town(rng: np.random.Generator, kind: str | None, reach: float, parts: TownParts, log: Log) -> Town | None:
+def _draw_scene(
+    rng: np.random.Generator,
+    kind: str | None,
+    reach: float,
+    parts: list[Callable[..., Any]],
+    log: Log,
+    lane_spacing: float,
+    line_spacing: float,
+) -> RawScene | None:
     """Draws a town; None if its plan cannot be built or too few cars move."""
-    drawn = parts.network(rng, reach, kind)
+    draw_network, compute_kerbs, draw_driveways, draw_gates, draw_traffic = parts
+    drawn: tuple[str, Network] | None = draw_network(rng, reach, kind)
     if drawn is None:
         return None
     kind, network = drawn
-    outer, islands, surface = parts.kerbs(network, reach)
+    outer, islands, surface = compute_kerbs(network, reach)
     pavements = [] if kind == "motorway" else outer
-    driveways, spots = parts.driveways(rng, network, pavements, surface)
-    network = network._replace(spots=[*network.spots, *spots])
+    driveways, spots = draw_driveways(rng, network, pavements, surface)
+    network.spots += spots
     times = add_warmup(log.times, log.warmup_s)
-    gates = parts.gates(rng, network, times)
+    gates: Gates = draw_gates(rng, network, times)
     for _ in range(MAX_TRAFFIC_REDRAWS):
-        recorded = _record(rng, parts.traffic(rng, network, pavements, surface, reach, times, gates), log)
+        recorded = _record(rng, draw_traffic(rng, network, pavements, surface, reach, times, gates), log)
         if recorded is not None:
-            return Town(kind, network, outer, islands, driveways, gates, *recorded)
+            users, sdc = recorded
+            blocks = {name: network.blocks.count(name) for name in sorted(set(network.blocks))}
+            return RawScene(
+                name=f"town-{kind}",
+                source="generator",
+                roads=_to_polylines(network, outer, islands, driveways, lane_spacing, line_spacing),
+                tracks=tuple(_to_track(i, user) for i, user in enumerate(users)),
+                times=log.times,
+                current=log.current,
+                sdc=sdc,
+                lights=_to_lights(network, gates, len(log.times)),
+                metadata={"dataset": "town", "format": "generated", "kind": kind, "blocks": blocks},
+            )
     return None
 
 
@@ -142,8 +138,10 @@ def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[
     Returns:
         The users in range and the index of the recording car; None if too few cars move.
     """
-    now, logs = log.current, [user.since(-len(log.times)) for user in users]
-    moving = [i for i, u in enumerate(logs) if u.kind == "vehicle" and u.valid[now] and measure_travel(u, now) > log.min_travel_m]
+    now, steps = log.current, len(log.times)
+    logs = [TownUser(u.kind, u.size, *(column[-steps:] for column in (u.position, u.yaw, u.speed, u.valid))) for u in users]
+    travel = [np.linalg.norm(np.diff(u.position[now:][u.valid[now:]], axis=0), axis=1).sum() for u in logs]
+    moving = [i for i, u in enumerate(logs) if u.kind == "vehicle" and u.valid[now] and travel[i] > log.min_travel_m]
     near = [i for i in moving if np.abs(logs[i].position[now]).max() <= log.max_sdc_distance_m and logs[i].valid[: now + 1].all()]
     near = [i for i in near if logs[i].valid.all()] or near
     if not near:
@@ -157,34 +155,26 @@ def _record(rng: np.random.Generator, users: list[TownUser], log: Log) -> tuple[
     return [logs[i] for i in kept], kept.index(sdc)
 
 
-def _to_scene(town: Town, log: Log, seed: int, index: int, lane_spacing: float, line_spacing: float) -> RawScene:
-    """Converts a town to a raw scene."""
-    kinds = town.network.kinds
-    return RawScene(
-        name=f"town-{town.kind}-{seed}-{index:06d}",
-        source=f"generator, seed {seed}, index {index}",
-        roads=_to_polylines(town, lane_spacing, line_spacing),
-        tracks=tuple(_to_track(i, user) for i, user in enumerate(town.users)),
-        times=log.times,
-        current=log.current,
-        sdc=town.sdc,
-        lights=_to_lights(town.network, town.gates, len(log.times)),
-        metadata={"dataset": "town", "format": "generated", "kind": town.kind, "seed": seed, "index": index}
-        | {"blocks": {name: kinds.count(name) for name in sorted(set(kinds))}},
-    )
-
-
-def _to_polylines(town: Town, lane_spacing: float, line_spacing: float) -> tuple[Polyline, ...]:
+def _to_polylines(
+    network: Network, outer: list[Points], islands: list[Points], driveways: list[Points], lane_spacing: float, line_spacing: float
+) -> tuple[Polyline, ...]:
     """Lists lanes (the id is the place in the list), then lines, edges, crosswalks, driveways and stop signs."""
-    network = town.network
-    links = zip(network.lanes, network.entries, network.exits, network.left, network.right, strict=True)
     lanes = [
-        Polyline(lane.kind, _flat(resample(lane.points, lane_spacing)), i, *ids, speed_limit=lane.limit)
-        for i, (lane, *ids) in enumerate(links)
+        Polyline(
+            lane.kind,
+            _flat(resample(lane.points, lane_spacing)),
+            i,
+            entry=tuple(sorted(network.entries[i])),
+            exit=tuple(network.exits[i]),
+            left=tuple(network.left[i]),
+            right=tuple(network.right[i]),
+            speed_limit=lane.limit,
+        )
+        for i, lane in enumerate(network.lanes)
     ]
-    features = [(line.kind, resample(line.points, line_spacing)) for line in network.lines]
-    features += [(EDGE_BOUNDARY, points) for points in town.outer] + [(EDGE_MEDIAN, points) for points in town.islands]
-    features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in town.driveways]
+    features = [(kind, resample(points, line_spacing)) for kind, points in network.lines]
+    features += [(EDGE_BOUNDARY, points) for points in outer] + [(EDGE_MEDIAN, points) for points in islands]
+    features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in driveways]
     features += [(STOP_SIGN, stop.post[None]) for stop in network.stops if stop.kind == "stop"]
     return (*lanes, *(Polyline(kind, _flat(points), len(lanes) + i) for i, (kind, points) in enumerate(features)))
 

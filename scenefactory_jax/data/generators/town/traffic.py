@@ -1,40 +1,21 @@
 """Draws and simulates the traffic of a town, without collisions."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
-
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from scenefactory_jax.core.types import RoadUser
-from scenefactory_jax.data.generators.curves import Points, arc_length, heading, interpolate
-from scenefactory_jax.data.generators.ranges import check_range, draw, draw_count, read_group
+from scenefactory_jax.core.schema import CountRange, Range
+from scenefactory_jax.data.generators.curves import Points, interpolate
 from scenefactory_jax.data.generators.town import road_users
-from scenefactory_jax.data.generators.town.driver_model import DriverParameters, Users, simulate
+from scenefactory_jax.data.generators.town.driver_model import DriverParameters, SimulatedUser, simulate
 from scenefactory_jax.data.generators.town.lane_paths import STEP_M
-from scenefactory_jax.data.generators.town.path_conflicts import find_conflicts
 from scenefactory_jax.data.generators.town.road_network import Network
+from scenefactory_jax.data.generators.town.road_users import CyclistNumbers, DrivingNumbers, PedestrianNumbers, TownUser
 from scenefactory_jax.data.generators.town.traffic_lights import Gates
 from scenefactory_jax.data.packing.pack import box_corners, overlaps
 
 WARMUP_STEP_S = 0.2
 RIM_M = 6.0  # of the square with kerbs, in which cars are not checked for leaving the road
-
-
-class TownUser(NamedTuple):
-    """States of one road user over time."""
-
-    kind: RoadUser
-    size: tuple[float, float, float]
-    position: Float[np.ndarray, "L 2"]
-    yaw: Float[np.ndarray, " L"]
-    speed: Float[np.ndarray, " L"]
-    valid: Bool[np.ndarray, " L"]
-
-    def since(self, step: int) -> "TownUser":
-        """The states from a step on."""
-        return TownUser(self.kind, self.size, self.position[step:], self.yaw[step:], self.speed[step:], self.valid[step:])
 
 
 def add_warmup(times: Float[np.ndarray, " L"], warmup_s: float) -> Float[np.ndarray, " M"]:
@@ -51,91 +32,35 @@ def populate(
     times: Float[np.ndarray, " L"],
     gates: Gates,
     *,
-    cars: list[int],
-    travel_m: list[float],
-    parked_fraction: list[float],
-    driving: Mapping[str, Any],
-    driver: Mapping[str, Any],
-    cyclists: Mapping[str, Any],
-    pedestrians: Mapping[str, Any],
+    cars: CountRange,
+    travel_m: Range,
+    parked_fraction: Range,
+    driving: DrivingNumbers,
+    driver: DriverParameters,
+    cyclists: CyclistNumbers,
+    pedestrians: PedestrianNumbers,
 ) -> list[TownUser]:
-    """Draws and simulates all road users over `times`, which include the warm-up.
-
-    Args:
-        kerbs, surface: road edges, and the paved surface.
-        gates: states of lights, signs and crosswalks at all times.
-        cars: range of the number of driving cars.
-        travel_m: minimum travel of a moving car; maximum travel since time 0, after which its log ends.
-        parked_fraction: range of the fraction of parking spaces with a car.
-        driving: numbers of `road_users.DrivingNumbers`.
-        driver: numbers of `DriverParameters`.
-        cyclists, pedestrians: numbers of `road_users.CyclistNumbers` and `road_users.PedestrianNumbers`.
-
-    Raises:
-        ConfigError: a number out of range.
-    """
-    for span, name in ((cars, "cars"), (travel_m, "travel_m"), (parked_fraction, "parked_fraction")):
-        check_range(span, f"traffic.{name}")
-    parameters = read_group(driver, DriverParameters, "traffic.driver")
-    drive = read_group(driving, road_users.DrivingNumbers, "traffic.driving")
-    walk = read_group(pedestrians, road_users.PedestrianNumbers, "traffic.pedestrians")
-    cycle = read_group(cyclists, road_users.CyclistNumbers, "traffic.cyclists")
+    """Draws and simulates all road users over `times`, which include the warm-up, as `gates` do."""
     simulated = [
-        *road_users.draw_cars(rng, network, draw_count(rng, cars), times, reach, drive),
-        *road_users.draw_cyclists(rng, network, times, reach, drive, cycle),
-        *road_users.draw_crossers(rng, network, times, walk),
+        *road_users.draw_cars(rng, network, int(rng.integers(*cars, endpoint=True)), times, reach, driving),
+        *road_users.draw_cyclists(rng, network, times, reach, driving, cyclists),
+        *road_users.draw_crossers(rng, network, times, pedestrians),
     ]
-    strolls = road_users.draw_strollers(rng, kerbs, surface, float(times[-1] - times[0]), walk)
-    parked = _park(rng, network, draw(rng, parked_fraction, "traffic.parked_fraction"), drive.size_m, times)
-    users = [
-        *_simulate(simulated, gates, times, parameters),
-        *(_stroll(*stroll, road_users.to_size(walk.size_m), times) for stroll in strolls),
-        *parked,
-    ]
+    strollers = road_users.draw_strollers(rng, kerbs, surface, times, pedestrians)
+    parked = road_users.draw_parked_cars(rng, network, rng.uniform(*parked_fraction), times, driving)
+    users = [*(_simulate(simulated, gates, times, driver) if simulated else []), *strollers, *parked]
     users = [_limit_travel(user, times, travel_m[1]) for user in users]
     return separate_users([user for user in users if user.kind != "vehicle" or _is_on_road(user, surface, reach)])
 
 
-def _simulate(
-    users: list[road_users.SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], parameters: DriverParameters
-) -> list[TownUser]:
+def _simulate(users: list[SimulatedUser], gates: Gates, times: Float[np.ndarray, " L"], driver: DriverParameters) -> list[TownUser]:
     """Simulates the road users along their paths."""
-    if not users:
-        return []
-    paths = [user.path for user in users]
-    columns = zip(*((user.size[0], user.size[1], 0.0, user.speed, user.enters) for user in users), strict=True)
-    states = Users(*(np.array(column, float) for column in columns))
-    table, zones = find_conflicts(paths, states.width)
-    motion = simulate(paths, states, table, zones, gates.state, times, parameters)
-    logs = []
-    for i, user in enumerate(users):
-        row, rows = motion.place[:, i] / STEP_M, np.arange(len(user.path.points), dtype=float)
+    logs, motion = [], simulate(users, gates.state, times, driver)
+    for user, place, speed, present in zip(users, motion.place.T, motion.speed.T, motion.present.T, strict=True):
+        row, rows = place / STEP_M, np.arange(len(user.path.points), dtype=float)
         position, yaw = interpolate(row, rows, user.path.points), np.interp(row, rows, user.path.yaw)
-        logs.append(TownUser(user.kind, user.size, position, yaw, motion.speed[:, i], motion.present[:, i]))
+        logs.append(TownUser(user.kind, user.size, position, yaw, speed, present))
     return logs
-
-
-def _stroll(points: Points, speed: float, size: tuple[float, float, float], times: Float[np.ndarray, " L"]) -> TownUser:
-    """Computes the log of a pedestrian with a constant speed."""
-    place = arc_length(points)
-    at = np.minimum(speed * (times - times[0]), place[-1])
-    step = np.gradient(points, axis=0)
-    yaw = np.interp(at, place, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
-    return TownUser("pedestrian", size, interpolate(at, place, points), yaw, np.full(len(times), speed), at < place[-1])
-
-
-def _park(
-    rng: np.random.Generator, network: Network, fraction: float, size_m: list[list[float]], times: Float[np.ndarray, " L"]
-) -> list[TownUser]:
-    """Draws cars in a fraction of the parking spaces."""
-    parked = []
-    for spot in network.spots:
-        if rng.random() < fraction:
-            size = road_users.draw_size(rng, size_m)
-            place = spot.place + rng.uniform(-0.2, 0.2) * heading(spot.yaw)
-            states = np.tile(place, (len(times), 1)), np.full(len(times), spot.yaw), np.zeros(len(times)), np.ones(len(times), bool)
-            parked.append(TownUser("vehicle", size, *states))
-    return parked
 
 
 def _limit_travel(user: TownUser, times: Float[np.ndarray, " L"], max_travel: float) -> TownUser:
@@ -182,9 +107,3 @@ def _find_overlaps(users: list[TownUser]) -> list[tuple[int, int]]:
     boxes = np.stack([box_corners(u.position, u.yaw, *u.size[:2]) for u in users])
     hit = overlaps(boxes[rows[pair], step], boxes[cols[pair], step])
     return sorted({(int(rows[p]), int(cols[p])) for p in pair[hit]})
-
-
-def measure_travel(user: TownUser, current: int) -> float:
-    """Computes the distance that a road user travels from a step on, m."""
-    rows = user.valid[current:]
-    return float(np.linalg.norm(np.diff(user.position[current:][rows], axis=0), axis=1).sum()) if rows.any() else 0.0

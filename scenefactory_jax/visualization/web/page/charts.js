@@ -1,185 +1,190 @@
 // ---- charts: the selected car over its time
 
-const ACTIONS = ["#2f7ed8", "#b26bd1", "#e0483e"];
-const FRONT_REAR = { FL: "#2f7ed8", FR: "#2f7ed8", RL: "#dd8a1d", RR: "#dd8a1d" };
-const shown = []; // the charts on the page: {plot, canvas, cursor, draw, tell}
+const MARGIN = { left: 34, right: 6, top: 4, bottom: 16 }; // of a plot, for its labels
+const [BLUE, VIOLET, RED, ORANGE] = ["#2f7ed8", "#b26bd1", "#e0483e", "#dd8a1d"];
+const charts = []; // those on the page: {plot, cursor, draw(), showValues(step)}
 
-/** What can be drawn of a world: titles, units, lines {array, label, colour, dashed, unit}, and where the axis lies. */
-function chartsOf(world) {
-  const wheels = world.wheels.map((wheel) => ({
-    array: `mu:${wheel}`,
-    label: wheel,
-    colour: FRONT_REAR[wheel],
-    dashed: wheel.endsWith("R"),
-  }));
-  const grip = [{ array: "grip", label: "mean", colour: "#2f7ed8" }];
-  return [
-    { title: "Speed", unit: "m/s", low: 0, least: 5, digits: 2, lines: [{ array: "speed", label: "", colour: "#2f7ed8" }] },
-    {
-      title: "Actions",
-      unit: "",
-      low: -1,
-      high: 1,
-      digits: 2,
-      lines: ["throttle", "turn", "brake"].map((array, i) => ({ array, label: array === "turn" ? "steer" : array, colour: ACTIONS[i] })),
-    },
-    { title: "Reward by term", unit: "a step", reward: true },
-    {
-      title: "Time to collision",
-      unit: "s",
-      low: 0,
-      high: 10,
-      cut: true,
-      digits: 2,
-      missing: `> ${replay.ttc_most}`,
-      lines: [
-        { array: "ttc", label: "cars", colour: "#d6569b" },
-        { array: "edge_ttc", label: "road edge", colour: "#8a5a44" },
-      ],
-    },
-    {
-      title: wheels.length ? "Friction under each wheel" : "Friction",
-      unit: wheels.length ? "μ" : "μ, mean of the wheels",
-      low: 0,
-      least: 0.5,
-      digits: 3,
-      lines: wheels.length ? wheels : grip,
-    },
-    {
-      title: "Grip in use",
-      unit: "largest wheel, 1 slides",
-      low: 0,
-      least: 1.2,
-      digits: 2,
-      rule: 1,
-      lines: [{ array: "friction_utilization", label: "", colour: "#1fa5a0" }],
-    },
-    {
-      title: "Wheel slip",
-      unit: "m/s, largest wheel",
-      low: 0,
-      least: 1,
-      digits: 2,
-      lines: [{ array: "slip", label: "", colour: "#dd8a1d" }],
-    },
-    {
-      title: "Contact force",
-      unit: "kN",
-      low: 0,
-      least: 10,
-      digits: 1,
-      scale: 1e-3,
-      lines: [{ array: "contact_force", label: "", colour: "#d62839" }],
-    },
-    {
-      title: "Distance to the goal",
-      unit: "m",
-      low: 0,
-      least: 10,
-      digits: 1,
-      lines: [{ array: "goal_distance", label: "", colour: "#12996a" }],
-    },
-  ];
+const line = (array, label, colour, dashed = false) => ({ array, label, colour, dashed });
+
+/** A chart of lines. Bounds: from `low` to `high`, or to the largest value and at least `least`. */
+function lineChart(title, unit, lines, options) {
+  const spec = { low: 0, digits: 2, scale: 1, missing: "–", lines, ...options };
+  const { arrays } = app.world; // of one value, zero: recordings have no actions, some worlds no contacts
+  const isZero = lines.every(({ array }) => arrays[array].step === undefined && arrays[array].low === 0);
+  const keys = (caption, car) => lineKeys(caption, spec, car);
+  return { title, unit, isZero, keys, draw: (picture, car) => drawLines(picture, spec, car) };
 }
 
-/** First and last step of a car's time. */
-const lifeOf = (car) => (car.spans.length ? [car.spans[0][0], Math.max(car.spans.at(-1)[1], car.spans[0][0] + 1)] : [0, 1]);
+function chartsOf({ wheels }) {
+  const friction = wheels.length
+    ? wheels.map((wheel) => line(`mu:${wheel}`, wheel, wheel.startsWith("F") ? BLUE : ORANGE, wheel.endsWith("R")))
+    : [line("grip", "mean", BLUE)];
+  const times = [line("ttc", "cars", "#d6569b"), line("edge_ttc", "road edge", "#8a5a44")];
+  const actions = [line("throttle", "throttle", BLUE), line("turn", "steer", VIOLET), line("brake", "brake", RED)];
+  return [
+    lineChart("Speed", "m/s", [line("speed", "", BLUE)], { least: 5 }),
+    lineChart("Actions", "", actions, { low: -1, high: 1 }),
+    { title: "Reward by term", unit: "a step", tall: true, keys: rewardKeys, draw: drawReward },
+    lineChart("Time to collision", "s", times, { high: 10, cut: true, missing: `> ${replay.max_ttc_s}` }),
+    wheels.length
+      ? lineChart("Friction under each wheel", "μ", friction, { least: 0.5, digits: 3 })
+      : lineChart("Friction", "μ, mean of the wheels", friction, { least: 0.5, digits: 3 }),
+    lineChart("Grip in use", "largest wheel, 1 slides", [line("friction_utilization", "", "#1fa5a0")], { least: 1.2, rule: 1 }),
+    lineChart("Wheel slip", "m/s, largest wheel", [line("slip", "", ORANGE)], { least: 1 }),
+    lineChart("Contact force", "kN", [line("contact_force", "", "#d62839")], { least: 10, digits: 1, scale: 1e-3 }),
+    lineChart("Distance to the goal", "m", [line("goal_distance", "", "#12996a")], { least: 10, digits: 1 }),
+  ];
+}
 
 function makeCharts() {
   const car = app.world.bySlot.get(app.selected);
   $("charts").replaceChildren();
-  shown.length = 0;
+  charts.length = 0;
   if (!car) return;
-  const specs = chartsOf(app.world);
-  const idle = specs.filter(allZero);
-  for (const spec of specs) {
-    if (idle.includes(spec)) continue;
-    const figure = element("figure", { className: "chart" });
+  const all = chartsOf(app.world);
+  for (const { title, unit, isZero, tall, keys, draw } of all) {
+    if (isZero) continue;
+    const heading = element("b", { textContent: title }, element("small", { textContent: unit }));
     const caption = element("figcaption");
-    caption.append(titleOf(spec));
-    const plot = element("div", { className: `plot${spec.reward ? " tall" : ""}` });
-    const picture = element("canvas");
-    const cursor = element("div", { className: "cursor" });
-    plot.append(picture, cursor);
-    const tell = spec.reward ? rewardKeys(caption, car) : lineKeys(caption, spec, car);
-    figure.append(...(spec.reward ? [caption.firstChild, plot, caption] : [caption, plot]));
-    $("charts").append(figure);
+    if (!tall) caption.append(heading);
+    const [picture, cursor] = [element("canvas"), element("div", { className: "cursor" })];
+    const plot = element("div", { className: `plot${tall ? " tall" : ""}` }, picture, cursor);
+    $("charts").append(element("figure", { className: "chart" }, ...(tall ? [heading, plot, caption] : [caption, plot])));
     scrubOn(plot, car);
-    shown.push({ plot, picture, cursor, tell, draw: spec.reward ? () => drawReward(picture, car) : () => drawLines(picture, spec, car) });
+    charts.push({ plot, cursor, draw: () => draw(picture, car), showValues: keys(caption, car) });
   }
-  if (idle.length) {
-    const titles = idle.map(({ title }) => title.toLowerCase()).join(", ");
-    $("charts").append(element("p", { className: "idle quiet", textContent: `Zero for every car all the time: ${titles}.` }));
+  const zero = all.filter(({ isZero }) => isZero).map(({ title }) => title.toLowerCase());
+  if (zero.length) {
+    $("charts").append(element("p", { className: "idle quiet", textContent: `Zero for every car all the time: ${zero.join(", ")}.` }));
   }
   drawCharts();
 }
 
-/** Whether nothing of a chart ever leaves zero in this world: a recording has no actions, a quiet world no contact. */
-function allZero({ lines }) {
-  return lines !== undefined && lines.every(({ array }) => app.world.arrays[array].step === undefined && app.world.arrays[array].low === 0);
-}
-
-function titleOf({ title, unit }) {
-  const bold = element("b", { textContent: title });
-  bold.append(element("small", { textContent: unit }));
-  return bold;
-}
-
-function element(kind, properties = {}) {
-  return Object.assign(document.createElement(kind), properties);
-}
-
-const number = (value, digits) => value.toFixed(digits).replace(/^-(?=0\.?0*$)/, "").replace("-", "−"); // a rounded nothing has no sign
-
-/** Legend entries with the values of now; returns the function that brings them up to date. */
-function lineKeys(caption, spec, car) {
-  const outputs = spec.lines.map(({ array, label, colour, dashed }) => {
-    const key = element("span", { className: "key" });
-    key.style.setProperty("--own", colour);
-    const output = element("output");
-    output.dataset.array = array;
-    if (label) key.append(element("i", { className: dashed ? "dashed" : "" }), label, " ");
-    key.append(output);
-    caption.append(key);
-    return output;
-  });
-  return (step) =>
-    spec.lines.forEach(({ array }, i) => {
-      const value = read(app.world, array, car.slot, step) * (spec.scale ?? 1);
-      outputs[i].textContent = Number.isNaN(value) ? (spec.missing ?? "–") : number(value, spec.digits);
-    });
-}
-
 function drawCharts() {
-  shown.forEach((chart) => chart.draw());
+  charts.forEach((chart) => chart.draw());
   moveCursors();
 }
 
-/** Cursors and values to the time that is now. */
+/** First and last step of a car's time. */
+const timeOf = ({ spans }) => (spans.length ? [spans[0][0], Math.max(spans.at(-1)[1], spans[0][0] + 1)] : [0, 1]);
+
+/** Moves cursors and values to the shown time. */
 function moveCursors() {
   const car = app.world.bySlot.get(app.selected);
   if (!car) return;
-  const step = now();
-  const [first, end] = lifeOf(car);
-  const share = clamp((app.time - first) / (end - first), 0, 1);
-  for (const { plot, cursor, tell } of shown) {
-    cursor.style.transform = `translateX(${ROOM.left + share * (plot.clientWidth - ROOM.left - ROOM.right)}px)`;
-    cursor.style.opacity = app.time < first - 0.5 || app.time > end + 0.5 ? 0.25 : 1;
-    tell(step);
+  const [first, last] = timeOf(car);
+  const fraction = clamp((app.time - first) / (last - first), 0, 1);
+  for (const { plot, cursor, showValues } of charts) {
+    cursor.style.transform = `translateX(${MARGIN.left + fraction * (plot.clientWidth - MARGIN.left - MARGIN.right)}px)`;
+    cursor.style.opacity = app.time < first - 0.5 || app.time > last + 0.5 ? 0.25 : 1;
+    showValues(now());
   }
 }
 
 /** Dragging over a chart moves the time. */
 function scrubOn(plot, car) {
-  const go = (event) => {
+  const [first, last] = timeOf(car);
+  const scrub = (event) => {
     const { left, width } = plot.getBoundingClientRect();
-    const [first, end] = lifeOf(car);
-    seek(Math.round(first + clamp((event.clientX - left - ROOM.left) / (width - ROOM.left - ROOM.right), 0, 1) * (end - first)));
+    const fraction = (event.clientX - left - MARGIN.left) / (width - MARGIN.left - MARGIN.right);
+    goTo(Math.round(first + clamp(fraction, 0, 1) * (last - first)));
   };
   plot.addEventListener("pointerdown", (event) => {
-    pause();
     plot.setPointerCapture(event.pointerId);
-    go(event);
+    scrub(event);
   });
-  plot.addEventListener("pointermove", (event) => plot.hasPointerCapture(event.pointerId) && go(event));
+  plot.addEventListener("pointermove", (event) => plot.hasPointerCapture(event.pointerId) && scrub(event));
+}
+
+// ---- axes
+
+/** A clean plot with axes and scales; `bounds` are the values at the bottom and the top. */
+function drawAxes(picture, car, bounds) {
+  const { brush, width, height } = fitCanvas(picture);
+  const [first, last] = timeOf(car);
+  const [right, floor] = [width - MARGIN.right, height - MARGIN.bottom];
+  const atStep = (step) => MARGIN.left + ((step - first) / (last - first)) * (right - MARGIN.left);
+  const atValue = (value) => floor - ((value - bounds[0]) / (bounds[1] - bounds[0])) * (floor - MARGIN.top);
+  Object.assign(brush, { font: "10px system-ui, sans-serif", textAlign: "right", textBaseline: "middle", lineWidth: 1 });
+  Object.assign(brush, { strokeStyle: css("grid"), fillStyle: css("quiet") });
+  for (const [value, text] of ticksOf(...bounds, 4)) {
+    strokeLine(brush, MARGIN.left, atValue(value), right, atValue(value));
+    brush.fillText(text, MARGIN.left - 6, clamp(atValue(value), 7, floor));
+  }
+  const { start, dt } = app.world;
+  brush.textAlign = "center";
+  for (const [value, text] of ticksOf(start + first * dt, start + last * dt, 6)) {
+    const left = atStep((value - start) / dt);
+    strokeLine(brush, left, MARGIN.top, left, floor);
+    brush.fillText(`${text} s`, clamp(left, MARGIN.left + 8, width - 12), height - 6);
+  }
+  return { brush, atStep, atValue, right, width, height, first, last };
+}
+
+function strokeLine(brush, left, top, right, bottom) {
+  brush.beginPath();
+  brush.moveTo(left, top);
+  brush.lineTo(right, bottom);
+  brush.stroke();
+}
+
+/** Round numbers between two bounds, at most one more than `count`, each with its text, of as many decimals as their distance has. */
+function ticksOf(low, high, count) {
+  const minimum = (high - low) / count;
+  const power = Math.floor(Math.log10(minimum));
+  const factor = [1, 2, 5, 10].find((candidate) => candidate * 10 ** power >= minimum * (1 - 1e-9));
+  const [step, decimals] = [factor * 10 ** power, Math.max(0, factor === 10 ? -power - 1 : -power)];
+  const ticks = [];
+  for (let i = Math.ceil(low / step - 1e-9); i <= high / step + 1e-9; i++) ticks.push([i * step, number(i * step, decimals)]);
+  return ticks;
+}
+
+// ---- lines
+
+/** Adds the legend of a chart of lines; returns the function that shows the values of a step. */
+function lineKeys(caption, { lines, scale, digits, missing }, car) {
+  const outputs = lines.map(({ array, label, colour, dashed }) => {
+    const output = element("output");
+    output.dataset.array = array;
+    const swatch = label ? [element("i", { className: dashed ? "dashed" : "" }), label, " "] : [];
+    const key = element("span", { className: "key" }, ...swatch, output);
+    key.style.setProperty("--colour", colour);
+    caption.append(key);
+    return output;
+  });
+  return (step) =>
+    lines.forEach(({ array }, i) => {
+      const value = read(app.world, array, car.slot, step) * scale;
+      outputs[i].textContent = Number.isNaN(value) ? missing : number(value, digits);
+    });
+}
+
+function eachStep(car, visit) {
+  for (const [first, last] of car.spans) for (let step = first; step <= last; step++) visit(step);
+}
+
+function drawLines(picture, { lines, low, high, least, scale, rule, cut }, car) {
+  const valueAt = (array, step) => read(app.world, array, car.slot, step) * scale;
+  let top = high ?? least;
+  if (high === undefined) for (const { array } of lines) eachStep(car, (step) => (top = Math.max(top, 1.05 * valueAt(array, step) || 0)));
+  const { brush, atStep, atValue, right } = drawAxes(picture, car, [low, top]);
+  if (rule !== undefined && rule < top) {
+    brush.setLineDash([4, 3]);
+    brush.strokeStyle = css("quiet");
+    strokeLine(brush, MARGIN.left, atValue(rule), right, atValue(rule));
+  }
+  Object.assign(brush, { lineJoin: "round", lineWidth: 1.6 });
+  for (const { array, colour, dashed } of lines) {
+    brush.strokeStyle = colour;
+    brush.setLineDash(dashed ? [5, 3] : []);
+    brush.beginPath();
+    let before = null; // the last step of the line so far
+    eachStep(car, (step) => {
+      const value = valueAt(array, step);
+      if (Number.isNaN(value) || (cut && value > top)) return;
+      brush[before === step - 1 ? "lineTo" : "moveTo"](atStep(step), atValue(clamp(value, low, top)));
+      before = step;
+    });
+    brush.stroke();
+  }
 }

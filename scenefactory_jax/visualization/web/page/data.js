@@ -1,20 +1,20 @@
-// ---- data: what the file holds, decoded when a world is first shown
+// ---- data: worlds of the file, decoded when first shown
 
 const MISSING = 65535;
 const replay = JSON.parse(document.getElementById("head").textContent);
 const packed = [...document.querySelectorAll("script.arrays")];
 
-/** A world with its arrays; each is {rows, columns, values} row by row. */
+/** A world with its arrays {columns, values}, row by row. */
 async function openWorld(index) {
-  const head = replay.worlds[index];
-  if (!head.array) {
+  const world = replay.worlds[index];
+  if (!world.array) {
     const bytes = await inflate(packed[index].textContent);
-    head.array = Object.fromEntries(Object.entries(head.arrays).map(([name, entry]) => [name, decode(entry, bytes)]));
-    head.road = roadLines(head);
-    head.bySlot = new Map(head.cars.map((car) => [car.slot, car]));
-    head.end = head.steps - 1;
+    world.array = Object.fromEntries(Object.entries(world.arrays).map(([name, entry]) => [name, decode(entry, bytes)]));
+    world.road = roadLines(world);
+    world.bySlot = new Map(world.cars.map((car) => [car.slot, car]));
+    world.end = world.steps - 1;
   }
-  return head;
+  return world;
 }
 
 async function inflate(text) {
@@ -24,68 +24,57 @@ async function inflate(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** The inverse of `replay_bytes.Packer.add`. */
-function decode({ shape, low, step, at }, bytes) {
-  const [rows, columns] = shape;
+/** The inverse of `array_packing.Packer.add`. */
+function decode({ shape: [rows, columns], low, step, at }, bytes) {
   const count = rows * columns;
   const values = new Float32Array(count).fill(low);
-  if (step === undefined) return { rows, columns, values };
-  for (let row = 0; row < rows; row++) {
-    let code = 0;
-    for (let i = row * columns; i < (row + 1) * columns; i++) {
-      const folded = bytes[at + i] | (bytes[at + count + i] << 8);
-      code = (code + ((folded >> 1) ^ -(folded & 1))) & 0xffff;
-      values[i] = code === MISSING ? NaN : low + code * step;
-    }
+  for (let i = 0, code = 0; step !== undefined && i < count; i++) {
+    const folded = bytes[at + i] | (bytes[at + count + i] << 8);
+    const change = (folded >> 1) ^ -(folded & 1);
+    code = ((i % columns ? code : 0) + change) & 0xffff;
+    values[i] = code === MISSING ? NaN : low + code * step;
   }
-  return { rows, columns, values };
+  return { columns, values };
 }
 
 /** Layer -> lines, each a flat list x, y, x, y. */
-function roadLines(head) {
-  const { columns, values } = head.array.road;
-  const layers = {};
+function roadLines(world) {
+  const { columns, values } = world.array.road;
   let next = 0;
-  for (const [name, counts] of Object.entries(head.layers)) {
-    layers[name] = counts.map((count) => {
-      const line = new Float32Array(2 * count);
-      for (let i = 0; i < count; i++, next++) {
-        line[2 * i] = values[next];
-        line[2 * i + 1] = values[columns + next];
-      }
-      return line;
-    });
-  }
-  return layers;
+  const line = (count) => {
+    const points = Array.from({ length: count }, (_, i) => [values[next + i], values[columns + next + i]]);
+    next += count;
+    return points.flat();
+  };
+  return Object.fromEntries(Object.entries(world.layers).map(([name, counts]) => [name, counts.map(line)]));
 }
 
-// ---- questions to a world
+// ---- values of a world
 
 const read = (world, name, row, step) => world.array[name].values[row * world.array[name].columns + step];
 const seconds = (world, step) => world.start + step * world.dt;
 const within = (spans, step) => spans.some(([first, last]) => step >= first && step <= last);
 
-/** Where something is between two steps; it jumps where it begins anew. */
+/** Position and yaw between two steps; a jump (a respawn) is not interpolated. */
 function pose(world, prefix, row, time) {
   const step = Math.min(Math.floor(time), world.end);
-  const after = Math.min(step + 1, world.end);
-  const [x0, y0, yaw0] = ["x", "y", "yaw"].map((name) => read(world, prefix + name, row, step));
-  const [x1, y1, yaw1] = ["x", "y", "yaw"].map((name) => read(world, prefix + name, row, after));
-  const share = Math.hypot(x1 - x0, y1 - y0) > 100 * world.dt ? 0 : time - step;
-  const turn = Math.atan2(Math.sin(yaw1 - yaw0), Math.cos(yaw1 - yaw0));
-  return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), yaw: yaw0 + share * turn };
+  const valuesAt = (at) => ["x", "y", "yaw"].map((name) => read(world, prefix + name, row, at));
+  const [before, after] = [valuesAt(step), valuesAt(Math.min(step + 1, world.end))];
+  const [dx, dy, turn] = after.map((value, i) => value - before[i]);
+  const fraction = Math.hypot(dx, dy) > 100 * world.dt ? 0 : time - step;
+  return {
+    x: before[0] + fraction * dx,
+    y: before[1] + fraction * dy,
+    yaw: before[2] + fraction * Math.atan2(Math.sin(turn), Math.cos(turn)),
+  };
 }
 
-/** 1 while a car drives, falling to 0 after its end. */
-function presence(world, car, time, fade = 0.6) {
-  let share = 0;
-  for (const [first, last] of car.spans) {
-    if (time < first) continue;
-    share = Math.max(share, 1 - Math.max(0, (time - last) * world.dt) / fade);
-  }
-  return Math.min(1, share);
+/** Opacity of a car: 1 while it is active, falling to 0 within `fade` seconds after its end. */
+function opacity(world, car, time, fade = 0.6) {
+  const ages = car.spans.filter(([first]) => time >= first).map(([, last]) => Math.max(0, (time - last) * world.dt));
+  return Math.max(0, 1 - Math.min(...ages) / fade);
 }
 
 const goalOf = (car, step) => car.goals.findLast(([from]) => from <= step) ?? car.goals[0];
-const lightNow = (light, time) => (light.shown.findLast(([from]) => from <= time + 1e-6) ?? [0, "unknown"])[1];
-const counted = (world, step) => world.events.filter((event) => event.step <= step);
+const lightState = (light, time) => (light.shown.findLast(([from]) => from <= time + 1e-6) ?? [0, "unknown"])[1];
+const pastEvents = (world, step) => world.events.filter((event) => event.step <= step);

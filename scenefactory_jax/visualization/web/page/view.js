@@ -1,118 +1,96 @@
-// ---- view: what of the world does not move, and the window on it
+// ---- view: the part of the world that the map shows
 
 const canvas = $("map");
-const pen = canvas.getContext("2d");
-let paths = {};
+let screen = { width: 1, height: 1 };
 
-/** Paths of everything that does not move, in metres, made once a world. */
-function preparePaths(world) {
-  paths = {};
-  for (const [name, lines] of Object.entries(world.road)) {
-    paths[name] = new Path2D();
-    lines.forEach((line) => addLine(paths[name], line));
-  }
-  paths.casing = paths.lane;
-  paths.centre = paths.lane;
-  paths.zebras = world.road.crosswalk.filter((line) => line.length >= 8).map(zebra);
-  paths.patches = world.patches.map((patch) => {
-    const path = new Path2D();
-    patch.pieces.forEach((piece) => {
-      addLine(path, oneWay(piece).flat());
-      path.closePath();
-    });
-    return { path, colour: patch.colour };
-  });
-}
-
-function addLine(path, line) {
-  for (let i = 0; i < line.length; i += 2) path[i ? "lineTo" : "moveTo"](line[i], line[i + 1]);
-}
-
-/** A polygon's points counter-clockwise, so that pieces that overlap fill as one. */
-function oneWay(points) {
-  const area = points.reduce((sum, [x, y], i) => {
-    const [u, v] = points[(i + 1) % points.length];
-    return sum + x * v - u * y;
-  }, 0);
-  return area < 0 ? [...points].reverse() : points;
-}
-
-/** A crosswalk: its outline, and the line along its longest side's direction on which the stripes are dashes. */
-function zebra(line) {
-  const outline = new Path2D();
-  addLine(outline, line);
-  outline.closePath();
-  let best = [0, 1, 0];
-  let [x, y, points] = [0, 0, line.length / 2];
-  for (let i = 0; i < line.length; i += 2) {
-    x += line[i] / points;
-    y += line[i + 1] / points;
-    const j = (i + 2) % line.length;
-    const [dx, dy] = [line[j] - line[i], line[j + 1] - line[i + 1]];
-    const length = Math.hypot(dx, dy);
-    if (length > best[0]) best = [length, dx / length, dy / length];
-  }
-  const axis = new Path2D();
-  addLine(axis, [x - 40 * best[1], y - 40 * best[2], x + 40 * best[1], y + 40 * best[2]]);
-  return { outline, axis };
-}
-
-// ---- the window
-
-function resize() {
-  const ratio = devicePixelRatio || 1;
-  const { width, height } = canvas.getBoundingClientRect();
-  canvas.width = Math.max(1, Math.round(width * ratio));
-  canvas.height = Math.max(1, Math.round(height * ratio));
-  refresh();
-}
-
-const size = () => [canvas.width / (devicePixelRatio || 1), canvas.height / (devicePixelRatio || 1)];
 function toScreen(x, y) {
-  const [width, height] = size();
-  return [width / 2 + (x - app.view.x) * app.view.scale, height / 2 - (y - app.view.y) * app.view.scale];
-}
-function toWorld(left, top) {
-  const [width, height] = size();
-  return [app.view.x + (left - width / 2) / app.view.scale, app.view.y - (top - height / 2) / app.view.scale];
+  const { scale } = app.view;
+  return [screen.width / 2 + (x - app.view.x) * scale, screen.height / 2 - (y - app.view.y) * scale];
 }
 
-/** Show every way and goal. */
+/** Shows all trajectories and goals. */
 function fit() {
-  const xs = [];
-  const ys = [];
+  const points = [];
   for (const car of app.world.cars) {
-    car.goals.forEach(([, x, y]) => xs.push(x) && ys.push(y));
-    for (const [first, end] of car.spans)
-      for (let step = first; step <= end; step += 5) {
-        xs.push(read(app.world, "x", car.slot, step));
-        ys.push(read(app.world, "y", car.slot, step));
-      }
+    car.goals.forEach(([, x, y]) => points.push([x, y]));
+    for (const [first, last] of car.spans)
+      for (let step = first; step <= last; step += 5) points.push(["x", "y"].map((name) => read(app.world, name, car.slot, step)));
   }
-  if (!xs.length) xs.push(0) && ys.push(0);
-  const [west, east, south, north] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  const [width, height] = size();
-  const margin = 12;
-  const scale = Math.min(width / Math.max(east - west + 2 * margin, 40), height / Math.max(north - south + 2 * margin, 40));
-  app.follow = false;
-  app.view = { x: (west + east) / 2, y: (south + north) / 2, scale: clamp(scale, 0.3, 60) };
-  showFollow();
-  refresh();
+  if (!points.length) points.push([0, 0]);
+  const bounds = [0, 1].map((axis) => [Math.min, Math.max].map((bound) => bound(...points.map((point) => point[axis]))));
+  const [x, y] = bounds.map(([low, high]) => (low + high) / 2);
+  const [wide, high] = bounds.map(([low, high]) => Math.max(high - low + 24, 40)); // a margin of 12 m
+  app.view = { x, y, scale: clamp(Math.min(screen.width / wide, screen.height / high), 0.3, 60) };
+  setFollow(false);
 }
 
-/** Zoom about a point of the screen, by default its middle. */
-function zoom(factor, left, top) {
-  const [width, height] = size();
-  [left, top] = app.follow || left === undefined ? [width / 2, height / 2] : [left, top];
-  const [x, y] = toWorld(left, top);
+/** Zooms about a point of the screen, by default its centre. */
+function zoom(factor, left = screen.width / 2, top = screen.height / 2) {
   const scale = clamp(app.view.scale * factor, 0.3, 120);
-  app.view = { x: x - (left - width / 2) / scale, y: y + (top - height / 2) / scale, scale };
+  if (!app.follow) {
+    const shift = 1 / app.view.scale - 1 / scale;
+    app.view.x += (left - screen.width / 2) * shift;
+    app.view.y -= (top - screen.height / 2) * shift;
+  }
+  app.view.scale = scale;
   refresh();
 }
 
-function follow(wanted) {
-  app.follow = wanted && app.selected !== null;
+function toggleFollow() {
+  setFollow(!app.follow);
   if (app.follow) app.view.scale = Math.max(app.view.scale, 9);
-  showFollow();
+}
+
+// ---- pointers: a drag moves the map, two fingers zoom, a click selects a car
+
+const pointers = new Map();
+let pressed = null; // where a click began, until the pointer moves
+
+function onDown(event) {
+  canvas.setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+  pressed = pointers.size === 1 ? [event.offsetX, event.offsetY] : null;
+}
+
+const centreOf = (points) => [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+const distanceOf = ([[a, b], [c, d]]) => Math.hypot(a - c, b - d);
+
+function onMove(event) {
+  if (!pointers.has(event.pointerId)) return;
+  const before = [...pointers.values()];
+  pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+  const after = [...pointers.values()];
+  if (pressed && distanceOf([pressed, [event.offsetX, event.offsetY]]) > 5) pressed = null;
+  if (pressed) return;
+  const [from, to] = [centreOf(before), centreOf(after)];
+  if (!app.follow) {
+    app.view.x -= (to[0] - from[0]) / app.view.scale;
+    app.view.y += (to[1] - from[1]) / app.view.scale;
+  } else if (after.length === 1) setFollow(false);
+  if (after.length === 2) zoom(distanceOf(after) / Math.max(distanceOf(before), 1), ...to);
   refresh();
+}
+
+function onUp(event) {
+  const slot = pressed && event.type === "pointerup" ? carAt(...pressed) : null;
+  if (slot !== null) select(slot);
+  pointers.delete(event.pointerId);
+  pressed = null;
+}
+
+function onWheel(event) {
+  event.preventDefault();
+  zoom(Math.exp(-clamp(event.deltaY, -240, 240) * 0.0022), event.offsetX, event.offsetY);
+}
+
+/** The nearest car within 16 pixels of a point of the screen, or null. */
+function carAt(left, top) {
+  let best = [16, null];
+  for (const car of app.world.cars) {
+    if (opacity(app.world, car, app.time) <= 0) continue;
+    const { x, y } = pose(app.world, "", car.slot, app.time);
+    const distance = Math.max(0, distanceOf([toScreen(x, y), [left, top]]) - 0.5 * car.size[1] * app.view.scale);
+    if (distance < best[0]) best = [distance, car.slot];
+  }
+  return best[1];
 }

@@ -1,0 +1,236 @@
+"""The fit of the articulated car to the teacher: recordings, search stage by stage, refinement, and the errors of each car.
+
+Every stage writes `out/stages/NAME.json` when it ends; with `resume` a stage that was made with the same settings is read instead.
+"""
+
+import functools
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scenefactory_jax.core import result_file
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
+from scenefactory_jax.core.parallel.task_map import open_pool, require_results
+from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.sysid import (
+    candidate_simulation,
+    error_metrics,
+    heldout_manoeuvres,
+    manoeuvres,
+    multibody_model,
+    optimization,
+    parameter_space,
+    reference_recordings,
+)
+from scenefactory_jax.sysid.candidate_simulation import ManoeuvreBatch, Simulator
+from scenefactory_jax.sysid.manoeuvres import ManoeuvreRecording
+from scenefactory_jax.sysid.optimization import Outcome, RefinementResult, Score, Stage
+from scenefactory_jax.sysid.parameter_space import Space
+
+LOG = logging.getLogger(__name__)
+Suites = Mapping[str, Sequence[ManoeuvreRecording]]  # training, extra and heldout
+
+
+def identify(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
+    """Fits the car of a config (`conf/command/sysid.yaml`), and evaluates it, the default car and the published one.
+
+    Returns:
+        The content of result.json: manoeuvres, space, stages, refined, slices, seconds, cars and samples.
+
+    Raises:
+        ConfigError: a name or number that does not fit; a missing teacher package.
+    """
+    (out / "stages").mkdir(parents=True, exist_ok=True)
+    settings, physics_hz = config["sysid"], float(config["physics_hz"])
+    suites = record_suites(config, out)
+    recordings, space = [*suites["training"], *suites["extra"]], parameter_space.make(settings["space"])
+    simulator = candidate_simulation.make_simulator(config["dynamics"], space, settings["friction"], physics_hz=physics_hz)
+    batch = candidate_simulation.stack_recordings(recordings)
+    score = candidate_simulation.make_scorer(simulator, batch, width=settings["width"])
+    stages = search_stages(config, out, recordings, space, score)
+    refined = refine(config, out, space, simulator, batch, stages[-1].best)
+    indices = range(len(recordings))
+    place, loss = optimization.compute_slices(score, space, refined.best, indices, weights=settings["weights"], **settings["slices"])
+    published = config["others"]["published"], parameter_space.make({}), settings["published_friction"]
+    drivers = {
+        "fitted": (simulator, refined.best),
+        "default": (simulator, space.start),
+        "published": (candidate_simulation.make_simulator(*published, physics_hz=physics_hz), np.zeros(0)),
+    }
+    errors, traces = {}, {}
+    for name, (car, values) in drivers.items():
+        errors[name], traces[name] = evaluate_car(suites, car, values, weights=settings["weights"])
+    return {
+        "manoeuvres": {name: len(suite) for name, suite in suites.items()},
+        "space": space._asdict(),
+        "stages": stages,
+        "refined": refined,
+        "slices": {"place": place, "loss": loss},
+        "seconds": sum(stage.seconds for stage in stages) + refined.seconds,
+        "cars": errors,
+        "samples": sample_traces(suites, settings["samples"], traces),
+    }
+
+
+def record_suites(config: Mapping[str, Any], out: Path) -> dict[str, list[ManoeuvreRecording]]:
+    """Records the teacher on the published manoeuvres, on further ones and on held-out ones, or reads its files of the same settings.
+
+    Of each suite every `sysid.every`-th manoeuvre.
+    """
+    car, _ = cars.read_parameters(config["dynamics"])
+    reference = instantiate(config["teacher"], builtins=multibody_model, where="teacher", car=car)()
+    modules = {"training": manoeuvres, "extra": manoeuvres, "heldout": heldout_manoeuvres}
+    masses = {name: config["dynamics"]["car"][name] for name in multibody_model.READS}
+    every, suites = config["sysid"]["every"], {}
+    with open_pool(config["workers"] if config["workers"] > 1 else 0) as task_map:
+        for name, module in modules.items():
+            path, entries = out / f"{name}.npz", config["manoeuvres"][name]
+            digest = result_file.digest({"car": masses, "teacher": config["teacher"], "manoeuvres": entries, "every": every})
+            if path.is_file():
+                try:
+                    suites[name] = reference_recordings.load(path, digest=digest)
+                    continue
+                except ConfigError:
+                    LOG.info("%s: of other settings, recorded anew", path)
+            start = time.perf_counter()
+            record = functools.partial(reference_recordings.record, reference=reference)
+            suite = manoeuvres.make_suite(entries, builtins=module, where=f"manoeuvres.{name}", reference=reference)
+            suites[name] = list(require_results(task_map(record, suite[::every])))
+            reference_recordings.save(path, suites[name], digest=digest)
+            LOG.info("%s: %d manoeuvres driven by the teacher in %.0f s", path, len(suites[name]), time.perf_counter() - start)
+    return suites
+
+
+def search_stages(
+    config: Mapping[str, Any], out: Path, recordings: Sequence[ManoeuvreRecording], space: Space, score: Score
+) -> list[Outcome]:
+    """Searches stage by stage, each from the end of the stage before."""
+    settings, outcomes, start = config["sysid"], dict[str, Outcome](), space.start
+    for place, (name, entry) in enumerate(settings["stages"].items(), start=1):
+        stage, rows = _make_stage(name, entry, settings, space, recordings)
+        start = start.copy()
+        if entry["restores"] is not None:  # the published fifth stage begins with the first one's values of its parameters
+            tuned = [space.names.index(parameter) for parameter in stage.tuned]
+            start[tuned] = outcomes[entry["restores"]].best[tuned]
+        digest = result_file.digest(
+            {"stage": entry, "budget": settings["budget"][name], "start": start.tolist(), "settings": _shared_settings(config)}
+        )
+        path = out / "stages" / f"{place}_{name}.json"
+        outcome = _read(path, digest, Outcome) if config["resume"] else None
+        if outcome is None:
+            outcome = optimization.search(
+                score, space, start, stage, rows, seed=settings["seed"] + place, weights=settings["weights"], **settings["search"],
+                clock=time.perf_counter, report=LOG.info,
+            )  # fmt: skip
+            result_file.write(path, {"made": digest, **outcome._asdict()}, digits=None)
+        LOG.info(
+            "%s: %.4f -> %.4f, %d candidates on %d manoeuvres, %.0f s",
+            name, outcome.start_loss, outcome.loss, outcome.evaluations, len(rows), outcome.seconds,
+        )  # fmt: skip
+        outcomes[name], start = outcome, outcome.best
+    return list(outcomes.values())
+
+
+def _make_stage(
+    name: str, entry: Mapping[str, Any], settings: Mapping[str, Any], space: Space, recordings: Sequence[ManoeuvreRecording]
+) -> tuple[Stage, list[int]]:
+    """A stage of the config and the indices of its manoeuvres; no families and no parameters stand for all of them."""
+    families = entry["families"] or sorted({recording.manoeuvre.family for recording in recordings})
+    rows = [i for i, recording in enumerate(recordings) if recording.manoeuvre.family in families]
+    if unknown := [parameter for parameter in entry["tuned"] if parameter not in space.names]:
+        raise ConfigError(f"sysid.stages.{name}.tuned: {unknown[0]!r}; valid: {', '.join(space.names)}")
+    if not rows:
+        raise ConfigError(f"sysid.stages.{name}.families: {families}; sysid.every={settings['every']} leaves none of their manoeuvres")
+    population, generations = settings["budget"][name]
+    return Stage(name, tuple(families), tuple(entry["tuned"]) or space.names, entry["window"], population, generations), rows
+
+
+def refine(
+    config: Mapping[str, Any], out: Path, space: Space, simulator: Simulator, batch: ManoeuvreBatch, start: np.ndarray
+) -> RefinementResult:
+    """Fits by least squares on all manoeuvres."""
+    settings, path = config["sysid"], out / "stages" / "refine.json"
+    digest = result_file.digest({"refine": settings["refine"], "start": start.tolist(), "shared": _shared_settings(config)})
+    refined = _read(path, digest, RefinementResult) if config["resume"] else None
+    if refined is None:
+        weights, index = optimization.weight_row(settings["weights"]), np.arange(len(batch.frames))
+        width = max(1, settings["width"] // len(index) // 4)  # candidates whose complete traces are on the device at once
+
+        def residuals_of(candidates: np.ndarray) -> list[np.ndarray]:
+            pairs = jnp.asarray(np.repeat(candidates, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(candidates)))
+            traces = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(len(candidates), len(index), *leaf.shape[1:]),
+                                  simulator.trace(*pairs, batch))  # fmt: skip
+            each = [jax.tree.map(lambda leaf, i=i: leaf[i], traces) for i in range(len(candidates))]
+            return [candidate_simulation.residuals(trace, batch, index, weights) for trace in each]
+
+        def residuals(candidates: np.ndarray) -> np.ndarray:
+            pieces = [np.resize(candidates[i : i + width], (width, candidates.shape[1])) for i in range(0, len(candidates), width)]
+            return np.stack([row for piece in pieces for row in residuals_of(piece)][: len(candidates)])
+
+        refined = optimization.refine(residuals, space, start, **settings["refine"], clock=time.perf_counter)
+        result_file.write(path, {"made": digest, **refined._asdict()}, digits=None)
+    LOG.info("least squares: %.4f -> %.4f, %d candidates", refined.start_loss, refined.loss, refined.evaluations)
+    return refined
+
+
+def _shared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that every stage depends on."""
+    settings = config["sysid"]
+    car = {name: value for name, value in config["dynamics"]["car"].items() if name not in settings["space"]}
+    shared = {name: config[name] for name in ("teacher", "manoeuvres", "physics_hz")} | {"dynamics": {**config["dynamics"], "car": car}}
+    return shared | {name: settings[name] for name in ("seed", "friction", "weights", "space", "search", "every")}
+
+
+def _read(path: Path, digest: str, kind: type) -> Any:
+    """The result of an earlier run if it was made with these settings, else None."""
+    content = result_file.read(path) if path.is_file() else {"made": None}
+    if content.pop("made") != digest:
+        return None
+    return kind(**{name: np.array(value) if isinstance(value, list) else value for name, value in content.items()})
+
+
+def evaluate_car(
+    suites: Suites, car: Simulator, values: np.ndarray, *, weights: Mapping[str, float]
+) -> tuple[dict[str, Any], dict[str, candidate_simulation.CandidatePath]]:
+    """Computes the errors of a car on every manoeuvre by suite, and its traces by manoeuvre."""
+    row, errors, traces = optimization.weight_row(weights), {}, {}
+    for suite, recordings in suites.items():
+        batch, index = candidate_simulation.stack_recordings(recordings), np.arange(len(recordings))
+        path = jax.tree.map(np.asarray, car.trace(jnp.asarray(np.tile(values, (len(index), 1)), jnp.float32), jnp.asarray(index), batch))
+        names = [recording.manoeuvre.name for recording in recordings]
+        single = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], path) for i in index]
+        squares = [candidate_simulation.residuals(trace, batch, index[i : i + 1], row) ** 2 for i, trace in enumerate(single)]
+        errors[suite] = {
+            "name": names,
+            "family": [recording.manoeuvre.family for recording in recordings],
+            "loss": [float(square.sum()) for square in squares],
+            **error_metrics.compute_errors(path, recordings)._asdict(),
+        }
+        traces |= {name: jax.tree.map(lambda leaf: leaf[0], trace) for name, trace in zip(names, single, strict=True)}
+    return errors, traces
+
+
+def sample_traces(suites: Suites, samples: Sequence[str], traces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns sample -> teacher and cars -> time, position, speed and yaw rate at 10 Hz.
+
+    Without a sample among the manoeuvres, the first manoeuvre of each suite.
+    """
+    stride = round(manoeuvres.RATE_HZ / 10.0)
+    recorded = {recording.manoeuvre.name: recording for recordings in suites.values() for recording in recordings}
+    names = [name for name in samples if name in recorded] or [recordings[0].manoeuvre.name for recordings in suites.values()]
+
+    def sample(teacher: ManoeuvreRecording) -> dict[str, Any]:
+        paths = {car: paths[teacher.manoeuvre.name] for car, paths in traces.items()}
+        columns = {"teacher": (teacher.position, teacher.speed, teacher.yaw_rate)}
+        columns |= {car: (path.position, path.pace, path.yaw_rate) for car, path in paths.items()}
+        time_s, keys = np.arange(1, len(teacher.yaw) + 1) / manoeuvres.RATE_HZ, ("time_s", "position", "speed", "yaw_rate")
+        thin = lambda column: np.round(np.asarray(column, float)[: len(time_s) : stride], 4)  # noqa: E731
+        return {car: dict(zip(keys, map(thin, (time_s, *values)), strict=True)) for car, values in columns.items()}
+
+    return {name: sample(recorded[name]) for name in names}
