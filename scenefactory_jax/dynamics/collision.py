@@ -3,10 +3,10 @@
 Every unordered pair of cars is evaluated once, and its force acts on both with opposite sign at the same point: linear and angular
 momentum are conserved to rounding.
 
-**Normal.** The separating-axis theorem has four candidate axes for two boxes. While boxes are apart, their velocities say on which axis they
-touch last; once they overlap, this axis stays theirs until they are apart. So it depends neither on the phase of the time step nor on how
-deep a fast box is when it is first seen. The face of the axis is clipped against the other box's nearest face, which leaves two contact
-points, each with half the stiffness. A contact that begins within a step acts for the rest of the step.
+**Normal.** The separating-axis theorem has four candidate axes for two boxes. While boxes are apart, their velocities say on which axis
+they touch last; once they overlap, this axis stays theirs until they are apart. So it depends neither on the phase of the time step nor
+on how deep a fast box is when it is first seen. The face of the axis is clipped against the other box's nearest face, which leaves two
+contact points, each with half the stiffness. A contact that begins within a step acts for the rest of the step.
 
 **Force.** F = stiffness depth (1 + dissipation closing speed), never negative: K. H. Hunt and F. R. E. Crossley, Coefficient of restitution
 interpreted as damping in vibroimpact, Journal of Applied Mechanics 42 (1975). Its restitution falls with the speed v of the impact, from 1
@@ -101,8 +101,8 @@ def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> C
     load = OFF_CENTRE * law.stiffness * step_s**2 / (law.mass / 2)
     if load >= 4.0:  # see `compute_forces`
         raise ConfigError(
-            f"dynamics.contact.stiffness: {law.stiffness:g} cannot be integrated: {OFF_CENTRE} k dt^2 / m, m half the mass: expected below 4, "
-            f"got {load:.2f} at a time step of {step_s:.5f} s"
+            f"dynamics.contact.stiffness: {law.stiffness:g} cannot be integrated: {OFF_CENTRE} k dt^2 / m, m half the mass: expected below "
+            f"4, got {load:.2f} at a time step of {step_s:.5f} s"
         )
     neighbours = functools.partial(find_neighbours, max_neighbours=law.max_neighbours)
     return Contact(init, neighbours, functools.partial(compute_forces, law=law, height=height, step_s=step_s))
@@ -182,7 +182,8 @@ def compute_forces(
     if count > 1:
         rows_first, rows_second = np.triu_indices(count, 1)
         first, second = jax.tree.map(lambda leaf: leaf[rows_first], cars), jax.tree.map(lambda leaf: leaf[rows_second], cars)
-        axis, force, torque_first, torque_second = _compute_pair_forces(state.cars[rows_first, rows_second], first, second, limited=False, **shared)
+        previous = state.cars[rows_first, rows_second]
+        axis, force, torque_first, torque_second = _compute_pair_forces(previous, first, second, limited=False, **shared)
         state = state._replace(cars=state.cars.at[rows_first, rows_second].set(axis))
         rows = _find_pairs(count)
         contacts = contacts + jnp.tile(safe_norm(force) > 0.0, 2)[rows].sum(1, dtype=jnp.float32)
@@ -333,6 +334,14 @@ def find_contact_points(axis: Int[Array, ""], first: Boxes, second: Boxes) -> Bo
     depths = front - points @ outward
     points = points + 0.5 * depths[:, None] * outward + pick(first.position, second.position)
     return BoxContact(normal=normal, points=points, depths=depths)
+
+
+def find_box_contact(first: Boxes, second: Boxes) -> BoxContact:
+    """Computes the contact points of two boxes at this moment; depths are not positive if they do not overlap."""
+    separation = compute_separation(first, second)
+    contact = find_contact_points(select_axis(separation, jnp.int32(NO_AXIS)), first, second)
+    overlap = jnp.all(separation.gap < 0.0)
+    return contact._replace(depths=jnp.where(overlap, contact.depths, jnp.minimum(contact.depths, 0.0)))
 
 
 def _axes(yaw: Float[Array, ""]) -> Float[Array, "2 2"]:

@@ -1,9 +1,11 @@
+# pyright: reportAttributeAccessIssue=false
 """Drives the cars of an exported world with MuJoCo alone: `python drive.py world.xml`, or `import drive` from your own program.
 
-MuJoCo computes the equations of motion, suspension, steering servo, normal forces of the tyres and contacts between cars. This file computes
-what MuJoCo has no model of, with the numbers of the world's custom field `car`: tangential forces of the tyres, which have a state, engine,
-brakes with anti-lock, bump stops and air drag. `data.ctrl` of each car is steer (rad), throttle in [-1, 1] and brake in [0, 1]. The friction
-coefficient under each wheel is that of its contact pair in the world. The equations are those of scenefactory_jax/dynamics/articulated.
+MuJoCo computes the equations of motion, suspension, steering servo, normal forces of the tyres and contacts between cars. This file
+computes what MuJoCo has no model of, with the numbers of the world's custom field `car`: tangential forces of the tyres, which have a
+state, engine, brakes with anti-lock, bump stops and air drag. `data.ctrl` of each car is steer (rad), throttle in [-1, 1] and brake in
+[0, 1]. The friction coefficient under each wheel is that of its contact pair. The equations are those of
+scenefactory_jax/dynamics/articulated.
 """
 
 import sys
@@ -15,9 +17,9 @@ import numpy as np
 
 PARAMETERS = (
     "mass_total", "wheel_radius", "wheel_width", "spin_inertia", "rolling_torque", "suspension_travel", "stop_stiffness", "drive_torque",
-    "drive_power", "spin_limit", "reverse_spin_limit", "reverse_speed", "brake_torque_front", "brake_torque_rear", "abs_enabled", "abs_slip",
-    "abs_speed", "air_drag", "tyre_slip_stiffness", "tyre_relaxation_length", "tyre_shape", "tyre_stiffness_fall", "tyre_peak_fall",
-    "tyre_sliding_fraction", "tyre_sliding_speed",
+    "drive_power", "spin_limit", "reverse_spin_limit", "reverse_speed", "brake_torque_front", "brake_torque_rear", "abs_enabled",
+    "abs_slip", "abs_speed", "air_drag", "tyre_slip_stiffness", "tyre_relaxation_length", "tyre_shape", "tyre_stiffness_fall",
+    "tyre_peak_fall", "tyre_sliding_fraction", "tyre_sliding_speed",
 )  # fmt: skip
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 FRONT, FADE, GRAVITY, NEWTON_STEPS = np.array([1.0, 1.0, 0.0, 0.0]), 0.1, 9.81, 4

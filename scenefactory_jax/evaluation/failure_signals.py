@@ -152,14 +152,10 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
     users = collect_road_users(after.motion, after.agents.size, before.active, boxes)
     velocity = jnp.concatenate([before.motion.velocity[:, :2], boxes.velocity])
     yaw_rate = jnp.concatenate([before.motion.yaw_rate, boxes.yaw_rate])
-    half = users.size / 2 + MARGIN_M
-    rows, columns = jnp.arange(count), jnp.arange(len(half))
-
-    def find_contact(row: Int[Array, ""], column: Int[Array, ""]):
-        outline = lambda index: (users.position[index], users.yaw[index], half[index])  # noqa: E731
-        return find_box_contact(*outline(row), *outline(column))
-
-    contact = jax.vmap(lambda row: jax.vmap(lambda column: find_contact(row, column))(columns))(rows)
+    boxes = users._replace(size=users.size + 2 * MARGIN_M, velocity=jnp.zeros_like(users.velocity))  # for the axis of least overlap
+    rows, columns = jnp.arange(count), jnp.arange(len(users.yaw))
+    agents = jax.tree.map(lambda leaf: leaf[:count], boxes)
+    contact = jax.vmap(lambda agent: jax.vmap(lambda user: find_box_contact(agent, user))(boxes))(agents)
     depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)
     partner = jnp.argmax(jnp.where(jnp.isfinite(depth), depth, -jnp.inf), axis=1).astype(jnp.int32)
     normal, point = contact.normal[rows, partner], contact.points[rows, partner].mean(1)
@@ -169,5 +165,5 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
         at_point = velocity[index] + yaw_rate[index][:, None] * jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
         return dot(at_point, normal)
 
-    partner_against = jnp.concatenate([against, jnp.zeros(len(half) - count, bool)])[partner]
+    partner_against = jnp.concatenate([against, jnp.zeros(len(users.yaw) - count, bool)])[partner]
     return Collision(partner, speed_along_normal(rows), -speed_along_normal(partner), against, partner_against)

@@ -96,7 +96,7 @@ def make_simulator(dynamics: Mapping[str, Any], space: Space, friction: Sequence
         friction: of the surfaces, where the space does not contain them.
     """
     car, solver = cars.read_parameters(dynamics)
-    compiled = articulated_car.compile_car(car, solver, brakes=dynamics["brakes"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
+    compiled = articulated_car.compile_car(car, solver, abs_enabled=dynamics["abs"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
     contact = collision.make_contact(dynamics["contact"], height=car.height, step_s=collision.REPORT_S)
     zero, size = np.zeros((1, 1), np.float32), (car.length, car.width)
     worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=size)

@@ -2,7 +2,8 @@
 # (the compiled parts of mujoco carry no types)
 """One physics step of a car by MJX: its stages for any tree of bodies, and its Newton solver. Equal to `closed_form_step`, but slower.
 
-The engine computes the equations of motion, the suspension and the tyres' normal forces; all other forces are applied as generalised forces.
+The engine computes the equations of motion, the suspension and the tyres' normal forces; all other forces are
+applied as generalised forces.
 """
 
 import contextlib

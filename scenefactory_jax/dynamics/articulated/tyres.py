@@ -14,8 +14,8 @@ axes, and u the slip velocity: that of the tyre's material at the contact over t
     F_peak = mu x load x (1 - q x)
     fall = s + (1 - s) exp(-v / v_fall)       v = max(0, |u| - r_peak (F_peak / C) |V|): sliding speed beyond the peak
 
-In steady rolling z / L is the slip, and F is the magic formula of that slip with no curvature factor. A locked wheel slides. A wheel at rest
-is a spring of stiffness C / L. One circle holds both directions.
+In steady rolling z / L is the slip, and F is the magic formula of that slip with no curvature factor. A locked wheel slides. A wheel at
+rest is a spring of stiffness C / L. One circle holds both directions.
 
 Sources: H. B. Pacejka, Tyre and Vehicle Dynamics, 3rd edition, equation 1.6 (magic formula), section 4.3 (combined slip by one normalised
 slip), chapter 7 (relaxation length); C. Canudas de Wit et al., "A new model for control of systems with friction", IEEE Transactions on
@@ -126,10 +126,9 @@ def compute_force(deflection: tuple[Number, Number], limits: Limits) -> tuple[tu
     peak, c = limits.peak, limits.shape
     ratio = size * limits.stiffness / jnp.maximum(peak, 1e-6)
     angle = jnp.arctan(ratio / c)
-    sticks = ratio < peak_ratio(c)
-    small = ratio < 1e-4
-    secant = jnp.where(sticks, jnp.where(small, 1.0, jnp.sin(c * angle) / jnp.where(small, 1.0, ratio)), 1.0 / jnp.where(sticks, 1.0, ratio))
-    secant = limits.stiffness * limits.fall * secant
+    sticks, small = ratio < peak_ratio(c), ratio < 1e-4
+    shape = jnp.where(sticks, jnp.sin(c * angle), 1.0)
+    secant = limits.stiffness * limits.fall * jnp.where(small, 1.0, shape / jnp.where(small, 1.0, ratio))
     radial = jnp.where(sticks, limits.stiffness * limits.fall * jnp.cos(c * angle) / (1.0 + (ratio / c) ** 2), 0.0)
     along = jnp.where(size > 1e-9, (x / jnp.maximum(size, 1e-9)) ** 2, 1.0)
     return (-secant * x, -secant * y), radial * along + secant * (1.0 - along)

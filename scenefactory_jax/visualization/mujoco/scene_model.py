@@ -129,6 +129,6 @@ def _add_mesh(model: mujoco.MjSpec, surface: Surface) -> None:
 
 def _build_car(car: CarParameters, slot: int) -> mujoco.MjSpec:
     """A car in the colour of its slot."""
-    spec = models.build_mjspec(car, visual=True, brake_rows=False)
+    spec = models.build_mjspec(car, visual=True)
     spec.geom("hull").rgba = [*rgb(colour_of(slot)), 1.0]
     return spec

@@ -40,7 +40,7 @@ def build(
         scene_size_m: side of the drawn ground; the physical plane is infinite.
     """
     parameters, solver = cars.read_parameters(dynamics)
-    car = models.build_mjspec(parameters, visual=True, brake_rows=False)
+    car = models.build_mjspec(parameters, visual=True)
     model = build_world(scene, car, scene_size_m=scene_size_m, goal_radius_m=goal_radius_m)
     for slot in np.flatnonzero(np.asarray(scene.agents.present)):
         models.add_ground_pairs(model, parameters, ground="ground", prefix=f"agent{slot}/")
