@@ -44,7 +44,7 @@ def compare_solvers(
     steps, hold = round(seconds * control_hz), round(hold_s * control_hz)
     actions = rng.uniform(-1.0, 1.0, (drives, -(-steps // hold), 3)).repeat(hold, axis=1)[:, :steps].astype(np.float32)
     car, solver = read_parameters(next(iter(backends.values())))
-    zero = np.zeros((drives, 1), np.float32)
+    abs_enabled, zero = next(iter(backends.values()))["abs"], np.zeros((drives, 1), np.float32)
     size = (car.length, car.width)
     scenes = open_ground.make_open_ground(np.zeros((drives, 1, 2)), zero, speed[:, None], mu, np.zeros(drives, np.int32), size=size)
     times = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
@@ -54,8 +54,8 @@ def compare_solvers(
         paths[name] = np.asarray(_simulate(backend)(scenes, jnp.asarray(actions[:, :, None])), float)
     paths[REFERENCE] = np.stack([
         mujoco_c.simulate(
-            car, solver, actions[i].astype(float), np.full(4, mu[i]), speed=speed[i], physics_dt=times["physics_dt"],
-            substeps=round(physics_hz / control_hz), **CONVERGED,
+            car, solver, actions[i].astype(float), np.full(4, mu[i]), speed=speed[i], abs_enabled=abs_enabled,
+            physics_dt=times["physics_dt"], substeps=round(physics_hz / control_hz), **CONVERGED,
         ).qpos[:, :2]
         for i in range(drives)
     ])  # fmt: skip

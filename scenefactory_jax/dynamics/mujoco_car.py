@@ -117,6 +117,7 @@ def apply_tyres(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespac
         newton = a - error / (car.spin_inertia + lever**2 * slope)
         a = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
     force, _ = respond(np.where(np.abs(needed) <= brake_torque, stop, a))
+    cars.tangent, cars.slip = np.hypot(*force), np.hypot(*slip) * pressed
     force = forward * force[0][..., None] + left * force[1][..., None]
     for place in np.ndindex(cars.wheel.shape):
         mujoco.mj_applyFT(model, data, force[place], np.zeros(3), (hub + arm)[place], cars.wheel[place], data.qfrc_applied)

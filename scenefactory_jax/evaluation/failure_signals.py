@@ -152,10 +152,10 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
     users = collect_road_users(after.motion, after.agents.size, before.active, boxes)
     velocity = jnp.concatenate([before.motion.velocity[:, :2], boxes.velocity])
     yaw_rate = jnp.concatenate([before.motion.yaw_rate, boxes.yaw_rate])
-    boxes = users._replace(size=users.size + 2 * MARGIN_M, velocity=jnp.zeros_like(users.velocity))  # for the axis of least overlap
+    enlarged = users._replace(size=users.size + 2 * MARGIN_M, velocity=jnp.zeros_like(users.velocity))  # for the axis of least overlap
     rows, columns = jnp.arange(count), jnp.arange(len(users.yaw))
-    agents = jax.tree.map(lambda leaf: leaf[:count], boxes)
-    contact = jax.vmap(lambda agent: jax.vmap(lambda user: find_box_contact(agent, user))(boxes))(agents)
+    agents = jax.tree.map(lambda leaf: leaf[:count], enlarged)
+    contact = jax.vmap(lambda agent: jax.vmap(lambda user: find_box_contact(agent, user))(enlarged))(agents)
     depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)
     partner = jnp.argmax(jnp.where(jnp.isfinite(depth), depth, -jnp.inf), axis=1).astype(jnp.int32)
     normal, point = contact.normal[rows, partner], contact.points[rows, partner].mean(1)

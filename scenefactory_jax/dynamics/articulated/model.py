@@ -177,11 +177,16 @@ def set_options(spec: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> No
 
 def build_standalone_model(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool) -> mujoco.MjModel:
     """Compiles one car on an infinite flat ground."""
+    return build_standalone_spec(car, solver, physics_dt=physics_dt, visual=visual).compile()
+
+
+def build_standalone_spec(car: CarParameters, solver: Solver, *, physics_dt: float, visual: bool) -> mujoco.MjSpec:
+    """Builds one car on an infinite flat ground."""
     spec = build_mjspec(car, visual=visual)
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
     add_ground_pairs(spec, car, ground="ground")
     set_options(spec, solver, physics_dt=physics_dt)
-    return spec.compile()
+    return spec
 
 
 def find_rest_pose(model: mujoco.MjModel, car: CarParameters) -> np.ndarray:
