@@ -37,7 +37,6 @@ from support.scene_documents import (
     written,
 )
 
-from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map as spreads
@@ -55,7 +54,6 @@ from scenefactory_jax.visualization import road_lines
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
-TOPOLOGY = {key: value for key, value in hydra_config.load_config("convert")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
