@@ -8,7 +8,6 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import yaml
 from mkdocs.structure.files import File
 
 import scenefactory_jax
@@ -129,6 +128,7 @@ def find_functions() -> dict[str, list[Callable[..., Any]]]:
 
 
 def format_value(value: Any) -> str:
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000).strip().removesuffix("\n...")
+    """Formats a default for a table, at most 60 characters long."""
+    text = annotated_config.format_value(value)
     text = text if len(text) <= 60 else text[:57] + "..."
     return f"`{text}`".replace("|", "\\|")

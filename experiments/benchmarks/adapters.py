@@ -24,8 +24,8 @@ import numpy as np
 from scenefactory_jax.adapters import episodes, flatten_observation
 from scenefactory_jax.cli import entry, schema
 from scenefactory_jax.cli import hydra_config as configs
-from scenefactory_jax.cli.hydra_config import versions
 from scenefactory_jax.core import markdown, result_file
+from scenefactory_jax.core.config import versions
 from scenefactory_jax.core.pytree import tree_where
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment

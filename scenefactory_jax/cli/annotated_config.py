@@ -98,7 +98,7 @@ def _lines(node: Mapping[str, Any], place: Place, comments: Mapping[Place, str],
         if here in options:
             parts.insert(0, _list_options(*options[here]))
         nested = isinstance(value, Mapping) and bool(value)
-        line = f"{indent}{key}:" if nested else f"{indent}{key}: {_plain(value)}"
+        line = f"{indent}{key}:" if nested else f"{indent}{key}: {format_value(value)}"
         comment = f"# {' '.join(parts)}" if parts else ""
         if len(line) + len(comment) < WIDTH:
             yield f"{line} {comment}".rstrip()
@@ -115,5 +115,6 @@ def _list_options(group: str, chosen: Any) -> str:
     return f"{group}={chosen or 'null'}{'; or ' if others else ''}{', '.join(others)}."
 
 
-def _plain(value: Any) -> str:
+def format_value(value: Any) -> str:
+    """Formats a value of a config in one line of YAML."""
     return yaml.safe_dump(value, default_flow_style=True, width=10_000).strip().removesuffix("\n...")

@@ -16,7 +16,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from scenefactory_jax.core.schema import Bounds, ConfigError, Fraction, check_names, read_value
+from scenefactory_jax.core.schema import Bounds, ConfigError, check_names, read_value
 
 
 def instantiate(entry: Mapping[str, Any], *, builtins: types.ModuleType | str, where: str, **context: Any) -> Callable[..., Any]:
@@ -76,9 +76,6 @@ def _is_defined_in(function: Callable[..., Any], module: types.ModuleType) -> bo
     return place == module.__name__ or (hasattr(module, "__path__") and place.startswith(f"{module.__name__}."))
 
 
-check_type = read_value
-
-
 def check_number(
     value: float | int, *, where: str, above: float | int | None = None, least: float | int | None = None, below: float | int | None = None
 ) -> None:
@@ -93,11 +90,6 @@ def check_numbers(values: Mapping[str, float], *, where: str, **bounds: float) -
     """Checks several keys of the entry `where` against the same bounds, as `check_number`."""
     for name, value in values.items():
         check_number(value, where=f"{where}.{name}", **bounds)
-
-
-def check_fraction(value: float | int, *, where: str) -> None:
-    """Checks that a number of a config is in [0, 1]; raises a ConfigError that names `where`."""
-    read_value(value, Fraction, where=where)
 
 
 def check_range(span: Sequence[float | int], *, where: str, least: float | None = 0.0) -> tuple[float | int, float | int]:

@@ -100,7 +100,7 @@ def test_nothing_to_train_on_says_why(tmp_path):
         ("quality.reject=[level]", "quality.reject: expected names of rules, got 'level'; valid: missing_map, "),
         ("lanes.topology.neighbour_distance_m=[5.0,2.0]", "lanes.topology.neighbour_distance_m: expected [min, max] >= 0, got [5.0, 2.0]"),
         ("features.streets.one_in=0", "features.streets.one_in: expected a number > 0, got 0"),
-        ("spread.timeout_s=0.0", "spread.timeout_s: expected a number > 0, got 0.0"),
+        ("spread.timeout_s=0.0", "spread.timeout_s: expected a number > 0 or null, got 0.0"),
         ("scenes.workers=0", "scenes.workers: expected an integer >= 1, got 0"),
     ],
 )

@@ -126,5 +126,5 @@ def test_a_run_resumes_with_the_parts_of_the_command(tmp_path, capsys):
 
 def test_runs_are_compared_without_trust(tmp_path):
     run_config.write(tmp_path, hydra_config.load_config("train", "+reward.mine={_target_: planted.make, weight: 1.0}"))
-    (tmp_path / "metrics.csv").write_text("iteration\n1\n")
-    assert _read(tmp_path).settings["reward.mine._target_"] == "planted.make"
+    (tmp_path / "metrics.csv").write_text("iteration,steps/total\n1,8\n")
+    assert _read(tmp_path, []).settings["reward.mine._target_"] == "planted.make"

@@ -37,9 +37,8 @@ from support.scene_documents import (
     written,
 )
 
-from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.core import folder_lock
-from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map as spreads
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.raw_scene import Light, Polyline, Reject, SceneError, Track
@@ -51,12 +50,10 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import columns, stack
 from scenefactory_jax.data.packing import summary as summary_text
-from scenefactory_jax.roadgraph import lane_topology
 from scenefactory_jax.visualization import road_lines
 from scenefactory_jax.visualization.mujoco import world_mjcf
 
 NONE = dict.fromkeys(stack.AXES)
-TOPOLOGY = {key: value for key, value in hydra_config.load_config("convert")["lanes"]["topology"].items() if key != "_target_"}
 
 
 @pytest.fixture(scope="module")
@@ -478,24 +475,19 @@ def test_a_file_that_gave_nothing_is_read_again(tmp_path):
 
 def test_a_mistake_in_the_config_is_an_error_of_no_file(tmp_path):
     folder = streets(tmp_path / "in", "a", "b", "c")
-    wrong = functools.partial(lane_topology.infer_lane_links, **TOPOLOGY | {"neighbour_distance_m": [5.0, 2.0]})
+    source = scene_source.open_files(folder, reader_selection.make(FORMATS))
     for workers in (1, 2):
-        spread = functools.partial(spreads.local, workers=workers, timeout_s=None)
-        with pytest.raises(ConfigError, match=r"lanes\.topology\.neighbour_distance_m: expected .*, got \[5\.0, 2\.0\]"):
-            conversion.convert(folder, tmp_path / "bank", **options(refine=wrong, spread=spread))
         with pytest.raises(ConfigError, match=r"scenes\.pack\.car_size_m: expected \[length, width\] or null, got \[4.0\]"):
-            source = scene_source.open_files(folder, reader_selection.make(FORMATS))
             scene_source.pack_all(source, check=checker(), pack=packer(car_size_m=[4.0]), workers=workers)
-    assert not (tmp_path / "bank").exists()
 
 
 @pytest.mark.parametrize("numbers", [{"workers": 0}, {"timeout_s": 0.0}, {"timeout_s": -1.0}])
 def test_numbers_with_which_nothing_would_be_done_are_refused(numbers):
     [name] = numbers
     with pytest.raises(ConfigError, match=rf"spread\.{name}: expected "):
-        list(spreads.local(dies_of_three, [1], **{"workers": 1, "timeout_s": None} | numbers))
-    with pytest.raises(ConfigError, match=r"spread\.pending: expected a number >= 1, got 0"):
-        list(spreads.ray(dies_of_three, [1], address=None, pending=0, timeout_s=None))
+        instantiate({"_target_": "local", "workers": 1, "timeout_s": None, **numbers}, builtins=spreads, where="spread")
+    with pytest.raises(ConfigError, match=r"spread\.pending: expected an integer >= 1, got 0"):
+        instantiate({"_target_": "ray", "address": None, "pending": 0, "timeout_s": None}, builtins=spreads, where="spread")
 
 
 def test_nothing_usable_writes_no_bank(tmp_path):
