@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
+from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.dynamics import mujoco_car
 from scenefactory_jax.dynamics.articulated import equations_of_motion
 from scenefactory_jax.dynamics.articulated import model as models
@@ -118,7 +119,13 @@ def simulate_placed(cars: CEngineCars, controls: Float[np.ndarray, "T N 3"], mu:
 
 
 def set_mu(cars: CEngineCars, mu: Float[np.ndarray, "N 4"]) -> None:
-    """Sets the friction coefficient under each wheel."""
+    """Sets the friction coefficient under each wheel.
+
+    Raises:
+        ConfigError: one that is not positive.
+    """
+    if not (mu > 0.0).all():
+        raise ConfigError(f"mu: expected coefficients > 0, got {np.min(mu):g}")
     cars.model.pair_friction[cars.cars.pair.ravel(), :2] = mu.reshape(-1, 1)
 
 

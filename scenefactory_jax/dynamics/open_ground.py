@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import make_empty_boxes, make_empty_log
 from scenefactory_jax.core.types import AgentLog, Agents, Road, Scene
 from scenefactory_jax.weather.friction import make_uniform
@@ -22,7 +23,12 @@ def make_open_ground(
     """Makes worlds that contain cars and nothing else.
 
     Their weather holds `friction` as its film and `pattern` as its surface: a friction function of the caller reads them.
+
+    Raises:
+        ConfigError: a friction coefficient that is not positive.
     """
+    if not (np.asarray(friction) > 0.0).all():
+        raise ConfigError(f"friction: expected coefficients > 0, got {np.min(friction):g}")
     count = yaw.shape[1]
 
     def make_world(position: Array, yaw: Array, speed: Array, friction: Array, pattern: Array) -> Scene:

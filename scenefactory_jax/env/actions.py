@@ -5,8 +5,19 @@ from jaxtyping import Array, Float
 
 
 def separate_pedals(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
-    """Throttle, steer, brake as they are; dynamics take a pedal below zero as released (the paper's action)."""
-    return action
+    """Throttle, steer, brake; a pedal below zero is released (the paper's action)."""
+    throttle, steer, brake = action.T
+    return jnp.stack([jnp.maximum(throttle, 0.0), steer, jnp.maximum(brake, 0.0)], axis=1)
+
+
+def pedals_with_reverse(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+    """Throttle, steer, brake; a throttle below zero is that of the reverse gear, a brake below zero is released.
+
+    The articulated car engages its reverse gear below `dynamics.car.reverse_speed` (`actuators.compute_drive_torque`). Bicycles have none:
+    for them such a throttle is released.
+    """
+    throttle, steer, brake = action.T
+    return jnp.stack([throttle, steer, jnp.maximum(brake, 0.0)], axis=1)
 
 
 def one_pedal(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:

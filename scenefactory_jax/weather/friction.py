@@ -133,13 +133,18 @@ def compute_mu(
         speed: of the cars, m/s.
         mode: `static` and `dynamic` evaluate the model at `reference_speed` and `slip_static` or `slip_dynamic` (the published choice is
             `static`); `speed` evaluates it at each car's own speed and `slip_static`.
-        floor: smallest coefficient of a contact; at 0 cars would fall through the road.
+        floor: smallest coefficient of a contact.
         surfaces: of every name of `types.SURFACES`.
+
+    Raises:
+        ConfigError: surfaces that are missing or unknown, or integer speeds.
     """
     if set(surfaces) != set(SURFACES):
         raise ConfigError(f"weather.friction.surfaces: expected {', '.join(SURFACES)}, got {', '.join(surfaces)}")
+    speed = jnp.asarray(speed)
+    if not jnp.issubdtype(speed.dtype, jnp.floating):  # the slip would be an integer, too: zero
+        raise ConfigError(f"speed: expected floating-point numbers, got {speed.dtype}")
     film_mm, surface = read_condition(weather, position)
-    speed = jnp.asarray(speed, jnp.result_type(speed, jnp.float32))  # integers would make the slip an integer
     v = speed if mode == "speed" else jnp.full_like(speed, reference_speed)
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
     theta = jnp.array([surfaces[name].theta for name in SURFACES], jnp.float32)[surface]

@@ -185,7 +185,12 @@ def test_one_pedal_brakes_below_zero():
     asked = jnp.array([[0.6, -0.2, -1.0], [-0.3, 0.1, -1.0], [-0.3, 0.0, 0.7], [0.5, 1.0, 0.4], [-1.0, 0.0, 0.0]])
     wanted = [[0.6, -0.2, -0.6], [0.0, 0.1, 0.3], [0.0, 0.0, 0.7], [0.5, 1.0, 0.4], [0.0, 0.0, 1.0]]
     np.testing.assert_allclose(actions.one_pedal(asked), wanted, rtol=1e-6)
-    np.testing.assert_array_equal(actions.separate_pedals(asked), asked)
+
+
+def test_pedals_below_zero_are_released_or_reverse():
+    asked = jnp.array([[0.6, -0.2, -1.0], [-0.3, 0.1, 0.7]])
+    np.testing.assert_array_equal(actions.separate_pedals(asked), np.float32([[0.6, -0.2, 0.0], [0.0, 0.1, 0.7]]))
+    np.testing.assert_array_equal(actions.pedals_with_reverse(asked), np.float32([[0.6, -0.2, 0.0], [-0.3, 0.1, 0.7]]))
 
 
 def test_controls_are_what_dynamics_and_rewards_are_given(config):

@@ -40,7 +40,7 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
     metrics = schema.read(config["step_metrics"], step_metrics.StepMetricsConfig)
     parts = environment.EnvParts(
         dynamics=glide(),
-        map_action=actions.separate_pedals,
+        map_action=actions.pedals_with_reverse,
         action_repeat=hold,
         sample_agents=draw,
         sample_weather=keep_condition,

@@ -93,7 +93,7 @@ def make(
         randomization: null: all cars are the reference car. An entry whose target, such as `car_parameter_sampler`, returns a function
             (key, scene) -> parameters with an agent axis, called at every start without recompilation. It may declare `car` and
             `physics_dt`.
-        friction: (weather, position, speed) -> friction coefficient, evaluated for every wheel at the start of every control step.
+        friction: (weather, position, speed) -> positive friction coefficient, evaluated for every wheel at the start of every control step.
         physics_dt: s; `control_dt` must be a multiple of it.
 
     Raises:
@@ -115,7 +115,7 @@ def compile_car(
     """Compiles the reference car.
 
     Raises:
-        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `closed_form` lacks,.
+        ConfigError: a spring too stiff for the time step, time steps that do not fit, an integrator that `closed_form` lacks.
     """
     check_stability(car, physics_dt=physics_dt, where="dynamics.car")
     if solver.algorithm == "closed_form" and solver.integrator != "Euler":
@@ -200,6 +200,8 @@ def control_step(
     speed = safe_norm(motion.velocity[:, :2])
     wheels = wheel_positions(car, motion.position[:, :2], motion.yaw)
     mu = friction(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
+    if mu.shape != wheels.shape[:-1] or not jnp.issubdtype(mu.dtype, jnp.floating):
+        raise ConfigError(f"weather.friction: expected floating-point numbers {list(wheels.shape[:-1])}, got {mu.dtype} {list(mu.shape)}")
     command = actuators.compute_command(car, action)
     step = jax.vmap(functools.partial(physics_step, compiled), in_axes=(None if body.constants is None else 0, 0, 0, 0, 0, 0))
     mass = equations_of_motion.total_mass(car)

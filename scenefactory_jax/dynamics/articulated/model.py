@@ -130,9 +130,8 @@ def _add_geom(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Seque
 def add_ground_pairs(spec: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "") -> None:
     """Adds the tyres' contacts with the geom `ground` as explicit pairs: MuJoCo would otherwise take the larger friction of the two geoms.
 
-    The contact is softer than MuJoCo's default in both directions. The convex contact model lifts what slides: a rigid wheel with the
-    default friction reference hops (normal force 0 to 60 kN in the converged solver) and needs many iterations. With the soft contact,
-    1, 2 and 100 Newton iterations agree to a centimetre.
+    They push and have no friction: the tangential force is that of `tyres`. They are softer than MuJoCo's default, so that a few Newton
+    iterations converge.
     """
     for name in WHEELS:
         pair = spec.add_pair(name=f"{prefix}ground_{name}", geomname1=ground, geomname2=f"{prefix}tyre_{name}")
@@ -186,6 +185,7 @@ def build_standalone_spec(car: CarParameters, solver: Solver, *, physics_dt: flo
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0)
     add_ground_pairs(spec, car, ground="ground")
     set_options(spec, solver, physics_dt=physics_dt)
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL  # no contact here has friction; MJX takes such contacts with this setting only
     return spec
 
 

@@ -91,7 +91,7 @@ class CarParameters:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solver:
-    """Settings of the contact solver. Friction cones are elliptic: pyramidal ones gave NaN at few iterations."""
+    """Settings of the contact solver."""
 
     algorithm: Literal["closed_form", "newton"]  # `contact_solver`, or `mjx.step` with MJX's Newton (`mjx_backend`)
     integrator: Literal["Euler", "implicitfast"]
@@ -125,12 +125,17 @@ def _check_moments(moments: list[float], axes: tuple[int, ...], *, where: str) -
 def check_stability(car: CarParameters, *, physics_dt: float, where: str) -> None:
     """Checks that the explicit integrator is stable for the car's springs and dampers.
 
-    Semi-implicit Euler with an explicit damper is stable for a mass m on a spring k and damper c if k dt^2 / m + 2 c dt / m < 4. The slip
-    of a tyre falls by damping dt / impedance in a step, and grows if that is 2 or more.
+    Semi-implicit Euler with an explicit damper is stable for a mass m on a spring k and damper c if k dt^2 / m + 2 c dt / m < 4. The tyres
+    of a car at rest are springs of `tyre_slip_stiffness` x load / `tyre_relaxation_length`. Their force is that of the deflection one step
+    ahead, which adds a damper of k dt. A push from the side moves and rolls the chassis.
 
     Raises:
         ConfigError: naming `where`, the spring, the sum and the bound.
     """
+    weight = car.mass + 4 * (car.wheel_mass + car.carrier_mass) + 2 * car.knuckle_mass
+    tread = car.tyre_slip_stiffness * weight * GRAVITY / car.tyre_relaxation_length
+    height = car.wheel_radius - car.wheel_height + car.mass_height
+    rolled = 1.0 / (1.0 / weight + height**2 / car.inertia[0])
     steering_inertia = car.wheel_inertia[1] + car.carrier_inertia + car.knuckle_inertia + car.steering_inertia
     suspension = car.suspension_stiffness + car.stop_stiffness
     springs = {  # name: mass, stiffness, damping
@@ -139,14 +144,15 @@ def check_stability(car: CarParameters, *, physics_dt: float, where: str) -> Non
         "wheel bearing": (car.wheel_inertia[0], 0.0, car.wheel_damping),
         "lateral damping": (car.mass, 0.0, car.lateral_damping),
         "yaw damping": (car.inertia[2], 0.0, car.yaw_damping),
+        "tyres' slip stiffness over relaxation length": (rolled, tread, tread * physics_dt),
         "body on the ground": (compute_effective_corner_mass(car), car.body_stiffness, car.body_damping),
     }
     for name, (mass, stiffness, damping) in springs.items():
         load = (stiffness * physics_dt + 2 * damping) * physics_dt / mass
         if load >= 4.0:
             raise ConfigError(
-                f"{where}: the {name} cannot be integrated: (k dt + 2 c) dt / m: expected below 4, "
-                f"got {load:.2f} at physics_dt {physics_dt:.5f}"
+                f"{where}: the {name} cannot be integrated: (k dt + 2 c) dt / m: expected below 4, got {load:.2f} at physics_dt "
+                f"{physics_dt:.5f}"
             )
 
 
