@@ -1,118 +1,154 @@
-"""What the car's laws say by themselves: tyres that turn, brakes that hold an engine."""
+"""Engine, brakes, anti-lock controller and reverse gear; stops, and steering under full braking."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
-from test_randomization import CAR, SOLVER
+from support.driving import CAR, DT, WEIGHT, G, move, numbers_of, place
 
-from scenefactory_jax.dynamics import mujoco_c
-from scenefactory_jax.dynamics.articulated import actuators, constants, equations_of_motion, tyres
-from scenefactory_jax.dynamics.articulated import model as models
-from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated import actuators, equations_of_motion
 from scenefactory_jax.dynamics.articulated import state as states
-from scenefactory_jax.dynamics.articulated.vector import dot as vector_dot
+from scenefactory_jax.dynamics.articulated.parameters import AHEAD, CarParameters
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+FAST, MU = 100 / 3.6, np.array([1.1, 0.5, 0.2])
 
 
-@pytest.fixture(scope="module")
-def rig():
-    newton = dataclasses.replace(SOLVER, algorithm="newton")
-    return mujoco_c.make_one(CAR, newton, physics_dt=1 / 120, iterations=100, line_search=50)
+def state_of(car, *, speed=0.0, spin=0.0):
+    qvel = jnp.zeros(16).at[0].set(speed).at[jnp.array([8, 11, 13, 15])].set(spin)
+    return states.from_mujoco(car, jnp.zeros(17).at[2].set(0.755).at[3].set(1.0), qvel)
 
 
-def slips(rig, qpos, qvel):
-    """Slip velocity of each tyre over the ground in the world's axes, from the C engine's Jacobian; hub to contact; the engine's state."""
-    rig.data.qpos[:], rig.data.qvel[:] = qpos, qvel
-    mujoco.mj_step1(rig.model, rig.data)
-    rows = rig.data.efc_J.reshape(-1, rig.model.nv) @ rig.data.qvel
-    slip, arm = np.full((4, 3), np.nan), np.full((4, 3), np.nan)
-    for contact in rig.data.contact:
-        wheel = rig.tyre_of[contact.geom[1]]
-        slip[wheel] = contact.frame.reshape(3, 3).T @ rows[contact.efc_address : contact.efc_address + 3]
-        arm[wheel] = contact.pos - rig.data.xpos[rig.model.geom_bodyid[contact.geom[1]]]
-    return slip, arm
+def test_commands_are_clipped_and_a_brake_below_zero_is_released():
+    command = actuators.compute_command(CAR, jnp.array([[3.0, -3.0, 0.5], [-0.5, 0.2, -1.0]]))
+    np.testing.assert_allclose(command.throttle, [1.0, -0.5])
+    np.testing.assert_allclose(command.steer, [-CAR.steering_limit, 0.2 * CAR.steering_limit], rtol=1e-6)
+    front, rear = 0.5 * CAR.brake_torque_front, 0.5 * CAR.brake_torque_rear
+    np.testing.assert_allclose(command.brake_torque, [[front, front, rear, rear], [0.0] * 4])
 
 
-def turning(qpos, qvel, arm):
-    """`tyres.turning`, in the world's axes, as the C engine has the arms; the tyres' own arms are those."""
-    own = constants.derive_constants(jax.tree.map(jnp.float32, CAR))
-    state = states.from_mujoco(own.car, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
-    patch = tyres.find_contact_patches(own.car, state)
-    world = lambda vector: np.stack([vector_dot(axis, vector) for axis in (state.east, state.north, state.up)], axis=-1)  # noqa: E731
-    np.testing.assert_allclose(world(patch.arm), arm, atol=1e-6)
-    return world(tyres.compute_jdot_qvel(patch, equations_of_motion.compute_bias_acceleration(state)))
+def test_engine_has_a_torque_a_power_and_a_spin_limit():
+    """Of the front wheels: full torque at low speed, half the power each beyond, nothing at the limit."""
+    car = dataclasses.replace(CAR, drive_torque=1000.0, drive_power=100e3, spin_limit=200.0)
+    torque = lambda spin, throttle=1.0: actuators.compute_drive_torque(car, jnp.float32(throttle), state_of(car, spin=spin))  # noqa: E731
+    for spin, wanted in ((0.0, 1000.0), (40.0, 1000.0), (100.0, 500.0), (190.0, 0.5 * 50e3 / 190.0), (200.0, 0.0), (400.0, 0.0)):
+        np.testing.assert_allclose(torque(spin), [wanted, wanted, 0.0, 0.0], rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(torque(100.0, 0.5), [250.0, 250.0, 0.0, 0.0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_turning_is_what_jacobian_times_acceleration_leaves_out(rig, seed):
-    """Against the difference of the slips a moment before and after, of a car that nothing accelerates."""
-    rng, at = np.random.default_rng(seed), models.find_addresses(rig.model)
-    qpos, qvel = models.find_rest_pose(rig.model, CAR), np.zeros(16)
-    qpos[3:7] = [np.cos(0.4), 0.0, 0.0, np.sin(0.4)]
-    qpos[at.steer_q], qvel[at.steer_v] = rng.uniform(-0.3, 0.3, 2), rng.uniform(-1.0, 1.0, 2)
-    qvel[:2], qvel[5], qvel[at.spin_v] = rng.uniform(-15.0, 15.0, 2), rng.uniform(-1.0, 1.0), rng.uniform(-50.0, 50.0, 4)
-    _, arm = slips(rig, qpos, qvel)
-    found = turning(qpos, qvel, arm)
-    ends = []
-    for time in (-1e-4, 1e-4):
-        moved = qpos.copy()
-        mujoco.mj_integratePos(rig.model, moved, qvel, time)
-        ends.append(slips(rig, moved, qvel)[0])
-    wanted = (ends[1] - ends[0]) / 2e-4
-    np.testing.assert_allclose(found[:, :2], wanted[:, :2], rtol=1e-3, atol=1e-2)
-    assert np.abs(wanted[:, :2]).max() > 1.0
+def test_reverse_gear_engages_at_low_speed_only():
+    car = dataclasses.replace(CAR, reverse_speed=0.5, reverse_spin_limit=30.0)
+    torque = lambda speed, spin: actuators.compute_drive_torque(car, jnp.float32(-0.5), state_of(car, speed=speed, spin=spin))  # noqa: E731
+    np.testing.assert_allclose(torque(0.4, 0.0), [-0.5 * car.drive_torque] * 2 + [0.0] * 2, rtol=1e-5)
+    np.testing.assert_array_equal(torque(0.6, 2.0), 0.0)
+    np.testing.assert_allclose(torque(-10.0, -28.5), [-0.25 * car.drive_torque] * 2 + [0.0] * 2, rtol=1e-5)
+    np.testing.assert_array_equal(torque(-11.0, -30.0), 0.0)
 
 
-def test_a_car_that_rolls_through_a_bend_slips_at_a_constant_rate(rig):
-    """Centripetal acceleration of the hubs and the turn of their axles cancel: seen with the car, nothing about it changes."""
-    at, qpos, qvel = models.find_addresses(rig.model), models.find_rest_pose(rig.model, CAR), np.zeros(16)
-    rate, radius = 0.5, CAR.wheel_radius
-    qvel[1], qvel[5] = 0.0, rate
-    qvel[0] = 10.0
-    _, arm = slips(rig, qpos, qvel)
-    forward = qvel[0] - rate * cars.LEFT * CAR.track / 2
-    qvel[at.spin_v] = forward / -arm[:, 2]
-    found = turning(qpos, qvel, arm)
-    centripetal = np.array([0.0, rate * qvel[0], 0.0])  # J qacc of a chassis on its circle
-    np.testing.assert_allclose(found[:, 1] + centripetal[1], 0.0, atol=1e-3)
-    assert radius == pytest.approx(-arm[0, 2], abs=0.01)
+def test_car_accelerates_drives_backwards_and_does_not_reverse_from_speed():
+    """0 to 100 km/h in 10 to 11 s; backwards up to 9 to 10.5 m/s; from 20 m/s a throttle below zero is no brake."""
+    carry = place(3, speed=jnp.array([0.0, 0.0, 20.0]))
+    throttle = [1.0, -1.0, -1.0]
+    near = move(carry, 1200, throttle=throttle)
+    then = move(near, 120, throttle=throttle)
+    assert near.qvel[0, 0] < FAST < then.qvel[0, 0]
+    assert -CAR.reverse_spin_limit * CAR.wheel_radius < then.qvel[1, 0] < -9.0
+    rolls = 20.0 - 11.0 * (0.42 * 20.0**2 + 4 * CAR.rolling_torque / CAR.wheel_radius) / (WEIGHT / G)
+    assert rolls < then.qvel[2, 0] < 18.5
+    assert np.abs(then.qpos[:, 1]).max() < 0.01
 
 
-def test_what_the_brakes_take_of_the_engine_is_taken_off():
-    car, brake = dataclasses.replace(CAR, rolling_torque=0.0), np.array([400.0, 700.0, 300.0, 0.0])
-    command = actuators.Command(jnp.float32(0.0), jnp.float32(600.0), jnp.asarray(brake))
-    for spin in (20.0, 0.0):
-        torque, loss = actuators.compute_wheel_torques(car, command, jnp.full(4, spin))
-        np.testing.assert_allclose(torque, [200.0, 0.0, 0.0, 0.0])
-        np.testing.assert_allclose(loss, [cars.MIN_FRICTION_LOSS, 100.0, 300.0, cars.MIN_FRICTION_LOSS], rtol=1e-6)
-    torque, loss = actuators.compute_wheel_torques(car, command, jnp.full(4, -20.0))
-    np.testing.assert_array_equal(torque, [600.0, 600.0, 0.0, 0.0])
-    np.testing.assert_allclose(loss[:3], brake[:3])
+# ---- brakes
 
 
-def test_the_engine_ends_at_the_spin_limit():
-    car = dataclasses.replace(CAR, spin_limit=100.0)
-    spins = jnp.array([[-50.0, 0.0, 0.0, 0.0], [89.0, 95.0, 0.0, 0.0], [100.0, 400.0, 0.0, 0.0]])
-    torque = jax.vmap(lambda spin: actuators.compute_drive_torque(car, jnp.float32(600.0), spin))(spins)
-    np.testing.assert_allclose(torque, [[600.0, 600.0, 0.0, 0.0], [600.0, 300.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], rtol=1e-5)
+def stop(*, abs_enabled, steps=2400):
+    """Cars that brake fully from 100 km/h on `MU`; distance, and step at which each wheel first turns slower than 0.3 of its speed."""
+    carry, locked = place(3, speed=FAST), np.full((3, 4), steps)
+    for step in range(0, steps, 6):
+        carry = move(carry, 6, brake=1.0, mu=MU, abs_enabled=abs_enabled)
+        slow = carry.qvel[:, [8, 11, 13, 15]] * CAR.wheel_radius < 0.3 * carry.qvel[:, :1]
+        locked = np.where(slow & (carry.qvel[:, :1] > 5.0), np.minimum(locked, step), locked)
+    return carry, locked
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["abs", "no abs"])
+def stopped(request):
+    return request.param, *stop(abs_enabled=request.param)
+
+
+def test_stops_use_the_friction_of_the_road(stopped):
+    """100 to 0 km/h at friction 1.1, 0.5, 0.2: at most 1.05 v^2 / (2 mu g), with the anti-lock controller and without."""
+    _, carry, _ = stopped
+    ratio = carry.qpos[:, 0] / (FAST**2 / (2 * MU * G))
+    assert (ratio < 1.05).all() and (ratio > 0.93).all(), ratio
+    assert carry.qpos[0, 0] < 40.0 and np.abs(carry.qvel[:, :6]).max() < 1e-3 and np.abs(carry.qpos[:, 1]).max() < 0.05
+
+
+def test_wheels_lock_without_the_controller_only_and_in_front_first(stopped):
+    abs_enabled, _, locked = stopped
+    if abs_enabled:
+        assert (locked == 2400).all()
+    else:
+        assert (locked < 2400).all() and (locked[:, :2].max(1) < locked[:, 2:].min(1)).all(), locked
+
+
+@pytest.mark.parametrize(("name", "front_first"), [("articulated", True), ("articulated_paper", False)])
+def test_front_axle_uses_more_friction_than_the_rear(name, front_first):
+    """UN R13-H, annex 5: friction used by an axle, force over load, at braking rates of 0.15 to 0.8, is larger in front."""
+    car = numbers_of(name)[0]
+    assert (min(front_over_rear(car)) > 1.0) == front_first
+
+
+def front_over_rear(car: CarParameters):
+    mass = float(equations_of_motion.total_mass(car))
+    unsprung = equations_of_motion.compute_unsprung(car).mass
+    height = car.wheel_radius - car.wheel_height + car.mass_height
+    height = (car.mass * height + float(np.sum(unsprung)) * car.wheel_radius) / mass
+    share = car.brake_torque_front / (car.brake_torque_front + car.brake_torque_rear)
+    for rate in np.arange(0.15, 0.81, 0.05):
+        load = float(np.sum(equations_of_motion.compute_wheel_loads(car) * (AHEAD > 0))) + rate * mass * G * height / car.wheelbase
+        yield share / load / ((1.0 - share) / (mass * G - load))
+
+
+def test_a_car_steers_under_full_braking_with_the_controller_and_not_without():
+    """A lane change of 3.5 m from 20 m/s on friction 0.3, straight after it: steered by the distance to the new lane."""
+    ends = {}
+    for abs_enabled in (True, False):
+        carry = place(3, speed=20.0)
+        ends[abs_enabled] = move(carry, 1080, brake=1.0, mu=0.3, gain=0.01, target=3.5, abs_enabled=abs_enabled)
+    for end in ends.values():
+        assert np.linalg.norm(end.qvel[:, :2], axis=1).max() < 1e-3
+    heading = 2 * np.arctan2(ends[True].qpos[0, 6], ends[True].qpos[0, 3])
+    assert ends[True].qpos[0, 1] == pytest.approx(3.5, abs=0.2) and abs(heading) < np.radians(1.5)
+    assert ends[True].qpos[0, 0] < 1.05 * 20.0**2 / (2 * 0.3 * G)
+    assert abs(ends[False].qpos[0, 1]) < 0.1, "locked front wheels do not steer"
 
 
 def test_others_push_where_they_touch_wherever_the_mass_is():
     """Force and torque of a contact are about the box's centre; both are at the height of the mass. Air acts at the mass itself."""
     car = dataclasses.replace(CAR, mass_forward=0.3, air_drag=2.0)
-    turn, zero = 0.7, jnp.zeros(4)
+    turn = 0.7
     qpos = jnp.zeros(17).at[2].set(0.755).at[3].set(np.cos(turn / 2)).at[6].set(np.sin(turn / 2))
 
+    @jax.jit
     def torque(force, speed):
         state = states.from_mujoco(car, qpos, jnp.zeros(16).at[1].set(speed))
-        push = actuators.PlanarForce(jnp.array(force), jnp.float32(500.0))
-        return np.array([*actuators.compute_applied_forces(car, state, jnp.float32(0.0), zero, push).torque])
+        push = actuators.PlanarForce(force, jnp.float32(500.0))
+        return jnp.stack([*actuators.compute_applied_forces(car, state, jnp.float32(0.0), push).torque])
 
     aside = 1000.0 * np.array([np.sin(turn), np.cos(turn)])  # of a push to the north, in the car's axes
-    np.testing.assert_allclose(torque([0.0, 1000.0], 0.0), [-car.mass_height * aside[1], car.mass_height * aside[0], 500.0], rtol=1e-5)
+    wanted = [-car.mass_height * aside[1], car.mass_height * aside[0], 500.0]
+    np.testing.assert_allclose(torque(jnp.array([0.0, 1000.0]), 0.0), wanted, rtol=1e-5)
     drag = -2.0 * 10.0**2 * np.array([np.sin(turn), np.cos(turn)])
     wanted = [-car.mass_height * drag[1], car.mass_height * drag[0], 500.0 + car.mass_forward * drag[1]]
-    np.testing.assert_allclose(torque([0.0, 0.0], 10.0), wanted, rtol=1e-5)
+    np.testing.assert_allclose(torque(jnp.zeros(2), 10.0), wanted, rtol=1e-5)
+
+
+def test_anti_lock_controller_leaves_a_gentle_brake_alone():
+    """At a sixth of the brakes no wheel comes near the slip that the controller allows: both cars are the same."""
+    ends = [move(place(3, speed=15.0), 60, brake=0.15, mu=[1.1, 0.9, 0.7], abs_enabled=on) for on in (True, False)]
+    np.testing.assert_allclose(ends[0].qvel, ends[1].qvel, atol=1e-4)
+    assert ends[0].qvel[0, 0] < 15.0 - 0.15 * 0.9 * G * 60 * DT

@@ -267,7 +267,8 @@ def wheel_positions(car: CarParameters, position: Float[Array, "A 2"], yaw: Floa
 def read(compiled: CompiledCar, body: Body) -> Motion:
     """Reads the motion of the cars."""
     rotation = states.rotation_matrix(body.qpos[:, 3:7].T)
-    tyres, loaded = body.tyres, body.tyres.normal > 1.0  # N
+    tyres, limit = body.tyres, body.tyres.mu * body.tyres.normal
+    loaded = limit > 1e-3  # N; at the start of an episode the friction coefficient is not known yet
     return Motion(
         position=body.qpos[:, :3],
         velocity=body.qvel[:, :3],
@@ -277,6 +278,6 @@ def read(compiled: CompiledCar, body: Body) -> Motion:
         steer=body.qpos[:, compiled.addresses.steer_q].mean(-1),
         contact_force=body.contact_force,
         mu=tyres.mu.mean(-1),
-        friction_utilization=jnp.where(loaded, tyres.tangent / (tyres.mu * jnp.where(loaded, tyres.normal, 1.0)), 0.0).max(-1),
+        friction_utilization=jnp.where(loaded, tyres.tangent / jnp.where(loaded, limit, 1.0), 0.0).max(-1),
         slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
     )
