@@ -6,21 +6,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli.schema import Group, Task
 from scenefactory_jax.core import schema
-from scenefactory_jax.core.instantiate import ConfigError, instantiate
-from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.schema import Bounds, Count, Seed
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.env import environment
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.visualization import recorded_episodes, rerun_file, video_file
-from scenefactory_jax.visualization.mujoco import film, keyboard_control, offscreen_renderer, world_mjcf
+from scenefactory_jax.visualization.mujoco import exported_world, film, keyboard_control, offscreen_renderer
 from scenefactory_jax.visualization.mujoco.film import Camera, FilmSettings
 from scenefactory_jax.visualization.mujoco.keyboard_control import Drive, KeyboardResponse, Keys
 from scenefactory_jax.visualization.recorded_episodes import ShownScenes
@@ -78,7 +76,8 @@ def replay(config: Mapping[str, Any]) -> Path:
     goal_radius_m, dynamics = settings["step_metrics"]["goal_radius_m"], _choose_car(settings)
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".xml":
-        return _write_mjcf(out, settings, shown, dynamics)
+        scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
+        return exported_world.write(out, {**settings, "dynamics": dynamics}, scene, seed=command.seed)
     policy = recorded_episodes.select_policy(settings, run=command.run, act=command.act, slots=shown.scene.agents.yaw.shape[1])
     recording = recorded_episodes.record_episodes(settings, shown.scene, policy, seconds=command.seconds, seed=command.seed)
     if out.suffix in film.SUFFIXES:
@@ -182,14 +181,3 @@ def _choose_scenes(command: View, settings: Mapping[str, Any], *, single: bool) 
 def _choose_car(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """Config of the articulated car to draw: the dynamics' own, or the default one for other dynamics."""
     return settings["dynamics"] if "car" in settings["dynamics"] else configs.load_config("task")["dynamics"]
-
-
-def _write_mjcf(out: Path, settings: Mapping[str, Any], shown: ShownScenes, dynamics: Mapping[str, Any]) -> Path:
-    """Writes the first scene with its traffic at the start."""
-    scene = jax.tree.map(lambda leaf: leaf[0], shown.scene)
-    context = {"control_dt": 1.0 / settings["timing"]["control_hz"]}
-    traffic = instantiate(settings["traffic"], builtins="scenefactory_jax.env.traffic", where="traffic", **context)
-    scene = replace(scene, traffic=traffic(jax.tree.map(jnp.asarray, scene), jnp.int32(0)))
-    size = {"scene_size_m": settings["scenes"]["pack"]["scene_size_m"], "goal_radius_m": settings["step_metrics"]["goal_radius_m"]}
-    out.write_text(world_mjcf.build(scene, dynamics, physics_hz=settings["timing"]["physics_hz"], **size).to_xml())
-    return out

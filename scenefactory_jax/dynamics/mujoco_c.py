@@ -39,7 +39,7 @@ class CEngineCars(NamedTuple):
     model: mujoco.MjModel
     data: mujoco.MjData
     car: CarParameters
-    cars: SimpleNamespace  # `mujoco_car.load`
+    cars: SimpleNamespace  # `mujoco_car.find_cars`
     boxes: Int[np.ndarray, " N"]  # geoms
     qpos: Float[np.ndarray, "N 17"]  # views of the engine's memory
     qvel: Float[np.ndarray, "N 16"]
@@ -84,7 +84,7 @@ def index_model(model: mujoco.MjModel, car: CarParameters, prefixes: Sequence[st
     """Collects the parts of the cars whose names begin with these prefixes."""
     data = mujoco.MjData(model)
     boxes = np.array([model.geom(f"{prefix}box").id for prefix in prefixes])
-    return CEngineCars(model, data, car, mujoco_car.load(model), boxes, data.qpos.reshape(-1, 17), data.qvel.reshape(-1, 16))
+    return CEngineCars(model, data, car, mujoco_car.find_cars(model), boxes, data.qpos.reshape(-1, 17), data.qvel.reshape(-1, 16))
 
 
 def place(
@@ -102,7 +102,7 @@ def place(
     qpos[:, 3], qpos[:, 6] = np.cos(yaw / 2.0), np.sin(yaw / 2.0)
     qvel[:, 0], qvel[:, 1] = speed * np.cos(yaw), speed * np.sin(yaw)
     cars.data.qvel[cars.cars.spin] = speed[:, None] / cars.car.wheel_radius
-    cars.cars.deflection[:], cars.cars.load[:] = 0.0, equations_of_motion.compute_wheel_loads(cars.car)
+    cars.data.sensordata[cars.cars.load] = equations_of_motion.compute_wheel_loads(cars.car)
 
 
 def simulate_placed(cars: CEngineCars, controls: Float[np.ndarray, "T N 3"], mu: Float[np.ndarray, "N 4"], *, substeps: int) -> Trajectory:
@@ -132,8 +132,7 @@ def set_mu(cars: CEngineCars, mu: Float[np.ndarray, "N 4"]) -> None:
 def set_controls(cars: CEngineCars, control: Float[np.ndarray, "N 3"]) -> None:
     """Sets throttle, steer and brake in [-1, 1] of each car."""
     throttle, steer, brake = np.clip(control, -1.0, 1.0).T
-    ctrl = cars.data.ctrl
-    ctrl[cars.cars.throttle], ctrl[cars.cars.steer], ctrl[cars.cars.brake] = throttle, cars.car.steering_limit * steer, brake
+    cars.data.ctrl[cars.cars.controls] = np.stack([cars.car.steering_limit * steer, throttle, brake], axis=-1)
 
 
 def step(cars: CEngineCars) -> None:
@@ -144,5 +143,5 @@ def step(cars: CEngineCars) -> None:
 def record(cars: CEngineCars) -> tuple[np.ndarray, ...]:
     """Reads state and tyre outputs of every car, as in `Trajectory`."""
     tyres = cars.cars
-    outputs = cars.model.pair_friction[tyres.pair, 0], tyres.load, tyres.tangent, tyres.slip
+    outputs = cars.model.pair_friction[tyres.pair, 0], cars.data.sensordata[tyres.load], tyres.tangent, tyres.slip
     return cars.qpos.copy(), cars.qvel.copy(), *(output.copy() for output in outputs)

@@ -14,6 +14,7 @@ LAYERS: dict[str, tuple[int, ...]] = {
     "driveway": (DRIVEWAY,), "lane": DRIVABLE, "bike": (LANE_BIKE,), "crosswalk": (CROSSWALK,), "bump": (SPEED_BUMP,),
     "white-broken": (6,), "white": (7, 8), "yellow-broken": (9, 10, 13), "yellow": (11, 12), "edge": EDGES,
 }  # fmt: skip
+WHITE, YELLOW = (0.95, 0.95, 0.95, 1.0), (0.95, 0.75, 0.15, 1.0)  # paint
 STRAIGHT_M = 0.03  # tolerance of simplified lines
 GAP_M = 0.02  # consecutive segments of a polyline that are farther apart are two lines
 

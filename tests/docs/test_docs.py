@@ -15,6 +15,7 @@ import scenefactory_jax as sf
 from scenefactory_jax import __version__
 from scenefactory_jax.adapters import layout
 from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.cli.view import view
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").rglob("*.md"))
 
@@ -52,6 +53,20 @@ def test_the_python_of_the_library_page_runs(quickly):
     assert samples["action"].shape == (32, 16, 4, 3) and samples["truncated"].shape == (32, 16)
     assert np.isfinite(seen).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
     assert found["recording"].shots.position.shape[:2] == (1, 3)
+
+
+def test_the_exported_world_drives_as_the_page_says(quickly, tmp_path):
+    """Its first command, the one without a window, and the program."""
+    section = (ROOT / "docs" / "commands.md").read_text().partition("### A world for MuJoCo alone")[2]
+    shell, program = (re.search(f"```{kind}\n(.*?)```", section, re.DOTALL)[1] for kind in ("", "python"))
+    write, _, headless = shell.splitlines()
+    words = write.split()[4:]
+    assert words[-1] == "out=world.xml"
+    view(hydra_config.load_config("view", *words[:-1], f"out={tmp_path / 'world.xml'}"))
+    headless = [sys.executable, *headless.partition("#")[0].split()[1:]]
+    for arguments in (headless, [sys.executable, "-c", program]):
+        done = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0 and "[" in done.stdout, done.stderr
 
 
 def test_the_task_page_has_the_numbers_of_the_configs(quickly):

@@ -7,16 +7,16 @@ a wheel. The motion is the same, and the kinematic tree is two levels deep inste
 body's mass, and to its inertia about the two axes across the spin axis.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from scenefactory_jax.dynamics import mujoco_car
 from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, compute_unsprung, total_mass
 from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FRONT_WHEELS, LEFT, WHEELS, CarParameters, Solver
 
+BRAKE_SPEED = 5.0  # m/s; see `add_actuators`
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
 
 
@@ -127,40 +127,97 @@ def _add_geom(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Seque
     return body.add_geom(name=name, type=kind, size=list(size), mass=0, contype=0, conaffinity=0, **options)
 
 
-def add_ground_pairs(spec: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "") -> None:
+def add_ground_pairs(
+    spec: mujoco.MjSpec, car: CarParameters, *, ground: str, prefix: str = "", mu: Sequence[float] | None = None
+) -> None:  # fmt: skip
     """Adds the tyres' contacts with the geom `ground` as explicit pairs: MuJoCo would otherwise take the larger friction of the two geoms.
 
-    They push and have no friction: the tangential force is that of `tyres`. They are softer than MuJoCo's default, so that a few Newton
-    iterations converge.
+    They are softer than MuJoCo's default, so that a few Newton iterations converge.
+
+    Args:
+        mu: friction coefficient under each wheel, of MuJoCo's friction cones. None: the contacts push and have no friction, because the
+            tangential force is that of `tyres`.
     """
-    for name in WHEELS:
+    for wheel, name in enumerate(WHEELS):
         pair = spec.add_pair(name=f"{prefix}ground_{name}", geomname1=ground, geomname2=f"{prefix}tyre_{name}")
         pair.condim = 1
         pair.solref = [car.tyre_time_constant, 1.0]
         pair.solimp = [car.tyre_impedance, car.tyre_impedance, 1e-3, 0.5, 2.0]
+        if mu is not None:
+            pair.condim, pair.friction[:2] = 3, [mu[wheel]] * 2
 
 
-def add_actuators(spec: mujoco.MjSpec, car: CarParameters, *, abs_enabled: bool, prefixes: Sequence[str] = ("",)) -> None:
-    """Adds what `dynamics/mujoco_car.py` needs to drive the cars with MuJoCo alone: steering servos, inputs, and the field `car`.
+def add_actuators(
+    spec: mujoco.MjSpec, cars: CarParameters | Sequence[CarParameters], *, abs_enabled: bool, prefixes: Sequence[str] = ("",)
+) -> None:  # fmt: skip
+    """Adds what `dynamics/mujoco_car.py` needs to drive the cars with MuJoCo alone: controls, custom fields, load sensors and user data.
 
-    The inputs `throttle` and `brake` of a car have no force of their own: the torques of engine and brakes depend on the tyres.
+    The custom fields are the numbers of `CarParameters` and three that follow from them, one number per car. The actuators `steer`,
+    `throttle` and `brake` are controls of the script, which computes their forces. Without it, they are what MuJoCo has:
+
+    - `steer`: a servo of the mean angle of the front wheels; the spring `toe` keeps the two angles equal.
+    - `throttle`: a torque on both front wheels that falls linearly with their spin, the tangent below the hyperbola of `drive_power`.
+    - `brake`: a damper on the mean spin of the wheels, limited by the brake torque, which it reaches at `BRAKE_SPEED`. Where it exceeds
+      the friction of the front wheels, they turn backwards while the rear ones still roll: MuJoCo has no dry friction that a control sets.
+
+    Args:
+        cars: one for all prefixes, or one for each.
     """
-    for prefix in prefixes:
-        for name, wheel in {"steer": "front_left", "steer_right": "front_right"}.items():
-            servo = _add_input(spec, f"{prefix}{name}", f"{prefix}steer_{wheel}", (-car.steering_limit, car.steering_limit))
-            servo.gainprm[0] = car.steering_stiffness
-            servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-            servo.biasprm[1], servo.biasprm[2] = -car.steering_stiffness, -car.steering_damping
-            servo.forcelimited, servo.forcerange = True, [-car.steering_torque, car.steering_torque]
-        for name, low in {"throttle": -1.0, "brake": 0.0}.items():
-            _add_input(spec, f"{prefix}{name}", f"{prefix}spin_front_left", (low, 1.0)).gainprm[0] = 0.0
-    numbers = {**vars(car), "mass_total": total_mass(car), "spin_inertia": car.wheel_inertia[0], "abs_enabled": float(abs_enabled)}
-    data = [float(numbers[name]) for name in mujoco_car.PARAMETERS]
-    spec.add_numeric(name="car", data=data, size=len(data))
+    cars = [cars] * len(prefixes) if isinstance(cars, CarParameters) else cars
+    for prefix, car in zip(prefixes, cars, strict=True):
+        k, c = car.steering_stiffness, car.steering_damping
+        both, torque = {"steer_front_left": 1.0, "steer_front_right": 1.0}, car.steering_torque
+        _add_control(spec, f"{prefix}steer", prefix, both, gain=[k], bias=[0.0, -k / 2, -c / 2], force=torque, limit=car.steering_limit)
+        toe = _add_tendon(spec, f"{prefix}toe", prefix, {"steer_front_left": 1.0, "steer_front_right": -1.0})
+        toe.stiffness = _linear(k / 2)
+        torque = car.drive_torque
+        fall = torque**2 / (2.0 * car.drive_power)  # per spin; torque (1 - spin / s) spin is at most torque s / 4 = power / 2
+        engine = {"spin_front_left": 1.0, "spin_front_right": 1.0}
+        _add_control(spec, f"{prefix}throttle", prefix, engine, gain=[torque, 0.0, -fall / 2], force=torque)
+        torque = car.brake_torque_front
+        brakes = {f"spin_{name}": 1.0 if name in FRONT_WHEELS else car.brake_torque_rear / torque for name in WHEELS}
+        damping = torque * car.wheel_radius / BRAKE_SPEED / sum(brakes.values())
+        _add_control(spec, f"{prefix}brake", prefix, brakes, gain=[0.0, 0.0, -damping], force=torque, low=0.0)
+        for name in WHEELS:
+            site = spec.body(f"{prefix}wheel_{name}").add_site(
+                name=f"{prefix}load_{name}", size=[1.1 * car.wheel_radius] * 3, rgba=[0.0] * 4
+            )
+            spec.add_sensor(
+                name=f"{prefix}load_{name}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
+            )
+    derived = [{"mass_total": total_mass(car), "spin_inertia": car.wheel_inertia[0], "abs_enabled": float(abs_enabled)} for car in cars]
+    numbers = [{**vars(car), **more} for car, more in zip(cars, derived, strict=True)]
+    for name in (name for name, value in numbers[0].items() if np.ndim(value) == 0):
+        spec.add_numeric(name=name, data=[float(car[name]) for car in numbers], size=len(cars))
+    spec.nuserdata = 2 * len(WHEELS) * len(cars)
 
 
-def _add_input(spec: mujoco.MjSpec, name: str, joint: str, limits: tuple[float, float]) -> mujoco.MjsActuator:
-    return spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True, ctrlrange=list(limits))
+def _add_control(
+    spec: mujoco.MjSpec,
+    name: str,
+    prefix: str,
+    joints: Mapping[str, float],
+    *,
+    gain: Sequence[float],
+    bias: Sequence[float] = (),
+    force: float,
+    limit: float = 1.0,
+    low: float | None = None,
+) -> None:
+    """Adds an actuator on the weighted sum of joints: affine gain, affine bias, both limited by a force."""
+    tendon = _add_tendon(spec, name, prefix, joints)
+    actuator = spec.add_actuator(name=name, target=tendon.name, trntype=mujoco.mjtTrn.mjTRN_TENDON, ctrllimited=True)
+    actuator.ctrlrange = [-limit if low is None else low, limit]
+    actuator.gaintype, actuator.gainprm[: len(gain)] = mujoco.mjtGain.mjGAIN_AFFINE, gain
+    actuator.biastype, actuator.biasprm[: len(bias)] = mujoco.mjtBias.mjBIAS_AFFINE, bias
+    actuator.forcelimited, actuator.forcerange = True, [-force, force]
+
+
+def _add_tendon(spec: mujoco.MjSpec, name: str, prefix: str, joints: Mapping[str, float]) -> Any:
+    tendon = spec.add_tendon(name=name)
+    for joint, weight in joints.items():
+        tendon.wrap_joint(f"{prefix}{joint}", weight)
+    return tendon
 
 
 def set_options(spec: mujoco.MjSpec, solver: Solver, *, physics_dt: float) -> None:

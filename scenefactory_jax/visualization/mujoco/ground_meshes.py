@@ -1,17 +1,19 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
 """Builds the surfaces of a road for pictures: asphalt under the lanes, paint, kerbs, and patches of the weather."""
 
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import shapely
 from jaxtyping import Float, Int
 from shapely import ops
 
-from scenefactory_jax.core.types import Road, Scene
+from scenefactory_jax.core.types import Road, Scene, Weather
 from scenefactory_jax.visualization.birds_eye import patch_overlay
 from scenefactory_jax.visualization.birds_eye.drawing import rgb
-from scenefactory_jax.visualization.mujoco.world_mjcf import WHITE, YELLOW
-from scenefactory_jax.visualization.road_lines import LAYERS, STRAIGHT_M, join_segments
+from scenefactory_jax.visualization.road_lines import LAYERS, STRAIGHT_M, WHITE, YELLOW, join_segments
 
 LANE_M, CLOSING_M = 2.0, 1.5  # half the width of a lane, and of a gap between lanes that is filled
 DASH_M, GAP_M = 3.0, 4.5  # of broken lines
@@ -60,10 +62,24 @@ def find_surfaces(scene: Scene) -> list[Surface]:
     for name, look in LOOKS.items():
         shapes = [_shape(line, look) for line, kind in lines if kind in LAYERS[name]]
         surfaces.append(prism(name, shapely.union_all(shapes), look.height_m, look.colour))
-    for number, area in enumerate(patch_overlay.areas(scene.weather)):
-        patch = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
-        surfaces.append(prism(f"patch{number}", patch, PATCH_M + 0.001 * number, (*rgb(area.colour), 0.75)))
-    return [surface for surface in surfaces if len(surface.faces)]
+    return [surface for surface in (*surfaces, *find_patches(scene.weather)) if len(surface.faces)]
+
+
+def find_patches(weather: Weather) -> list[Surface]:
+    """Surfaces `patch{number}` of the present patches of one world, later ones higher; one without area has no faces."""
+    surfaces = []
+    for number, area in enumerate(patch_overlay.areas(weather)):
+        shape = shapely.union_all([shapely.Polygon(piece).buffer(0) for piece in area.pieces])
+        surfaces.append(prism(f"patch{number}", shape, PATCH_M + 0.001 * number, (*rgb(area.colour), 0.75)))
+    return surfaces
+
+
+def add_mesh(model: mujoco.MjSpec, surface: Surface) -> mujoco.MjsGeom:
+    """Adds a surface without contacts."""
+    mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
+    look = {"name": surface.name, "type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": surface.name, "rgba": list(surface.colour)}
+    return model.worldbody.add_geom(contype=0, conaffinity=0, **look)
 
 
 def _shape(line: shapely.LineString, look: LayerLook) -> shapely.Geometry:

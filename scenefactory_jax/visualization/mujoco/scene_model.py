@@ -17,7 +17,6 @@ from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.mujoco import ground_meshes
-from scenefactory_jax.visualization.mujoco.ground_meshes import Surface
 
 GROUND, SKY, HORIZON = (0.44, 0.47, 0.41, 1.0), (0.44, 0.62, 0.84), (0.86, 0.90, 0.94)
 SUN = (0.45, 0.3, -1.0)  # direction of its light
@@ -45,7 +44,7 @@ def build(scene: Scene, car: CarParameters) -> RenderModel:
     """
     model = _empty(scene)
     for surface in ground_meshes.find_surfaces(scene):
-        _add_mesh(model, surface)
+        ground_meshes.add_mesh(model, surface)
     slots = np.flatnonzero(np.asarray(scene.agents.present))
     for slot in slots:
         length, width = (float(side) for side in np.asarray(scene.agents.size)[slot])
@@ -117,14 +116,6 @@ def _empty(scene: Scene) -> mujoco.MjSpec:
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     model.worldbody.add_geom(name="ground", type=plane, size=[0, 0, 1], rgba=list(GROUND), contype=0, conaffinity=0)
     return model
-
-
-def _add_mesh(model: mujoco.MjSpec, surface: Surface) -> None:
-    """Adds a surface without contacts."""
-    mesh = model.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    mesh.uservert, mesh.userface = surface.vertices.ravel().astype(np.float32), surface.faces.ravel().astype(np.int32)
-    kind = mujoco.mjtGeom.mjGEOM_MESH
-    model.worldbody.add_geom(name=surface.name, type=kind, meshname=surface.name, rgba=list(surface.colour), contype=0, conaffinity=0)
 
 
 def _build_car(car: CarParameters, slot: int) -> mujoco.MjSpec:

@@ -1,20 +1,24 @@
-"""Builds a scene as one MuJoCo model that can be simulated: ground, road lines, cars, goals and traffic."""
+"""Builds a scene as one MuJoCo model that can be simulated: ground, road lines, cars with controls, contacts, goals and traffic."""
 # pyright: reportAttributeAccessIssue=false
 # mujoco is an extension module without stubs
 
-from collections.abc import Mapping
-from typing import Any
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, EDGES, LANE_BIKE, LINES, SPEED_BUMP, Scene
 from scenefactory_jax.dynamics.articulated import model as models
-from scenefactory_jax.dynamics.articulated import parameters as cars
+from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
+from scenefactory_jax.dynamics.articulated.parameters import CarParameters, Solver
+from scenefactory_jax.dynamics.collision import ContactLaw
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
-from scenefactory_jax.visualization.road_lines import STRAIGHT_M, join_segments
+from scenefactory_jax.visualization.mujoco import ground_meshes
+from scenefactory_jax.visualization.road_lines import STRAIGHT_M, WHITE, YELLOW, join_segments
 
-WHITE, YELLOW = (0.95, 0.95, 0.95, 1.0), (0.95, 0.75, 0.15, 1.0)
 PAINT = dict.fromkeys(LINES[:3], WHITE) | dict.fromkeys(LINES[3:], YELLOW)  # WOMD: 6-8 white, 9-13 yellow
 COLOURS = PAINT | {
     **dict.fromkeys(DRIVABLE, (0.35, 0.50, 0.70, 1.0)),
@@ -26,45 +30,130 @@ COLOURS = PAINT | {
 }
 GREY = (0.5, 0.5, 0.5, 1.0)
 LINE_HALF_M, LINE_M, TRAFFIC_M = 0.05, 0.02, 1.5  # half width and height of lines, height of traffic
+ITERATIONS, LINE_SEARCH = 100, 50  # of MuJoCo's solver, which stops when it has converged
+# Contacts of bodies: the softest at which cars at 2 x 60 m/s do not pass through each other. A stiffer one depends more on the phase of the
+# step: the restitution is 0.12 to 0.27 at 1 to 60 m/s. Two cars overlap by 4 cm at 5 m/s; in `collision`, which crushes, by 24 cm.
+IMPACT_TIME_CONSTANT, IMPACT_SPEED = 0.03, 5.0  # s, m/s
+SURFACES = 2  # geom group of ground and patches
 VISUAL = {"contype": 0, "conaffinity": 0}
 
 
+class WorldStart(NamedTuple):
+    """Start of an episode of one world, on the host."""
+
+    scene: Scene  # agents, weather and traffic of the start
+    cars: Sequence[CarParameters]  # of every slot
+    qpos: Float[np.ndarray, "A 17"]
+    qvel: Float[np.ndarray, "A 16"]
+    mu: Float[np.ndarray, "A 4"]  # friction coefficient under the wheels
+    road_mu: float  # outside of patches
+    patch_mu: Float[np.ndarray, " N"]  # of the present patches
+
+
 def build(
-    scene: Scene, dynamics: Mapping[str, Any], *, physics_hz: float | int, scene_size_m: float | int, goal_radius_m: float | int
+    start: WorldStart,
+    solver: Solver,
+    law: ContactLaw,
+    *,
+    abs_enabled: bool,
+    physics_hz: float | int,
+    scene_size_m: float | int,
+    goal_radius_m: float | int,
 ) -> mujoco.MjSpec:
-    """Builds a scene with articulated cars, their tyre contacts and the solver's options.
+    """Builds a world whose cars `dynamics/mujoco_car.py` drives: its keyframe `start` is the start of the episode.
 
     Args:
-        scene: one world; its `traffic` stands fixed.
-        dynamics: config of the articulated car.
+        solver: of the articulated car; its limits on iterations are replaced by those of a converged solver.
+        law: of the contacts between cars and with traffic, which stands fixed.
         scene_size_m: side of the drawn ground; the physical plane is infinite.
     """
-    parameters, solver = cars.read_parameters(dynamics)
-    car = models.build_mjspec(parameters, visual=True)
-    model = build_world(scene, car, scene_size_m=scene_size_m, goal_radius_m=goal_radius_m)
-    for slot in np.flatnonzero(np.asarray(scene.agents.present)):
-        models.add_ground_pairs(model, parameters, ground="ground", prefix=f"agent{slot}/")
-    models.set_options(model, solver, physics_dt=1.0 / physics_hz)
+    scene = start.scene
+    slots = np.flatnonzero(np.asarray(scene.agents.present)).tolist()
+    prefixes, cars = [f"agent{slot}/" for slot in slots], [start.cars[slot] for slot in slots]
+    sizes = np.asarray(scene.agents.size, float)
+    shapes = {slot: _build_car(start.cars[slot], *sizes[slot].tolist(), slot=slot) for slot in slots}
+    model = build_world(scene, shapes, scene_size_m=scene_size_m, goal_radius_m=goal_radius_m)
+    models.set_options(model, dataclasses.replace(solver, iterations=ITERATIONS, line_search=LINE_SEARCH), physics_dt=1.0 / physics_hz)
+    ground = model.geom("ground")
+    ground.group, ground.friction[0] = SURFACES, start.road_mu
+    for surface, mu in zip(ground_meshes.find_patches(scene.weather), start.patch_mu.tolist(), strict=True):
+        if len(surface.faces):
+            patch = ground_meshes.add_mesh(model, surface)
+            patch.group, patch.friction[0] = SURFACES, mu
+    for slot, prefix, car in zip(slots, prefixes, cars, strict=True):
+        models.add_ground_pairs(model, car, ground="ground", prefix=prefix, mu=start.mu[slot].tolist())
+        _add_body_contacts(model, car, law, prefix)
+    for row in np.flatnonzero(np.asarray(scene.traffic.present)):
+        _set_contact(model.geom(f"traffic{row}"), law)
+    models.add_actuators(model, cars, abs_enabled=abs_enabled, prefixes=prefixes)
+    model.add_key(name="start", qpos=start.qpos[slots].ravel(), qvel=start.qvel[slots].ravel())
     return model
 
 
+def _build_car(car: CarParameters, length: float, width: float, *, slot: int) -> mujoco.MjSpec:
+    """Builds a car in the colour of its goal, with a box of its agent's size, which collisions use."""
+    spec = models.build_mjspec(dataclasses.replace(car, length=length, width=width), visual=True)
+    spec.geom("hull").rgba = [*rgb(colour_of(slot)), 1.0]
+    return spec
+
+
+def _add_body_contacts(model: mujoco.MjSpec, car: CarParameters, law: ContactLaw, prefix: str) -> None:
+    """Lets a car's box collide with other boxes, and with the ground if the car rolls over."""
+    box = model.geom(f"{prefix}box")
+    box.contype = box.conaffinity = 1
+    _set_contact(box, law)
+    pair = model.add_pair(name=f"{prefix}ground_box", geomname1="ground", geomname2=box.name)
+    pair.condim, pair.friction[:2] = 3, [car.body_friction] * 2
+    mass = total_mass(car) / 4  # on a corner
+    pair.solref = [-car.body_stiffness / mass, -car.body_damping / mass]
+
+
+def _set_contact(geom: mujoco.MjsGeom, law: ContactLaw) -> None:
+    """Sets MuJoCo's contact near the law of `collision`."""
+    geom.condim, geom.friction[0] = 3, law.friction
+    geom.solref = find_solref(law)
+
+
+def find_solref(law: ContactLaw) -> list[float]:
+    """Computes time constant, s, and damping ratio of MuJoCo's contact.
+
+    The restitution of `law` falls with the speed v of an impact: with x = dissipation v and y = x e, integration of its equation of motion
+    gives -y - log(1 - y) = x - log(1 + x). That of a spring and damper which only push is the same at any speed, exp(-2 z t / s), with the
+    damping ratio z, s = sqrt(1 - z^2) and t = arctan(s / z). The two are equal at `IMPACT_SPEED`.
+    """
+    x, y = max(law.dissipation * IMPACT_SPEED, 1e-3), np.linspace(0.0, 1.0, 10_000, endpoint=False)
+    restitution = np.interp(x - np.log1p(x), -y - np.log1p(-y), y) / x
+    ratio = np.linspace(0.01, 0.99, 99)
+    root = np.sqrt(1.0 - ratio**2)
+    found = np.interp(-restitution, -np.exp(-2.0 * ratio * np.arctan(root / ratio) / root), ratio)
+    return [IMPACT_TIME_CONSTANT, float(found)]
+
+
 def build_world(
-    scene: Scene, car: mujoco.MjSpec, *, scene_size_m: float | int, goal_radius_m: float | int, straight_m: float | None = STRAIGHT_M
+    scene: Scene,
+    car: mujoco.MjSpec | Mapping[int, mujoco.MjSpec],
+    *,
+    scene_size_m: float | int,
+    goal_radius_m: float | int,
+    straight_m: float | None = STRAIGHT_M,
 ) -> mujoco.MjSpec:
     """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}` and boxes `traffic{row}`.
 
-    Only ground, cars and traffic can collide. Contacts that are explicit pairs are not added.
+    Lines and goals collide with nothing. Contacts that are explicit pairs, such as those of the tyres, are not added: `build` adds them.
 
     Args:
         scene: one world.
-        car: one car whose top body has a free joint, at its height above z = 0; it is copied.
+        car: one car for all slots, or one for each; its top body has a free joint, at its height above z = 0. It is copied.
         straight_m: tolerance within which neighbouring segments are merged; None: a box per segment.
 
     Raises:
         ValueError: the spec has no body with a free joint at the top.
     """
-    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in car.worldbody.bodies for joint in body.joints):
-        raise ValueError("car: expected a spec whose top body has a free joint")
+    slots = np.flatnonzero(np.asarray(scene.agents.present)).tolist()
+    specs: Mapping[int, Any] = car if isinstance(car, Mapping) else dict.fromkeys(slots, car)
+    for spec in specs.values():
+        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in spec.worldbody.bodies for joint in body.joints):
+            raise ValueError("car: expected a spec whose top body has a free joint")
     model = _build_ground(scene_size_m)
     for points, kind in join_segments(scene.road, straight_m):
         delta, middle = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
@@ -72,9 +161,9 @@ def build_world(
         for place, yaw, half in zip(middle, np.arctan2(delta[:, 1], delta[:, 0]), size, strict=True):
             _add_box(model, place, float(yaw), half, COLOURS.get(kind, GREY), **VISUAL)
     agents = scene.agents
-    for slot in np.flatnonzero(np.asarray(agents.present)).tolist():
+    for slot in slots:
         x, y, yaw = (float(value) for value in (*np.asarray(agents.position)[slot], np.asarray(agents.yaw)[slot]))
-        model.attach(car.copy(), prefix=f"agent{slot}/", frame=model.worldbody.add_frame(pos=[x, y, 0.0], quat=_quaternion(yaw)))
+        model.attach(specs[slot].copy(), prefix=f"agent{slot}/", frame=model.worldbody.add_frame(pos=[x, y, 0.0], quat=_quaternion(yaw)))
         place, disc = [*np.asarray(agents.goal, float)[slot].tolist(), 0.0], mujoco.mjtGeom.mjGEOM_CYLINDER
         look = {"type": disc, "size": [goal_radius_m, LINE_M, 0.0], "rgba": [*rgb(colour_of(slot)), 0.4], **VISUAL}
         model.worldbody.add_geom(name=f"goal{slot}", pos=place, **look)

@@ -1,0 +1,104 @@
+"""Samples the start of an episode, and writes it as a world that MuJoCo alone can drive: `NAME.xml` and, beside it, `drive.py`."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core import schema
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.types import Scene, Weather
+from scenefactory_jax.dynamics import mujoco_car
+from scenefactory_jax.dynamics.articulated import articulated_car
+from scenefactory_jax.dynamics.articulated.parameters import read_parameters
+from scenefactory_jax.dynamics.collision import ContactLaw
+from scenefactory_jax.env import environment
+from scenefactory_jax.visualization.mujoco import world_mjcf
+from scenefactory_jax.visualization.mujoco.world_mjcf import WorldStart
+from scenefactory_jax.weather import friction
+
+SCRIPT = "drive.py"
+COMMENT = """
+{name}: a world of scenefactory_jax at the start of an episode (keyframe `start`).
+
+    python drive.py {name} --viewer           drives its cars with the tyres, brakes and engine of the package
+    python -m mujoco.viewer --mjcf={name}     plain MuJoCo, with what stands in for them
+
+Controls of each car: agentN/steer (rad), agentN/throttle (-1 to 1) and agentN/brake (0 to 1).
+
+Friction: each pair agentN/ground_WHEEL holds the friction coefficient sampled under that wheel. A plain mj_step has MuJoCo's friction
+cones of these coefficients. drive.py reads them, sets condim of these pairs to 1, and applies the tangential forces itself: friction acts
+once. The friction of the geoms `ground` and `patchN` is that of the road and of its patches; where there are patches, drive.py
+updates the pairs with the friction of the geom under each wheel.
+
+Stand-ins of a plain mj_step: `steer` is a servo of the mean angle of the front wheels, `throttle` a torque that falls linearly with
+the spin and stays below the engine's power, `brake` a damper of the mean spin of the wheels, limited by the brake torque: where it exceeds
+the friction, the front wheels turn backwards. It has no anti-lock brakes, bump stops, air drag and rolling resistance. drive.py turns these
+forces off and computes the package's.
+
+Custom fields: parameters of the cars, SI units, one number per car in the order of the bodies. Cars collide with each other and with the
+boxes trafficN, which stand fixed.
+"""
+
+
+def sample_start(settings: Mapping[str, Any], scene: Scene, *, seed: int) -> WorldStart:
+    """Samples starts, weather and cars as the first episode of `view` has them, and the traffic of that time.
+
+    Args:
+        settings: groups of the environment; the dynamics is an articulated car.
+        scene: one world.
+
+    Raises:
+        ConfigError: a key that does not fit, or no car starts in this scene.
+    """
+    env, (reference, _) = environment.make_env(settings), read_parameters(settings["dynamics"])
+    scene = jax.tree.map(jnp.asarray, scene)
+    _, key = jax.random.split(jax.random.split(jax.random.key(seed), 1)[0])  # those of `env.rollout.record`
+    state = jax.jit(env.init_state)(key, scene)
+    scene, body = env.current_scene(scene, state), state.body
+    if not bool(state.agents.present.any()):
+        raise ConfigError("scenes: no car starts in this scene; for example skip=1 shows the next")
+    compute_mu, speed = friction.make(settings["weather"]["friction"]), state.agents.speed
+    varied = None if body.constants is None else body.constants.car
+    wheels = articulated_car.wheel_positions(varied or reference, state.agents.position, state.agents.yaw)
+    mu = compute_mu(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
+    mean_speed = jnp.mean(speed, where=state.agents.present)
+    road_mu, patch_mu = compute_surface_mu(compute_mu, scene.weather, mean_speed)
+    slots = range(len(speed))
+    cars = [reference if varied is None else jax.tree.map(lambda leaf, slot=slot: float(leaf[slot]), varied) for slot in slots]
+    scene, qpos, qvel, mu = jax.device_get((scene, body.qpos, body.qvel, mu))
+    return WorldStart(scene, cars, np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(mu, float), road_mu, patch_mu)
+
+
+def compute_surface_mu(
+    compute_mu: Callable[..., Array], weather: Weather, speed: Float[Array, ""]
+) -> tuple[float, Float[np.ndarray, " N"]]:  # fmt: skip
+    """Computes the friction coefficients of the road outside of patches and of every present patch, for one speed, m/s."""
+    patches = weather.patches
+    film_mm = jnp.append(weather.film_mm, patches.film_mm + patches.open_road_film_fraction * weather.film_mm)
+    uniform = jax.vmap(friction.make_uniform)(film_mm, jnp.append(weather.surface, patches.surface))
+    mu = np.asarray(jax.vmap(lambda one: compute_mu(one, jnp.zeros(2), speed))(uniform), float)
+    return float(mu[0]), mu[1:][np.asarray(patches.present)]
+
+
+def write(out: Path, settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Path:
+    """Writes the world and the script that drives it; arguments and errors as of `sample_start`."""
+    dynamics = settings["dynamics"]
+    model = world_mjcf.build(
+        sample_start(settings, scene, seed=seed),
+        read_parameters(dynamics)[1],
+        schema.read(dynamics["contact"], ContactLaw, where="dynamics.contact"),
+        abs_enabled=dynamics["abs"],
+        physics_hz=settings["timing"]["physics_hz"],
+        scene_size_m=settings["scenes"]["pack"]["scene_size_m"],
+        goal_radius_m=settings["step_metrics"]["goal_radius_m"],
+    )
+    model.comment = COMMENT.format(name=out.name)
+    out.write_text(model.to_xml())
+    shutil.copyfile(mujoco_car.__file__, out.with_name(SCRIPT))
+    return out
