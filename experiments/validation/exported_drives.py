@@ -73,16 +73,16 @@ def drive_exported(world: Path, cases: Sequences, mu: Float[np.ndarray, "N 4"], 
     paths = np.zeros((*cases.controls.shape[:2], 2))
     mujoco.set_mjcb_control(lambda model, data: drive.apply_forces(model, data, cars))
     try:
-        for path, speed, friction, controls in zip(paths, cases.speed, mu, cases.controls.astype(float), strict=True):
+        for drive_index, speed in enumerate(cases.speed.tolist()):
             mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
-            model.pair_friction[cars.pair[0], :2] = friction[:, None]
+            model.pair_friction[cars.pair[0], :2] = mu[drive_index, :, None]
             data.qvel[cars.root[0, 0]], data.qvel[cars.spin[0]] = speed, speed / radius
             mujoco.mj_forward(model, data)
-            for place, (throttle, steer, brake) in zip(path, controls, strict=True):
+            for step, (throttle, steer, brake) in enumerate(cases.controls[drive_index].tolist()):
                 data.ctrl[cars.controls[0]] = limits * (steer, throttle, brake)
                 for _ in range(substeps):
                     mujoco.mj_step(model, data)
-                place[:] = data.qpos[:2]
+                paths[drive_index, step] = data.qpos[:2]
     finally:
         mujoco.set_mjcb_control(None)
     return paths
@@ -103,7 +103,7 @@ def main() -> None:
     cases = random_drives.draw(validation["seed"], **drawn)
     with tempfile.TemporaryDirectory() as folder:
         distance_mm = 1e3 * measure_distances(config, cases, Path(folder))
-    values = ", ".join(f"{percent} %: {value:.3f}" for percent, value in zip(PERCENTS, np.percentile(distance_mm, PERCENTS), strict=True))
+    values = ", ".join(f"{percent} %: {np.percentile(distance_mm, percent):.3f}" for percent in PERCENTS)
     print(f"{len(distance_mm)} drives of {seconds} s, largest distance in mm: {values}")
     print(f"within {bound_mm:.0f} mm: {100 * np.mean(distance_mm <= bound_mm):.1f} %")
     for index in np.argsort(distance_mm)[: -1 - validation["worst"] : -1].tolist():

@@ -643,7 +643,7 @@ LOOKS = {"goal_radius_m": 3.0, "scene_size_m": 200.0}
 
 def test_a_scene_becomes_one_model(street):
     scene = prepared(replace(street, roads=(*street.roads, curve(2, 20, 50))), agents=4).scene
-    model = world_mjcf.build_world(scene, stand_in_car(), straight_m=None, **LOOKS)
+    model = world_mjcf.build_world(scene, dict.fromkeys(range(2), stand_in_car()), straight_m=None, **LOOKS)
     compiled = model.compile()
     assert compiled.ngeom == 1 + len(scene.road.kind) + 2 * 2 and compiled.nv == 2 * 6
     data = mujoco.MjData(compiled)
@@ -657,7 +657,7 @@ def test_a_scene_becomes_one_model(street):
     np.testing.assert_allclose(data.qpos[2], 0.5, atol=0.01)
     mujoco.MjModel.from_xml_string(model.to_xml())
     with pytest.raises(ValueError, match="free joint"):
-        world_mjcf.build_world(scene, mujoco.MjSpec(), straight_m=None, **LOOKS)
+        world_mjcf.build_world(scene, {0: mujoco.MjSpec()}, straight_m=None, **LOOKS)
 
 
 def test_others_stand_in_the_model_and_can_be_hit(street):
@@ -665,7 +665,7 @@ def test_others_stand_in_the_model_and_can_be_hit(street):
     f = lambda *rows: jnp.array(rows, jnp.float32)  # noqa: E731
     still, size = f([0, 0], [0, 0]), f([4, 2], [4, 2])
     boxes = Boxes(f([9, 3], [0, 0]), f(0.7, 0), f(0.5, 0), still, f(0, 0), size, f(np.inf, np.inf), jnp.array([True, False]))
-    model = world_mjcf.build_world(replace(scene, traffic=boxes), stand_in_car(), straight_m=None, **LOOKS).compile()
+    model = world_mjcf.build_world(replace(scene, traffic=boxes), {0: stand_in_car()}, straight_m=None, **LOOKS).compile()
     assert model.geom("traffic0").size.tolist() == [2.0, 1.0, 0.75] and model.geom("traffic0").contype == 1
     with pytest.raises(KeyError):
         model.geom("traffic1")

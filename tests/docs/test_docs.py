@@ -58,7 +58,7 @@ def test_the_python_of_the_library_page_runs(quickly):
 def test_the_exported_world_drives_as_the_page_says(quickly, tmp_path):
     """Its first command, the one without a window, and the program."""
     section = (ROOT / "docs" / "commands.md").read_text().partition("### A world for MuJoCo alone")[2]
-    shell, program = (re.search(f"```{kind}\n(.*?)```", section, re.DOTALL)[1] for kind in ("", "python"))
+    shell, program = (re.findall(f"```{kind}\n(.*?)```", section, re.DOTALL)[0] for kind in ("", "python"))
     write, _, headless = shell.splitlines()
     words = write.split()[4:]
     assert words[-1] == "out=world.xml"

@@ -3,9 +3,11 @@
 
 import ast
 import dataclasses
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import mujoco
@@ -120,6 +122,28 @@ def test_the_exported_car_drives_like_the_package(tmp_path):
     drawn = {**validation["drives"]["draw"], "count": 6, "seconds": seconds, "control_hz": config["timing"]["control_hz"]}
     distance = exported_drives.measure_distances(config, random_drives.draw(3, **drawn), tmp_path)
     assert 0.0 < distance.max() < validation["bound"]["bound_m"]
+
+
+def test_the_viewer_steps_with_the_forces_of_the_script(tmp_path, monkeypatch):
+    """All but the window."""
+    world, final = export(tmp_path, scene_with((0, 0, 0, 12)), DRY), []
+
+    def launch(model, data):
+        for _ in range(120):
+            mujoco.mj_step(model, data)
+        final.append(data.qpos.copy())
+
+    monkeypatch.setattr(mujoco, "viewer", SimpleNamespace(launch=launch), raising=False)
+    monkeypatch.setattr(sys, "argv", ["drive.py", str(world), "--viewer", "--drive", "0.1", "0", "0.5", "9"])
+    try:
+        runpy.run_path(str(world.with_name("drive.py")), run_name="__main__")
+    finally:
+        mujoco.set_mjcb_control(None)
+    drive, model, data, cars = opened(world)
+    data.ctrl[cars.controls] = 0.1, 0.0, 0.5
+    for _ in range(120):
+        drive.step(model, data, cars)
+    np.testing.assert_array_equal(final[0], data.qpos)
 
 
 # ---- contacts

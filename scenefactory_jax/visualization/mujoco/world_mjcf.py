@@ -131,7 +131,7 @@ def find_solref(law: ContactLaw) -> list[float]:
 
 def build_world(
     scene: Scene,
-    car: mujoco.MjSpec | Mapping[int, mujoco.MjSpec],
+    cars: Mapping[int, mujoco.MjSpec],
     *,
     scene_size_m: float | int,
     goal_radius_m: float | int,
@@ -143,17 +143,15 @@ def build_world(
 
     Args:
         scene: one world.
-        car: one car for all slots, or one for each; its top body has a free joint, at its height above z = 0. It is copied.
+        cars: of the present slots. The top body has a free joint, at its height above z = 0. They are copied.
         straight_m: tolerance within which neighbouring segments are merged; None: a box per segment.
 
     Raises:
-        ValueError: the spec has no body with a free joint at the top.
+        ValueError: a car has no body with a free joint at the top.
     """
-    slots = np.flatnonzero(np.asarray(scene.agents.present)).tolist()
-    specs: Mapping[int, Any] = car if isinstance(car, Mapping) else dict.fromkeys(slots, car)
-    for spec in specs.values():
-        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in spec.worldbody.bodies for joint in body.joints):
-            raise ValueError("car: expected a spec whose top body has a free joint")
+    for slot, car in cars.items():
+        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for body in car.worldbody.bodies for joint in body.joints):
+            raise ValueError(f"cars: {slot}: expected a spec whose top body has a free joint")
     model = _build_ground(scene_size_m)
     for points, kind in join_segments(scene.road, straight_m):
         delta, middle = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
@@ -161,9 +159,9 @@ def build_world(
         for place, yaw, half in zip(middle, np.arctan2(delta[:, 1], delta[:, 0]), size, strict=True):
             _add_box(model, place, float(yaw), half, COLOURS.get(kind, GREY), **VISUAL)
     agents = scene.agents
-    for slot in slots:
+    for slot, car in cars.items():
         x, y, yaw = (float(value) for value in (*np.asarray(agents.position)[slot], np.asarray(agents.yaw)[slot]))
-        model.attach(specs[slot].copy(), prefix=f"agent{slot}/", frame=model.worldbody.add_frame(pos=[x, y, 0.0], quat=_quaternion(yaw)))
+        model.attach(car.copy(), prefix=f"agent{slot}/", frame=model.worldbody.add_frame(pos=[x, y, 0.0], quat=_quaternion(yaw)))
         place, disc = [*np.asarray(agents.goal, float)[slot].tolist(), 0.0], mujoco.mjtGeom.mjGEOM_CYLINDER
         look = {"type": disc, "size": [goal_radius_m, LINE_M, 0.0], "rgba": [*rgb(colour_of(slot)), 0.4], **VISUAL}
         model.worldbody.add_geom(name=f"goal{slot}", pos=place, **look)
