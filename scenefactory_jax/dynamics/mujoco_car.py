@@ -66,8 +66,8 @@ def apply_forces(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespa
     data.qfrc_applied[cars.steering] = np.clip(servo, -car.steering_torque, car.steering_torque)
     data.qfrc_applied[cars.root[:, 3:]] = np.einsum("nij,ni->nj", rotation, torque) - car.yaw_damping * UP * data.qvel[cars.root[:, 3:]]
     speed, spin = (rotation[:, :, 0] * velocity).sum(-1, keepdims=True), np.abs(data.qvel[cars.spin])
-    limit = np.where(throttle < 0.0, car.reverse_spin_limit, car.spin_limit)
-    engine = FRONT * np.minimum(car.drive_torque, 0.5 * car.drive_power / np.maximum(spin, 1.0)) * np.clip(10 - 10 * spin / limit, 0, 1)
+    fade = np.clip((1.0 - spin / np.where(throttle < 0.0, car.reverse_spin_limit, car.spin_limit)) / car.drive_fade_fraction, 0.0, 1.0)
+    engine = FRONT * fade * np.minimum(car.drive_torque, 0.5 * car.drive_power / np.maximum(spin, 1.0))
     drive = np.where((throttle >= 0.0) | (speed < car.reverse_speed), throttle, 0.0) * engine
     apply_tyres(model, data, cars, drive, brake * np.where(FRONT, car.brake_torque_front, car.brake_torque_rear) + car.rolling_torque)
 
@@ -80,19 +80,19 @@ def apply_tyres(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespac
     reach = np.sqrt(round_ + oval * axle[..., 2] ** 2)  # of the ellipsoid, down from the hub
     depth = reach - hub[..., 2]
     arm = (0.5 * depth - round_ / reach)[..., None] * UP - (oval * axle[..., 2] / reach)[..., None] * axle
-    rate, velocity = np.split(data.cvel[cars.wheel], 2, axis=-1)
-    velocity = velocity + np.cross(rate, hub + arm - data.subtree_com[model.body_rootid[cars.wheel]])
+    twist, place = data.cvel[cars.wheel], hub + arm  # `cvel` is that of the car's centre of mass
+    velocity = twist[..., 3:] + np.cross(twist[..., :3], place - data.subtree_com[model.body_rootid[cars.wheel]])
     forward = np.cross(axle, UP) / np.maximum(np.hypot(axle[..., 0], axle[..., 1]), 1e-3)[..., None]
-    left = np.cross(UP, forward)
-    slip, lever = np.stack([(forward * velocity).sum(-1), (left * velocity).sum(-1)]), (axle * np.cross(arm, forward)).sum(-1)
+    left, lever = np.cross(UP, forward), (axle * np.cross(arm, forward)).sum(-1)
+    slip = np.stack([(forward * velocity).sum(-1), (left * velocity).sum(-1)])
     rolling, pressed, found = np.abs(lever * spin), depth > 0.0, np.zeros(1, np.int32)
     for wheel in np.ndindex(shape) if cars.patches else ():  # the surface under the wheel
         if mujoco.mj_ray(model, data, hub[wheel], -UP, SURFACES, True, -1, found) >= 0.0:
             model.pair_friction[cars.pair[wheel], :2] = model.geom_friction[found[0], 0]
     load = data.sensordata[cars.load] * pressed
-    extra = load / (car.mass_total * 9.81 / 4) - 1.0
-    stiffness = car.tyre_slip_stiffness * load * np.maximum(1.0 - car.tyre_stiffness_fall * extra, 0.3)
-    peak = model.pair_friction[cars.pair, 0] * load * np.maximum(1.0 - car.tyre_peak_fall * extra, 0.3)
+    extra = load / car.nominal_load - 1.0
+    stiffness = car.tyre_slip_stiffness * load * np.maximum(1.0 - car.tyre_stiffness_fall * extra, car.min_load_factor)
+    peak = model.pair_friction[cars.pair, 0] * load * np.maximum(1.0 - car.tyre_peak_fall * extra, car.min_load_factor)
     furthest = car.tyre_shape * np.tan(0.5 * np.pi / car.tyre_shape)
     sliding = np.maximum(np.hypot(*slip) - furthest * peak / np.maximum(stiffness, 1.0) * rolling, 0.0)
     fall = car.tyre_sliding_fraction + (1.0 - car.tyre_sliding_fraction) * np.exp(-sliding / car.tyre_sliding_speed)
@@ -118,7 +118,7 @@ def apply_tyres(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespac
     brake = np.clip(needed := respond(stop)[2], -brake_torque, brake_torque)
     low, high = ((drive + brake + sign * peak * np.abs(lever)) / car.spin_inertia for sign in (-1.0, 1.0))
     a = np.clip(stop, low, high)
-    for _ in range(4):  # Newton's method in a bracket
+    for _ in range(int(car.newton_steps.max())):  # in a bracket
         _, slope, missing = respond(a)
         low, high = np.where(missing < brake, a, low), np.where(missing < brake, high, a)
         newton = a - (missing - brake) / (car.spin_inertia + lever**2 * slope)
@@ -127,7 +127,7 @@ def apply_tyres(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespac
     cars.tangent, cars.slip = np.hypot(*force), np.hypot(*slip) * pressed
     force = forward * force[0][..., None] + left * force[1][..., None]
     for wheel in np.ndindex(shape):
-        mujoco.mj_applyFT(model, data, force[wheel], np.zeros(3), (hub + arm)[wheel], cars.wheel[wheel], data.qfrc_applied)
+        mujoco.mj_applyFT(model, data, force[wheel], np.zeros(3), place[wheel], cars.wheel[wheel], data.qfrc_applied)
     data.qfrc_applied[cars.spin] += drive + brake
 
 

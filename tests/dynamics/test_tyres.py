@@ -2,14 +2,16 @@
 
 import dataclasses
 import functools
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.driving import CAR, DT, WEIGHT, compiled_car, move, place
+from support.driving import CAR, DT, SOLVER, WEIGHT, compiled_car, move, place
 
-from scenefactory_jax.dynamics import mujoco_car
+from scenefactory_jax.dynamics import mujoco_c, mujoco_car
 from scenefactory_jax.dynamics.articulated import actuators, articulated_car, parameters, tyres
 from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
@@ -167,10 +169,11 @@ def test_slopes_of_a_step_are_finite():
 
 
 def test_forces_are_those_of_the_script_for_stock_mujoco():
-    """The laws are written twice; the constants that both need once each."""
-    assert set(mujoco_car.PARAMETERS) - {"mass_total", "spin_inertia", "abs_enabled"} <= {f.name for f in dataclasses.fields(CAR)}
-    assert mujoco_car.GRAVITY == parameters.GRAVITY and mujoco_car.FADE == parameters.DRIVE_FADE_FRACTION
-    assert mujoco_car.NEWTON_STEPS == tyres.NEWTON_STEPS and mujoco_car.WHEELS == parameters.WHEELS
+    """The laws are written twice; the script reads all their numbers from the model."""
+    numbers = mujoco_c.make_one(CAR, SOLVER, abs_enabled=True, physics_dt=DT, iterations=1, line_search=1).cars.car
+    used = set(re.findall(r"\bcar\.(\w+)", Path(mujoco_car.__file__).read_text()))
+    assert used <= set(vars(numbers)) and tuple(wheel[1:] for wheel in mujoco_car.WHEELS) == parameters.WHEELS
+    assert numbers.newton_steps == tyres.NEWTON_STEPS and numbers.nominal_load == pytest.approx(WEIGHT / 4)
 
 
 def tread_length(load):

@@ -228,7 +228,7 @@ def test_cars_that_differ_keep_their_parameters_and_boxes(tmp_path):
     scene = replace(scene, agents=replace(scene.agents, size=jnp.array([[4.0, 2.0], [9.0, 2.5]], jnp.float32)))
     world = export(tmp_path, scene, "dynamics/randomization=sizes")
     model = mujoco.MjModel.from_xml_path(str(world))
-    mass, base = model.numeric("mass_total").data, model.numeric("wheelbase").data
+    mass, base = 4 / G * model.numeric("nominal_load").data, model.numeric("wheelbase").data
     assert mass[1] > 1.5 * mass[0] and base[1] > 1.5 * base[0]
     np.testing.assert_allclose(model.geom("agent1/box").size, [4.5, 1.25, 0.5], rtol=1e-4)
     np.testing.assert_allclose(model.body_subtreemass[model.body("agent1/chassis").id], mass[1], rtol=1e-4)

@@ -13,8 +13,18 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from scenefactory_jax.dynamics.articulated import tyres
 from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, compute_unsprung, total_mass
-from scenefactory_jax.dynamics.articulated.parameters import AHEAD, FRONT_WHEELS, LEFT, WHEELS, CarParameters, Solver
+from scenefactory_jax.dynamics.articulated.parameters import (
+    AHEAD,
+    DRIVE_FADE_FRACTION,
+    FRONT_WHEELS,
+    GRAVITY,
+    LEFT,
+    WHEELS,
+    CarParameters,
+    Solver,
+)
 
 BRAKE_SPEED = 5.0  # m/s; see `add_actuators`
 PAINT, RUBBER = [0.2, 0.4, 0.8, 1.0], [0.1, 0.1, 0.1, 1.0]
@@ -152,7 +162,7 @@ def add_actuators(
 ) -> None:  # fmt: skip
     """Adds what `dynamics/mujoco_car.py` needs to drive the cars with MuJoCo alone: controls, custom fields, load sensors and user data.
 
-    The custom fields are the numbers of `CarParameters` and three that follow from them, one number per car. The actuators `steer`,
+    The custom fields are the numbers of `CarParameters` and of `_derive_numbers`, one number per car. The actuators `steer`,
     `throttle` and `brake` are controls of the script, which computes their forces. Without it, they are what MuJoCo has:
 
     - `steer`: a servo of the mean angle of the front wheels; the spring `toe` keeps the two angles equal.
@@ -185,11 +195,16 @@ def add_actuators(
             spec.add_sensor(
                 name=f"{prefix}load_{name}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
             )
-    derived = [{"mass_total": total_mass(car), "spin_inertia": car.wheel_inertia[0], "abs_enabled": float(abs_enabled)} for car in cars]
-    numbers = [{**vars(car), **more} for car, more in zip(cars, derived, strict=True)]
+    numbers = [{**vars(car), **_derive_numbers(car), "abs_enabled": float(abs_enabled)} for car in cars]
     for name in (name for name, value in numbers[0].items() if np.ndim(value) == 0):
         spec.add_numeric(name=name, data=[float(car[name]) for car in numbers], size=len(cars))
     spec.nuserdata = 2 * len(WHEELS) * len(cars)
+
+
+def _derive_numbers(car: CarParameters) -> dict[str, float]:
+    """Collects the numbers of the laws of tyres and engine that `CarParameters` does not hold itself."""
+    constants = {"drive_fade_fraction": DRIVE_FADE_FRACTION, "min_load_factor": tyres.MIN_LOAD_FACTOR, "newton_steps": tyres.NEWTON_STEPS}
+    return {"nominal_load": float(total_mass(car)) * GRAVITY / 4, "spin_inertia": car.wheel_inertia[0], **constants}
 
 
 def _add_control(
