@@ -12,7 +12,7 @@ contact points, each with half the stiffness. A contact that begins within a ste
 interpreted as damping in vibroimpact, Journal of Applied Mechanics 42 (1975). Its restitution falls with the speed v of the impact, from 1
 to 1 / (dissipation v). With 1 s/m it is 0.3 at 3 m/s and 0.1 at 10 m/s. Cars: 0.2 to 0.4 in impacts of some m/s, and about 0.1 at medium
 and high speed (R. P. Howard, J. Bomar and C. Bare, SAE 931842, 1993; K. L. Monson and G. J. Germane, SAE 1999-01-0097, 1999). The force is
-implicit in the closing speed: it is stable at any stiffness of the dissipation, and stops two boxes at any speed.
+implicit in the closing speed: it is stable at any dissipation, and stops two boxes at any speed.
 """
 
 import dataclasses
@@ -110,7 +110,7 @@ def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> C
 
 def init(cars: int, objects: int) -> ContactState:
     """Pairs that have not been seen yet."""
-    return ContactState(jnp.full((cars, cars), NO_AXIS), jnp.full((cars, objects), NO_AXIS))
+    return ContactState(jnp.full((cars, cars), NO_AXIS, jnp.int32), jnp.full((cars, objects), NO_AXIS, jnp.int32))
 
 
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
@@ -263,10 +263,11 @@ def _is_valid(boxes: Boxes) -> Bool[Array, "*n"]:
 
 
 def _sanitize(boxes: Boxes, mass: float) -> Boxes:
-    """Replaces boxes that take no part by absent ones at rest at the origin, so that their NaN values do not propagate."""
+    """Replaces boxes that take no part by absent ones of 1 m at rest at the origin, so that no NaN propagates: theirs or that of 0 / 0."""
     valid = _is_valid(boxes)
     clean = jax.tree.map(lambda x: jnp.where(valid.reshape((-1,) + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x)), boxes)
-    return replace(clean, mass=jnp.where(valid, boxes.mass, mass), present=valid)
+    size = jnp.where(valid[:, None], boxes.size, 1.0)
+    return replace(clean, size=size, mass=jnp.where(valid, boxes.mass, mass), present=valid)
 
 
 def _find_pairs(count: int) -> Int[np.ndarray, "A partners"]:
