@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.driving import KEY, make
 from support.hand_scenes import scene_of
-from test_dynamics import KEY, make
 
 from experiments.validation import extreme_states, robustness_report
 from scenefactory_jax.cli.hydra_config import load_config
