@@ -1,5 +1,6 @@
 """The batched cars against MuJoCo's C engine at toy size, and the experiments' own ability to fail."""
 
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
