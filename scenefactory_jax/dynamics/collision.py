@@ -12,7 +12,7 @@ contact points, each with half the stiffness. A contact that begins within a ste
 interpreted as damping in vibroimpact, Journal of Applied Mechanics 42 (1975). Its restitution falls with the speed v of the impact, from 1
 to 1 / (dissipation v). With 1 s/m it is 0.3 at 3 m/s and 0.1 at 10 m/s. Cars: 0.2 to 0.4 in impacts of some m/s, and about 0.1 at medium
 and high speed (R. P. Howard, J. Bomar and C. Bare, SAE 931842, 1993; K. L. Monson and G. J. Germane, SAE 1999-01-0097, 1999). The force is
-implicit in the closing speed: it is stable at any stiffness of the dissipation, and stops two boxes at any speed.
+implicit in the closing speed: it is stable at any dissipation, and stops two boxes at any speed.
 """
 
 import dataclasses
@@ -110,7 +110,7 @@ def make_contact(entry: Mapping[str, Any], *, height: float, step_s: float) -> C
 
 def init(cars: int, objects: int) -> ContactState:
     """Pairs that have not been seen yet."""
-    return ContactState(jnp.full((cars, cars), NO_AXIS), jnp.full((cars, objects), NO_AXIS))
+    return ContactState(jnp.full((cars, cars), NO_AXIS, jnp.int32), jnp.full((cars, objects), NO_AXIS, jnp.int32))
 
 
 def collect_boxes(motion: Motion, size: Float[Array, "A 2"], active: Bool[Array, " A"], mass: float | Float[Array, "*A"]) -> Boxes:
@@ -158,14 +158,14 @@ def compute_forces(
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
     The stiffness of a pair scales with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
-    pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and 0.26 off centre
+    pedestrian. So k dt^2 / m is the same for every pair: 0.008 at 1.2e5 N/m and 120 Hz (m the reduced mass), and 0.03 off centre
     (`OFF_CENTRE`). Semi-implicit Euler is stable while that is below 4.
 
     Args:
         cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
             more than `height` do not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
-            speed within `momentum_transfer_s`.
+            speed within `momentum_transfer_s`, and ends after that time.
     """
     count, beside = neighbours.rows.shape
     shared: dict[str, Any] = {"law": law, "height": height, "step_s": step_s}
@@ -235,7 +235,9 @@ def _compute_pair_forces(
     push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
     reduced = 0.5 * law.mass * scale
     if limited:
-        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / law.momentum_transfer_s  # per contact point
+        # per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
+        approach = jnp.maximum(closing, 0.0)
+        limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
         push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
     drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]
@@ -263,10 +265,11 @@ def _is_valid(boxes: Boxes) -> Bool[Array, "*n"]:
 
 
 def _sanitize(boxes: Boxes, mass: float) -> Boxes:
-    """Replaces boxes that take no part by absent ones at rest at the origin, so that their NaN values do not propagate."""
+    """Replaces boxes that take no part by absent ones of 1 m at rest at the origin, so that no NaN propagates: theirs or that of 0 / 0."""
     valid = _is_valid(boxes)
     clean = jax.tree.map(lambda x: jnp.where(valid.reshape((-1,) + (1,) * (x.ndim - 1)), x, jnp.zeros_like(x)), boxes)
-    return replace(clean, mass=jnp.where(valid, boxes.mass, mass), present=valid)
+    size = jnp.where(valid[:, None], boxes.size, 1.0)
+    return replace(clean, size=size, mass=jnp.where(valid, boxes.mass, mass), present=valid)
 
 
 def _find_pairs(count: int) -> Int[np.ndarray, "A partners"]:

@@ -1,93 +1,45 @@
-"""The backends against laws of motion, the C engine and their own contracts.
-
-All articulated runs share one compiled function: eight cars on eight "lanes" 500 m apart, each lane with its own friction. Tests that want
-other numbers of cars put them on the same eight slots.
-"""
+"""The backends against laws of motion, the C engine and their contracts."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
-from support.hand_scenes import scene_of
+from support.driving import (
+    CAR,
+    CHUNK,
+    CONVERGED,
+    DT,
+    EVERYONE,
+    KEY,
+    LANES,
+    MU,
+    SOLVER,
+    WEIGHT,
+    G,
+    backend,
+    compile_,
+    config,
+    constant,
+    drive,
+    friction,
+    make,
+    numbers_of,
+    random_controls,
+    scene_for,
+)  # fmt: skip
 
-from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.dynamics import mujoco_c
+from scenefactory_jax.dynamics import mujoco_c, open_ground
 from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
-G, WHEELBASE = 9.81, 2.6
-LOCK, AIR = 0.55654, 0.42 / 1980.0  # rad; the air's deceleration over speed squared, 1/m
-MU = np.array([0.86, 0.05, 0.1, 0.3, 0.5, 0.7, 1.0, 1.1], np.float32)
-LANES = 500.0 * np.arange(8)
-EVERYONE = jnp.ones(8, bool)
-KEY = jax.random.key(0)
-CHUNK = 30  # control steps in one compiled run: a second
+pytestmark = pytest.mark.usefixtures("quickly")
+
+LOCK = CAR.steering_limit
 BACKENDS = ("articulated", "bicycle", "log_playback")
-
-
-@functools.cache
-def config(name):
-    return load_config("task", f"dynamics={name}")["dynamics"]
-
-
-def numbers_of(name):
-    return cars.CarParameters(**config(name)["car"]), cars.Solver(**config(name)["solver"])
-
-
-def friction(weather, position, speed):
-    """Friction by lane; between lanes, of the nearest."""
-    lane = jnp.clip(jnp.round(position[..., 1] / 500.0).astype(jnp.int32), 0, 7)
-    return jnp.asarray(MU)[lane]
-
-
-def make(name, **changes):
-    entry = OmegaConf.to_container(OmegaConf.merge(config(name), changes))
-    context = {"friction": friction, "physics_dt": 1 / 120, "control_dt": 1 / 30}
-    return instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", **context)()
-
-
-def scene_for(position=None, yaw=None, speed=0.0):
-    position = np.stack([np.zeros(8), LANES], 1) if position is None else position
-    yaw = np.zeros(8) if yaw is None else yaw
-    return scene_of(position, position, yaws=yaw, speeds=np.broadcast_to(speed, 8))
-
-
-def compile_(dynamics):
-    def second(scene, body, action, active):
-        def step(body, a):
-            body = dynamics.advance(scene, body, a, active)
-            return body, (body, dynamics.read(body))
-
-        return jax.lax.scan(step, body, action)
-
-    return jax.jit(second)
-
-
-@functools.cache
-def backend(name):
-    dynamics = make(name)
-    return dynamics, compile_(dynamics), jax.jit(functools.partial(dynamics.init, KEY))
-
-
-def drive(name, scene, action, active=EVERYONE, body=None):
-    """Run whole seconds of `action` [T, 8, 3]; the bodies and motions of every step, as numpy."""
-    _, second, init = backend(name)
-    body = init(scene) if body is None else body
-    parts = []
-    for chunk in np.asarray(action, np.float32).reshape(-1, CHUNK, 8, 3):
-        body, trace = second(scene, body, jnp.asarray(chunk), active)
-        parts.append(jax.tree.map(np.asarray, trace))
-    return body, jax.tree.map(lambda *x: np.concatenate(x), *parts)
-
-
-def constant(throttle=0.0, steer=0.0, brake=0.0, seconds=1):
-    return np.tile(np.array([throttle, steer, brake]), (seconds * CHUNK, 8, 1))
 
 
 def acceleration(motion):
@@ -102,36 +54,31 @@ def braking():
     return drive("articulated", scene_for(speed=15.0), constant(brake=1.0, seconds=34))
 
 
-def test_braking_distance_is_the_tyres_limit_or_the_brakes(braking):
+def test_braking_distance_is_that_of_the_friction(braking):
+    """With the anti-lock controller, air and rolling resistance: at most 1.05 v^2 / (2 mu g)."""
     _, (_, motion) = braking
-    stop = motion.position[-1, :, 0]
-    limit = np.log(1.0 + AIR * 15.0**2 / (MU * G)) / (2 * AIR)
-    locked = (MU <= 0.3) & (MU >= 0.1)
-    np.testing.assert_allclose(stop[locked], limit[locked], rtol=0.01)
-    # 2 x (1055 + 814) N m / 0.35 m over 2062 kg, and what rolls and drags: 5.18 + 0.15 m/s^2
-    np.testing.assert_allclose(stop[MU > 0.8], 15.0**2 / (2 * 5.33), rtol=0.02)
-    by_grip = stop[np.argsort(MU)]
-    assert (np.diff(by_grip) < 0.05).all() and by_grip[0] > by_grip[1] > by_grip[2] + 50
+    stop, limit = motion.position[-1, :, 0], 15.0**2 / (2 * MU * G)
+    assert (stop < 1.05 * limit).all() and (stop > 0.93 * limit)[MU >= 0.3].all()
+    resistance = (4 * CAR.rolling_torque / CAR.wheel_radius + CAR.air_drag * 15.0**2) / WEIGHT
+    assert (stop > 0.95 * 15.0**2 / (2 * (MU + resistance) * G)).all()
     assert np.abs(motion.position[-1, :, 1] - LANES).max() < 0.1
 
 
 def test_braked_cars_hold_still(braking):
     body, _ = braking
     _, (_, motion) = drive("articulated", scene_for(), constant(brake=1.0, seconds=10), body=body)
-    still = MU >= 0.1  # at 0.05 the car is not there yet
-    moved = np.linalg.norm(motion.position[-1] - motion.position[0], axis=-1)
-    assert moved[still].max() < 1e-3
+    assert np.linalg.norm(motion.position[-1] - motion.position[0], axis=-1).max() < 1e-3
 
 
-def test_tyres_use_no_more_than_their_grip(braking):
+def test_tyres_use_no_more_than_their_friction(braking):
+    """The force is that of the load at the beginning of a step, the utilization over that at its end: they differ while a car pitches."""
     _, (_, motion) = braking
-    assert motion.friction_utilization.max() < 1.01
+    assert motion.friction_utilization.max() < 1.1
     np.testing.assert_allclose(motion.mu[0], MU, rtol=1e-6)
-    sliding = motion.friction_utilization[CHUNK, (MU <= 0.5)]
-    np.testing.assert_allclose(sliding, 1.0, atol=0.01)
+    np.testing.assert_allclose(motion.friction_utilization[CHUNK, MU <= 0.5], 1.0, atol=0.03)
     slip = motion.slip[:, np.isclose(MU, 0.1)]
-    assert slip[CHUNK] > 12.0 and slip[-1] < 0.01
-    assert (acceleration(motion) < 1.1 * MU * G + AIR * 15.0**2).all()  # locked wheels hop, and what hops presses harder for a while
+    assert 0.5 < slip[CHUNK] < 2.5 and slip[-1] < 0.01, "the anti-lock controller holds a slip of a tenth"
+    assert (acceleration(motion) < 1.05 * MU * G + 0.3).all()
 
 
 @pytest.mark.parametrize("steer", [0.25, -0.5])
@@ -140,47 +87,48 @@ def test_yaw_rate_is_that_of_a_rolling_car_at_low_speed(steer):
     speed = np.linalg.norm(motion.velocity[-1, :, :2], axis=-1)
     # the box's centre runs ahead of the rear axle: v cos(beta) tan(steer) / L with tan(beta) = tan(steer) / 2
     beta = np.arctan(np.tan(motion.steer[-1]) / 2)
-    wanted = speed * np.cos(beta) * np.tan(motion.steer[-1]) / WHEELBASE
+    wanted = speed * np.cos(beta) * np.tan(motion.steer[-1]) / CAR.wheelbase
     grips = MU >= 0.5
-    np.testing.assert_allclose(motion.yaw_rate[-1, grips], wanted[grips], rtol=0.1)  # tyres that yield: at the front more than behind
-    np.testing.assert_allclose(motion.steer[-1, grips], LOCK * steer, rtol=0.1)
-
-
-def random_controls(seed, seconds, hold):
-    rng = np.random.default_rng(seed)
-    return np.repeat(rng.uniform(-1, 1, (seconds * CHUNK // hold, 8, 3)), hold, axis=0).astype(np.float32)
+    np.testing.assert_allclose(motion.yaw_rate[-1, grips], wanted[grips], rtol=0.07)
+    np.testing.assert_allclose(motion.steer[-1, grips], LOCK * steer, rtol=0.02)
 
 
 def test_trajectories_agree_with_the_c_engine():
-    """3 s of random controls from 4 to 16 m/s, sliding included.
-
-    MJX runs in float32 with Newton 2/4, the C engine in float64 to convergence. Measured: 4 cm after 3 s where cars slide, 1 mm where
-    they grip; the bounds leave a factor of three, for other platforms' rounding.
-    """
-    car, solver = numbers_of("articulated")
-    speed, action = np.linspace(4, 16, 8), random_controls(0, 3, 15)
+    """2 s of random controls from 4 to 16 m/s, sliding included: float32 and two iterations against float64 to convergence."""
+    speed, action = np.linspace(4, 16, 8), random_controls(0, 2, 15)
     _, (body, _) = drive("articulated", scene_for(speed=speed), action)
     for i in range(8):
-        converged = {"physics_dt": 1 / 120, "substeps": 4, "iterations": 100, "line_search": 50}
-        truth = mujoco_c.simulate(car, solver, action[:, i], np.full(4, float(MU[i])), speed=float(speed[i]), **converged)
+        drives = {"speed": float(speed[i]), "abs_enabled": True, **CONVERGED}
+        truth = mujoco_c.simulate(CAR, SOLVER, action[:, i], np.full(4, float(MU[i])), **drives)
         apart = body.qpos[:, i] - truth.qpos
         apart[:, 1] -= LANES[i]
-        assert np.linalg.norm(apart[: CHUNK, :2], axis=1).max() < 0.02
-        assert np.linalg.norm(apart[:, :2], axis=1).max() < 0.15
+        assert np.linalg.norm(apart[:, :2], axis=1).max() < 0.02
         assert np.abs(apart[:, 2]).max() < 0.005 and np.abs(apart[:, 3:7]).max() < 0.02
-        assert np.linalg.norm((body.qvel[:, i] - truth.qvel)[:, :2], axis=1).max() < 0.15
+        assert np.linalg.norm((body.qvel[:, i] - truth.qvel)[:, :2], axis=1).max() < 0.05
 
 
-def test_locked_stops_reach_the_tyre_limit_in_the_c_engine():
-    """With brakes four times as strong, so that wheels lock at any friction: from 15 m/s, within 3 % of v^2 / (2 mu g) less the air."""
-    car, solver = numbers_of("articulated")
-    strong = dataclasses.replace(car, brake_torque_front=4 * car.brake_torque_front, brake_torque_rear=4 * car.brake_torque_rear)
-    for mu in (0.3, 0.86, 1.1):
-        action = np.tile(np.array([0.0, 0.0, 1.0]), (240, 1))
-        options = {"physics_dt": 1 / 120, "substeps": 4, "iterations": solver.iterations, "line_search": solver.line_search}
-        path = mujoco_c.simulate(strong, solver, action, np.full(4, mu), speed=15.0, **options)
-        assert path.qpos[-1, 0] == pytest.approx(np.log(1.0 + AIR * 15.0**2 / (mu * G)) / (2 * AIR), rel=0.03)
-        assert np.linalg.norm(path.qvel[-1]) < 1e-3
+@pytest.mark.parametrize("abs_enabled", [True, False])
+def test_stops_of_the_c_engine_are_those_of_the_friction(abs_enabled):
+    for mu in (0.3, 1.1):
+        action = np.tile(np.array([0.0, 0.0, 1.0]), (180, 1))
+        options = CONVERGED | {"abs_enabled": abs_enabled, "iterations": 2, "line_search": 6}
+        path = mujoco_c.simulate(CAR, SOLVER, action, np.full(4, mu), speed=15.0, **options)
+        assert path.qpos[-1, 0] == pytest.approx(15.0**2 / (2 * mu * G), rel=0.05)
+        assert np.linalg.norm(path.qvel[-1]) < 0.05
+
+
+def test_friction_that_no_road_has_is_refused():
+    rig = mujoco_c.make_one(CAR, SOLVER, abs_enabled=True, physics_dt=DT, iterations=2, line_search=4)
+    with pytest.raises(ConfigError, match=r"^mu: expected coefficients > 0, got -0\.1$"):
+        mujoco_c.set_mu(rig, np.array([[0.5, 0.5, -0.1, 0.5]]))
+    one = np.zeros((1, 1))
+    with pytest.raises(ConfigError, match=r"^friction: expected coefficients > 0, got 0$"):
+        open_ground.make_open_ground(np.zeros((1, 1, 2)), one, one, np.zeros(1), np.zeros(1, np.int32), size=(4.0, 2.0))
+    for bad in (lambda _, position, speed: jnp.ones(speed.shape, jnp.int32), lambda _, position, speed: jnp.ones(8)):
+        dynamics = make("articulated", friction=bad)
+        scene = scene_for()
+        with pytest.raises(ConfigError, match=r"^weather\.friction: expected floating-point numbers \[8, 4\], got "):
+            jax.eval_shape(dynamics.advance, scene, dynamics.init(KEY, scene), jnp.zeros((8, 3)), EVERYONE)
 
 
 def test_a_whole_episode_of_random_driving_stays_finite_and_upright():
@@ -190,7 +138,7 @@ def test_a_whole_episode_of_random_driving_stays_finite_and_upright():
     height = motion.position[..., 2]
     assert height.min() > 0.65 and height.max() < 0.85
     assert np.linalg.norm(motion.velocity, axis=-1).max() < 25 and np.abs(motion.steer).max() < 1.05 * LOCK
-    assert motion.friction_utilization.max() < 1.01
+    assert motion.friction_utilization.max() < 1.25
 
 
 def test_a_hard_turn_on_the_best_road_slides_and_does_not_roll_over():
@@ -211,7 +159,7 @@ def rear_end(offset):
 def test_a_rear_end_collision_keeps_momentum_and_does_not_penetrate(offset):
     _, (_, motion) = drive("articulated", rear_end(offset), constant(seconds=1))
     touching = np.nonzero(motion.contact_force.max(1) > 25)[0]
-    assert 2 <= len(touching) <= 8
+    assert 2 <= len(touching) <= 15
     before, after = touching[0] - 1, touching[-1] + 1
     total = motion.velocity[:, :2, :2].sum(1)
     np.testing.assert_allclose(total[after, 0], total[before, 0], rtol=0.04)  # tyres and bearings take the rest
@@ -222,7 +170,7 @@ def test_a_rear_end_collision_keeps_momentum_and_does_not_penetrate(offset):
     assert motion.velocity[after, 1, 0] > motion.velocity[after, 0, 0] > 0
     assert motion.upright.min() > 0.97
     if offset:
-        assert motion.yaw_rate[after, :2].min() > 0.05
+        assert motion.yaw_rate[touching, :2].max(0).min() > 0.05
 
 
 def test_inactive_cars_are_held_bit_for_bit_and_touch_nobody():
@@ -297,7 +245,7 @@ def test_bicycle_circle_closes_and_braking_stops():
     free = make("bicycle", rolling=0.0, drag=0.0, air_drag=0.0)
     scene = scene_for(speed=speed)
     beta = np.arctan(0.5 * np.tan(LOCK * steer))
-    period = 2 * np.pi / (speed * np.cos(beta) * np.tan(LOCK * steer) / WHEELBASE)
+    period = 2 * np.pi / (speed * np.cos(beta) * np.tan(LOCK * steer) / CAR.wheelbase)
     steps = round(period * 30)
     run = jax.jit(lambda body: jax.lax.scan(lambda b, a: (b := free.advance(scene, b, a, EVERYONE), free.read(b)), body, turn))
     turn = jnp.tile(jnp.array([0.0, steer, 0.0]), (steps, 8, 1))
@@ -309,7 +257,7 @@ def test_bicycle_circle_closes_and_braking_stops():
     np.testing.assert_allclose(across, 2 * speed * period / (2 * np.pi), rtol=0.01)
     _, (body, motion) = drive("bicycle", scene_for(speed=5.0), constant(brake=1.0, seconds=2))
     assert (body.speed[-1] == 0).all() and (np.diff(body.speed, axis=0) <= 0).all()
-    assert motion.position[-1, 0, 0] == pytest.approx(5.0**2 / (2 * 5.29), rel=0.02)
+    assert motion.position[-1, 0, 0] == pytest.approx(5.0**2 / (2 * 10.61), rel=0.02)
 
 
 def test_bicycle_and_car_share_limits():
@@ -319,14 +267,15 @@ def test_bicycle_and_car_share_limits():
     mass = car["mass"] + 4 * (car["wheel_mass"] + car["carrier_mass"] + inertia) + 2 * car["knuckle_mass"]
     per_torque = 2 / car["wheel_radius"] / mass
     assert bicycle["acceleration"] == pytest.approx(car["drive_torque"] * per_torque, rel=1e-3)
-    assert bicycle["deceleration"] == pytest.approx((car["brake_torque_front"] + car["brake_torque_rear"]) * per_torque, rel=1e-3)
+    strongest = (car["brake_torque_front"] + car["brake_torque_rear"]) * per_torque
+    assert 0.9 * strongest < bicycle["deceleration"] < strongest, "on a dry road the tyres are the limit"
     assert bicycle["rolling"] == pytest.approx(4 * car["rolling_torque"] / car["wheel_radius"] / mass, rel=1e-3)
     assert bicycle["drag"] == pytest.approx(4 * car["wheel_damping"] / car["wheel_radius"] ** 2 / mass, rel=1e-2)
     assert bicycle["air_drag"] == pytest.approx(car["air_drag"] / mass, rel=1e-2)
     top = bicycle["speed_limit"]
     drags = bicycle["rolling"] + (bicycle["drag"] + bicycle["air_drag"] * top) * top
-    left = (car["spin_limit"] - top / car["wheel_radius"]) / (0.1 * car["spin_limit"])
-    assert bicycle["acceleration"] * left == pytest.approx(drags, rel=1e-2)
+    assert drags == pytest.approx(car["drive_power"] / mass / top, rel=1e-3)
+    assert top / car["wheel_radius"] < 0.9 * car["spin_limit"]
 
 
 def test_bicycle_reports_contact_and_keeps_going():
@@ -338,8 +287,8 @@ def test_bicycle_reports_contact_and_keeps_going():
 @pytest.mark.parametrize("name", ["articulated", "articulated_paper"])
 def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
     car, solver = numbers_of(name)
-    plain = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
-    seen = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=True, brake_rows=True)
+    plain = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False)
+    seen = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=True)
     assert (plain.nq, plain.nv, plain.npair) == (17, 16, 4) and seen.ngeom > plain.ngeom
     np.testing.assert_allclose(seen.body_mass, plain.body_mass)
     assert plain.body_mass.sum() == pytest.approx(1980.03, abs=0.01)
@@ -356,12 +305,14 @@ def test_cars_compile_ride_at_their_height_and_can_be_seen(name):
         ({"car": {"mass": "heavy"}}, "dynamics.car.mass"),
         ({"solver": {"algorithm": "CG"}}, "dynamics.solver.algorithm"),
         ({"contact": {"bounce": 1.0}}, "dynamics.contact.bounce"),
-        ({"brakes": "drum"}, "dynamics.brakes"),
+        ({"abs": "drum"}, "dynamics.abs"),
+        ({"brakes": "latched"}, "dynamics.brakes"),
         ({"car": {"stop_stiffness": 1e7}}, "suspension and stop"),
-        ({"car": {"steering_damping": 3e3}}, "steering cannot be integrated"),
-        ({"car": {"tyre_slip_damping": 130.0}}, "expected below 2, got 2.17 at physics_dt 0.00833"),
+        ({"car": {"steering_damping": 2e4}}, "steering cannot be integrated"),
+        ({"car": {"tyre_slip_stiffness": 400.0}}, "dynamics.car: the tyres' slip stiffness over relaxation length cannot be integrated"),
+        ({"car": {"tyre_relaxation_length": 0.01}}, "dynamics.car: the tyres' slip stiffness over relaxation length cannot be integrated"),
         ({"solver": {"integrator": "implicitfast"}}, "dynamics.solver.integrator: expected Euler"),
-        ({"contact": {"stiffness": 1e8}}, "dynamics.contact: stiffness 1e.08 and damping 30000 cannot be integrated"),
+        ({"contact": {"stiffness": 1e8}}, r"^dynamics\.contact\.stiffness: 1e\+08 cannot be integrated"),
     ],
 )
 def test_refuses_by_name(changes, named):
@@ -379,8 +330,10 @@ def test_refuses_by_name(changes, named):
         ("car.wheel_radius", -0.35, "> 0"), ("car.suspension_stiffness", 0.0, "> 0"), ("car.spin_limit", 0.0, "> 0"),
         ("car.suspension_damping", -1.0, ">= 0"), ("car.knuckle_mass", -50.0, ">= 0"),
         ("car.drive_torque", -500.0, ">= 0"), ("car.steering_limit", 1.6, "< 1.5708"),
-        ("car.tyre_impedance", 1.0, "< 1"), ("car.brake_impedance", 0.0, "> 0"), ("car.mass_height", float("inf"), "expected a"),
-        ("solver.iterations", 0, ">= 1"), ("solver.line_search", -1, ">= 1"), ("solver.friction_ratio", 0.0, "> 0"),
+        ("car.tyre_impedance", 1.0, "< 1"), ("car.tyre_slip_stiffness", 0.0, "> 0"), ("car.tyre_relaxation_length", -0.1, "> 0"),
+        ("car.tyre_shape", 2.0, "< 2"), ("car.tyre_sliding_fraction", 1.1, "<= 1"), ("car.abs_slip", 0.0, "> 0"),
+        ("car.mass_height", float("inf"), "expected a"),
+        ("solver.iterations", 0, ">= 1"), ("solver.line_search", -1, ">= 1"),
     ],
 )  # fmt: skip
 def test_numbers_that_no_car_has_are_refused(key, bad, wanted):
@@ -424,13 +377,13 @@ def test_refuses_a_control_step_that_is_no_multiple():
 
 
 @pytest.mark.slow
-def test_published_car_drives_and_creeps_under_its_latched_brakes():
-    """The published scheme flips the brake torque every substep at a locked wheel: the car never holds."""
+def test_published_car_stops_and_stands():
+    """Its brakes reach half of a dry road's friction, and its rear wheels lock first."""
     scene = scene_for(speed=15.0)
     dynamics = make("articulated_paper")
     second, body = compile_(dynamics), dynamics.init(KEY, scene)
     for _ in range(34):
         body, (_, motion) = second(scene, body, jnp.asarray(constant(brake=1.0), jnp.float32), EVERYONE)
-    assert np.isfinite(body.qpos).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(body))
     moved = np.linalg.norm(motion.position[-1] - motion.position[0], axis=-1)
-    assert moved.max() > 0.01
+    assert moved.max() < 1e-3
