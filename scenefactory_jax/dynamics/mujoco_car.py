@@ -85,8 +85,8 @@ def apply_tyres(model: mujoco.MjModel, data: mujoco.MjData, cars: SimpleNamespac
     forward = np.cross(axle, UP) / np.maximum(np.hypot(axle[..., 0], axle[..., 1]), 1e-3)[..., None]
     left, lever = np.cross(UP, forward), (axle * np.cross(arm, forward)).sum(-1)
     slip = np.stack([(forward * velocity).sum(-1), (left * velocity).sum(-1)])
-    rolling, pressed, found = np.abs(lever * spin), depth > 0.0, np.zeros(1, np.int32)
-    for wheel in np.ndindex(shape) if cars.patches else ():  # the surface under the wheel
+    rolling, pressed, found = np.abs(lever * spin), depth > 0.0, np.zeros(1, np.int32)  # found: the surface under a wheel
+    for wheel in np.ndindex(shape) if cars.patches and round(data.time / dt) % car.friction_substeps.max() == 0 else ():
         if mujoco.mj_ray(model, data, hub[wheel], -UP, SURFACES, True, -1, found) >= 0.0:
             model.pair_friction[cars.pair[wheel], :2] = model.geom_friction[found[0], 0]
     load = data.sensordata[cars.load] * pressed

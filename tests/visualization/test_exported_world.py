@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -24,6 +25,7 @@ from scenefactory_jax.core.types import Boxes
 from scenefactory_jax.dynamics import mujoco_car
 from scenefactory_jax.dynamics.articulated.parameters import read_parameters
 from scenefactory_jax.dynamics.collision import ContactLaw
+from scenefactory_jax.env import environment
 from scenefactory_jax.visualization.mujoco import exported_world, world_mjcf
 from scenefactory_jax.weather import friction
 
@@ -146,6 +148,27 @@ def test_the_viewer_steps_with_the_forces_of_the_script(tmp_path, monkeypatch):
     np.testing.assert_array_equal(final[0], data.qpos)
 
 
+def test_a_world_with_patches_and_cars_that_differ_drives_like_the_environment(tmp_path):
+    config = settings("weather=split", "dynamics/randomization=spread")
+    scene = scene_with((-40, 1, 0, 12), (-10, -2, 0.1, 8), (20, 0, 2.5, 5))
+    env, actions = environment.make_env(config), jnp.array([[0.6, 0.2, 0.0], [0.0, -0.1, 0.8], [0.3, 0.3, 0.0]], jnp.float32)
+    key = jax.random.split(jax.random.split(jax.random.key(0), 1)[0])[1]  # as `sample_start`
+
+    @jax.jit
+    def run(key):
+        state = env.init_state(key, scene)
+        return jax.lax.scan(lambda state, _: (env.control_step(scene, state, actions)[0], state.body.qpos), state, None, length=31)[1]
+
+    expected = np.asarray(run(key))[1:, :, :2]
+    drive, model, data, cars = opened(export(tmp_path, scene, "weather=split", "dynamics/randomization=spread"))
+    throttle, steer, brake = np.asarray(environment.make_parts(config).map_action(actions)).T
+    data.ctrl[cars.controls] = np.stack([cars.car.steering_limit[:, 0] * steer, throttle, brake], axis=-1)
+    for positions in expected:
+        for _ in range(4):
+            drive.step(model, data, cars)
+        np.testing.assert_allclose(data.qpos.reshape(-1, 17)[:, :2], positions, atol=0.01)
+
+
 # ---- contacts
 
 
@@ -196,7 +219,7 @@ BUILT = (
     read_parameters(settings()["dynamics"])[1],
     schema.read(settings()["dynamics"]["contact"], ContactLaw, where="dynamics.contact"),
 )
-SIZES = {"abs_enabled": True, "physics_hz": 120.0, "scene_size_m": 200.0, "goal_radius_m": 3.0}
+SIZES = {"abs_enabled": True, "physics_hz": 120.0, "control_hz": 30.0, "scene_size_m": 200.0, "goal_radius_m": 3.0}
 
 
 def test_the_restitution_of_contacts_is_that_of_the_law():

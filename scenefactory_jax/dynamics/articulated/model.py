@@ -158,8 +158,13 @@ def add_ground_pairs(
 
 
 def add_actuators(
-    spec: mujoco.MjSpec, cars: CarParameters | Sequence[CarParameters], *, abs_enabled: bool, prefixes: Sequence[str] = ("",)
-) -> None:  # fmt: skip
+    spec: mujoco.MjSpec,
+    cars: CarParameters | Sequence[CarParameters],
+    *,
+    abs_enabled: bool,
+    prefixes: Sequence[str] = ("",),
+    friction_substeps: int = 1,
+) -> None:
     """Adds what `dynamics/mujoco_car.py` needs to drive the cars with MuJoCo alone: controls, custom fields, load sensors and user data.
 
     The custom fields are the numbers of `CarParameters` and of `_derive_numbers`, one number per car. The actuators `steer`,
@@ -172,6 +177,7 @@ def add_actuators(
 
     Args:
         cars: one for all prefixes, or one for each.
+        friction_substeps: physics steps from one look-up of the friction coefficients under the wheels to the next, if there are patches.
     """
     cars = [cars] * len(prefixes) if isinstance(cars, CarParameters) else cars
     for prefix, car in zip(prefixes, cars, strict=True):
@@ -195,7 +201,8 @@ def add_actuators(
             spec.add_sensor(
                 name=f"{prefix}load_{name}", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
             )
-    numbers = [{**vars(car), **_derive_numbers(car), "abs_enabled": float(abs_enabled)} for car in cars]
+    settings = {"abs_enabled": float(abs_enabled), "friction_substeps": friction_substeps}
+    numbers = [{**vars(car), **_derive_numbers(car), **settings} for car in cars]
     for name in (name for name, value in numbers[0].items() if np.ndim(value) == 0):
         spec.add_numeric(name=name, data=[float(car[name]) for car in numbers], size=len(cars))
     spec.nuserdata = 2 * len(WHEELS) * len(cars)

@@ -34,7 +34,7 @@ Controls of each car: agentN/steer (rad), agentN/throttle (-1 to 1) and agentN/b
 Friction: each pair agentN/ground_WHEEL holds the friction coefficient sampled under that wheel. A plain mj_step has MuJoCo's friction
 cones of these coefficients. drive.py reads them, sets condim of these pairs to 1, and applies the tangential forces itself: friction acts
 once. The friction of the geoms `ground` and `patchN` is that of the road and of its patches; where there are patches, drive.py
-updates the pairs with the friction of the geom under each wheel.
+updates the pairs every control step with the friction of the geom under each wheel.
 
 Stand-ins of a plain mj_step: `steer` is a servo of the mean angle of the front wheels, `throttle` a torque that falls linearly with
 the spin and stays below the engine's power, `brake` a damper of the mean spin of the wheels, limited by the brake torque: where it exceeds
@@ -95,6 +95,7 @@ def write(out: Path, settings: Mapping[str, Any], scene: Scene, *, seed: int) ->
         schema.read(dynamics["contact"], ContactLaw, where="dynamics.contact"),
         abs_enabled=dynamics["abs"],
         physics_hz=settings["timing"]["physics_hz"],
+        control_hz=settings["timing"]["control_hz"],
         scene_size_m=settings["scenes"]["pack"]["scene_size_m"],
         goal_radius_m=settings["step_metrics"]["goal_radius_m"],
     )

@@ -57,6 +57,7 @@ def build(
     *,
     abs_enabled: bool,
     physics_hz: float | int,
+    control_hz: float | int,
     scene_size_m: float | int,
     goal_radius_m: float | int,
 ) -> mujoco.MjSpec:
@@ -85,7 +86,8 @@ def build(
         _add_body_contacts(model, car, law, prefix)
     for row in np.flatnonzero(np.asarray(scene.traffic.present)):
         _set_contact(model.geom(f"traffic{row}"), law)
-    models.add_actuators(model, cars, abs_enabled=abs_enabled, prefixes=prefixes)
+    substeps = round(physics_hz / control_hz)
+    models.add_actuators(model, cars, abs_enabled=abs_enabled, prefixes=prefixes, friction_substeps=substeps)
     model.add_key(name="start", qpos=start.qpos[slots].ravel(), qvel=start.qvel[slots].ravel())
     return model
 
