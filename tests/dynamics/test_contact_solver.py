@@ -119,7 +119,7 @@ def test_forces_never_pull_and_do_what_newton_says(cases):
 
 def test_gradients_are_finite(cases):
     def total(push):
-        return (solve((*cases[:2], push), iterations=2)[0] ** 2).sum()
+        return (solve((*cases[:2], push), iterations=1)[0] ** 2).sum()
 
     assert np.isfinite(jax.jit(jax.grad(total))(cases[2])).all()
 
