@@ -25,6 +25,7 @@ from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 from scenefactory_jax.sysid.parameter_space import Space
 
 COMPARED = ("position", "yaw", "pace", "yaw_rate", "wheel_spin", "steer")  # fields of `CandidatePath` and `ManoeuvreBatch`
+TRACE_WIDTH = 4096  # largest number of pairs whose complete motion is on the device at once
 TERMS = ("position", "yaw", "speed", "yaw_rate", "wheel_spin", "steer", "end_position", "end_speed", "relative_yaw_rate")
 MIN_YAW_RATE = 0.02  # rad/s: largest one of a recording whose relative yaw rate is compared
 
@@ -199,6 +200,18 @@ def make_scorer(simulator: Simulator, batch: ManoeuvreBatch, *, width: int) -> C
         return errors
 
     return score
+
+
+def trace_pairs(
+    simulator: Simulator, rows: Float[np.ndarray, "N P"], index: Int[np.ndarray, " N"], batch: ManoeuvreBatch, *, width: int
+) -> CandidatePath:
+    """Traces pairs, `width` or TRACE_WIDTH at a time: one compilation for all. Leaves [N, T, ...] are on the host."""
+    width, chunks = min(width, TRACE_WIDTH), []
+    for begin in range(0, len(rows), width):
+        pairs = np.resize(np.arange(begin, min(begin + width, len(rows))), width)  # the last chunk repeats itself
+        path = simulator.trace(jnp.asarray(rows[pairs], jnp.float32), jnp.asarray(index[pairs], jnp.int32), batch)
+        chunks.append(jax.tree.map(np.asarray, path))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(rows)], *chunks)
 
 
 def residuals(

@@ -58,12 +58,13 @@ def identify(config: Mapping[str, Any], out: Path) -> dict[str, Any]:
     }
     _check_tuned(settings, [name for structure in structures.values() for name in structure["sysid"]["space"]])
     suites = record_suites(config, out)
-    fits = {name: fit(structure, out / "stages" / name, suites) for name, structure in structures.items()}
+    batch = candidate_simulation.stack_recordings([recording for recordings in suites.values() for recording in recordings])
+    fits = {name: fit(structure, out / "stages" / name, suites, batch) for name, structure in structures.items()}
     cars = {name: (fit.simulator, fit.refined.best) for name, fit in fits.items()}
     cars = {"fitted": cars["fitted"], "start": (fits["fitted"].simulator, fits["fitted"].space.start), "published": cars["published"]}
     errors, responses, traces = {}, {"teacher": measure_teacher(suites)}, {}
     for name, (car, values) in cars.items():
-        errors[name], responses[name], traces[name] = evaluate_car(suites, car, values, weights=settings["weights"])
+        errors[name], responses[name], traces[name] = evaluate_car(suites, batch, car, values, settings)
     return {
         "manoeuvres": {name: len(suite) for name, suite in suites.items()},
         "fits": {name: {"space": fit.space, "stages": fit.stages, "refined": fit.refined} for name, fit in fits.items()},
@@ -87,17 +88,20 @@ class Fit(NamedTuple):
     seconds: float
 
 
-def fit(config: Mapping[str, Any], folder: Path, suites: Suites) -> Fit:
-    """Fits the car of `config["dynamics"]` to the manoeuvres that are not held out; writes its stages into a folder."""
+def fit(config: Mapping[str, Any], folder: Path, suites: Suites, batch: ManoeuvreBatch) -> Fit:
+    """Fits the car of `config["dynamics"]` to the manoeuvres that are not held out; writes its stages into a folder.
+
+    Args:
+        batch: all recordings, those of the fit first. The fit uses the held-out ones nowhere; one batch saves a compilation.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     settings = config["sysid"]
     recordings, space = [*suites["training"], *suites["extra"]], parameter_space.make(settings["space"])
     simulator = candidate_simulation.make_simulator(config["dynamics"], space, settings["friction"], physics_hz=float(config["physics_hz"]))
-    batch = candidate_simulation.stack_recordings(recordings)
     score = candidate_simulation.make_scorer(simulator, batch, width=settings["width"])
     stages = search_stages(config, folder, recordings, space, score)
-    refined = refine(config, folder, space, simulator, batch, stages[-1].best)
     indices = range(len(recordings))
+    refined = refine(config, folder, space, simulator, batch, indices, stages[-1].best)
     slices = optimization.compute_slices(score, space, refined.best, indices, weights=settings["weights"], **settings["slices"])
     return Fit(space, simulator, stages, refined, slices, sum(stage.seconds for stage in stages) + refined.seconds)
 
@@ -187,26 +191,22 @@ def _check_tuned(settings: Mapping[str, Any], valid: Sequence[str]) -> None:
 
 
 def refine(
-    config: Mapping[str, Any], folder: Path, space: Space, simulator: Simulator, batch: ManoeuvreBatch, start: np.ndarray
-) -> RefinementResult:
-    """Fits by least squares on all manoeuvres."""
+    config: Mapping[str, Any], folder: Path, space: Space, simulator: Simulator, batch: ManoeuvreBatch, manoeuvres: Sequence[int],
+    start: np.ndarray,
+) -> RefinementResult:  # fmt: skip
+    """Fits by least squares on all manoeuvres of the fit, indices into a batch."""
     settings, path = config["sysid"], folder / "refine.json"
     digest = result_file.digest({"refine": settings["refine"], "start": start.tolist(), "shared": _shared_settings(config)})
     refined = _read(path, digest, RefinementResult) if config["resume"] else None
     if refined is None:
-        weights, index = optimization.weight_row(settings["weights"]), np.arange(len(batch.frames))
-        width = max(1, settings["width"] // len(index) // 4)  # candidates whose complete traces are on the device at once
-
-        def residuals_of(candidates: np.ndarray) -> list[np.ndarray]:
-            pairs = jnp.asarray(np.repeat(candidates, len(index), axis=0), jnp.float32), jnp.asarray(np.tile(index, len(candidates)))
-            traces = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(len(candidates), len(index), *leaf.shape[1:]),
-                                  simulator.trace(*pairs, batch))  # fmt: skip
-            each = [jax.tree.map(lambda leaf, i=i: leaf[i], traces) for i in range(len(candidates))]
-            return [candidate_simulation.residuals(trace, batch, index, weights) for trace in each]
+        weights, index = optimization.weight_row(settings["weights"]), np.asarray(manoeuvres)
 
         def residuals(candidates: np.ndarray) -> np.ndarray:
-            pieces = [np.resize(candidates[i : i + width], (width, candidates.shape[1])) for i in range(0, len(candidates), width)]
-            return np.stack([row for piece in pieces for row in residuals_of(piece)][: len(candidates)])
+            pairs = np.repeat(candidates, len(index), axis=0), np.tile(index, len(candidates))
+            paths = candidate_simulation.trace_pairs(simulator, *pairs, batch, width=settings["width"])
+            parts = [slice(i * len(index), (i + 1) * len(index)) for i in range(len(candidates))]
+            each = [jax.tree.map(lambda leaf, part=part: leaf[part], paths) for part in parts]
+            return np.stack([candidate_simulation.residuals(path, batch, index, weights) for path in each])
 
         refined = optimization.refine(residuals, space, start, **settings["refine"], clock=time.perf_counter)
         result_file.write(path, {"made": digest, **refined._asdict()}, digits=None)
@@ -236,13 +236,12 @@ def measure_teacher(suites: Suites) -> dict[str, Any]:
 
 
 def evaluate_car(
-    suites: Suites, car: Simulator, values: np.ndarray, *, weights: Mapping[str, float]
+    suites: Suites, batch: ManoeuvreBatch, car: Simulator, values: np.ndarray, settings: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, candidate_simulation.CandidatePath]]:
     """Computes the errors and the responses of a car on every manoeuvre by suite, and its traces by manoeuvre."""
-    row, errors, responses, traces = optimization.weight_row(weights), {}, {}, {}
-    every = [recording for recordings in suites.values() for recording in recordings]
-    batch, index = candidate_simulation.stack_recordings(every), np.arange(len(every))
-    paths = jax.tree.map(np.asarray, car.trace(jnp.asarray(np.tile(values, (len(index), 1)), jnp.float32), jnp.asarray(index), batch))
+    row, errors, responses, traces = optimization.weight_row(settings["weights"]), {}, {}, {}
+    index = np.arange(len(batch.frames))
+    paths = candidate_simulation.trace_pairs(car, np.tile(values, (len(index), 1)), index, batch, width=settings["width"])
     single = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], paths) for i in index]
     losses = [float((candidate_simulation.residuals(trace, batch, index[i : i + 1], row) ** 2).sum()) for i, trace in enumerate(single)]
     first = 0

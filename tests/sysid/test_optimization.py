@@ -1,7 +1,6 @@
 """Search and refinement on problems with known solutions, and the car on recordings of itself."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -158,9 +157,20 @@ def lesson(config):
 
 
 def traced(simulator, row, plan):
+    """The motion of one candidate on all manoeuvres, two pairs at a time."""
     index = np.arange(len(plan.frames))
-    rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), simulator.trace(rows, jnp.asarray(index), plan))
+    path = candidate_simulation.trace_pairs(simulator, np.tile(row, (len(index), 1)), index, plan, width=2)
+    return jax.tree.map(lambda leaf: leaf.astype(float), path)
+
+
+def test_pairs_are_traced_in_chunks(lesson):
+    simulator, begin, own = lesson
+    plan = candidate_simulation.stack_recordings(own)
+    rows = np.stack([begin, begin, begin + np.array([100.0, 0.0])])
+    path = candidate_simulation.trace_pairs(simulator, rows, np.array([0, 1, 0]), plan, width=2)
+    one = traced(simulator, begin, plan)
+    assert path.yaw.shape == (3, 24) and np.array_equal(path.position[:2], one.position.astype(np.float32))
+    assert path.pace[2, 11] > path.pace[0, 11] + 0.01, "the third pair is the one with the stronger engine"
 
 
 def test_a_car_on_its_own_recording_makes_no_error_and_another_does(lesson, config):
