@@ -171,7 +171,7 @@ def _sum_square_errors(start: Callable, step: Callable, rows: Array, index: Arra
 
 def _differences(path: CandidatePath, recorded: Any, at: Any, numpy: ModuleType) -> list[Any]:
     """Computes the differences of the fields COMPARED: leaves of `path` less rows `at` of the recorded ones, the yaw wrapped."""
-    targets = {name: getattr(recorded, name)[at] for name in COMPARED}
+    targets = {name: numpy.asarray(getattr(recorded, name))[at] for name in COMPARED}
     targets["steer"] = targets["steer"][..., None]  # of both front wheels
     errors = {name: getattr(path, name) - target for name, target in targets.items()}
     errors["yaw"] = numpy.arctan2(numpy.sin(errors["yaw"]), numpy.cos(errors["yaw"]))
@@ -219,16 +219,13 @@ def residuals(
 ) -> Float[np.ndarray, "*n R"]:
     """Computes the residuals of traced manoeuvres [M, T], flat: their squares sum to the loss of `optimization.losses`."""
     rows = np.asarray(index)
-    count, frame = np.asarray(batch.frames)[rows][:, None], np.arange(batch.yaw.shape[1])[None]
-    end, mean = frame == count - 1, np.where(frame < count, 1.0 / np.sqrt(count), 0.0)
-    as_double = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, float))
-    position, yaw, pace, yaw_rate, spin, steer = _differences(as_double(path), as_double(batch), rows, np)
-    columns = [
-        (mean, position), (mean, yaw), (mean, pace), (mean, yaw_rate), (mean, spin / 2.0), (mean, steer / np.sqrt(2.0)),
-        (end, position), (end, pace), (mean, yaw_rate * np.asarray(batch.yaw_rate_scale)[rows][:, None]),
-    ]  # fmt: skip
-    parts = []
-    for weight, (per_frame, error) in zip(weights, columns, strict=True):
-        error = error if error.ndim == 3 else error[..., None]
-        parts.append((np.sqrt(weight / len(rows)) * np.asarray(per_frame, float)[..., None] * error).ravel())
-    return np.concatenate(parts)
+    count = np.asarray(batch.frames)[rows]
+    frame, last = np.arange(count.max()), (np.arange(len(rows)), count - 1)
+    mean = np.where(frame < count[:, None], 1.0 / np.sqrt(count)[:, None], 0.0)
+    used = jax.tree.map(lambda leaf: np.asarray(leaf[:, : len(frame)], float), path)
+    position, yaw, pace, yaw_rate, spin, steer = _differences(used, batch, (rows, slice(len(frame))), np)
+    scale = np.asarray(batch.yaw_rate_scale, float)[rows][:, None]
+    per_frame = (position, yaw, pace, yaw_rate, spin / 2.0, steer / np.sqrt(2.0))
+    columns = [mean.reshape(*mean.shape, *[1] * (error.ndim - 2)) * error for error in per_frame]
+    columns += [position[last], pace[last], mean * scale * yaw_rate]
+    return np.concatenate([np.sqrt(weight / len(rows)) * column.ravel() for weight, column in zip(weights, columns, strict=True)])
