@@ -10,7 +10,16 @@ from scenefactory_jax.core import result_file
 from scenefactory_jax.visualization.report import sysid_report as report
 
 COMMITTED = configs.find_conf().parent / "experiments" / "sysid"
-TARGETS = {"end_share": 0.05, "yaw_rate_nrmse": 0.15, "phase_deg": 5.0, "gain": 0.1, "rise": 0.2, "spin_yaw_deg": 20.0, "minutes": 4.0}
+TARGETS = {
+    "end_share": 0.05,
+    "yaw_rate_nrmse": 0.15,
+    "stop_share": 0.05,
+    "phase_deg": 5.0,
+    "gain": 0.1,
+    "rise": 0.2,
+    "spin_yaw_deg": 20.0,
+    "minutes": 4.0,
+}
 SPINS = ["spin"]
 NAN = float("nan")
 
@@ -75,11 +84,13 @@ def test_verdicts_are_worst_responses_and_medians_and_worst_errors(result):
         ("6 degrees", False),
         ("4 %", True),
         ("30 %", False),  # the step steer at 20 m/s; the one at 10 m/s has no target
-        ("12 degrees", True),
+        ("12 degrees (c; median 12)", True),
         ("30 % (spin)", False),
         ("30 % (c)", False),
         ("14 % (circle)", True),
         ("20 % (b)", False),
+        ("3 % (spin)", True),
+        ("3 % (c)", True),
         ("friction_dry", False),
         ("0.4 min", True),
     ]
@@ -101,6 +112,7 @@ def test_the_report_is_written_from_its_results(tmp_path, result):
     assert "| b | 0.25 | 0.33 (+30 %) | 0.50 (+100 %) |" in text
     assert "| c | 1.50 | -130 | -118 (+12) | -20 (+110) |" in text
     assert "| circle | 2 | 1.5 / 1.9 / 2.0 | 15.0 / 19.0 / 20.0 | 14.0 / 18.8 / 20.0 |" in text
+    assert "| teacher | 1.000 | 1.00 | 1.000 | 1.00 |" in text and "left at 40 degrees" in text
     for name in report.PICTURES:
         assert f"({name}.png)" in text and (tmp_path / f"{name}.png").stat().st_size > 5_000
 

@@ -28,7 +28,6 @@ PICTURES = {  # name -> caption and figure
     "slices": ("The loss along each parameter alone, the others as fitted", figures.slices),
 }
 MEASURES = {key: label[0].upper() + label[1:] for key, label in figures.MEASURES.items()}
-TARGET_MEASURES = ("end_share", "yaw_rate_nrmse")  # those with a target for every family
 MIN_RISE_SPEED = 20.0  # m/s: of the step steers whose rise time has a target
 
 
@@ -50,7 +49,7 @@ def write(folder: Path, result: Result, targets: Mapping[str, float], spins: Seq
         document.section("Step steer", *_rise_times(result)),
         document.section("Spins", *_spins(result, spins)),
         document.section("Manoeuvres kept out of the fit", *_families(result, "heldout"), pictures["heldout"], pictures["paths"]),
-        document.section("Tyre", pictures["tyre"]),
+        document.section("Tyre", *_tyres(result), pictures["tyre"]),
         document.section("Parameters", *_parameters(result), pictures["slices"]),
         document.section("Stages", *_stages(result), pictures["search"]),
         document.section("Manoeuvres of the fit", *used),
@@ -73,15 +72,17 @@ def _response_verdicts(result: Result, targets: Mapping[str, float], spins: Sequ
     gain = np.abs(sines["fitted"]["gain"] / sines["teacher"]["gain"] - 1.0)
     rise = np.abs(steps["fitted"] / steps["teacher"] - 1.0)[steps["speed"] >= MIN_RISE_SPEED]
     found = []
-    for what, values, target, scale, unit in (
-        ("Phase of the yaw rate, worst", phase, targets["phase_deg"], 1.0, "degrees"),
-        ("Gain of the yaw rate, worst", gain, targets["gain"], 100.0, "%"),
-        (f"Rise time of the yaw rate at {MIN_RISE_SPEED:g} m/s or more, worst", rise, targets["rise"], 100.0, "%"),
-        ("Final yaw of the spins, worst", np.abs(ends["fitted"] - ends["teacher"]), targets["spin_yaw_deg"], 1.0, "degrees"),
+    for what, values, names, target, scale, unit in (
+        ("Phase of the yaw rate", phase, None, targets["phase_deg"], 1.0, "degrees"),
+        ("Gain of the yaw rate", gain, None, targets["gain"], 100.0, "%"),
+        (f"Rise time of the yaw rate at {MIN_RISE_SPEED:g} m/s or more", rise, None, targets["rise"], 100.0, "%"),
+        ("Final yaw of the spins", np.abs(ends["fitted"] - ends["teacher"]), ends["name"], targets["spin_yaw_deg"], 1.0, "degrees"),
     ):
         if len(values):
             worst = float(np.max(values))  # NaN is a miss
-            found.append(Verdict(f"{what} of {len(values)}", f"< {scale * target:g} {unit}", f"{scale * worst:.2g} {unit}", worst < target))
+            where = f" ({names[int(np.argmax(values))]}; median {scale * np.median(values):.2g})" if names else ""
+            measured = f"{scale * worst:.2g} {unit}{where}"
+            found.append(Verdict(f"{what}, worst of {len(values)}", f"< {scale * target:g} {unit}", measured, worst < target))
     return found
 
 
@@ -89,7 +90,7 @@ def _error_verdicts(result: Result, targets: Mapping[str, float]) -> list[Verdic
     """Verdicts on held-out manoeuvres: the family with the largest median, and the worst manoeuvre."""
     errors, found = result["cars"]["fitted"]["heldout"], []
     families = np.array(errors["family"])
-    for key in TARGET_MEASURES:
+    for key in MEASURES:
         values, target = np.abs(np.array(errors[key], float)), targets[key]
         defined = np.isfinite(values)
         medians = {family: float(np.median(values[defined & (families == family)])) for family in dict.fromkeys(families[defined].tolist())}
@@ -151,6 +152,18 @@ def _spins(result: Result, spins: Sequence[str]) -> list[str]:
         "its braked rear wheels spin backwards at 200 rad/s. A recording ends there, and so does every comparison."
     )
     return [text, markdown.format_table(["Manoeuvre", "Compared, s", "Teacher", *cars], rows)]
+
+
+def _tyres(result: Result) -> list[str]:
+    """Friction at the peak, and what is left of it on a locked wheel and at the largest slip angle."""
+    rows = []
+    for name, curves in result["tyres"]["curves"].items():
+        along, across = (np.array(curves[direction], float) for direction in ("longitudinal", "lateral"))
+        rows.append([name, *(text for x in (along, across) for text in (f"{x.max():.3f}", f"{x[-1] / x.max():.2f}"))])
+    largest = result["tyres"]["slip_angle_deg"][-1]
+    header = ["Tyre", "Peak along", "left at slip 1", "Peak across", f"left at {largest:g} degrees"]
+    text = "Force over load. The car's tyre has one friction circle, the same along and across; the teacher's has two peaks."
+    return [text, markdown.format_table(header, rows)]
 
 
 def _find_steps(result: Result) -> dict[str, Any]:
