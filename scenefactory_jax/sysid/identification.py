@@ -218,7 +218,9 @@ def _shared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every stage depends on."""
     settings = config["sysid"]
     car = {name: value for name, value in config["dynamics"]["car"].items() if name not in settings["space"]}
-    shared = {name: config[name] for name in ("teacher", "manoeuvres", "physics_hz")} | {"dynamics": {**config["dynamics"], "car": car}}
+    fitted = {name: suite for name, suite in config["manoeuvres"].items() if name != "heldout"}
+    shared = {"teacher": config["teacher"], "manoeuvres": fitted, "physics_hz": config["physics_hz"]}
+    shared["dynamics"] = {**config["dynamics"], "car": car}
     return shared | {name: settings[name] for name in ("seed", "friction", "weights", "space", "search", "every")}
 
 

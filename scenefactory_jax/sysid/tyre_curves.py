@@ -27,7 +27,7 @@ def compute_curves(car: CarParameters, mu: float, *, speed: float) -> dict[str, 
         furthest = tyres.peak_ratio(car.tyre_shape) * limits.peak / limits.stiffness
         deflection = jnp.minimum(car.tyre_relaxation_length * slip / jnp.maximum(rolling[name], 1e-6), furthest)
         (force, _), _ = tyres.compute_force((deflection, zero), limits)
-        curves[name] = -np.asarray(force, float) / load
+        curves[name] = np.asarray(-force / load, float)
     return curves
 
 

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -54,5 +56,7 @@ def test_curves_have_the_stiffness_the_peak_and_the_sliding_friction_of_the_tyre
     for name, slip in (("longitudinal", tyre_curves.SLIP), ("lateral", np.tan(np.radians(tyre_curves.SLIP_ANGLE_DEG)))):
         assert curves[name][1] / slip[1] == pytest.approx(car.tyre_slip_stiffness, rel=0.05)
         assert 0.75 < curves[name].max() <= 0.8 and curves[name][-1] == pytest.approx(0.6 * 0.8, rel=0.02)
+    device = jax.tree.map(jnp.float32, car)
+    np.testing.assert_allclose(tyre_curves.compute_curves(device, 0.8, speed=20.0)["lateral"], curves["lateral"], rtol=1e-4)
     strong = tyre_curves.compute_curves(dataclasses.replace(car, tyre_sliding_fraction=1.0), 0.8, speed=20.0)
     assert strong["lateral"].max() == pytest.approx(0.8, rel=1e-3) == strong["longitudinal"][-1]
