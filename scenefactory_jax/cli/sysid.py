@@ -22,24 +22,27 @@ def sysid(config: Mapping[str, Any]) -> dict[str, Any]:
     """Fits a config's car (`load_config("sysid", "sysid=full")`).
 
     Returns:
-        The content of `out/result.json`: the stages, the refinement, the fitted numbers with their standard deviations, and the errors of
-        each car on the manoeuvres of the fit and on held-out ones.
+        The content of `out/result.json`: of each structure the stages, the refinement, and the fitted numbers with their standard
+        deviations; the errors and responses of each car on the manoeuvres of the fit and on held-out ones.
 
     Raises:
         ConfigError: a key or number that does not fit, by name; a missing teacher package.
     """
     schema.check(config, schema.Sysid)
     scene_source.use_compilation_cache()
-    out, targets = Path(config["out"]), config["sysid"]["targets"]
-    fit = identification.identify(config, out)
-    result = {"command": run_config.format_command("sysid"), "versions": run_config.versions(), **fit}
+    out, settings = Path(config["out"]), config["sysid"]
+    found = identification.identify(config, out)
+    result = {"command": run_config.format_command("sysid"), "versions": run_config.versions(), **found}
     result_file.write(out / "result.json", result, digits=DIGITS)
-    values = dict(zip(fit["space"]["names"], fit["refined"].best.tolist(), strict=True))
+    fit = found["fits"]["fitted"]
+    values = dict(zip(fit["space"].names, fit["refined"].best.tolist(), strict=True))
+    others = settings["teacher_only"]
     fitted = {
-        "car": {name: value for name, value in values.items() if name not in FRICTION},
+        "car": {name: value for name, value in values.items() if name not in (*FRICTION, *others)},
+        "teacher_only": {name: values[name] for name in others if name in values},
         "friction": {name: values[name] for name in FRICTION if name in values},
     }
     (out / "fitted.yaml").write_text(yaml.safe_dump(result_file.plain(fitted, digits=5), sort_keys=False))
-    result = result_file.read(out / "result.json")
-    print(f"{report.write(out, result, targets)}\n{verdicts.text(report.verdicts(result, targets))}", flush=True)
+    result, judged = result_file.read(out / "result.json"), (settings["targets"], settings["spins"])
+    print(f"{report.write(out, result, *judged)}\n{verdicts.text(report.verdicts(result, *judged))}", flush=True)
     return result

@@ -25,7 +25,9 @@ from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 from scenefactory_jax.sysid.parameter_space import Space
 
 COMPARED = ("position", "yaw", "pace", "yaw_rate", "wheel_spin", "steer")  # fields of `CandidatePath` and `ManoeuvreBatch`
-TERMS = ("position", "yaw", "speed", "yaw_rate", "wheel_spin", "steer", "end_position", "end_speed")
+TRACE_WIDTH = 4096  # largest number of pairs whose complete motion is on the device at once
+TERMS = ("position", "yaw", "speed", "yaw_rate", "wheel_spin", "steer", "end_position", "end_speed", "relative_yaw_rate")
+MIN_YAW_RATE = 0.02  # rad/s: largest one of a recording whose relative yaw rate is compared
 
 
 @pytree_dataclass
@@ -44,6 +46,7 @@ class ManoeuvreBatch:
     yaw_rate: Float[Array, "M T"]
     wheel_spin: Float[Array, "M T 4"]
     steer: Float[Array, "M T"]
+    yaw_rate_scale: Float[Array, " M"]  # one over the largest yaw rate, s/rad; 0 if that is below MIN_YAW_RATE
 
 
 class CandidatePath(NamedTuple):
@@ -62,7 +65,7 @@ class CandidatePath(NamedTuple):
 class Simulator(NamedTuple):
     """A compiled car that simulates recorded manoeuvres."""
 
-    square_errors: Callable[..., Array]  # (rows [N, P], manoeuvre [N], batch, frames) -> squared errors [N, 8], see TERMS
+    square_errors: Callable[..., Array]  # (rows [N, P], manoeuvre [N], batch, frames) -> squared errors [N, 9], see TERMS
     trace: Callable[..., CandidatePath]  # (rows [N, P], manoeuvre [N], batch) -> leaves [N, T, ...]
 
 
@@ -76,7 +79,7 @@ def stack_recordings(recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreBatch
         return jnp.asarray(np.stack([np.concatenate(pair) for pair in zip(columns, ends, strict=True)]), dtype)
 
     motion = {"position": "position", "yaw": "yaw", "pace": "speed", "yaw_rate": "yaw_rate", "wheel_spin": "wheel_spin", "steer": "steer"}
-    plans = [recording.manoeuvre for recording in recordings]
+    plans, peaks = [recording.manoeuvre for recording in recordings], [np.abs(recording.yaw_rate).max() for recording in recordings]
     return ManoeuvreBatch(
         controls=pad([plan.controls for plan in plans], max(frames), None, jnp.float32),
         frames=jnp.asarray(frames, jnp.int32),
@@ -84,6 +87,7 @@ def stack_recordings(recordings: Sequence[ManoeuvreRecording]) -> ManoeuvreBatch
         edges=pad([plan.edges for plan in plans], strips - 1, np.inf, jnp.float32),
         left=pad([plan.left for plan in plans], strips, None, jnp.int32),
         right=pad([plan.right for plan in plans], strips, None, jnp.int32),
+        yaw_rate_scale=jnp.asarray([1.0 / peak if peak > MIN_YAW_RATE else 0.0 for peak in peaks], jnp.float32),
         **{name: pad([getattr(r, field) for r in recordings], max(frames), None, jnp.float32) for name, field in motion.items()},
     )
 
@@ -146,7 +150,7 @@ def make_simulator(dynamics: Mapping[str, Any], space: Space, friction: Sequence
 
 
 def _sum_square_errors(start: Callable, step: Callable, rows: Array, index: Array, batch: ManoeuvreBatch, frames: Array) -> Array:
-    """Computes the squared errors of all pairs [N, 8]; `frames` is the length of their longest manoeuvre."""
+    """Computes the squared errors of all pairs [N, 9]; `frames` is the length of their longest manoeuvre."""
 
     def add_frame(row: Array, index: Array, body: Any, total: Array, frame: Array) -> tuple[Any, Array]:
         body, path = step(row, index, batch, body, frame)
@@ -154,7 +158,8 @@ def _sum_square_errors(start: Callable, step: Callable, rows: Array, index: Arra
         position, yaw, pace, yaw_rate, spin, steer = (error**2 for error in errors)
         squares, count = jnp.stack([position.sum(), yaw, pace, yaw_rate, spin.mean(), steer.mean()]), batch.frames[index]
         end, weight = jnp.where(frame == count - 1, 1.0, 0.0), 1.0 / count
-        squares = jnp.concatenate([weight * squares, end * squares[jnp.array([0, 2])]])
+        relative = batch.yaw_rate_scale[index] ** 2 * yaw_rate
+        squares = jnp.concatenate([weight * squares, end * squares[jnp.array([0, 2])], weight * relative[None]])
         return body, total + jnp.where(frame < count, squares, 0.0)
 
     def add_frames(frame: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
@@ -166,7 +171,7 @@ def _sum_square_errors(start: Callable, step: Callable, rows: Array, index: Arra
 
 def _differences(path: CandidatePath, recorded: Any, at: Any, numpy: ModuleType) -> list[Any]:
     """Computes the differences of the fields COMPARED: leaves of `path` less rows `at` of the recorded ones, the yaw wrapped."""
-    targets = {name: getattr(recorded, name)[at] for name in COMPARED}
+    targets = {name: numpy.asarray(getattr(recorded, name))[at] for name in COMPARED}
     targets["steer"] = targets["steer"][..., None]  # of both front wheels
     errors = {name: getattr(path, name) - target for name, target in targets.items()}
     errors["yaw"] = numpy.arctan2(numpy.sin(errors["yaw"]), numpy.cos(errors["yaw"]))
@@ -174,7 +179,7 @@ def _differences(path: CandidatePath, recorded: Any, at: Any, numpy: ModuleType)
 
 
 def make_scorer(simulator: Simulator, batch: ManoeuvreBatch, *, width: int) -> Callable[[np.ndarray, Sequence[int]], np.ndarray]:
-    """Makes the function (rows [N, P], manoeuvres) -> squared errors [N, M, 8] of every candidate on every manoeuvre.
+    """Makes the function (rows [N, P], manoeuvres) -> squared errors [N, M, 9] of every candidate on every manoeuvre.
 
     It simulates `width` pairs at a time, sorted by length: one compilation for all, and a chunk runs no longer than its longest manoeuvre.
     """
@@ -197,21 +202,30 @@ def make_scorer(simulator: Simulator, batch: ManoeuvreBatch, *, width: int) -> C
     return score
 
 
+def trace_pairs(
+    simulator: Simulator, rows: Float[np.ndarray, "N P"], index: Int[np.ndarray, " N"], batch: ManoeuvreBatch, *, width: int
+) -> CandidatePath:
+    """Traces pairs, `width` or TRACE_WIDTH at a time: one compilation for all. Leaves [N, T, ...] are on the host."""
+    width, chunks = min(width, TRACE_WIDTH), []
+    for begin in range(0, len(rows), width):
+        pairs = np.resize(np.arange(begin, min(begin + width, len(rows))), width)  # the last chunk repeats itself
+        path = simulator.trace(jnp.asarray(rows[pairs], jnp.float32), jnp.asarray(index[pairs], jnp.int32), batch)
+        chunks.append(jax.tree.map(np.asarray, path))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(rows)], *chunks)
+
+
 def residuals(
-    path: CandidatePath, batch: ManoeuvreBatch, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "8"]
+    path: CandidatePath, batch: ManoeuvreBatch, index: Sequence[int] | np.ndarray, weights: Float[np.ndarray, "9"]
 ) -> Float[np.ndarray, "*n R"]:
     """Computes the residuals of traced manoeuvres [M, T], flat: their squares sum to the loss of `optimization.losses`."""
     rows = np.asarray(index)
-    count, frame = np.asarray(batch.frames)[rows][:, None], np.arange(batch.yaw.shape[1])[None]
-    end, mean = frame == count - 1, np.where(frame < count, 1.0 / np.sqrt(count), 0.0)
-    as_double = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, float))
-    position, yaw, pace, yaw_rate, spin, steer = _differences(as_double(path), as_double(batch), rows, np)
-    columns = [
-        (mean, position), (mean, yaw), (mean, pace), (mean, yaw_rate), (mean, spin / 2.0), (mean, steer / np.sqrt(2.0)),
-        (end, position), (end, pace),
-    ]  # fmt: skip
-    parts = []
-    for weight, (per_frame, error) in zip(weights, columns, strict=True):
-        error = error if error.ndim == 3 else error[..., None]
-        parts.append((np.sqrt(weight / len(rows)) * np.asarray(per_frame, float)[..., None] * error).ravel())
-    return np.concatenate(parts)
+    count = np.asarray(batch.frames)[rows]
+    frame, last = np.arange(count.max()), (np.arange(len(rows)), count - 1)
+    mean = np.where(frame < count[:, None], 1.0 / np.sqrt(count)[:, None], 0.0)
+    used = jax.tree.map(lambda leaf: np.asarray(leaf[:, : len(frame)], float), path)
+    position, yaw, pace, yaw_rate, spin, steer = _differences(used, batch, (rows, slice(len(frame))), np)
+    scale = np.asarray(batch.yaw_rate_scale, float)[rows][:, None]
+    per_frame = (position, yaw, pace, yaw_rate, spin / 2.0, steer / np.sqrt(2.0))
+    columns = [mean.reshape(*mean.shape, *[1] * (error.ndim - 2)) * error for error in per_frame]
+    columns += [position[last], pace[last], mean * scale * yaw_rate]
+    return np.concatenate([np.sqrt(weight / len(rows)) * column.ravel() for weight, column in zip(weights, columns, strict=True)])

@@ -6,11 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from scenefactory_jax.sysid.candidate_simulation import CandidatePath
+from scenefactory_jax.sysid.candidate_simulation import MIN_YAW_RATE, CandidatePath
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, ManoeuvreRecording
 
 STANDING_MPS = 0.1  # below it a car stands
-MIN_YAW_RATE = 0.02  # rad/s: of a recording whose yaw rates are compared
 
 
 class ManoeuvreErrors(NamedTuple):

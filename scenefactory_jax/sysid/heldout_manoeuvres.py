@@ -1,8 +1,9 @@
 """Standard tests that no fit may use: a car fitted to the training manoeuvres is evaluated on them.
 
-Open loop: steady circles (ISO 4138), step steer (ISO 7401), braking in a turn (ISO 7975), sine with dwell (FMVSS 126), straight and split
-stops. Closed loop: double lane changes (ISO 3888-1, 3888-2). There a driver steers the reference car, and its commands are the manoeuvre,
-replayed open loop as all others. The tests start at speed, with the wheels rolling. Numbers: `conf/sysid/manoeuvres.yaml`.
+Open loop: steady circles (ISO 4138), step steer (ISO 7401), braking in a turn (ISO 7975), straight and split stops, and three in which the
+reference car spins: sine with dwell (FMVSS 126), trail braking, and a swerve on wet road. Closed loop: double lane changes (ISO 3888-1,
+3888-2). There a driver steers the reference car, and its commands are the manoeuvre, replayed open loop as all others. The tests start at
+speed, with the wheels rolling. Numbers: `conf/sysid/manoeuvres.yaml`.
 """
 
 import math
@@ -54,8 +55,9 @@ def brake_in_turn(*, cases: list[list[float]], brakes: list[float], turn_s: floa
 
 
 def sine_with_dwell(
-    *, speed: float, amplitudes: list[float], frequency_hz: float, dwell_s: float, straight_s: float, after_s: float
-) -> list[Manoeuvre]:
+    *, family: str, speed: float, surface: str, amplitudes: list[float], frequency_hz: float, dwell_s: float, straight_s: float,
+    after_s: float,
+) -> list[Manoeuvre]:  # fmt: skip
     """FMVSS 126: one coasting sine of the steer that stays at its second peak for `dwell_s`."""
 
     def steer(time: float) -> float:
@@ -66,7 +68,18 @@ def sine_with_dwell(
     wave, suite = [steer(time) for time in times.tolist()], []
     for amplitude, (side, sign) in product(amplitudes, SIDES):
         segments = [(straight_s, 0.0, 0.0, 0.0), *((1.0 / RATE_HZ, 0.0, sign * amplitude * level, 0.0) for level in wave)]
-        suite.append(open_loop("sine_with_dwell", [amplitude, side], segments, speed=speed))
+        suite.append(open_loop(family, [amplitude, side], segments, speed=speed, surface=surface))
+    return suite
+
+
+def trail_braking(
+    *, speed: float, steer: float, throttle: float, turns_s: list[float], brake: float, straight_s: float, stop_s: float
+) -> list[Manoeuvre]:
+    """Brake hard at fixed steer, `turns_s` after the begin of the turn: the rear axle loses its grip."""
+    suite = []
+    for turn_s, (side, sign) in product(turns_s, SIDES):
+        turn = [(turn_s, throttle, sign * steer, 0.0), (stop_s, 0.0, sign * steer, brake)]
+        suite.append(open_loop("trail_braking", [turn_s, side], [(straight_s, 0.0, 0.0, 0.0), *turn], speed=speed))
     return suite
 
 

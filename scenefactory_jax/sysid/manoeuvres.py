@@ -1,7 +1,8 @@
 """Manoeuvres of one car as commands over time on a road of one or several surfaces, and recordings of them.
 
 The 139 of training are SceneFactory's suite: same families, grids, durations and numbers of frames, all from rest. Their numbers are in
-`conf/sysid/manoeuvres.yaml`, an entry a family; the functions here are those entries' targets.
+`conf/sysid/manoeuvres.yaml`, an entry a family; the functions here are those entries' targets. Of a left and a right turn that mirror each
+other, the fit uses one (`drop_mirrored`): car and reference car are symmetric.
 """
 
 import types
@@ -89,6 +90,20 @@ def sample_commands(segments: Sequence[Segment]) -> Float[np.ndarray, "T 3"]:
 def mirror(manoeuvre: Manoeuvre) -> Manoeuvre:
     """Exchanges left and right."""
     return manoeuvre._replace(controls=manoeuvre.controls * [1.0, -1.0, 1.0], left=manoeuvre.right, right=manoeuvre.left)
+
+
+def drop_mirrored(suite: Sequence[Manoeuvre]) -> list[Manoeuvre]:
+    """Keeps the first of each pair of manoeuvres that mirror each other."""
+    kept: dict[tuple[Any, ...], Manoeuvre] = {}
+    for manoeuvre in suite:
+        if _contents(mirror(manoeuvre)) not in kept:
+            kept[_contents(manoeuvre)] = manoeuvre
+    return list(kept.values())
+
+
+def _contents(manoeuvre: Manoeuvre) -> tuple[Any, ...]:
+    controls = manoeuvre.controls + 0.0  # no negative zeros
+    return manoeuvre.speed, controls.tobytes(), manoeuvre.edges.tobytes(), manoeuvre.left.tobytes(), manoeuvre.right.tobytes()
 
 
 def straight_accel(
@@ -200,15 +215,33 @@ def chirp_steer(
     ]
 
 
+def frequency_response(*, cases: list[list[float]], frequencies: list[float], steer_s: float) -> list[Manoeuvre]:
+    """ISO 7401, sinusoidal steering of a small amplitude at constant speed.
+
+    Args:
+        cases: [speed, steer, throttle] each, the throttle such that the speed stays about the same.
+        frequencies: Hz; whole periods fit into the second half of `steer_s`.
+    """
+    times, suite = np.arange(round(steer_s * RATE_HZ)) / RATE_HZ, []
+    for (speed, amplitude, throttle), frequency in product(cases, frequencies):
+        segments = [(1.0 / RATE_HZ, throttle, amplitude * np.sin(2 * np.pi * frequency * t), 0) for t in times]
+        suite.append(open_loop("frequency_response", [speed, f"{frequency:g}Hz"], segments, speed=speed))
+    return suite
+
+
 def handling_limit(
-    *, speeds: list[float], surfaces: list[str], straight_s: float, ramp_s: float, level_s: float, hold_s: float, stop_s: float
-) -> list[Manoeuvre]:
-    """Steering that grows to full lock at speed, then full brakes. The published suite has few speeds above 8 m/s and does not show the
-    tyres' friction limit on every surface."""
+    *, speeds: list[float], surfaces: list[str], straight_s: float, ramp_s: float, level_s: float, hold_s: float, exit_s: float,
+    stop_s: float,
+) -> list[Manoeuvre]:  # fmt: skip
+    """Steering that grows to full lock at speed, zero steering for `exit_s`, then full brakes.
+
+    The published suite has few speeds above 8 m/s, and does not reach the tyres' friction limit on every surface. Brakes while the car
+    still turns would decide by one rear wheel whether it spins; spins are held out.
+    """
     suite = []
     for speed, surface, (side, sign) in product(speeds, surfaces, SIDES):
         ramp = [(level_s, 0, sign * steer, 0) for steer in np.linspace(0.0, 1.0, round(ramp_s / level_s))]
-        segments = [(straight_s, 0, 0, 0), *ramp, (hold_s, 0, sign, 0), (stop_s, 0, 0, 1.0)]
+        segments = [(straight_s, 0, 0, 0), *ramp, (hold_s, 0, sign, 0), (exit_s, 0, 0, 0), (stop_s, 0, 0, 1.0)]
         suite.append(open_loop("limit", [speed, surface, side], segments, speed=speed, surface=surface))
     return suite
 

@@ -184,7 +184,7 @@ def rates(state: Float[np.ndarray, "29"], time: float, vehicle: Vehicle, command
     spins = x[SPIN]
     rolling = 0.0 if abs(sideways) > SLIDE else min(max(2.0 - forward / CREEP, 0.0), 1.0)
     if rolling < 1.0:
-        extra = _floor(p, x)
+        extra = missing_speed(p, x)
         x[FORWARD] += extra
     else:
         extra, x[FORWARD] = 0.0, max(-0.9 * CREEP, min(forward, 0.9 * CREEP))
@@ -242,7 +242,7 @@ def _wheel_speeds(p: Body, angle: float, forward: float, yaw_rate: float, sidewa
 
 
 @no_type_check  # called thousands of times a simulated second
-def _floor(p: Body, x: list[float]) -> float:
+def missing_speed(p: Body, x: list[float]) -> float:
     """Computes the forward speed to add to car and wheels, at the same sliding, so that the model divides by no speed below FLOOR."""
     swing, angle = 0.5 * abs(x[YAW_RATE]), x[STEER]
     across = (x[SIDEWAYS] + p.a * x[YAW_RATE]) * math.sin(angle)

@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.sysid.candidate_simulation import TERMS
 from scenefactory_jax.sysid.parameter_space import Space, from_unit_box, to_unit_box
 
-Score = Callable[[Float[np.ndarray, "N P"], Sequence[int]], Float[np.ndarray, "N M 8"]]  # (rows, manoeuvres) -> squared errors
+Score = Callable[[Float[np.ndarray, "N P"], Sequence[int]], Float[np.ndarray, "N M 9"]]  # (rows, manoeuvres) -> squared errors
 
 
 class Stage(NamedTuple):
@@ -36,20 +36,20 @@ class Outcome(NamedTuple):
     name: str
     best: Float[np.ndarray, " P"]
     loss: float
-    terms: Float[np.ndarray, "8"]  # weighted, mean over manoeuvres: they sum to the loss
+    terms: Float[np.ndarray, "9"]  # weighted, mean over manoeuvres: they sum to the loss
     start_loss: float
     evaluations: int
     history: Float[np.ndarray, "G 3"]  # per generation: best so far, best and median of the generation
     seconds: float
 
 
-def losses(terms: Float[np.ndarray, "*n M 8"], weights: Mapping[str, float]) -> Float[np.ndarray, "*n"]:
+def losses(terms: Float[np.ndarray, "*n M 9"], weights: Mapping[str, float]) -> Float[np.ndarray, "*n"]:
     """Computes the mean over manoeuvres of the weighted squared errors; infinite where they are not finite."""
     loss = (terms * weight_row(weights)).sum(-1).mean(-1)
     return np.where(np.isfinite(loss), loss, np.inf)
 
 
-def weight_row(weights: Mapping[str, float]) -> Float[np.ndarray, "8"]:
+def weight_row(weights: Mapping[str, float]) -> Float[np.ndarray, "9"]:
     """Arranges the weights in the order of `TERMS`.
 
     Raises:

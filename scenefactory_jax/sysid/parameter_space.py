@@ -43,15 +43,15 @@ class SearchRange:
             raise ConfigError(f"start: expected a number in {self.range}, got {self.start:g}")
 
 
-def make(ranges: Mapping[str, Any]) -> Space:
+def make(ranges: Mapping[str, Any], *, where: str = "sysid.space") -> Space:
     """Makes the space of a config: name -> `SearchRange`.
 
     Raises:
         ConfigError: a name that is neither a number of the car nor a surface's friction, or a bad range, scale or start.
     """
     valid = [*(name for name in CarParameters.__dataclass_fields__ if name not in ("inertia", "wheel_inertia")), *FRICTION]
-    schema.check_names(ranges, valid, where="sysid.space", required=[])
-    entries = [schema.read(entry, SearchRange, where=f"sysid.space.{name}") for name, entry in ranges.items()]
+    schema.check_names(ranges, valid, where=where, required=[])
+    entries = [schema.read(entry, SearchRange, where=f"{where}.{name}") for name, entry in ranges.items()]
     low, high, start = np.array([(*entry.range, entry.start) for entry in entries], float).reshape(-1, 3).T
     return Space(tuple(ranges), low, high, np.array([entry.scale == "log" for entry in entries], bool), start)
 

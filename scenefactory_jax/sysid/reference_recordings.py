@@ -15,12 +15,15 @@ from scenefactory_jax.sysid import multibody_model
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, Manoeuvre, ManoeuvreRecording
 from scenefactory_jax.sysid.multibody_model import ReferenceVehicle, Vehicle
 
+SLIDING_MPS = 2.0  # of a car whose slide is compared
 STATE_FLOOR = 1e-3  # absolute tolerance over the relative one: states count as at least this large
 MAX_STEPS = 50_000  # of the integrator between two frames
 
 
 def record(manoeuvre: Manoeuvre, *, reference: ReferenceVehicle) -> ManoeuvreRecording:
     """Simulates the reference car on a manoeuvre, open loop; arguments and result may cross processes.
+
+    The recording ends where the reference car is not valid any more, see `count_valid_frames`.
 
     Raises:
         ConfigError: CommonRoad's package is missing.
@@ -33,7 +36,23 @@ def record(manoeuvre: Manoeuvre, *, reference: ReferenceVehicle) -> ManoeuvreRec
     for first, last in zip([0, *changes], [*changes, len(manoeuvre.controls)], strict=True):
         states.append(advance(state, manoeuvre.controls[first], int(last - first), vehicle=vehicle, road=road))
         state = states[-1][-1]
-    return _read_states(manoeuvre, np.concatenate(states), vehicle=vehicle, road=road)
+    joined = np.concatenate(states)
+    frames = count_valid_frames(vehicle, joined)
+    return _read_states(manoeuvre._replace(controls=manoeuvre.controls[:frames]), joined[:frames], vehicle=vehicle, road=road)
+
+
+def count_valid_frames(vehicle: Vehicle, states: Float[np.ndarray, "T 29"]) -> int:
+    """Counts the frames before a wheel of a sliding car has no forward speed left: T if there is none.
+
+    The model divides the slip velocity of a tyre by the forward speed of its wheel. A car that spins so far that a wheel moves aside or
+    backwards is outside of it: after a trail braking at 25 m/s from 126 degrees on, where the braked rear wheels soon spin backwards at
+    209 rad/s.
+    """
+    speed = np.hypot(states[:, multibody_model.FORWARD], states[:, multibody_model.SIDEWAYS])
+    outside = [
+        v > SLIDING_MPS and multibody_model.missing_speed(vehicle.body, x) > 0.0 for v, x in zip(speed, states.tolist(), strict=True)
+    ]
+    return int(np.argmax(outside)) if any(outside) else len(states)
 
 
 def advance(

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import sys
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
-from scenefactory_jax.sysid import heldout_manoeuvres, manoeuvres, multibody_model
+from scenefactory_jax.sysid import heldout_manoeuvres, manoeuvres, multibody_model, response_metrics
 from scenefactory_jax.sysid.manoeuvres import RATE_HZ, SURFACES, Manoeuvre, open_loop
 from scenefactory_jax.sysid.reference_recordings import load, make_road, record, save
 
@@ -91,6 +92,40 @@ def test_training_is_the_published_suite(training):
     assert brake[5 * 60 + 7 * 12].tolist() == pytest.approx([0.5, -0.7, 0.4])  # half way: throttle 1 - f, all of the steer, brake 0.8 f
     chirp = next(m for m in training if m.family == "chirp_steer").controls
     assert chirp[60 + 3 * 100, 1] == pytest.approx(0.3 * math.sin(2 * math.pi * 1.3 * 5.0))  # at 5 s f is 1.3 Hz
+
+
+def test_of_mirrored_manoeuvres_the_first_is_kept(training, unseen):
+    kept = manoeuvres.drop_mirrored(training)
+    assert len(kept) == 139 - (40 + 24 + 18) // 2 and not [m for m in kept if m.name.endswith("_right")]
+    assert [m.name for m in kept] == [m.name for m in training if not m.name.endswith("_right")]
+    assert not [m for m in manoeuvres.drop_mirrored(unseen) if m.name.endswith("_right")]
+    straight = drive((1.0, 0.5, 0.0, 0.0))
+    assert manoeuvres.drop_mirrored([straight, straight._replace(name="again")]) == [straight]
+
+
+def test_sines_have_their_frequency_and_whole_periods_to_fit(entries):
+    suite = manoeuvres.make_suite(entries["extra"], builtins=manoeuvres, where="extra")
+    sines = [m for m in suite if m.family == response_metrics.SINE_FAMILY]
+    assert {(m.speed, response_metrics.find_frequency(m.controls[:, 1])) for m in sines} == set(
+        product((10.0, 20.0, 30.0), (0.5, 1.0, 2.0))
+    )
+    for m in sines:
+        steer, hz = m.controls[:, 1], response_metrics.find_frequency(m.controls[:, 1])
+        assert len(steer) / 2 / RATE_HZ * hz % 1.0 == 0.0
+        later = np.roll(steer, round(0.125 * RATE_HZ / hz))  # by 45 degrees
+        response = response_metrics.fit_sine(0.5 * later + 0.01, hz) / response_metrics.fit_sine(steer, hz)
+        assert abs(response) == pytest.approx(0.5, rel=0.02) and np.degrees(np.angle(response)) == pytest.approx(-45.0, abs=6.0)
+
+
+def test_a_recording_ends_where_the_model_ends(teacher):
+    """Braking hard in a turn at 25 m/s: the car spins until its rear wheels have no forward speed left, at 20 to 50 km/h."""
+    m = heldout_manoeuvres.trail_braking(
+        speed=25.0, steer=0.08, throttle=0.1, turns_s=[0.3], brake=0.8, straight_s=0.2, stop_s=4.0
+    )[0]  # fmt: skip
+    r = record(m, reference=teacher)
+    assert len(r.yaw) == len(r.manoeuvre.controls) < len(m.controls)
+    assert 90.0 < np.degrees(r.yaw[-1]) < 150.0 and 5.0 < r.speed[-1] < 15.0
+    assert r.wheel_spin.min() > -5.0, "no wheel spins backwards yet"
 
 
 def test_heldout_manoeuvres_differ_from_training(training, unseen):

@@ -1,7 +1,6 @@
 """Search and refinement on problems with known solutions, and the car on recordings of itself."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -12,6 +11,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.sysid import candidate_simulation, error_metrics, identification, optimization, parameter_space
 from scenefactory_jax.sysid.candidate_simulation import TERMS
 from scenefactory_jax.sysid.manoeuvres import Manoeuvre, ManoeuvreRecording
+from scenefactory_jax.visualization.report import sysid_report
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -157,9 +157,20 @@ def lesson(config):
 
 
 def traced(simulator, row, plan):
+    """The motion of one candidate on all manoeuvres, two pairs at a time."""
     index = np.arange(len(plan.frames))
-    rows = jnp.asarray(np.tile(row, (len(index), 1)), jnp.float32)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), simulator.trace(rows, jnp.asarray(index), plan))
+    path = candidate_simulation.trace_pairs(simulator, np.tile(row, (len(index), 1)), index, plan, width=2)
+    return jax.tree.map(lambda leaf: leaf.astype(float), path)
+
+
+def test_pairs_are_traced_in_chunks(lesson):
+    simulator, begin, own = lesson
+    plan = candidate_simulation.stack_recordings(own)
+    rows = np.stack([begin, begin, begin + np.array([100.0, 0.0])])
+    path = candidate_simulation.trace_pairs(simulator, rows, np.array([0, 1, 0]), plan, width=2)
+    one = traced(simulator, begin, plan)
+    assert path.yaw.shape == (3, 24) and np.array_equal(path.position[:2], one.position.astype(np.float32))
+    assert path.pace[2, 11] > path.pace[0, 11] + 0.01, "the third pair is the one with the stronger engine"
 
 
 def test_a_car_on_its_own_recording_makes_no_error_and_another_does(lesson, config):
@@ -218,7 +229,6 @@ def test_stages_continue_each_other_and_resume_with_equal_settings(tmp_path, cap
         terms[..., 0] = ((parameter_space.to_unit_box(where, rows) - parameter_space.to_unit_box(where, target)) ** 2).sum(-1)[:, None]
         return terms
 
-    (tmp_path / "stages").mkdir()
     found = identification.search_stages(config, tmp_path, stand_ins(), where, score)
     assert [outcome.name for outcome in found] == list(config["sysid"]["stages"])
     losses = [loss for outcome in found[:4] for loss in (outcome.start_loss, outcome.loss)]
@@ -226,7 +236,7 @@ def test_stages_continue_each_other_and_resume_with_equal_settings(tmp_path, cap
     tuned = [name for name, a, b in zip(where.names, where.start, found[0].best, strict=True) if a != b]
     assert set(tuned) <= set(config["sysid"]["stages"]["longitudinal"]["tuned"]) and tuned
     assert asked[0] == (1, (0,)) and asked[3] == (1, (1,)) and asked[6] == (1, (2, 3)) and asked[9] == (1, (0, 1, 2, 3))
-    restored = [where.names.index(name) for name in config["sysid"]["stages"]["brake_preservation"]["tuned"]]
+    restored = [i for i, name in enumerate(where.names) if name in config["sysid"]["stages"]["brake_preservation"]["tuned"]]
     again = found[3].best.copy()
     again[restored] = found[0].best[restored]
     gap = parameter_space.to_unit_box(where, again) - parameter_space.to_unit_box(where, target)
@@ -238,21 +248,26 @@ def test_stages_continue_each_other_and_resume_with_equal_settings(tmp_path, cap
     other = {**config, "sysid": {**config["sysid"], "budget": {**budget, "surface": [4, 3]}}}
     identification.search_stages(other, tmp_path, stand_ins(), where, score)
     assert asked[0] == (1, (2, 3)), "the first two stages stay, the third is searched anew"
-    assert len(list((tmp_path / "stages").iterdir())) == 5
+    assert len(list(tmp_path.iterdir())) == 5
 
 
-@pytest.mark.parametrize(
-    "override, message",
-    [
-        ("sysid.stages.steering.tuned=[sterring_limit]", r"sysid.stages.steering.tuned: 'sterring_limit'; valid: drive_torque"),
-        ("sysid.stages.surface.families=[ice]", r"sysid.stages.surface.families: \['ice'\]; sysid.every=16 leaves none"),
-    ],
-)
-def test_stages_with_unknown_names_are_errors(tmp_path, override, message):
-    config = load_config("sysid", override, "sysid.budget={longitudinal: [2,1], steering: [2,1], surface: [2,1]}")
+def test_a_structure_tunes_the_parameters_of_a_stage_that_it_has():
+    settings = load_config("sysid")["sysid"]
+    published = parameter_space.make(settings["published_space"])
+    stage, _ = identification._make_stage("steering", settings["stages"]["steering"], settings, published, stand_ins())
+    assert (
+        set(stage.tuned) == {*settings["stages"]["steering"]["tuned"]} & {*settings["published_space"]} and "tyre_shape" not in stage.tuned
+    )
+    every, _ = identification._make_stage("refinement", settings["stages"]["refinement"], settings, published, stand_ins())
+    assert every.tuned == published.names
+
+
+def test_stages_with_unknown_names_are_errors(tmp_path):
+    with pytest.raises(ConfigError, match=r"sysid.stages.steering.tuned: 'sterring_limit'; valid: drive_torque.*yaw_damping"):
+        identification.identify(load_config("sysid", "sysid.stages.steering.tuned=[sterring_limit]"), tmp_path)
+    config = load_config("sysid", "sysid.stages.longitudinal.families=[ice]")
     where = parameter_space.make(config["sysid"]["space"])
-    (tmp_path / "stages").mkdir()
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=r"sysid.stages.longitudinal.families: \['ice'\]; sysid.every=7 leaves none"):
         identification.search_stages(config, tmp_path, stand_ins(), where, lambda rows, _: np.ones((len(rows), 1, len(TERMS))))
 
 
@@ -262,9 +277,10 @@ def test_the_whole_command(tmp_path):
     config = load_config("sysid", f"out={tmp_path}", "sysid.every=40", "sysid.refine.rounds=1", "workers=2", f"sysid.budget={budget}")
     found = sysid(config)
     written = {path.name for path in tmp_path.iterdir()}
-    figures = {"search.png", "slices.png", "heldout.png", "paths.png"}
+    figures = {f"{name}.png" for name in sysid_report.PICTURES}
     assert written == {"training.npz", "extra.npz", "heldout.npz", "stages", "result.json", "fitted.yaml", "sysid.md"} | figures
-    assert found["refined"]["loss"] <= found["refined"]["start_loss"] and set(found["cars"]) == {"fitted", "default", "published"}
+    assert all(fit["refined"]["loss"] <= fit["refined"]["start_loss"] for fit in found["fits"].values())
+    assert set(found["cars"]) == {"fitted", "start", "published"} and set(found["responses"]) == {"teacher", *found["cars"]}
     car = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["car"]
     fitted = load_config("train", *(f"dynamics.car.{name}={value}" for name, value in car.items()))["dynamics"]["car"]
     assert all(fitted[name] == value for name, value in car.items()), "the fitted parameters are a valid car"
