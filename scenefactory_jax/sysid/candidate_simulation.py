@@ -103,7 +103,7 @@ def make_simulator(dynamics: Mapping[str, Any], space: Space, friction: Sequence
     compiled = articulated_car.compile_car(car, solver, abs_enabled=dynamics["abs"], physics_dt=1.0 / physics_hz, control_dt=1.0 / RATE_HZ)
     contact = collision.make_contact(dynamics["contact"], height=car.height, step_s=collision.REPORT_S)
     zero, size = np.zeros((1, 1), np.float32), (car.length, car.width)
-    worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, zero[0], np.zeros(1, np.int32), size=size)
+    worlds = open_ground.make_open_ground(np.zeros((1, 1, 2)), zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
     empty = jax.tree.map(lambda leaf: leaf[0], worlds)
 
     def make_world(row: Array, index: Array, batch: ManoeuvreBatch) -> tuple[Dynamics, Scene]:
