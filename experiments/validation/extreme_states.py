@@ -162,9 +162,9 @@ def _begin(
     size = (car.length, car.width)
     worlds = open_ground.make_open_ground(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
     scene = jax.tree.map(lambda leaf: leaf[0], worlds)
-    body = jax.jit(backend.init)(jax.random.key(0), scene)
     walls = np.flatnonzero(["wall" in case.name for case in crowd])
-    scene = replace(scene, traffic=_walls(lanes[walls], wall_m, height=float(body.qpos[0, 2])))
+    scene = replace(scene, traffic=_walls(lanes[walls], wall_m, height=car.wheel_radius - car.wheel_height))  # contacts remember every pair
+    body = jax.jit(backend.init)(jax.random.key(0), scene)
     qpos, qvel = np.array(body.qpos), np.array(body.qvel)
     roll, pitch = (np.array([getattr(case, name) for case in crowd]) / 2 for name in ("roll", "pitch"))
     turn = [np.cos(roll) * np.cos(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch), -np.sin(roll) * np.sin(pitch)]

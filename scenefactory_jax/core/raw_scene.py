@@ -12,7 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from scenefactory_jax.core.types import RoadUser
 
-LightState = Literal["unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution"]
+LightState = Literal[
+    "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution"
+]
 LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)  # the order of WOMD's TrafficSignalLaneState.State (map.proto)
 
 

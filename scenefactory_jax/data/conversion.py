@@ -138,7 +138,9 @@ def convert_file(item: tuple[int, Path], *, root: Path, out: Path, tools: SceneT
     return SourceFileResult(_name(path, root), part=part, rows=tuple(rows), **list_entries(rejects), account=count_results(trials))
 
 
-def complete(raw: RawScene, *, check: Check, rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]) -> RawScene:
+def complete(
+    raw: RawScene, *, check: Check, rebuild: Callable[[RawScene], RawScene], gate: Callable[[RawScene], RawScene]
+) -> RawScene:
     """The scene with lane links where its source has none, without what the quality rules leave out: the `refine` of a bank."""
     check(raw)  # refuses what the geometry of the next two cannot use
     return gate(rebuild(raw))

@@ -158,14 +158,14 @@ def compute_forces(
     """Computes the horizontal force and yaw torque on each car's box centre, and the largest force of a single pair, N and N m.
 
     The stiffness of a pair scales with its reduced mass over that of two cars: 1 between cars, 2 against a wall, little against a
-    pedestrian. So k dt^2 / m is the same for every pair: 0.07 at 1e6 N/m and 120 Hz (m the reduced mass), and 0.26 off centre
+    pedestrian. So k dt^2 / m is the same for every pair: 0.008 at 1.2e5 N/m and 120 Hz (m the reduced mass), and 0.03 off centre
     (`OFF_CENTRE`). Semi-implicit Euler is stable while that is below 4.
 
     Args:
         cars: boxes that are not present, have no size, or have a state that is not finite take no part. Two whose elevations differ by
             more than `height` do not touch.
         neighbours: they follow their path and feel no force. If their mass is finite, the force is limited to what gives them the car's
-            speed within `momentum_transfer_s`.
+            speed within `momentum_transfer_s`, and ends after that time.
     """
     count, beside = neighbours.rows.shape
     shared: dict[str, Any] = {"law": law, "height": height, "step_s": step_s}
@@ -235,7 +235,9 @@ def _compute_pair_forces(
     push = spring * jnp.maximum(1.0 + law.dissipation * closing, 0.0) / implicit
     reduced = 0.5 * law.mass * scale
     if limited:
-        limit = 0.5 * reduced * jnp.maximum(closing, 0.0) / law.momentum_transfer_s  # per contact point
+        # per contact point; at a constant closing speed, the depth that it reaches in that time says when it is over
+        approach = jnp.maximum(closing, 0.0)
+        limit = jnp.where(depths < approach * law.momentum_transfer_s, 0.5 * reduced * approach / law.momentum_transfer_s, 0.0)
         push = jnp.where(jnp.isfinite(second.mass)[:, None], jnp.minimum(push, limit), push)
     drag = jnp.clip(0.125 * reduced / step_s * sliding, -law.friction * push, law.friction * push)
     force = push[..., None] * normal[:, None] - drag[..., None] * tangent[:, None]

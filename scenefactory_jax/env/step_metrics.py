@@ -98,7 +98,9 @@ def _find_non_finite(state: State) -> Bool[Array, " A"]:
     return ~(is_finite(state.motion) & spawning.find_usable(state.agents))
 
 
-def _is_out_of_bounds(motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig) -> Bool[Array, " A"]:
+def _is_out_of_bounds(
+    motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig
+) -> Bool[Array, " A"]:
     """Whether a car tipped over or fell, is outside the scene, or is further from its start than any way to its goal requires."""
     fell = (motion.upright < config.upright_min) | (motion.position[:, 2] < config.height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * config.scene_size_m

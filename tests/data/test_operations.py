@@ -392,7 +392,10 @@ def test_a_stopped_conversion_is_told_beside_the_account(tmp_path, capsys):
     assert json.loads(told.out) == found and f"bank {bank.path}, whose conversion was stopped" in told.err
     command(bank, "op=select", "select.sample.count=1", f"out={tmp_path / 'sample'}")
     assert "whose conversion was stopped" in capsys.readouterr().err
-    assert "whose conversion was stopped" in scene_source.open_bank(tmp_path / "sample").description
+    assert (
+        "whose conversion was stopped"
+        in scene_source.open_bank(tmp_path / "sample").description
+    )
 
 
 def test_banks_are_judged_and_compared(town, tmp_path):

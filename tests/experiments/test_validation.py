@@ -1,5 +1,6 @@
 """The car in JAX against the stock MuJoCo engine at toy size, cars that collide, and the experiments' own ability to fail."""
 
+
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -63,12 +63,6 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
         dt=jnp.float32(0.1),
     )
     return Scene(
-        road=road_of([lane, *edges]),
-        lanes=road_of([lane]),
-        edges=road_of(edges),
-        agents=agents,
-        log=log,
-        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)),
-        traffic_log=make_empty_log(steps),
-        traffic=make_empty_boxes(),
+        road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
+        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)), traffic_log=make_empty_log(steps), traffic=make_empty_boxes(),
     )

@@ -1,59 +1,47 @@
-"""What MJX's stages make of a car, as the `Problem` of `contact_solver`."""
+"""What MJX's stages make of a car, as the `Problem` of `contact_solver`, and states near and far from rest."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 from scenefactory_jax.dynamics.articulated import contact_solver
 from scenefactory_jax.dynamics.articulated import model as models
+from scenefactory_jax.dynamics.articulated import state as states
 from scenefactory_jax.dynamics.articulated.mjx_backend import MjxCar
 
 
-def taken_apart(mass, force, jacobian, reference, weight, mu, brake, *, stages: MjxCar, friction_ratio, rotation=None):
-    """MuJoCo's M, forces, J, a_ref and D as a `contact_solver.Problem`.
-
-    Args:
-        brake: dry friction of the wheels, whose rows come first.
-        rotation: of the chassis, to see the linear motion in its axes; None leaves it in the world's.
-    """
-    own, tyre, brakes = columns(stages), stages.rows, np.arange(4)
-    if rotation is not None:
-        turn = jax.scipy.linalg.block_diag(rotation, jnp.eye(mass.shape[0] - 3))
-        mass, force, jacobian = turn.T @ mass @ turn, turn.T @ force, jacobian @ turn
-    padded = jnp.pad(mass, (0, 1)) + np.diag(np.eye(mass.shape[0] + 1)[-1])  # the missing joint: one on the diagonal
+def problem_of_mjx(stages: MjxCar, fields, qpos, qvel, applied) -> contact_solver.Problem:
+    """MuJoCo's M, forces, J, a_ref and D under generalised forces, the chassis' linear motion in its axes."""
+    model, data = stages.model.replace(**fields), stages.data.replace(qpos=qpos, qvel=qvel, qfrc_applied=applied)
+    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+        data = stage(model, data)
+    rows, rotation = data._impl, jnp.stack([jnp.stack(row) for row in states.rotation_matrix(qpos[3:7])])
+    turn = jax.scipy.linalg.block_diag(rotation, jnp.eye(13))
+    mass, force, jacobian = turn.T @ rows.M @ turn, turn.T @ data.qfrc_smooth, rows.efc_J[stages.rows] @ turn
+    own = columns(stages)
+    padded = jnp.pad(mass, (0, 1)) + np.diag(np.eye(17)[-1])  # the missing joint: one on the diagonal
     padded_rows, forces = jnp.pad(jacobian, ((0, 0), (0, 1))), jnp.pad(force, (0, 1))
-    base, three = range(contact_solver.BASE), range(contact_solver.WHEEL)
+    base, three, wheel = range(contact_solver.BASE), range(contact_solver.WHEEL), np.arange(4)
     return contact_solver.Problem(
         base=[[mass[i, j] for j in base] for i in base],
         across=[[padded[i, own[:, k]] for k in three] for i in base],
         wheel=[[padded[own[:, j], own[:, k]] for k in three] for j in three],
         force_base=[force[i] for i in base],
         force_wheel=[forces[own[:, k]] for k in three],
-        tyre=contact_solver.TyreRows(
-            jacobian=[[padded_rows[tyre[:, r], i] for i in base] + [padded_rows[tyre[:, r], own[:, k]] for k in three] for r in range(3)],
-            reference=[reference[tyre[:, r]] for r in range(3)],
-            weight=[weight[tyre[:, r]] for r in range(3)],
-            mu=mu,
-            cone=mu / friction_ratio**0.5,
+        rows=contact_solver.NormalRows(
+            jacobian=[*(padded_rows[:, i] for i in base), *(padded_rows[wheel, own[:, k]] for k in three)],
+            reference=rows.efc_aref[stages.rows],
+            weight=rows.efc_D[stages.rows],
         ),
-        brake=contact_solver.BrakeRows(reference[brakes], weight[brakes], brake),
     )
 
 
 def columns(stages: MjxCar) -> np.ndarray:
     """[4, 3] degrees of freedom of the wheels: suspension, spin, steering; 16, one past the last, where a wheel has none."""
-    own = np.full((4, contact_solver.WHEEL), 16)
-    own[:, 0], own[:, contact_solver.SPIN], own[:2, 2] = stages.addresses.suspension_v, stages.addresses.spin_v, stages.addresses.steer_v
+    own, at = np.full((4, contact_solver.WHEEL), 16), stages.addresses
+    own[:, 0], own[:, 1], own[:2, 2] = at.suspension_v, at.spin_v, at.steer_v
     return own
-
-
-def newton(*arrays, stages: MjxCar, friction_ratio, iterations, line_search):
-    """`contact_solver.solve_contacts` from rest on MuJoCo's arrays; acceleration [16] and contact forces [4, 3] in MuJoCo's order."""
-    problem = taken_apart(*arrays, stages=stages, friction_ratio=friction_ratio)
-    zero = contact_solver.Acceleration([jnp.zeros(())] * contact_solver.BASE, [jnp.zeros(4)] * contact_solver.WHEEL)
-    found, force = contact_solver.solve_contacts(problem, zero, iterations=iterations, line_search=line_search)
-    flat = jnp.zeros(17).at[columns(stages)].set(jnp.stack(found.wheel, axis=-1)).at[: contact_solver.BASE].set(jnp.stack(found.base))
-    return flat[:16], jnp.stack(force, axis=-1)
 
 
 def random_states(model, car, *, count, seed):

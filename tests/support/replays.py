@@ -41,15 +41,8 @@ def _dressed(recording: Recording) -> Recording:
     position = np.stack([np.stack([ahead, ahead * 0 + 3.0], -1), np.tile([20.0, 7.0], (STEPS, 1))], axis=1)
     present = np.stack([np.arange(STEPS) >= STEPS // 2, np.ones(STEPS, bool)], axis=1)
     others = unchecked(
-        Boxes,
-        position=np.stack([position] * 2),
-        elevation=zero,
-        yaw=zero,
-        velocity=np.zeros((2, STEPS, 2, 2)),
-        yaw_rate=zero,
-        size=np.broadcast_to([4.5, 2.0], (2, STEPS, 2, 2)),
-        mass=zero,
-        present=np.stack([present] * 2),
+        Boxes, position=np.stack([position] * 2), elevation=zero, yaw=zero, velocity=np.zeros((2, STEPS, 2, 2)), yaw_rate=zero,
+        size=np.broadcast_to([4.5, 2.0], (2, STEPS, 2, 2)), mass=zero, present=np.stack([present] * 2),
     )
     return changed(recording, wheels=wheels, traffic=others)
 

@@ -1,6 +1,6 @@
 """Runs in processes of its own: a few iterations of PPO on so many devices in so many shards; prints what was learnt as JSON.
 
-python sharding.py DEVICES:SHARDS[,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
+    python sharding.py DEVICES:SHARDS[,DEVICES:SHARDS ...] [COORDINATOR PROCESSES INDEX]
 """
 
 import itertools

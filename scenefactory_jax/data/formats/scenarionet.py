@@ -141,7 +141,9 @@ def _track(track: Node, number: int, steps: int) -> Track:
     )
 
 
-def _roads(features: Node, ids: Mapping[str, int], outlines_are_edges: bool, dataset: str) -> tuple[list[Polyline], Counter[str]]:
+def _roads(
+    features: Node, ids: Mapping[str, int], outlines_are_edges: bool, dataset: str
+) -> tuple[list[Polyline], Counter[str]]:
     """The features of the map, and the number of features of each type that WOMD has no map element for, such as sidewalks."""
     roads, left_out = [], Counter()
     for key, feature in features.entries(dict).items():

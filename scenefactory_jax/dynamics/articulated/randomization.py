@@ -21,8 +21,8 @@ WHERE = "dynamics.randomization"
 SCALE_WITH_FOOTPRINT = (  # every parameter with a newton, a kilogram or a watt in its unit
     "mass", "inertia", "wheel_mass", "wheel_inertia", "wheel_damping", "carrier_mass", "carrier_inertia", "knuckle_mass", "knuckle_inertia",
     "suspension_stiffness", "suspension_damping", "stop_stiffness", "steering_stiffness", "steering_damping", "steering_torque",
-    "steering_friction", "steering_inertia", "drive_torque", "drive_power", "brake_torque_front", "brake_torque_rear", "body_stiffness", "body_damping",
-    "lateral_damping", "yaw_damping", "rolling_torque", "air_drag",
+    "steering_friction", "steering_inertia", "drive_torque", "drive_power", "brake_torque_front", "brake_torque_rear", "body_stiffness",
+    "body_damping", "lateral_damping", "yaw_damping", "rolling_torque", "air_drag",
 )  # fmt: skip
 
 

@@ -74,7 +74,9 @@ class Motion(NamedTuple):
     present: Bool[np.ndarray, "L N"]
 
 
-def simulate(users: list[SimulatedUser], gates: Int[np.ndarray, "G L"], times: Float[np.ndarray, " L"], driver: DriverParameters) -> Motion:
+def simulate(
+    users: list[SimulatedUser], gates: Int[np.ndarray, "G L"], times: Float[np.ndarray, " L"], driver: DriverParameters
+) -> Motion:
     """Simulates all steps with constant accelerations within each step; `gates` are the states of stops and crosswalks."""
     simulation = Simulation(users, driver)
     log = []

@@ -18,7 +18,6 @@ CURVE_RAD = np.radians(20.0)  # a road with a larger range of yaw is a curve
 MIN_LANE_M = 6.0  # length of a lane before and behind a taper
 MIN_PARKING_ROAD_M = 40.0  # length of a road with parking spaces
 
-
 @dataclass(frozen=True)
 class RoadDimensions:
     """Dimensions of all roads of a town."""
@@ -51,7 +50,9 @@ def connect_ports(network: Network, first: Port, second: Port, via: list[Pose], 
     kind = "curve" if np.ptp(yaw) > CURVE_RAD else "straight"
     network.add_block("lane_drop" if min(changes) < 0 else "lane_gain" if max(changes) > 0 else kind)
     for curve, a, b in (((points, yaw), first, second), ((points[::-1], yaw[::-1] + np.pi), second, first)):
-        way = build_carriageway(network, curve, len(a.leaving), len(b.entering), street, dimensions, side=b.side, controlled=b.controlled)
+        way = build_carriageway(
+            network, curve, len(a.leaving), len(b.entering), street, dimensions, side=b.side, controlled=b.controlled
+        )
         network.link_slots([*a.leaving, a.cycles_leaving], [*([lane] for lane in way.start), way.cycles])
         network.link_slots([*([lane] for lane in way.end), way.cycles], [*b.entering, b.cycles_entering])
     if street.median == 0:
