@@ -92,15 +92,16 @@ def hunt_crossley_restitution(speed: float) -> float:
 
 
 def fast_encounters(
-    entry: Mapping[str, Any], *, physics_hz: float, count: int, seed: int, speed_min: float, speed_max: float, head_on_share: float,
-    miss_m: float, lead_s: float, seconds: float, friction: float,
+    entry: Mapping[str, Any], *, physics_hz: float, count: int, seed: int, speed_min: float, speed_max: float, closing_min: float,
+    head_on_share: float, miss_m: float, lead_s: float, seconds: float, friction: float,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Random encounters of two fast cars, recorded at every physics step.
 
-    The cars drive straight for one point, head on or from any direction. Without a contact their centres would come within `miss_m`, less
-    than half the width of a car. So a pair whose centres come that close has passed through each other.
+    The cars drive straight for one point, head on or from any direction. Cars that pass through each other come as close as
+    `passing_distance`: the boxes of others do not overlap by so much.
 
     Args:
+        closing_min: smallest relative speed, m/s; over `lead_s`, the cars are longer than their distance at the start.
         head_on_share: fraction of the encounters with opposite headings.
         miss_m: largest distance of the two paths, m.
         lead_s: time to the encounter, s.
@@ -112,13 +113,15 @@ def fast_encounters(
         whether all is finite.
     """
     rng, car = np.random.default_rng(seed), cars.read_parameters(entry)[0]
-    speed, aside = rng.uniform(speed_min, speed_max, (count, 2)), rng.uniform(-miss_m, miss_m, count)
-    heading = np.where(rng.random(count) < head_on_share, np.pi, rng.uniform(-np.pi, np.pi, count))
+    speed, aside = rng.uniform(speed_min, speed_max, (4 * count, 2)), rng.uniform(-miss_m, miss_m, (4 * count, 1))
+    heading = np.where(rng.random(4 * count) < head_on_share, np.pi, rng.uniform(-np.pi, np.pi, 4 * count))
     along = np.stack([np.cos(heading), np.sin(heading)], -1)
-    relative = speed[:, 1:] * along - np.stack([speed[:, 0], 0 * aside], -1)
-    across = np.stack([-relative[:, 1], relative[:, 0]], -1) / np.linalg.norm(relative, axis=-1, keepdims=True)
-    first = np.stack([-lead_s * speed[:, 0], 0 * aside], -1)
-    position = np.stack([first, aside[:, None] * across - lead_s * speed[:, 1:] * along], 1)
+    relative = speed[:, 1:] * along - speed[:, :1] * [1.0, 0.0]
+    closing = np.linalg.norm(relative, axis=-1)
+    chosen = np.flatnonzero(closing >= closing_min)[:count]
+    speed, aside, heading, along, relative, closing = (x[chosen] for x in (speed, aside, heading, along, relative, closing))
+    across = np.stack([-relative[:, 1], relative[:, 0]], -1) / closing[:, None]
+    position = np.stack([-lead_s * speed[:, :1] * [1.0, 0.0], aside * across - lead_s * speed[:, 1:] * along], 1)
     meet = meeting(entry, friction=friction, physics_hz=physics_hz, control_hz=physics_hz)
     run = meet(position, np.stack([0 * heading, heading], -1), speed, seconds=seconds)
     mass, flat = float(total_mass(car)), run.qvel[..., :2]
@@ -131,6 +134,11 @@ def fast_encounters(
         "energy_rise": (stored / stored[:, :1]).max(1) - 1.0,
         "momentum": change,
         "allowance": seconds * (2.0 * friction * mass * GRAVITY + air),
-        "closing": np.linalg.norm(relative, axis=-1),
+        "closing": closing,
         "finite": np.array(np.isfinite(run.qpos).all((1, 2, 3))),
     }
+
+
+def passing_distance(*, miss_m: float, speed_max: float, physics_hz: float) -> float:
+    """Computes how close the centres of cars that pass through each other come at the latest, at one of the recorded steps, m."""
+    return float(np.hypot(miss_m, speed_max / physics_hz))

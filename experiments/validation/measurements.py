@@ -109,7 +109,10 @@ def collisions(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "phases": own["grazes"]["phases"],
         "speed_max": own["fast"]["speed_max"],
         "miss_m": own["fast"]["miss_m"],
-        "tunnel_m": entry["car"]["width"] / 2.0,
+        "graze_s": own["grazes"]["seconds"],
+        "tunnel_m": impacts.passing_distance(
+            **{name: own["fast"][name] for name in ("miss_m", "speed_max")}, physics_hz=rates["physics_hz"]
+        ),
     }
 
 

@@ -59,7 +59,7 @@ def collisions(result: Result) -> Figure:
             y, angle, speed = grazed["case"]
             label = f"y {y:g} m, {np.rad2deg(angle):.0f}°, {speed:g} m/s"
             right.plot(np.arange(len(yaw)) / len(yaw), yaw, MARKERS[index], color=COLOURS[index], markersize=3.5, label=label)
-        right.set(xlabel="start, in ways of a physics step", title="Grazing hits: turn of the struck car, degrees")
+        right.set(xlabel="start, in ways of a physics step", title="Turn of a grazed car, degrees")
         right.margins(y=0.75)
         right.legend(fontsize=7, loc="upper right", ncols=2)
     return figure

@@ -281,13 +281,14 @@ def _collisions(result: Result, folder: Path) -> list[str]:
     passed = int((fast["distance_m"] < result["tunnel_m"]).sum())
     return [
         "## Collisions",
-        f"A grazing hit with its start shifted through one physics step in {result['phases']} parts: smallest and largest outcome.",
+        f"A grazing hit with its start shifted through one physics step in {result['phases']} parts: smallest and largest outcome "
+        f"after {result['graze_s']:g} s.",
         markdown.format_table(header, rows),
         _picture(folder, "collisions", "Restitution over speed; overlap; grazing hits by phase", figures.collisions(result)),
-        "The law of the force is that of Hunt and Crossley (1975); its restitution beside measurements on cars: `dynamics/collision.py`.",
+        "The law of the force is that of Hunt and Crossley (1975). `dynamics/collision.py` cites measurements of restitution on cars.",
         f"{count} random encounters of two cars at up to {result['speed_max']:g} m/s each, half of them head on, whose paths come within "
-        f"{result['miss_m']:g} m: in {passed} the centres come closer than {result['tunnel_m']:g} m, as those of cars that pass through "
-        f"each other would; the smallest distance is {fast['distance_m'].min():.2f} m. {int((fast['force'] > 0.0).sum())} have a contact. "
+        f"{result['miss_m']:g} m: in {passed} the centres come closer than {result['tunnel_m']:.2f} m, as those of cars that pass through "
+        f"each other do; the smallest distance is {fast['distance_m'].min():.2f} m. {int((fast['force'] > 0.0).sum())} have a contact. "
         f"The kinetic energy of both rises by at most {100 * fast['energy_rise'].max():.2g} %, and the momentum changes by at most "
         f"{(fast['momentum'] / fast['allowance']).max():.2f} of what tyres and air can do.",
     ]
