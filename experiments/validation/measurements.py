@@ -148,6 +148,7 @@ def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
         "speed": speed,
         "brake_limit_m": motion_laws.brake_limit_m(car, speed),
         "hold_s": settings["standing"]["hold_s"],
+        "split_speed": settings["split"]["speed"],
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
         "backends": {name: _obeys(config, name, car) for name in settings["backends"]},
         "patches": on_patches(config["dynamics"], config["weather"]["friction"]),

@@ -163,7 +163,9 @@ def split(result: Result) -> Figure:
                 label = NAMES.get(name, name) if not side else None
                 left.plot(found["time_s"], np.rad2deg(found["yaw"][side]), style, color=COLOURS[index], label=label)
         high, low = result["split_friction"]
-        left.set(title=f"Braking from {result['speed']:g} m/s, friction {high:g} and {low:g}", xlabel="time, s", ylabel="yaw, degrees")
+        left.set(
+            title=f"Braking from {result['split_speed']:g} m/s, friction {high:g} and {low:g}", xlabel="time, s", ylabel="yaw, degrees"
+        )
         left.plot([], [], "-", color=GREY, label="left wheels slippery")
         left.plot([], [], "--", color=GREY, label="right wheels slippery")
         left.legend()

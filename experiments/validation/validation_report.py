@@ -197,9 +197,10 @@ def _split(result: Result, folder: Path) -> Sequence[str]:
         name: [w for kind, w in zip(bend["surface"], bend["wide_m"], strict=True) if kind == name]
         for name in dict.fromkeys(bend["surface"])
     }
-    ways = ", ".join(f"{name} {' and '.join(f'{w:.1f}' for w in both)} m" for name, both in wide.items())
+    ways = ", ".join(f"{name} {' and '.join(f'{abs(w):.1f}' for w in both)} m" for name, both in wide.items())
     return [
-        f"Full brake with one side on friction {low:g}, the other on {high:g}: the car turns to the side that grips (left is positive).",
+        f"Full brake from {result['split_speed']:g} m/s with one side on friction {low:g}, the other on {high:g}: the car turns to the "
+        "side that grips (left is positive).",
         markdown.format_table(header, rows),
         _picture(folder, "split", "Yaw while braking on split friction", figures.split(result)),
         f"A patch of ice or snow in a bend carries the car off the dry car's circle (left and right turn): {ways}.",

@@ -90,7 +90,7 @@ def test_cornering_ends_at_the_grip(drive, car):
     limit = found["friction"][:, None] * G
     assert (found["lateral"] <= 1.05 * limit).all() and found["demand"][0, 1] > 5 * limit[0, 0]
     assert 0.8 < found["lateral"][0, 1] / limit[0, 0] < 1.05
-    assert found["yaw_ratio"][1, 0] == pytest.approx(1.0, abs=0.03) and found["yaw_ratio"][0, 1] < 0.2
+    assert found["yaw_ratio"][1, 0] == pytest.approx(1.0, abs=0.05) and found["yaw_ratio"][0, 1] < 0.2
     right = motion_laws.cornering(drive, steer=-0.5, **numbers)
     np.testing.assert_allclose(right["yaw_ratio"][1, 0], found["yaw_ratio"][1, 0], atol=1e-3)
 
