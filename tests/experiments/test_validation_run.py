@@ -170,7 +170,7 @@ def test_ice_pushes_wide_and_splits(entry):
 # ---- the command
 
 TOY = (  # as many cases, as long, as in test_validation: this program is compiled once for both
-    "parts=[drives,handling]", "validation.drives.draw.count=13", "validation.drives.draw.seconds=2.0",
+    "parts=[drives,handling]", "validation.drives.draw.count=6", "validation.drives.draw.seconds=2.0",
     "~validation.drives.columns", "validation.worst=3",
     "+validation.drives.columns={stock MuJoCo: {stock: true}, closed form at 240 Hz: {physics_hz: 240}}",
     "validation.handling.width=4", "validation.handling.acceleration.seconds=14.0", "validation.handling.understeer.speeds=[20.0]",
@@ -195,7 +195,7 @@ def test_a_run_writes_numbers_figures_and_verdicts(measured, capsys):
     assert "## Verdicts" in text and "| yes |" in text and "sequence " in text and "nan" not in text
     for name in ("errors", "tyre", "lane_change"):
         assert (out / f"{name}.png").is_file() and f"({name}.png)" in text
-    assert results["drives"]["result"]["count"] == 13 and results["drives"]["seconds"] > 0
+    assert results["drives"]["result"]["count"] == 6 and results["drives"]["seconds"] > 0
 
 
 def test_the_car_handles(measured):
@@ -253,7 +253,7 @@ def test_verdicts_can_fail(measured):
     targets = load_config("validate")["validation"]["targets"]
     worse = json.loads(json.dumps(results))
     worse["drives"]["result"]["columns"]["stock MuJoCo"]["within"] = 0.5
-    worse["drives"]["result"]["finite"] = 12
+    worse["drives"]["result"]["finite"] = 5
     worse["handling"]["result"]["parking"]["creep_mm"][0][0] = 3.0
     honest, broken = (target_check.of(r, targets) for r in (results, worse))
     changed = [a.what for a, b in zip(honest, broken, strict=True) if a.met and not b.met]
