@@ -17,7 +17,7 @@ from scenefactory_jax.core.types import Env, Scene, State, StepResult
 from scenefactory_jax.learning.trainer import Trainer
 
 STEERING = np.array([8, 11])  # the steering hinges in a car's qpos
-BREAKS = ("qpos", "qvel", "qacc_warmstart", "steering", "tyres", "action")  # what of a car becomes NaN
+BREAKS = ("qpos", "qvel", "steering", "tyres", "action")  # what of a car becomes NaN; the warm start only says which tyres press
 
 
 class Finding(NamedTuple):
@@ -115,7 +115,6 @@ def hurt(state: State, action: Float[Array, "A 3"], harm: Harm) -> tuple[State, 
         body,
         qpos=jnp.where(nan["qpos"] | steering, jnp.nan, body.qpos),
         qvel=jnp.where(nan["qvel"], jnp.nan, body.qvel),
-        qacc_warmstart=jnp.where(nan["qacc_warmstart"], jnp.nan, body.qacc_warmstart),
         tyres=replace(body.tyres, forward=jnp.where(nan["tyres"], jnp.nan, body.tyres.forward)),
     )
     action = jnp.where(nan["action"], jnp.nan, action)

@@ -152,8 +152,17 @@ def find_collision_partners(before: State, after: State, boxes: Boxes, against: 
     users = collect_road_users(after.motion, after.agents.size, before.active, boxes)
     velocity = jnp.concatenate([before.motion.velocity[:, :2], boxes.velocity])
     yaw_rate = jnp.concatenate([before.motion.yaw_rate, boxes.yaw_rate])
-    enlarged = users._replace(size=users.size + 2 * MARGIN_M, velocity=jnp.zeros_like(users.velocity))  # for the axis of least overlap
-    rows, columns = jnp.arange(count), jnp.arange(len(users.yaw))
+    rows, columns, zero = jnp.arange(count), jnp.arange(len(users.yaw)), jnp.zeros_like(users.yaw)
+    enlarged = Boxes(  # at rest: contacts are on the axis of least overlap
+        position=users.position,
+        elevation=zero,
+        yaw=users.yaw,
+        velocity=jnp.zeros_like(users.velocity),
+        yaw_rate=zero,
+        size=users.size + 2 * MARGIN_M,
+        mass=zero,
+        present=users.present,
+    )
     agents = jax.tree.map(lambda leaf: leaf[:count], enlarged)
     contact = jax.vmap(lambda agent: jax.vmap(lambda user: find_box_contact(agent, user))(enlarged))(agents)
     depth = jnp.where(users.present & (rows[:, None] != columns), contact.depths.max(-1), -jnp.inf)

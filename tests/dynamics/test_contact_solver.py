@@ -28,7 +28,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def cases(model):
-    """Cars above, in and below their ride height, leaning, some in the air, pushed in all directions; wheels that lift and land."""
+    """Cars above, in and below their ride height, some in the air, pushed in all directions; wheels that lift and land."""
     at, rng = models.find_addresses(model), np.random.default_rng(0)
     qpos = np.tile(models.find_rest_pose(model, CAR), (COUNT, 1))
     qpos[:, 2] += rng.normal(0, 0.015, COUNT)
@@ -119,7 +119,7 @@ def test_forces_never_pull_and_do_what_newton_says(cases):
 
 def test_gradients_are_finite(cases):
     def total(push):
-        return (solve((*cases[:2], push), iterations=2)[0] ** 2).sum()
+        return (solve((*cases[:2], push), iterations=1)[0] ** 2).sum()
 
     assert np.isfinite(jax.jit(jax.grad(total))(cases[2])).all()
 

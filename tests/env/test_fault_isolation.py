@@ -45,7 +45,7 @@ def report(env):
 def test_addresses(env):
     model_config = config()["dynamics"]
     car, solver = cars.CarParameters(**model_config["car"]), cars.Solver(**model_config["solver"])
-    model = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False, brake_rows=True)
+    model = models.build_standalone_model(car, solver, physics_dt=1 / 120, visual=False)
     np.testing.assert_array_equal(models.find_addresses(model).steer_q, fault_isolation.STEERING)
 
 

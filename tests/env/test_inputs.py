@@ -11,6 +11,7 @@ from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import geometry
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import ROAD_USERS, TrafficLog
 from scenefactory_jax.env import environment
 from scenefactory_jax.roadgraph import spatial_grid
@@ -126,13 +127,14 @@ def test_an_unknown_distance_is_not_short():
 
 @pytest.mark.usefixtures("unchecked_annotations")
 @pytest.mark.parametrize("mode", ["static", "speed"])
-def test_whole_numbers_are_numbers_to_friction(mode):
+def test_integer_speeds_are_refused(mode):
     entry = load_config("task")["weather"]["friction"] | {"mode": mode}
     grip = instantiate(entry, builtins=friction, where="weather.friction")
     road = lambda film: friction.make_uniform(film, jnp.int32(0))  # noqa: E731
-    whole = grip(road(jnp.int32(0)), jnp.zeros((2, 2), int), jnp.array([10, 20]))
-    np.testing.assert_array_equal(whole, grip(road(jnp.float32(0)), jnp.zeros((2, 2)), jnp.array([10.0, 20.0])))
-    assert whole.dtype == jnp.float32 and (whole > 0.9).all()
+    mu = grip(road(jnp.int32(0)), jnp.zeros((2, 2), int), jnp.array([10.0, 20.0]))
+    assert mu.dtype == jnp.float32 and (mu > 0.9).all()
+    with pytest.raises(ConfigError, match=r"^speed: expected floating-point numbers, got int32$"):
+        grip(road(jnp.float32(0)), jnp.zeros((2, 2)), jnp.array([10, 20]))
 
 
 @pytest.fixture(scope="module")
