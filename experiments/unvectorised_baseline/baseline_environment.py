@@ -199,8 +199,8 @@ def _refuse(config: Mapping[str, Any]) -> None:
     """Rejects parts that only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
     is_articulated = dynamics["_target_"].endswith("articulated_car.make")
-    if not is_articulated or dynamics["brakes"] != "friction" or dynamics["randomization"] is not None:
-        raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
+    if not is_articulated or dynamics["randomization"] is not None:
+        raise ConfigError("dynamics: the baseline has the articulated car, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
         raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
     if config["traffic"]["_target_"] != "no_traffic":
@@ -208,7 +208,7 @@ def _refuse(config: Mapping[str, Any]) -> None:
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["friction"]["mode"] == "speed":
-        raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
+        raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, friction.mode static or dynamic")
     for group in ("observations", "reward"):
         for name, entry in config[group].items():
             if entry is not None and "." in entry["_target_"]:
