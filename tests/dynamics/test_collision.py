@@ -316,6 +316,14 @@ def test_a_person_hardly_slows_a_car_but_is_felt(speed):
     assert float(trace.velocity[-1, 0, 0]) < 0.0, "a wall throws it back"
 
 
+def test_three_contacts_on_one_car_have_the_strength_of_two():
+    """A car with one in front, one behind and a short one beside it: two thirds of each force, on both of a pair."""
+    cars = boxes([[0.0, 0.0], [3.99, 0.0], [-3.99, 0.0], [0.0, 1.99]], size=[[4.0, 2.0], [4.0, 2.0], [4.0, 2.0], [2.0, 2.0]])
+    among, alone = forces(cars), forces(jax.tree.map(lambda leaf: leaf[jnp.array([0, 3])], cars))
+    np.testing.assert_allclose(among[0][3], 2 / 3 * alone[0][1], rtol=1e-3)
+    np.testing.assert_allclose(among[0].sum(0), 0.0, atol=0.1)
+
+
 @pytest.mark.parametrize("spread", [0.0, 1.5])
 def test_a_heap_flies_apart_and_does_not_blow_up(spread):
     """16 cars at one place, or nearly: what they start with inside each other is at most 64 MJ, 2 MJ a pair at two contacts' strength."""
