@@ -208,7 +208,7 @@ def _refuse(config: Mapping[str, Any]) -> None:
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["friction"]["mode"] == "speed":
-        raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, friction.mode static or dynamic")
+        raise ConfigError("weather: the baseline has one friction in an episode: no patches, no rain, friction.mode static or dynamic")
     for group in ("observations", "reward"):
         for name, entry in config[group].items():
             if entry is not None and "." in entry["_target_"]:
