@@ -1,7 +1,7 @@
 """The benchmark with rows that only a checkout can measure: trainings with a stream of scenes, and the unvectorised baseline.
 
-    python -m experiments.benchmarks.run experiment=paper suite=throughput 'baseline={worlds: 1, steps: 90, repeats: 3}' out=FOLDER
-    python -m experiments.benchmarks.run experiment=paper suite=streaming scenes=womd scenes.path=BANK out=FOLDER
+python -m experiments.benchmarks.run experiment=paper suite=throughput 'baseline={worlds: 1, steps: 90, repeats: 3}' out=FOLDER
+python -m experiments.benchmarks.run experiment=paper suite=streaming scenes=womd scenes.path=BANK out=FOLDER
 """
 
 from collections.abc import Mapping

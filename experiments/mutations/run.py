@@ -111,7 +111,7 @@ MUTATIONS = (
              "dynamics/test_collision.py::test_friction_turns_each_car_about_its_own_centre"),
     Mutation("contact", "every contact of a heap has its whole strength", "dynamics/collision.py",
              "jnp.minimum(1.0, 2.0 / jnp.maximum(contacts, 1.0))", "1.0 + 0.0 * contacts",
-             "dynamics/test_collision.py::test_a_heap_flies_apart_and_does_not_blow_up"),
+             "dynamics/test_collision.py::test_three_contacts_on_one_car_have_the_strength_of_two"),
     Mutation("friction", "the surface's ratio is left out", "weather/friction.py",
              "theta * compute_asperity_spacing(", "compute_asperity_spacing(", "weather/test_friction.py"),
     Mutation("friction", "wheels read the road of the other side", "dynamics/articulated/articulated_car.py",

@@ -1,7 +1,7 @@
 """The same task without vectorising: cars in MuJoCo's C engine, loops over worlds and agents in Python.
 
 The reference of a speed-up, written for one machine without an accelerator: one world after the other, each with all its cars in one C
-model (`make_encounter`, with the config's solver settings), and for every agent in turn observation, step metrics, reward,
+model (`baseline_cars`, with the config's solver settings), and for every agent in turn observation, step metrics, reward,
 termination and both towers of the policy in numpy (`baseline_agent`). Left out is what a loop does not need: padding, absent slots, metrics
 that no reward reads, and friction where the weather does not change.
 
@@ -9,8 +9,8 @@ It collects a rollout, with actions sampled as in PPO, and does not learn: learn
 
 Differences from the environment on the device:
 - The engine has double precision and stops its solver by tolerance, with the config's iterations as the limit.
-- Contacts between cars are MuJoCo's box-box contacts with the spring's law (`make_encounter`). Several at once on one
-  car do not share their strength, as those of `dynamics.collision` do.
+- Contacts between cars are MuJoCo's box-box contacts: springs with constant damping (`baseline_cars`). Several at once on one car do not
+  share their strength, as those of `dynamics.collision` do.
 - A car that rolls over sinks through the road, since only tyres touch it; the event `out_of_bounds` comes all the same.
 - A number that is not finite breaks its whole world, not one car: all its agents end with `numerical_error`.
 - Finished cars are held in the air beside the scene, without contacts.
@@ -31,9 +31,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from experiments.unvectorised_baseline import baseline_agent as one
+from experiments.unvectorised_baseline import baseline_cars
 from experiments.unvectorised_baseline.baseline_agent import Agent, Crowd, Observation, Place
-from experiments.validation import c_engine_encounters, engines
-from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.types import Scene
@@ -200,8 +199,8 @@ def _refuse(config: Mapping[str, Any]) -> None:
     """Rejects parts that only the vectorised environment has."""
     dynamics, weather = config["dynamics"], config["weather"]
     is_articulated = dynamics["_target_"].endswith("articulated_car.make")
-    if not is_articulated or dynamics["brakes"] != "friction" or dynamics["randomization"] is not None:
-        raise ConfigError("dynamics: the baseline has the articulated car with friction brakes, every car the same")
+    if not is_articulated or dynamics["randomization"] is not None:
+        raise ConfigError("dynamics: the baseline has the articulated car, every car the same")
     if config["actions"] != {"command": {"_target_": "separate_pedals"}, "action_repeat": 1}:
         raise ConfigError(f"actions: {config['actions']}; the baseline has pedals, read at every control step")
     if config["traffic"]["_target_"] != "no_traffic":
@@ -209,7 +208,7 @@ def _refuse(config: Mapping[str, Any]) -> None:
     if config["spawning"]["respawn_clearance_m"] is not None:
         raise ConfigError(f"spawning.respawn_clearance_m: {config['spawning']['respawn_clearance_m']}; the baseline has null")
     if any(weather["patches"].values()) or weather["rain"] is not None or weather["friction"]["mode"] == "speed":
-        raise ConfigError("weather: the baseline has one friction for all of an episode: no patches, no rain, grip.mode static or dynamic")
+        raise ConfigError("weather: the baseline has one friction in an episode: no patches, no rain, friction.mode static or dynamic")
     for group in ("observations", "reward"):
         for name, entry in config[group].items():
             if entry is not None and "." in entry["_target_"]:
@@ -217,18 +216,14 @@ def _refuse(config: Mapping[str, Any]) -> None:
 
 
 def _engine(config: Mapping[str, Any]) -> Engine:
-    """The articulated car with Newton's method; `solve.newton` is the same for one car on the device."""
+    """The articulated car with the config's iterations."""
     car, solver = cars.read_parameters(config["dynamics"])
-    newton = dataclasses.replace(solver, algorithm="newton")
     timing = config["timing"]
     limits = {"physics_dt": 1.0 / timing["physics_hz"], "iterations": solver.iterations, "line_search": solver.line_search}
-    # the spring law of two cars in MuJoCo's terms, with the impedance that validation has found to be it
-    impedance = configs.load_config("validate")["validation"]["encounters"]["impedances"]["spring"]
-    touch = engines.touch(config["dynamics"], impedance=impedance)
-    alone = mujoco_c.make_one(car, newton, **limits)
+    alone = models.build_standalone_model(car, solver, physics_dt=limits["physics_dt"], visual=False)
     return Engine(
-        rig=functools.cache(lambda count: c_engine_encounters.make_encounter(car, newton, touch, count=count, **limits)),
-        still=models.find_rest_pose(alone.model, car),
+        rig=functools.cache(lambda count: baseline_cars.make_cars(config["dynamics"], count, **limits)),
+        still=models.find_rest_pose(alone, car),
         substeps=round(timing["physics_hz"] / timing["control_hz"]),
         apart_m=config["step_metrics"]["scene_size_m"],
     )
@@ -277,8 +272,8 @@ def drive(engine: Engine, world: World, actions: Sequence[Float[np.ndarray, "3"]
         if not world.agents[row].active:
             rig.qpos[row], rig.qvel[row] = engine.still, 0.0
             rig.qpos[row, :3] = engine.apart_m * (row + 1), 0.0, engine.apart_m
-    force = c_engine_encounters.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
-    if c_engine_encounters.has_failed(rig):
+    force = baseline_cars.advance(rig, control, np.full((len(actions), 4), world.mu), substeps=engine.substeps)
+    if baseline_cars.has_failed(rig):
         rig.qpos[:] = np.nan
     world.step += 1
     for row, agent in enumerate(world.agents):

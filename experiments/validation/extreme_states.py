@@ -241,12 +241,12 @@ def _judge(
     )
 
 
-def energy(car: CarParameters, qpos: Float[np.ndarray, "T 17"], qvel: Float[np.ndarray, "T 16"]) -> Float[np.ndarray, " T"]:
+def energy(car: CarParameters, qpos: Float[np.ndarray, "*n 17"], qvel: Float[np.ndarray, "*n 16"]) -> Float[np.ndarray, "*n"]:
     """Mechanical energy over the ground, J: the whole mass at the box's centre, the chassis' and the wheels' rotation."""
     mass = equations_of_motion.total_mass(car)
-    moving = 0.5 * mass * (qvel[:, :3] ** 2).sum(-1) + mass * cars.GRAVITY * qpos[:, 2]
-    turning = 0.5 * (np.asarray(car.inertia) * qvel[:, 3:6] ** 2).sum(-1)
-    return moving + turning + 0.5 * car.wheel_inertia[0] * (qvel[:, SPIN] ** 2).sum(-1)
+    moving = 0.5 * mass * (qvel[..., :3] ** 2).sum(-1) + mass * cars.GRAVITY * qpos[..., 2]
+    turning = 0.5 * (np.asarray(car.inertia) * qvel[..., 3:6] ** 2).sum(-1)
+    return moving + turning + 0.5 * car.wheel_inertia[0] * (qvel[..., SPIN] ** 2).sum(-1)
 
 
 def _worst(rows: Sequence[Row]) -> Row:

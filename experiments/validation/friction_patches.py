@@ -28,11 +28,11 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
     """A world a patch, each with one car on dry asphalt; None is a world without."""
     count = len(patches)
     zero = np.zeros((count, 1), np.float32)
-    dry, asphalt = np.zeros(count), np.full(count, SURFACES.index("AC"), np.int32)
-    worlds = open_ground.make_open_ground(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), dry, asphalt, size=size)
+    one, asphalt = np.ones(count), np.full(count, SURFACES.index("AC"), np.int32)
+    worlds = open_ground.make_open_ground(zero[..., None].repeat(2, -1), zero, zero + np.float32(speed), one, asphalt, size=size)
     some = [patch or Patch([(0.0, 0.0), (0.0, 0.0)], 0.0, "AC") for patch in patches]
 
-    def one(line: Array, radius: Array, surface: Array, present: Array) -> Patches:
+    def place(line: Array, radius: Array, surface: Array, present: Array) -> Patches:
         nothing = jnp.zeros(1)
         return Patches(line[None], jnp.zeros(1, bool), radius[None], surface[None], nothing, nothing, present[None])
 
@@ -42,7 +42,7 @@ def scenes(patches: Sequence[Patch | None], speed: float, *, size: tuple[float, 
         jnp.array([SURFACES.index(patch.surface) for patch in some], jnp.int32),
         jnp.array([patch is not None for patch in patches], bool),
     )
-    weather = jax.vmap(lambda weather, *patch: replace(weather, patches=one(*patch)))(worlds.weather, *columns)
+    weather = jax.vmap(lambda weather, *patch: replace(weather, film_mm=jnp.zeros(()), patches=place(*patch)))(worlds.weather, *columns)
     return replace(worlds, weather=weather)
 
 
@@ -73,7 +73,7 @@ def patches(
     """
     context = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
     road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.friction")
-    backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
+    backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", friction=road, **context)()
     run = motion_laws.tracer(backend, control_hz=control_hz, width=6)
     size = motion_laws.footprint(entry)
     spot = [(ahead_m, 0.0), (ahead_m, 0.0)]

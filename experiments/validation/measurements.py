@@ -9,9 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.validation import encounters as meetings
-from experiments.validation import engines, equivalence, extreme_states, friction_patches, impacts, motion_laws, random_drives
-from experiments.validation.engines import Run
+from experiments.validation import collisions as impacts
+from experiments.validation import engines, equivalence, extreme_states, friction_patches, handling, motion_laws, random_drives
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel.task_map import open_pool, require_results
 from scenefactory_jax.dynamics.articulated import parameters as cars
@@ -51,146 +50,134 @@ def _rates(config: Mapping[str, Any]) -> dict[str, float]:
 
 
 def drives(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
-    """Single cars on the batched path and in the C engine, and how sensitive the drives themselves are.
+    """Single cars in the closed form, and their distances from other engines, time steps and solvers until the horizon.
 
     Raises:
-        ConfigError: drives that end before the bound does, which they would keep unseen.
+        ConfigError: drives shorter than the horizon.
     """
-    settings, entry, rates = config["validation"], config["dynamics"], _rates(config)
-    cases = _sequences(config, settings["drives"]["draw"]["count"])
-    seconds, until = settings["drives"]["draw"]["seconds"], settings["bound"]["horizon_s"]
-    if seconds < until:
-        raise ConfigError(f"validation.drives.draw.seconds: {seconds}; at least {until}, validation.bound.horizon_s")
-    truth = {**rates, **settings["road"], **settings["reference"], "friction_scale": 1.0}
-    run = engines.drive(entry, cases, **rates, **settings["road"])
-    reference, nudged = (
-        spread(functools.partial(engines.drive_c, entry, nudge=nudge, **truth), cases) for nudge in (0.0, settings["drives"]["nudge"])
-    )
-    options = {"control_hz": rates["control_hz"], "bins": settings["drives"]["bins"], **settings["bound"]}
-    wheel = {"wheel_radius": entry["car"]["wheel_radius"]}
-    found = equivalence.compare(run, reference, **wheel, **options)
-    horizon = round(until * rates["control_hz"]) - 1
-    position = equivalence.errors(run, reference, **wheel).position[..., 0]
-    sensitivity = equivalence.errors(nudged, reference, **wheel).position[..., 0]
+    settings, rates, own = config["validation"], _rates(config), config["validation"]["drives"]
+    cases = _sequences(config, own["draw"]["count"])
+    until, bound_m = settings["bound"]["horizon_s"], settings["bound"]["bound_m"]
+    if own["draw"]["seconds"] < until:
+        raise ConfigError(f"validation.drives.draw.seconds: {own['draw']['seconds']}; at least {until}, validation.bound.horizon_s")
+    run = engines.drive(config["dynamics"], cases, **rates, **settings["road"])
+    short = cases._replace(controls=cases.controls[:, : round(until * rates["control_hz"])])
+    columns = {}
+    for name, column in own["columns"].items():
+        distance = equivalence.compute_distances(run, _simulate_column(config, column, short, spread))
+        worst = np.argsort(-distance.max(1), kind="stable")[: settings["worst"]]
+        named = [{"case": random_drives.describe(cases, int(i)), "largest_m": float(distance[i].max())} for i in worst]
+        columns[name] = {**equivalence.summarize(distance, bound_m=bound_m), "worst": named}
+    up = 1.0 - 2.0 * (run.qpos[:, :, 0, 4] ** 2 + run.qpos[:, :, 0, 5] ** 2)
+    acceleration = np.linalg.norm(np.diff(run.qvel[:, :, 0, :2], axis=1), axis=-1) * rates["control_hz"]
     return {
         "bound": settings["bound"],
         "count": len(cases.speed),
-        "control_steps": int(cases.controls.shape[1]),
+        "seconds": own["draw"]["seconds"],
+        "physics_hz": rates["physics_hz"],
         "percents": equivalence.PERCENTILES,
-        "time_s": found.time_s,
-        "percentiles": found.percentiles,
-        "within": float(found.within.mean()),
-        "nudge": settings["drives"]["nudge"],
-        "nudged_m": [float(np.median(sensitivity[:, horizon])), float(sensitivity[:, horizon].max())],
-        "error_m": position[:, horizon],
-        "histograms": {name: histogram._asdict() for name, histogram in found.histograms.items()},
-        "overlap": {name: equivalence.overlap(histogram) for name, histogram in found.histograms.items()},
-        "worst": [
-            {
-                "case": random_drives.describe(cases, i),
-                "horizon_m": position[i, horizon],
-                "end_m": position[i, -1],
-                "nudged_m": sensitivity[i, -1],
-            }
-            for i in map(int, found.worst[: settings["worst"]])
-        ],
+        "time_s": np.arange(1, short.controls.shape[1] + 1) / rates["control_hz"],
+        "columns": columns,
+        "finite": int((np.isfinite(run.qpos).all((1, 2, 3)) & np.isfinite(run.qvel).all((1, 2, 3))).sum()),
+        "upright": float(up.min()),
+        "acceleration": float(acceleration.max()),
     }
 
 
-def trials(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
-    """The drives with other solvers, iterations, integrators and time steps."""
-    settings, own = config["validation"], config["validation"]["settings"]
-    cases = _sequences(config, own["count"], seconds=settings["bound"]["horizon_s"])
+def _simulate_column(config: Mapping[str, Any], column: Mapping[str, Any], cases: random_drives.Sequences, spread: Spread) -> engines.Run:
+    """The drives as a column of the equivalence has them: `stock`, or changes of backend, time step and solver."""
+    settings, rates = config["validation"], _rates(config)
+    if column.get("stock"):
+        exact = {**rates, **settings["road"], **settings["reference"], "friction_scale": 1.0}
+        return spread(functools.partial(engines.drive_stock, config["dynamics"], **exact), cases)
+    entry = config["backends"][column.get("backend", "articulated")]
+    entry = {**entry, "solver": {**entry["solver"], **column.get("solver", {})}}
+    rates["physics_hz"] = float(column.get("physics_hz", rates["physics_hz"]))
+    return engines.drive(entry, cases, **rates, **settings["road"])
 
-    def reference(entry: Mapping[str, Any], drawn: random_drives.Sequences, **numbers: Any) -> Run:
-        return spread(functools.partial(engines.drive_c, entry, **numbers), drawn)
 
-    rows = equivalence.settings(
-        reference,
-        config["dynamics"],
-        cases,
-        own["trials"],
-        control_hz=_rates(config)["control_hz"],
-        fine_hz=None if own["fine_hz"] is None else float(own["fine_hz"]),
-        **settings["bound"],
-        **settings["road"],
-        **settings["reference"],
-    )
+def collisions(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
+    """Two cars: grazing hits, restitution, fast encounters."""
+    del spread
+    own, entry, rates = config["validation"]["collisions"], config["dynamics"], _rates(config)
+    where = "validation.collisions"
+    fast = {"physics_hz": rates["physics_hz"], "seed": config["validation"]["seed"]}
     return {
-        "bound": settings["bound"],
-        "count": own["count"],
-        "fine_hz": own["fine_hz"],
-        "percents": equivalence.PERCENTILES,
-        "shipped": config["dynamics"]["solver"],
-        "shipped_hz": config["timing"]["physics_hz"],
-        "rows": [row._asdict() for row in rows],
+        "grazes": bound(own["grazes"], impacts, "grazes", f"{where}.grazes", **rates)(entry),
+        "restitution": bound(own["restitution"], impacts, "restitution", f"{where}.restitution", **rates)(entry),
+        "fast": bound(own["fast"], impacts, "fast_encounters", f"{where}.fast", **fast)(entry),
+        "phases": own["grazes"]["phases"],
+        "speed_max": own["fast"]["speed_max"],
+        "miss_m": own["fast"]["miss_m"],
+        "graze_s": own["grazes"]["seconds"],
+        "tunnel_m": impacts.passing_distance(
+            **{name: own["fast"][name] for name in ("miss_m", "speed_max")}, physics_hz=rates["physics_hz"]
+        ),
     }
 
 
-def encounters(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
-    """Two cars that meet, on the batched path and in the C engine with each kind of contact."""
-    settings, entry, rates = config["validation"], config["dynamics"], _rates(config)
-    own = settings["encounters"]
-    cases = bound(own["draw"], meetings, "draw", "validation.encounters.draw", control_hz=rates["control_hz"])(settings["seed"])
-    run = engines.meet(entry, cases, **rates)
-    found = {}
-    for name, impedance in own["impedances"].items():
-        numbers = {**rates, **settings["reference"], "impedance": impedance, "nudge": 0.0}
-        reference, _ = spread(functools.partial(engines.meet_c, entry, **numbers), cases)
-        seen = impacts.compare(entry, run, reference, cases.friction, control_hz=rates["control_hz"], **own["collision"])
-        found[name] = {"impedance": impedance, **_impacts(seen, cases, settings["worst"])}
-    return {"count": len(cases.kind), "kinds": meetings.KINDS, "kind": cases.kind, "contacts": found}
+def car_handling(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
+    """Acceleration, understeer, a lane change under full braking, standing on a grade, and the tyre alone."""
+    del spread
+    own, entry, rates = config["validation"]["handling"], config["dynamics"], _rates(config)
+    car, _ = cars.read_parameters(entry)
+    drive = motion_laws.driver(entry, **rates, slippery=1.0, width=own["width"])
+    physics = {"physics_hz": rates["physics_hz"]}
 
+    def experiment(name: str, **context: Any) -> Callable[..., Any]:
+        return bound(own[name], handling, name, f"validation.handling.{name}", **context)
 
-def _impacts(seen: impacts.Impacts, cases: meetings.Encounters, most: int) -> dict[str, Any]:
-    """What the report shows of a comparison; per encounter only where both engines saw the impact to its end."""
-    rows = np.flatnonzero(seen.compared)
-    change = {name: np.linalg.norm(side.momentum, axis=1) for name, side in (("batched", seen.batched), ("reference", seen.reference))}
-    apart = np.linalg.norm(seen.batched.momentum - seen.reference.momentum, axis=1) / np.maximum(seen.batched.scale, 1e-9)
-    columns = {
-        "closing": seen.closing,
-        "relative": seen.relative,
-        "speed_share": seen.speed_share,
-        "speed": np.linalg.norm(seen.batched_velocity, axis=-1),
-        "speed_reference": np.linalg.norm(seen.after_velocity, axis=-1),
-        "yaw_rate": seen.yaw_rate,
-        "delay_steps": seen.delay_steps,
-        "peak": seen.peak,
-        "momentum": change["batched"],
-        "momentum_reference": change["reference"],
-        "allowance": seen.batched.allowance,
-        "momentum_apart": apart,
-        "lost": seen.batched.lost,
-        "lost_reference": seen.reference.lost,
-        "kind": cases.kind,
-    }
-    worst = [int(i) for i in seen.worst[: min(most, len(rows))]]
+    change = experiment("lane_change", **physics)
     return {
-        "events": seen.events._asdict(),
-        "agree": seen.agree,
-        "rows": {name: column[rows] for name, column in columns.items()},
-        "worst": [
-            {"case": meetings.describe(cases, i), "relative": seen.relative[i], "speed_share": seen.speed_share[i].max()} for i in worst
-        ],
+        "acceleration": experiment("acceleration", control_hz=rates["control_hz"])(drive, car),
+        "understeer": experiment("understeer", control_hz=rates["control_hz"])(drive, car),
+        "lane_change": {**own["lane_change"], "runs": {name: change({**entry, "abs": name == "on"}) for name in ("on", "off")}},
+        "parking": {**own["parking"], **experiment("parking", **physics)(entry)},
+        "tyre": {"speed": own["tyre_curves"]["speed"], **experiment("tyre_curves", **physics)(car)},
     }
 
 
 def laws_of_motion(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     """Every backend against the laws that it is meant to obey, and the car on patches of the real weather."""
+    del spread
     settings, rates = config["validation"]["laws"], _rates(config)
     car, _ = cars.read_parameters(config["dynamics"])
     speed = settings["stopping"]["speed"]
     on_patches = bound(settings["patches"], friction_patches, "patches", "validation.laws.patches", **rates)
     return {
         "speed": speed,
-        "grip_limit_m": motion_laws.grip_limit_m(car, speed, settings["stopping"]["frictions"]),
         "brake_limit_m": motion_laws.brake_limit_m(car, speed),
         "hold_s": settings["standing"]["hold_s"],
-        "strong": settings["strong"],
-        "locked_c_m": _locked_in_c(config, spread),
+        "split_speed": settings["split"]["speed"],
         "split_friction": [settings["split"]["friction"], settings["split"]["friction"] * settings["slippery"]],
-        "backends": {name: _obeys(name, settings, entry, rates, wheelbase=car.wheelbase) for name, entry in config["backends"].items()},
+        "backends": {name: _obeys(config, name, car) for name in settings["backends"]},
         "patches": on_patches(config["dynamics"], config["weather"]["friction"]),
+    }
+
+
+def _obeys(config: Mapping[str, Any], name: str, car: cars.CarParameters) -> dict[str, Any]:
+    """All experiments that make sense for one backend."""
+    settings, rates, entry = config["validation"]["laws"], _rates(config), config["backends"][name]
+    clock, drive = (
+        {"control_hz": rates["control_hz"]},
+        motion_laws.driver(entry, **rates, slippery=settings["slippery"], width=settings["width"]),
+    )
+
+    def experiment(law: str, **context: Any) -> Callable[..., Any]:
+        return bound(settings[law], motion_laws, law, f"validation.laws.{law}", **clock, **context)
+
+    found: dict[str, Any] = {
+        "stopping": experiment("stopping", wheel_radius=car.wheel_radius)(drive),
+        "standing": experiment("standing")(drive),
+        "cornering": experiment("cornering", wheelbase=car.wheelbase)(drive),
+    }
+    if "car" not in entry:
+        return found
+    own, _ = cars.read_parameters(entry)
+    return found | {
+        "split": experiment("split")(drive),
+        "ride": experiment("ride")(drive, own),
+        "rolling": experiment("rolling")(drive, entry),
     }
 
 
@@ -201,37 +188,3 @@ def whole_episodes(config: Mapping[str, Any], spread: Spread) -> dict[str, Any]:
     run = bound(own, extreme_states, "run", "validation.extremes", **_rates(config))
     rows = run(config["dynamics"], extreme_states.CASES)
     return {"seconds": own["seconds"], "rows": [row._asdict() for row in rows]}
-
-
-def _obeys(
-    name: str, settings: Mapping[str, Any], entry: Mapping[str, Any], rates: Mapping[str, float], *, wheelbase: float
-) -> dict[str, Any]:  # fmt: skip
-    """All experiments that make sense for one backend; those with locked wheels need a compilation of their own."""
-    look = {**rates, "slippery": settings["slippery"], "width": settings["width"]}
-    context = {"control_hz": rates["control_hz"], "wheelbase": wheelbase}
-    experiment = lambda law: bound(settings[law], motion_laws, law, f"validation.laws.{law}", **context)  # noqa: E731
-    drive = motion_laws.driver(entry, **look)
-    found: dict[str, Any] = {law: experiment(law)(drive) for law in ("stopping", "standing", "cornering")}
-    if "car" not in entry:
-        return found
-    car, _ = cars.read_parameters(entry)
-    found |= {"split": experiment("split")(drive), "ride": experiment("ride")(drive, car), "rolling": experiment("rolling")(drive, entry)}
-    if name not in settings["locked"]:
-        return found
-    return found | {"locked": experiment("stopping")(motion_laws.driver(_locking(settings, entry), **look))}
-
-
-def _locking(settings: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The same car with brakes that lock its wheels on any road."""
-    torques = ("brake_torque_front", "brake_torque_rear")
-    return {**entry, "car": {**entry["car"], **{torque: settings["strong"] * entry["car"][torque] for torque in torques}}}
-
-
-def _locked_in_c(config: Mapping[str, Any], spread: Spread) -> np.ndarray:
-    """Ways to a halt with locked wheels in the C engine, as `laws.stopping` has them on the batched path."""
-    settings, rates = config["validation"]["laws"], _rates(config)
-    stop, reference = settings["stopping"], config["validation"]["reference"]
-    cases = motion_laws.held(stop["frictions"], stop["speed"], motion_laws.FULL_BRAKE, steps=round(stop["seconds"] * rates["control_hz"]))
-    exact = {"slippery": 1.0, "friction_min": 0.0, "friction_scale": 1.0, "nudge": 0.0}
-    run = spread(functools.partial(engines.drive_c, _locking(settings, config["dynamics"]), **rates, **reference, **exact), cases)
-    return motion_laws.way(run.qpos[:, :, 0, :2])

@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (the compiled parts of mujoco carry no types)
 """Cars against laws of motion: stopping, standing, cornering, split friction, riding and rolling, for any backend.
 
 Every experiment takes a `Drive`, which runs single cars on roads of a given friction through the real `Dynamics`, and returns plain arrays.
@@ -9,19 +11,24 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.validation import c_engine_encounters, engines
+from experiments.validation import engines
+from experiments.validation.equivalence import SPIN
 from experiments.validation.random_drives import PATTERN_NAMES, Sequences
 from scenefactory_jax.core.types import Dynamics, Scene
-from scenefactory_jax.dynamics import mujoco_c, open_ground
+from scenefactory_jax.dynamics import open_ground
 from scenefactory_jax.dynamics.articulated import articulated_car
+from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.equations_of_motion import compute_loads, total_mass
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY, CarParameters
 
 FULL_BRAKE, FULL_BOTH, COAST = (0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 0.0, 0.0)  # throttle, steer, brake
+LOCKED = 0.3  # rim speed over the car's speed, below which a wheel counts as locked
+LOCK_SPEED = 5.0  # m/s; slower cars are not looked at
 EVEN, LEFT, RIGHT = (PATTERN_NAMES.index(name) for name in ("even", "left", "right"))
 
 
@@ -48,7 +55,7 @@ def driver(entry: Mapping[str, Any], *, physics_hz: float, control_hz: float, sl
         slippery: share of the road's friction under the wheels that a case's pattern marks.
     """
     road = {"slippery": slippery, "friction_min": 0.0}
-    run = tracer(engines.dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, **road), control_hz=control_hz, width=width)
+    run = tracer(engines.make_dynamics(entry, physics_hz=physics_hz, control_hz=control_hz, **road), control_hz=control_hz, width=width)
     size = footprint(entry)
 
     def drive(cases: Sequences) -> Trace:
@@ -110,34 +117,35 @@ def held(friction: Sequence[float] | np.ndarray, speed: Any, control: Sequence[f
     return Sequences(speeds, np.asarray(friction, np.float32), patterns, one)
 
 
-def stopping(drive: Drive, *, control_hz: float, frictions: list[float], speed: float, seconds: float) -> dict[str, np.ndarray]:
+def stopping(
+    drive: Drive, *, control_hz: float, frictions: list[float], speed: float, seconds: float, wheel_radius: float
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Full brake until every car stands or the time is up.
 
     Returns:
-        For each friction the way to a halt along the path, the mean deceleration over it, how far the car came off its line, and whether
-        it stopped.
+        For each friction the distance to a halt along the path, the largest distance from the line, m, whether the car stopped, and, of
+        articulated cars, when a front and when a rear wheel first locks, s; -1 if none does.
     """
     trace = drive(held(frictions, speed, FULL_BRAKE, steps=round(seconds * control_hz)))
-    distance = way(trace.position[..., :2])
-    return {
+    found = {
         "friction": np.array(frictions),
-        "distance_m": distance,
-        "deceleration": speed**2 / (2.0 * np.maximum(distance, 1e-9)),
+        "distance_m": way(trace.position[..., :2]),
         "aside_m": np.abs(trace.position[..., 1]).max(1),
         "stopped": np.linalg.norm(trace.velocity[:, -1, :2], axis=-1) < 0.02,  # m/s
     }
+    if trace.qvel is None:
+        return found
+    pace = np.linalg.norm(trace.velocity[..., :2], axis=-1)[..., None]
+    locked = (trace.qvel[..., SPIN] * wheel_radius < LOCKED * pace) & (pace > LOCK_SPEED)
+    for name, wheels in {"front_locks_s": locked[..., :2], "rear_locks_s": locked[..., 2:]}.items():
+        found[name] = np.where(wheels.any((1, 2)), (wheels.any(2).argmax(1) + 1) / control_hz, -1.0)
+    return found
 
 
 def way(position: Float[np.ndarray, "N T 2"]) -> Float[np.ndarray, " N"]:
     """Length of paths that begin at the origin, m."""
     path = np.concatenate([np.zeros((len(position), 1, 2)), position], axis=1)
     return np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(1)
-
-
-def grip_limit_m(car: CarParameters, speed: float, friction: Any) -> Any:
-    """The way to a halt if all tyres slide: v^2 / (2 mu g), and a little less for the air, v dv/dx = -(mu g + k v^2)."""
-    k, slides = max(car.air_drag / total_mass(car), 1e-12), np.asarray(friction, float) * GRAVITY
-    return np.log1p(k * speed**2 / slides) / (2.0 * k)
 
 
 def brake_limit_m(car: CarParameters, speed: float) -> float:
@@ -255,17 +263,31 @@ def rolling(
 ) -> dict[str, np.ndarray]:
     """Rolling without engine: energy over time, and the largest rise between any two times, as shares of the start's kinetic energy."""
     car, solver = cars.read_parameters(entry)
-    rig = mujoco_c.make_one(car, solver, physics_dt=1.0 / control_hz, iterations=1, line_search=1)
+    model = models.build_standalone_model(car, solver, physics_dt=1.0 / control_hz, visual=False)
     mu, steer = (x.ravel() for x in np.meshgrid(frictions, steers, indexing="ij"))
     cases = held(mu, speed, COAST, steps=round(seconds * control_hz))
     cases.controls[..., 1] = steer[:, None]
     trace = drive(cases)
     assert trace.qpos is not None and trace.qvel is not None
-    energy = np.array([
-        [sum(c_engine_encounters.compute_mechanics(rig, q[None], v[None])[2:]) for q, v in zip(*path, strict=True)]
-        for path in zip(trace.qpos, trace.qvel, strict=True)
-    ])  # fmt: skip
+    energy = compute_energy(model, car, trace.qpos, trace.qvel)
     scale = 0.5 * total_mass(car) * speed**2
     rise = (energy - np.minimum.accumulate(energy, axis=1)).max(1)
     spent = energy[:, :1] - energy
     return {"friction": mu, "steer": steer, "time_s": _times(trace, control_hz), "spent": spent / scale, "rise": rise / scale}
+
+
+def compute_energy(
+    model: mujoco.MjModel, car: CarParameters, qpos: Float[np.ndarray, "N T 17"], qvel: Float[np.ndarray, "N T 16"]
+) -> Float[np.ndarray, "N T"]:  # fmt: skip
+    """Computes the energy of motion, height, springs and bump stops, J; not that of the tyres' compression."""
+    data, energy = mujoco.MjData(model), np.zeros(qpos.shape[:2])
+    suspension = models.find_addresses(model).suspension_q
+    for place in np.ndindex(energy.shape):
+        data.qpos[:], data.qvel[:] = qpos[place], qvel[place]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_energyVel(model, data)
+        mujoco.mj_energyPos(model, data)
+        beyond = np.maximum(np.abs(qpos[place][suspension]) - car.suspension_travel, 0.0)
+        energy[place] = data.energy.sum() + 0.5 * car.stop_stiffness * (beyond**2).sum()
+    return energy

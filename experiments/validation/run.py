@@ -1,4 +1,4 @@
-"""`validate`: the physics against the C engine and against laws of motion, and a report of it.
+"""`validate`: the physics against the stock MuJoCo engine and against laws of motion, and a report of it.
 
 Every part writes its numbers to `out/results/PART.json` as soon as they are there; `validation.md` and its figures are made of these files
 alone, so a part can be measured again, or elsewhere, without the others.
@@ -29,13 +29,14 @@ class Part(NamedTuple):
     reads: tuple[str, ...]
 
 
-SHARED = ("validation.seed", "validation.reference", "validation.road", "validation.bound", "validation.worst", "timing", "dynamics")
+SHARED = ("validation.seed", "timing", "dynamics")
+DRIVES = ("reference", "road", "bound", "worst", "drives")
 PARTS = {
-    "drives": Part(measurements.drives, (*SHARED, "validation.drives")),
-    "settings": Part(measurements.trials, (*SHARED, "validation.drives", "validation.settings")),
-    "encounters": Part(measurements.encounters, (*SHARED, "validation.encounters")),
-    "laws": Part(measurements.laws_of_motion, ("validation.laws", "validation.reference", "timing", "dynamics", "backends", "weather")),
-    "extremes": Part(measurements.whole_episodes, ("validation.extremes", "timing", "dynamics")),
+    "drives": Part(measurements.drives, (*SHARED, "backends", *(f"validation.{name}" for name in DRIVES))),
+    "laws": Part(measurements.laws_of_motion, (*SHARED, "backends", "weather", "validation.laws")),
+    "handling": Part(measurements.car_handling, (*SHARED, "validation.handling")),
+    "collisions": Part(measurements.collisions, (*SHARED, "validation.collisions")),
+    "extremes": Part(measurements.whole_episodes, (*SHARED, "validation.extremes")),
     "faults": Part(task_experiments.faults, ("validation.seed", "validation.faults")),
     "costs": Part(task_experiments.costs, ("validation.seed", "validation.costs")),
 }
@@ -103,4 +104,4 @@ def subset(config: Mapping[str, Any], places: Sequence[str]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    entry.run("validate", validate, about="validate the physics against the C engine and laws of motion")
+    entry.run("validate", validate, about="validate the physics against the stock MuJoCo engine and laws of motion")

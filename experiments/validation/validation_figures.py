@@ -14,7 +14,7 @@ from scenefactory_jax.visualization.report.plots import COLOURS, STYLE
 Result = Mapping[str, Any]
 BATCHED, REFERENCE, GREY = COLOURS[0], COLOURS[1], "#777777"
 MARKERS = "osD^vP*X"
-NAMES = {"articulated": "articulated", "latched": "articulated, latched brakes", "published": "articulated_paper", "bicycle": "bicycle"}
+NAMES = {"articulated": "articulated", "without_abs": "articulated, no ABS", "published": "articulated_paper", "bicycle": "bicycle"}
 
 
 def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, list[Axes]]:
@@ -23,132 +23,105 @@ def _panels(width: float, height: float, rows: int, columns: int) -> tuple[Figur
 
 
 def errors(result: Result) -> Figure:
-    """Differences from the C engine over time, as bands of percentiles."""
-    shown = {
-        "position": ("Position", "m"),
-        "yaw": ("Yaw", "rad"),
-        "velocity": ("Velocity", "m/s"),
-        "state": ("Whole state, L2", "SI units"),
-    }
-    time, bound = np.array(result["time_s"]), result["bound"]
+    """Distances of the drives from those of every other engine, time step and solver over time, as bands of percentiles."""
+    time, bound, columns = np.array(result["time_s"]), result["bound"], result["columns"]
     with matplotlib.rc_context(STYLE):
-        figure, grid = _panels(9.5, 5.6, 2, 2)
-        for axes, (name, (title, unit)) in zip(grid, shown.items(), strict=True):
-            rows = np.maximum(np.array(result["percentiles"][name]), 1e-7)
-            axes.plot(time, rows[-1], color=GREY, linewidth=1.0, label="worst")
-            axes.fill_between(time, rows[1], rows[2], color=BATCHED, alpha=0.18, linewidth=0, label="90 to 99 %")
-            axes.fill_between(time, rows[0], rows[1], color=BATCHED, alpha=0.4, linewidth=0, label="50 to 90 %")
-            axes.plot(time, rows[0], color=BATCHED, label="median")
-            axes.set(yscale="log", title=title, ylabel=unit, xlabel="time, s", xlim=(0, time[-1]))
-        grid[0].plot([0, bound["horizon_s"]], [bound["bound_m"]] * 2, color=REFERENCE, linestyle="--")
-        place = (bound["horizon_s"], bound["bound_m"])
-        grid[0].annotate("bound", place, (6, -4), textcoords="offset points", color=REFERENCE, fontsize=8)
+        figure, grid = _panels(10.0, 5.6, 2, -(-len(columns) // 2))
+        for axes, (name, column) in zip(grid, columns.items(), strict=False):
+            middle, high, worst = np.maximum(1e3 * np.array(column["percentiles_m"]), 1e-4)
+            axes.plot(time, worst, color=GREY, linewidth=1.0, label="worst")
+            axes.fill_between(time, middle, high, color=BATCHED, alpha=0.35, linewidth=0, label="50 to 90 %")
+            axes.plot(time, middle, color=BATCHED, label="median")
+            axes.axhline(1e3 * bound["bound_m"], color=REFERENCE, linestyle="--", linewidth=1.0, label=f"{1e3 * bound['bound_m']:g} mm")
+            axes.set(yscale="log", title=name, xlabel="time, s", xlim=(0, time[-1]), ylim=(1e-4, 2e3))
+        for axes in grid[:: -(-len(columns) // 2)]:
+            axes.set_ylabel("distance, mm")
+        for axes in grid[len(columns) :]:
+            axes.set_visible(False)
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return figure
 
 
-def settings(result: Result) -> Figure:
-    """Position error of every setting at the horizon, and the share of drives inside the bound against the iterations."""
-    rows = [row for row in result["rows"] if row["refused"] is None]
-    labels = [f"{row['name']}, {row['physics_hz']:g} Hz" for row in rows]
+def collisions(result: Result) -> Figure:
+    """Restitution and largest overlap over the speed of a head-on impact, and the outcomes of grazing hits over the phase."""
+    found = {name: np.array(value) for name, value in result["restitution"].items()}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 0.3 * len(rows) + 1.6), layout="constrained")
-        left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
-        for index, row in enumerate(rows):
-            middle, _, high, worst = row["error_m"]
-            left.plot([middle, worst], [index, index], color="#cccccc", linewidth=1.2, zorder=1)
-            for value, marker, label in ((middle, "o", "median"), (high, "D", "99 %"), (worst, "|", "worst")):
-                left.plot(value, index, marker, color=BATCHED, markersize=6, label=label if not index else None)
-            if row["fine_m"] is not None:
-                text = f"median against {result['fine_hz']:g} Hz"
-                left.plot(row["fine_m"][0], index, "o", mfc="white", mec=REFERENCE, label=text if not index else None)
-        left.set_yticks(range(len(rows)), labels)
-        left.invert_yaxis()
-        left.axvline(result["bound"]["bound_m"], color=REFERENCE, linestyle="--", linewidth=1.0)
-        left.set(xscale="log", xlabel=f"position error after {result['bound']['horizon_s']:g} s, m", title="Error of the solver")
-        left.legend(loc="upper center", bbox_to_anchor=(0.35, -0.24), ncols=4, columnspacing=1.0, handletextpad=0.3)
-        here = [row for row in rows if row["physics_hz"] == result["shipped_hz"] and row["solver"]["integrator"] == "Euler"]
-        for index, kind in enumerate(dict.fromkeys(row["solver"]["algorithm"] for row in here)):
-            line = sorted((row["solver"]["iterations"], 100 * row["share_within"]) for row in here if row["solver"]["algorithm"] == kind)
-            right.plot(*zip(*line, strict=True), color=COLOURS[index], marker=MARKERS[index], label=kind)
-        right.set(
-            xlabel="iterations",
-            ylabel=f"% inside {1e3 * result['bound']['bound_m']:g} mm",
-            title=f"Within the bound, {result['shipped_hz']:g} Hz",
-        )
-        right.set_ylim(top=102)
-        right.legend(loc="lower right")
+        figure, (left, middle, right) = _panels(11.0, 3.7, 1, 3)
+        left.plot(found["closing"], found["law"], color="#000000", linewidth=1.1, label="Hunt and Crossley 1975")
+        left.plot(found["closing"], found["restitution"], "o", color=BATCHED, label="simulated")
+        left.set(xscale="log", xlabel="closing speed, m/s", title="Coefficient of restitution", ylim=(0, 1))
+        left.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
+        left.legend()
+        middle.plot(found["closing"], found["overlap_m"], "o-", color=BATCHED)
+        middle.set(xlabel="closing speed, m/s", title="Largest overlap of the two cars, m", xlim=(0, None), ylim=(0, None))
+        for index, grazed in enumerate(result["grazes"]):
+            yaw = np.array(grazed["yaw_deg"])[:, 1]
+            y, angle, speed = grazed["case"]
+            label = f"y {y:g} m, {np.rad2deg(angle):.0f}°, {speed:g} m/s"
+            right.plot(np.arange(len(yaw)) / len(yaw), yaw, MARKERS[index], color=COLOURS[index], markersize=3.5, label=label)
+        right.set(xlabel="start, in ways of a physics step", title="Turn of a grazed car, degrees")
+        right.margins(y=0.75)
+        right.legend(fontsize=7, loc="upper right", ncols=2)
     return figure
 
 
-def histograms(result: Result) -> Figure:
-    """Forces, grip and slip of the wheels in both engines."""
-    shown = {
-        "normal": "Normal force, kN",
-        "tangent": "Friction force, kN",
-        "friction_utilization": "Share of grip in use",
-        "slip": "Slip, m/s",
-    }
+def tyre(result: Result) -> Figure:
+    """Force of a tyre over longitudinal slip and slip angle, for several friction coefficients and loads."""
+    slip, styles = np.array(result["slip"]), ("-", "--", ":")
     with matplotlib.rc_context(STYLE):
-        figure, grid = _panels(9.5, 5.2, 2, 2)
-        for axes, (name, title) in zip(grid, shown.items(), strict=True):
-            histogram = result["histograms"][name]
-            edges = np.array(histogram["edges"]) * (1e-3 if "kN" in title else 1.0)
-            share = {kind: np.array(histogram[kind]) / np.sum(histogram[kind]) for kind in ("batched", "reference")}
-            axes.stairs(share["reference"], edges, fill=True, color=REFERENCE, alpha=0.35, label="C engine")
-            axes.stairs(share["batched"], edges, color=BATCHED, linewidth=1.3, label="batched")
-            axes.set(yscale="log", title=f"{title} (overlap {100 * result['overlap'][name]:.1f} %)", ylabel="share of wheel steps")
-        grid[0].legend()
+        figure, grid = _panels(10.0, 4.2, 1, 2)
+        for axes, name in zip(grid, ("longitudinal", "lateral"), strict=True):
+            over = slip if name == "longitudinal" else np.rad2deg(np.arctan(slip))
+            for row, mu in enumerate(result["friction"]):
+                for column, load in enumerate(result["load"]):
+                    label = f"μ = {mu:g}, {1e-3 * load:g} kN"
+                    force = 1e-3 * np.array(result[name][row][column])
+                    axes.plot(over, force, styles[column % 3], color=COLOURS[row], linewidth=1.3, label=label)
+            axes.set(ylabel=f"{name} force, kN", xlim=(0, over[-1]), ylim=(0, None))
+        grid[0].set(xlabel="slip of a braked wheel, 1: locked", title=f"Braking, {result['speed']:g} m/s")
+        grid[1].set(xlabel="slip angle, degrees", title=f"Cornering, {result['speed']:g} m/s")
+        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
-def collisions(result: Result, contact: str) -> Figure:
-    """Speed after the impact, momentum and energy of both engines, an encounter a point."""
-    rows = {name: np.array(column) for name, column in result["contacts"][contact]["rows"].items()}
-    pairs = (
-        ("Speed of each car after the impact, m/s", rows["speed_reference"], rows["speed"], 1.0),
-        ("Change of both cars' momentum, kN s", rows["momentum_reference"], rows["momentum"], 1e-3),
-        ("Energy lost, kJ", rows["lost_reference"], rows["lost"], 1e-3),
-    )
+def lane_change(result: Result) -> Figure:
+    """Paths of a lane change under full braking, with and without the anti-lock controller."""
     with matplotlib.rc_context(STYLE):
-        figure, grid = _panels(10.5, 3.9, 1, 3)
-        for axes, (title, wanted, found, scale) in zip(grid, pairs, strict=True):
-            top = 1.05 * scale * max(wanted.max(), found.max())
-            axes.plot([0, top], [0, top], color=GREY, linewidth=0.9)
-            for index, kind in enumerate(result["kinds"]):
-                chosen = rows["kind"] == index
-                if chosen.any():
-                    label = kind.replace("_", " ")
-                    axes.plot(scale * wanted[chosen].ravel(), scale * found[chosen].ravel(), MARKERS[index], color=COLOURS[index],
-                              markersize=4, alpha=0.75, markeredgewidth=0, label=label)  # fmt: skip
-            axes.set(title=title, xlabel=f"C engine, {contact} contact", ylabel="batched", aspect="equal", xlim=(0, top), ylim=(0, top))
-        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(result["kinds"]))
+        figure, (axes,) = _panels(8.0, 3.0, 1, 1)
+        for index, (name, run) in enumerate(result["runs"].items()):
+            path = np.array(run["path_m"])
+            axes.plot(*path.T, color=COLOURS[index], label=f"ABS {name}")
+            axes.plot(*path[-1], "o", color=COLOURS[index])
+        axes.axhline(result["offset_m"], color=GREY, linestyle="--", linewidth=1.0, label="the other lane")
+        axes.set(xlabel="m", ylabel="m", ylim=(-0.6, result["offset_m"] + 0.8))
+        axes.legend(loc="center left")
     return figure
 
 
 def stopping(result: Result) -> Figure:
-    """Way to a halt against friction beside v^2 / (2 mu g) and the brakes' limit; the shipped brakes, and stronger ones that lock."""
-    titles = {"stopping": "The car's brakes", "locked": f"Brakes {result['strong']:g} times as strong"}
+    """Distance to a halt over friction beside v^2 / (2 mu g)."""
     with matplotlib.rc_context(STYLE):
-        figure, grid = _panels(9.5, 4.2, 1, 2)
-        for axes, (kind, title) in zip(grid, titles.items(), strict=True):
-            have = [name for name in result["backends"] if kind in result["backends"][name]]
-            friction = np.array(result["backends"][have[0]][kind]["friction"])
-            axes.plot(friction, result["grip_limit_m"], color="#000000", linewidth=1.2, label="v²/(2 μ g), less the air")
-            if kind == "stopping":
-                axes.axhline(
-                    result["brake_limit_m"], color="#000000", linewidth=1.2, linestyle="--", label="brakes' torque, wheels rolling"
-                )
-            for index, name in enumerate(have):
-                way, stands = (np.array(result["backends"][name][kind][key]) for key in ("distance_m", "stopped"))
-                look = {"mec": COLOURS[index], "mfc": "none", "markersize": 5 + 2.2 * index, "markeredgewidth": 1.4, "linestyle": "none"}
-                axes.plot(friction[stands], way[stands], MARKERS[index], **look, label=NAMES.get(name, name))
-                axes.plot(friction[~stands], way[~stands], MARKERS[index], **look, alpha=0.4)
-            axes.set(xscale="log", yscale="log", title=title, xlabel="friction μ", ylabel=f"way to a halt from {result['speed']:g} m/s, m")
-            if kind == "stopping":
-                axes.plot([], [], "o", mfc="none", mec=GREY, alpha=0.5, label="pale: still moving at the end")
-                axes.legend()
-            _plain_ticks(axes, [0.05, 0.1, 0.2, 0.5, 1.0], [10.0, 20.0, 50.0, 100.0, 200.0])
+        figure, (left, right) = _panels(9.5, 4.0, 1, 2)
+        for index, (name, found) in enumerate((n, f["stopping"]) for n, f in result["backends"].items()):
+            friction, way, stands = (np.array(found[key]) for key in ("friction", "distance_m", "stopped"))
+            law = result["speed"] ** 2 / (2.0 * friction * GRAVITY)
+            look = {"color": COLOURS[index], "markersize": 6, "linewidth": 0.8, "mfc": "none", "markeredgewidth": 1.3}
+            left.plot(friction, way, MARKERS[index], **look, label=NAMES.get(name, name))
+            left.plot(friction[~stands], way[~stands], "x", color=COLOURS[index], markersize=11)
+            if name in ("articulated", "without_abs"):
+                right.plot(friction, way / law, MARKERS[index] + "-", **look)
+            if not index:
+                left.plot(friction, law, color="#000000", linewidth=1.0, label="v²/(2 μ g)")
+        left.axhline(result["brake_limit_m"], color="#000000", linestyle="--", linewidth=1.0, label="brakes' torque, wheels rolling")
+        left.set(xscale="log", yscale="log", xlabel="friction μ", title=f"Distance to a halt from {3.6 * result['speed']:.0f} km/h, m")
+        _plain_ticks(left, [0.1, 0.2, 0.5, 1.0], [20.0, 50.0, 100.0, 200.0, 400.0])
+        left.plot([], [], "x", color=GREY, label="still moves at the end")
+        left.legend(fontsize=7.5)
+        right.axhline(1.05, color=REFERENCE, linestyle="--", linewidth=1.0)
+        right.axhline(1.0, color="#000000", linewidth=1.0)
+        right.set(xscale="log", xlabel="friction μ", title="Distance over v²/(2 μ g)", ylim=(0.85, 1.15))
+        right.set_xticks([0.1, 0.2, 0.5, 1.0], ["0.1", "0.2", "0.5", "1"])
+        right.minorticks_off()
     return figure
 
 
@@ -190,7 +163,9 @@ def split(result: Result) -> Figure:
                 label = NAMES.get(name, name) if not side else None
                 left.plot(found["time_s"], np.rad2deg(found["yaw"][side]), style, color=COLOURS[index], label=label)
         high, low = result["split_friction"]
-        left.set(title=f"Braking from {result['speed']:g} m/s, friction {high:g} and {low:g}", xlabel="time, s", ylabel="yaw, degrees")
+        left.set(
+            title=f"Braking from {result['split_speed']:g} m/s, friction {high:g} and {low:g}", xlabel="time, s", ylabel="yaw, degrees"
+        )
         left.plot([], [], "-", color=GREY, label="left wheels slippery")
         left.plot([], [], "--", color=GREY, label="right wheels slippery")
         left.legend()

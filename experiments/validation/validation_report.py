@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from experiments.validation import robustness_report, target_check
 from experiments.validation import validation_figures as figures
+from experiments.validation.motion_laws import LOCKED
 from experiments.validation.validation_figures import NAMES
 from scenefactory_jax.core import markdown
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
@@ -27,7 +28,7 @@ def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mappi
     """
     folder.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[Result, Path], list[str]]] = {
-        "drives": _drives, "settings": _settings, "encounters": _encounters, "laws": _laws,
+        "drives": _drives, "laws": _laws, "handling": _handling, "collisions": _collisions,
         "extremes": robustness_report.extremes, "faults": robustness_report.faults, "costs": robustness_report.costs,
     }  # fmt: skip
     lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(target_check.of(results, targets))]
@@ -50,9 +51,10 @@ def _made(results: Mapping[str, Mapping[str, Any]]) -> str:
     versions = ", ".join(f"{name} {' and '.join(found)}" for name, found in packages.items())
     whole = sum(part["seconds"] for part in results.values())
     return "\n\n".join([
-        f"The batched cars against MuJoCo's C engine, in double precision and converged, and against laws of motion. {versions}; "
-        f"{whole / 60:.1f} minutes in all, compilation included. The numbers are in `results/`.",
-        markdown.format_table(["Part", "Seconds", "Device", "Processes for the C engine", "Command"], rows),
+        f"The batched cars against the stock MuJoCo engine and against laws of motion. {versions}; {whole / 60:.1f} minutes in all, "
+        "compilation included. The numbers are in `results/`. Frequency responses, rise times, spins and other manoeuvres against the "
+        "reference car, CommonRoad's multi-body model, are in [sysid](../sysid/sysid.md).",
+        markdown.format_table(["Part", "Seconds", "Device", "Processes", "Command"], rows),
     ])  # fmt: skip
 
 
@@ -66,123 +68,42 @@ def _mm(metres: float) -> str:
 
 
 def _drives(result: Result, folder: Path) -> list[str]:
-    bound = result["bound"]
-    error = np.array(result["error_m"])
-    seconds = result["time_s"][-1]
-    middle, worst = result["nudged_m"]
-    hits = round(result["within"] * result["count"])
-    words = (
-        f"{result['count']} random drives of {seconds:g} s (friction, start speed, patterns of slippery wheels, held and "
-        "extreme controls). The C engine has the same time step and its solver converged, so what differs is the batched solver's work "
-        "and single precision. "
-        f"{hits} of {result['count']} drives stay within {_mm(bound['bound_m'])} at all times up to {bound['horizon_s']:g} s; "
-        f"then the median error is {_mm(np.median(error))}, the largest {_mm(error.max())}. The drives themselves forgive: in the C "
-        f"engine a start {result['nudge']:g} m/s faster moves the car by {_mm(middle)} (median) and {_mm(worst)} (largest) at that time."
-    )
-    why = (
-        f"Why {_mm(bound['bound_m'])}: no lane, goal or contact is decided by so little, and rounding alone moves these drives by far "
-        "less, so a drive that leaves the bound shows an error of the solver."
-    )
-    rows = [[row["case"], _mm(row["horizon_m"]), _mm(row["end_m"]), _mm(row["nudged_m"])] for row in result["worst"]]
-    header = ["Worst drives", f"Error at {bound['horizon_s']:g} s", f"at {seconds:g} s", f"of the nudged C engine at {seconds:g} s"]
-    shares = ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f} %" for name, share in result["overlap"].items())
-    return [
-        "## Single cars: error growth", words, why,
-        _picture(folder, "errors", "Difference of the batched path from the C engine over time", figures.errors(result)),
-        markdown.format_table(header, rows),
-        "## Forces on the wheels",
-        f"What the tyres did in all drives at all control steps. Share that the two engines' histograms have in common: {shares}.",
-        _picture(folder, "forces", "Wheels of all drives in both engines; shares on a log scale", figures.histograms(result)),
-    ]  # fmt: skip
-
-
-def _settings(result: Result, folder: Path) -> list[str]:
-    rows, kept, refused = [], [], []
-    shipped = (
-        result["shipped"]["algorithm"],
-        result["shipped"]["iterations"],
-        result["shipped"]["line_search"],
-        result["shipped"]["integrator"],
-    )
-    for row in result["rows"]:
-        own = row["solver"]
-        mark = " (shipped)" if (own["algorithm"], own["iterations"], own["line_search"], own["integrator"]) == shipped and (
-            row["physics_hz"] == result["shipped_hz"]) else ""  # fmt: skip
-        if row["refused"] is not None:
-            refused.append(f"{row['name']} at {row['physics_hz']:g} Hz is refused: {row['refused']}.")
-            continue
-        kept.append(row)
-        fine = "" if row["fine_m"] is None else _mm(row["fine_m"][0])
-        error = [_mm(row["error_m"][i]) for i in (0, 2, 3)]
-        rows.append(
-            [f"{row['name']}{mark}", f"{row['physics_hz']:g}", own["integrator"], *error, f"{100 * row['share_within']:.3g} %", fine]
-        )
-    header = [
-        "Solver, iterations/line search",
-        "Hz",
-        "Integrator",
-        "Median",
-        "99 %",
-        "Worst",
-        "Within the bound",
-        f"Median against {result['fine_hz']:g} Hz",
-    ]
-    words = (
-        f"{result['count']} drives with other solvers. Errors are against the converged C engine at the same time step and "
-        f"integrator; the last column is against the C engine at {result['fine_hz']:g} Hz and so holds the error of the time step, too."
-    )
-    chosen = next((row for row, cells in zip(kept, rows, strict=True) if cells[0].endswith("(shipped)")), None)
-    if chosen is not None and chosen["fine_m"] is not None and chosen["fine_m"][0] > 5.0 * chosen["error_m"][0]:
-        refused.append(
-            f"With the shipped setting the solver's own error is {_mm(chosen['error_m'][0])} (median); the time step costs "
-            f"{_mm(chosen['fine_m'][0])}. So a better solver gains nothing that a finer time step does not gain first, and a bound of "
-            f"{_mm(result['bound']['bound_m'])} asks the solver to add no more than a time step does."
-        )
-    return [
-        "## Solver, iterations, time step", words, markdown.format_table(header, rows), " ".join(refused),
-        _picture(folder, "settings", "Position error by setting, and the share of drives inside the bound", figures.settings(result)),
-    ]  # fmt: skip
-
-
-def _encounters(result: Result, folder: Path) -> list[str]:
-    lines = [
-        "## Collisions",
-        f"{result['count']} random encounters of two cars: {', '.join(kind.replace('_', ' ') for kind in result['kinds'])}. The "
-        "batched path pushes boxes apart in the plane, the C engine has its own box-box contact in space; it is run with the same spring "
-        "and damper at every contact point, and once more as a constraint of the same stiffness, which tells how "
-        "much the choice of a contact model matters at all.",
-    ]
+    bound, columns = result["bound"], result["columns"]
     rows = []
-    for name, seen in result["contacts"].items():
-        events, found = seen["events"], {key: np.array(value) for key, value in seen["rows"].items()}
-        if not len(found["closing"]):
-            continue
-        percent = lambda share: f"{100 * share:.3g} %"  # noqa: E731
-        ratio = found["lost"] / np.maximum(found["lost_reference"], 1e-9)
-        rows.append([
-            name, percent(seen["agree"]), events["both"], events["batched_only"], events["reference_only"], events["neither"],
-            len(found["closing"]), percent(np.median(found["speed_share"])), percent(np.percentile(found["speed_share"], 90)),
-            percent(np.median(found["relative"])),
-            percent(np.median(found["momentum_apart"])), f"{np.median(ratio):.2f}", int(np.abs(found["delay_steps"]).max()),
-        ])  # fmt: skip
-    header = ["C engine's contact", "Same event", "Both hit", "Batched only", "C only", "Neither", "Compared",
-              "Speed error, median", "90 %", "Velocity error / closing speed, median", "Momentum, median", "Energy lost / C's, median",
-              "Largest delay, steps"]  # fmt: skip
-    lines += [markdown.format_table(header, rows)]
-    name, seen = next(iter(result["contacts"].items()))
-    if seen["rows"]["closing"]:
-        caption = f"Both engines' collisions, {name} contact in the C engine; an encounter or car a point"
-        lines += [_picture(folder, "collisions", caption, figures.collisions(result, name))]
-        worst = [[row["case"], f"{100 * row['relative']:.3g} %", f"{100 * row['speed_share']:.3g} %"] for row in seen["worst"]]
-        lines += [markdown.format_table([f"Worst encounters ({name})", "Velocity error / closing speed", "Speed error"], worst)]
-    return lines
+    for name, column in columns.items():
+        largest, final = np.array(column["largest_m"]), column["final_m"]
+        rows.append([name, f"{100 * column['within']:.3g} %", *(_mm(value) for value in (*final, np.percentile(largest, 99)))])
+    header = ["Compared with", f"Within {_mm(bound['bound_m'])}", f"Median at {bound['horizon_s']:g} s", "90 %", "Worst",
+              "Largest distance of a drive, 99 %"]  # fmt: skip
+    words = (
+        f"{result['count']} random drives (friction, start speed, patterns of slippery wheels, held and extreme controls), stepped by the "
+        f"closed form at {result['physics_hz']:g} Hz in single precision. `stock MuJoCo` is the unchanged engine in double precision: "
+        "`mj_step` with the package's forces of tyres, engine and brakes, computed anew in numpy on the engine's positions and "
+        "velocities and applied as `qfrc_applied` where `mj_step` calls its control callback. `MJX` is `mjx.step` with the same forces. "
+        "Both have the same time step, so what differs is solver and precision. The finer time steps show the error of the time step: "
+        "semi-implicit Euler displaces a car by half a step times its change of speed, "
+        f"{500.0 / result['physics_hz']:.1f} mm for each m/s. The "
+        "iterations that of the solver of the normal forces. A drive is within the bound if it is at all times until "
+        f"{bound['horizon_s']:g} s."
+    )
+    worst = [[name, row["case"], _mm(row["largest_m"])] for name in list(columns)[:3] for row in columns[name]["worst"]]
+    stable = (
+        f"For {result['seconds']:g} s, {result['finite']} of {result['count']} drives are finite; the car's vertical axis is never more "
+        f"than {np.degrees(np.arccos(min(result['upright'], 1.0))):.0f} degrees from upright, and the largest acceleration in the plane "
+        f"is {result['acceleration']:.1f} m/s²."
+    )
+    return [
+        "## Equivalence", words, markdown.format_table(header, rows),
+        _picture(folder, "errors", "Distance of the closed form from other engines, time steps and solvers", figures.errors(result)),
+        markdown.format_table(["Compared with", "Worst drives", "Largest distance"], worst), stable,
+    ]  # fmt: skip
 
 
 def _laws(result: Result, folder: Path) -> list[str]:
     return [
         "## Stopping",
         *_stopping(result),
-        _picture(folder, "stopping", "Way to a halt against friction", figures.stopping(result)),
+        _picture(folder, "stopping", "Distance to a halt against friction", figures.stopping(result)),
         "## Standstill",
         *_standing(result),
         "## Cornering",
@@ -202,63 +123,35 @@ def _rows(result: Result, key: str) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _stopping(result: Result) -> Sequence[str]:
-    limit = np.array(result["grip_limit_m"])
-    found, locked = _rows(result, "stopping"), _rows(result, "locked")
+    found = _rows(result, "stopping")
     friction = next(iter(found.values()))["friction"]
-    dry = int(np.argmax(friction))
+    law = result["speed"] ** 2 / (2.0 * friction * GRAVITY)
     words = (
-        f"Full brake from {result['speed']:g} m/s. With wheels that roll the brakes' torque alone needs {result['brake_limit_m']:.1f} m; "
-        f"brakes {result['strong']:g} times as strong lock the wheels on any road. Ways along the path; * still moves when the time is up. "
-        f"Mean deceleration at friction {friction[dry]:g}: "
-        f"{', '.join(f'{name} {_at(one, dry)} m/s²' for name, one in found.items())}."
+        f"Full brake from {3.6 * result['speed']:.0f} km/h; * still moves when the time is up. The brakes' torque alone, with rolling "
+        f"wheels, needs {result['brake_limit_m']:.1f} m. A wheel counts as locked below {LOCKED:g} of the car's speed."
     )
-    rows = [["v²/(2 μ g), less the air", *(f"{way:.1f}" for way in limit)]]
-    for kind, backends in (("", found), (f", brakes x {result['strong']:g}", locked)):
-        rows += [[f"{name}{kind}", *_ways(one)] for name, one in backends.items()]
-    rows += [[f"C engine, articulated, brakes x {result['strong']:g}", *(f"{way:.1f}" for way in result["locked_c_m"])]]
-    return [
-        words,
-        markdown.format_table(["Way to a halt, m", *(f"μ = {mu:g}" for mu in friction)], rows),
-        _brakes(found, limit),
-        _hops(result),
+    rows = [["v²/(2 μ g)", *(f"{way:.1f}" for way in law)]]
+    rows += [[name, *_ways(one)] for name, one in found.items()]
+    ratios = [[f"{name}, over v²/(2 μ g)", *(f"{ratio:.3f}" for ratio in found[name]["distance_m"] / law)] for name in list(found)[:2]]
+    locks = [
+        [f"{name}, locks first", *(_first(*pair) for pair in zip(one["front_locks_s"], one["rear_locks_s"], strict=True))]
+        for name, one in found.items()
+        if "front_locks_s" in one
     ]
+    return [words, markdown.format_table(["Distance to a halt, m", *(f"μ = {mu:g}" for mu in friction)], [*rows, *ratios, *locks])]
 
 
-def _hops(result: Result) -> str:
-    """Why the way may be longer than that of tyres that slide throughout."""
-    share = np.array(result["locked_c_m"]) / np.array(result["grip_limit_m"])
-    worst, friction = int(share.argmax()), result["backends"]["articulated"]["locked"]["friction"]
-    return (
-        f"The C engine needs up to {share[worst]:.3f} of the way of tyres that slide, at friction {friction[worst]:g}: "
-        "wheels that lock so suddenly hop, and the soft contact does not reach the whole friction of a wheel's short landings."
-    )
-
-
-def _at(found: Mapping[str, np.ndarray], index: int) -> str:
-    return f"{found['deceleration'][index]:.2f}"
+def _first(front: float, rear: float) -> str:
+    """The axle that locks first; times below zero: not at all."""
+    if front < 0.0 and rear < 0.0:
+        return "none"
+    if front < 0.0 or 0.0 <= rear < front:
+        return f"rear, {rear:.2f} s"
+    return f"front, {front:.2f} s" if rear < 0.0 or front < rear else f"both, {front:.2f} s"
 
 
 def _ways(found: Mapping[str, np.ndarray]) -> list[str]:
     return [f"{way:.1f}{'' if stands else '*'}" for way, stands in zip(found["distance_m"], found["stopped"], strict=True)]
-
-
-def _brakes(found: Mapping[str, Mapping[str, np.ndarray]], limit: np.ndarray) -> str:
-    """What brakes as friction and latched ones do where wheels lock."""
-    pair = [found.get(str(NAMES[name])) for name in ("articulated", "latched")]
-    if pair[0] is None or pair[1] is None:
-        return ""
-    share = pair[1]["distance_m"] / limit
-    locks = np.flatnonzero(pair[0]["distance_m"] < 1.05 * limit)
-    if not len(locks):
-        return ""
-    own = (pair[0]["distance_m"] / limit)[locks]
-    return (
-        f"Brakes as joint friction let a locked wheel slide: up to friction {pair[0]['friction'][locks].max():g} the car needs "
-        f"{own.min():.3f} to {own.max():.3f} of the way of tyres that slide. The published latched torque acts against a remembered "
-        "sign of the wheel's rate, which flips with every physics step once the wheel locks: there the car needs "
-        f"{share[locks].min():.2f} to {share[locks].max():.2f} of it, and {int((~pair[1]['stopped']).sum())} of {len(limit)} cars have "
-        "not come to rest when the time is up."
-    )
 
 
 def _standing(result: Result) -> Sequence[str]:
@@ -268,11 +161,7 @@ def _standing(result: Result) -> Sequence[str]:
     rows = [
         [f"{name}, {what}", *(f"{value:.2g}" for value in one[column])] for name, one in found.items() for what, column in columns.items()
     ]
-    words = (
-        f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by friction. "
-        "MuJoCo's friction losses are soft: a joint that holds a torque yields at a rate in proportion. What the brakes take of the "
-        "engine's torque is therefore taken off before the solver sees it; latched brakes cannot do that."
-    )
+    words = f"Braked to a halt, then held for {result['hold_s']:g} s: the farthest that the car comes from where it stood, by friction."
     return [words, markdown.format_table(["Creep, mm", *(f"μ = {mu:g}" for mu in friction)], rows)]
 
 
@@ -310,9 +199,10 @@ def _split(result: Result, folder: Path) -> Sequence[str]:
         name: [w for kind, w in zip(bend["surface"], bend["wide_m"], strict=True) if kind == name]
         for name in dict.fromkeys(bend["surface"])
     }
-    ways = ", ".join(f"{name} {' and '.join(f'{w:.1f}' for w in both)} m" for name, both in wide.items())
+    ways = ", ".join(f"{name} {' and '.join(f'{abs(w):.1f}' for w in both)} m" for name, both in wide.items())
     return [
-        f"Full brake with one side on friction {low:g}, the other on {high:g}: the car turns to the side that grips (left is positive).",
+        f"Full brake from {result['split_speed']:g} m/s with one side on friction {low:g}, the other on {high:g}: the car turns to the "
+        "side that grips (left is positive).",
         markdown.format_table(header, rows),
         _picture(folder, "split", "Yaw while braking on split friction", figures.split(result)),
         f"A patch of ice or snow in a bend carries the car off the dry car's circle (left and right turn): {ways}.",
@@ -341,3 +231,71 @@ def _ride(result: Result) -> Sequence[str]:
     lying = [(name, f"{100 * share:.0f} %") for name, share in carried.items() if share < 0.5]
     notes = [f"{name} lies on its bump stops: its springs carry {share} of the weight." for name, share in lying]
     return [words, markdown.format_table(header, rows), " ".join(notes)]
+
+
+def _handling(result: Result, folder: Path) -> list[str]:
+    drive, turn, change, stand, tyre = (result[key] for key in ("acceleration", "understeer", "lane_change", "parking", "tyre"))
+    speeds = ", ".join(f"{value:+.2f} deg/g at {v:g} m/s" for v, value in zip(turn["speed"], turn["gradient"], strict=True))
+    ends = "; ".join(
+        f"with ABS {name} the car stops {run['end_m'][0]:.1f} m ahead and {run['end_m'][1]:.2f} m aside, turned by {run['yaw_deg']:.1f}°"
+        for name, run in change["runs"].items()
+    )
+    grid = [
+        [f"{side}, {what}", *(f"{value:.2g}" for value in stand[key][row])]
+        for row, side in enumerate(("along the car", "across it"))
+        for key, what in (("creep_mm", f"creep in {stand['seconds']:g} s"), ("settled_mm", f"in the first {stand['settle_s']:g} s"))
+    ]
+    limit, loads = np.array(tyre["friction"])[:, None] * np.array(tyre["load"]), tyre["load"]
+    rows = [
+        [f"{1e-3 * load:g} kN", f"{1e-3 * tyre['stiffness'][i]:.1f} kN/rad", f"{tyre['stiffness'][i] / load:.1f} /rad",
+         *(f"{np.max(tyre['lateral'][row][i]) / limit[row, i]:.3f}, {tyre['longitudinal'][row][i][-1] / limit[row, i]:.3f}"
+           for row in range(len(limit)))]
+        for i, load in enumerate(loads)
+    ]  # fmt: skip
+    header = ["Load", "Cornering stiffness", "over the load", *(f"Peak, locked; over μ load, μ = {mu:g}" for mu in tyre["friction"])]
+    return [
+        "## Tyre",
+        f"Steady forces of one tyre at {tyre['speed']:g} m/s. Beyond the peak the force falls with the sliding speed.",
+        _picture(folder, "tyre", "Force against slip by friction and load", figures.tyre(tyre)),
+        markdown.format_table(header, rows),
+        "## Handling",
+        f"Full throttle: 0 to 100 km/h in {drive['to_100_s']:.1f} s; top speed {3.6 * drive['top_speed']:.0f} km/h; the engine's power "
+        f"equals drag and rolling resistance at {3.6 * drive['top_speed_law']:.0f} km/h. Understeer gradient in steady turns up to "
+        f"{np.max(turn['lateral']):.1f} m/s²: {speeds} (above zero: understeer).",
+        f"A lane change of {change['offset_m']:g} m from {change['speed']:g} m/s under full braking on friction "
+        f"{change['friction']:g}: {ends}.",
+        _picture(folder, "lane_change", "Lane change under full braking", figures.lane_change(change)),
+        f"Braked on the force of a {100 * stand['grade']:g} % grade:",
+        markdown.format_table(["Way, mm", *(f"μ = {mu:g}" for mu in stand["friction"])], grid),
+    ]
+
+
+def _collisions(result: Result, folder: Path) -> list[str]:
+    rows = []
+    for grazed in result["grazes"]:
+        y, angle, speed = grazed["case"]
+        ranges = [_range(np.array(grazed[name])[:, car]) for car in (1, 0) for name in ("speed", "yaw_deg")]
+        hits = int((np.array(grazed["force"]) > 0.0).sum())
+        rows.append([f"{y:g} m, {np.rad2deg(angle):.0f}°, {speed:g} m/s", f"{hits} of {result['phases']}", *ranges])
+    header = ["Struck car's place aside, angle, speed of the other", "Hits", "Struck car: speed after, m/s", "turn, degrees",
+              "Other car: speed after, m/s", "turn, degrees"]  # fmt: skip
+    fast = {name: np.array(value) for name, value in result["fast"].items()}
+    count = len(fast["distance_m"])
+    passed = int((fast["distance_m"] < result["tunnel_m"]).sum())
+    return [
+        "## Collisions",
+        f"A grazing hit with its start shifted through one physics step in {result['phases']} parts: smallest and largest outcome "
+        f"after {result['graze_s']:g} s.",
+        markdown.format_table(header, rows),
+        _picture(folder, "collisions", "Restitution over speed; overlap; grazing hits by phase", figures.collisions(result)),
+        "The law of the force is that of Hunt and Crossley (1975). `dynamics/collision.py` cites measurements of restitution on cars.",
+        f"{count} random encounters of two cars at up to {result['speed_max']:g} m/s each, half of them head on, whose paths come within "
+        f"{result['miss_m']:g} m: in {passed} the centres come closer than {result['tunnel_m']:.2f} m, as those of cars that pass through "
+        f"each other do; the smallest distance is {fast['distance_m'].min():.2f} m. {int((fast['force'] > 0.0).sum())} have a contact. "
+        f"The kinetic energy of both rises by at most {100 * fast['energy_rise'].max():.2g} %, and the momentum changes by at most "
+        f"{(fast['momentum'] / fast['allowance']).max():.2f} of what tyres and air can do.",
+    ]
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.min():.2f} to {values.max():.2f}"

@@ -217,7 +217,7 @@ def test_cars_push_each_other_and_those_off_stage_touch_nobody(task, scene):
     rig.qpos[1, 3:7], rig.qpos[2, :7] = rig.qpos[0, 3:7], rig.qpos[1, :7]
     third.active = False
     baseline_environment.drive(task.engine, crowd, [None if agent is third else np.zeros(3) for agent in crowd.agents])
-    assert first.contact_force == second.contact_force > 1e4  # 0.1 m at 1e6 N/m, less as they part
+    assert first.contact_force == second.contact_force > 5e3  # 0.1 m at 1.2e5 N/m, less as they part
     assert third.contact_force == 0.0 and third.age == 0 and first.age == 1
 
 
