@@ -6,6 +6,7 @@ from support import compiler  # noqa: F401  # before anything imports JAX
 
 # isort: split
 import pytest
+from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
@@ -14,6 +15,8 @@ LONGEST = (  # files that take longest, by CPU time: started first, or one worke
     "test_validation", "test_digests", "test_environment", "test_optimization", "test_ppo", "test_unvectorised_baseline",
     "test_extreme_states", "test_set_kernel", "test_dynamics", "test_collision", "test_adapters_gymnasium", "test_adapters_brax",
 )  # fmt: skip
+
+composing.share()
 
 
 def pytest_collection_modifyitems(items):
