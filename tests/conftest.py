@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from support import compiler  # noqa: F401  # before anything imports JAX
+from support import compiler, type_checks  # noqa: F401  # before anything imports JAX or the package
 
 # isort: split
 import pytest
