@@ -27,12 +27,12 @@ def test_shapes_are_checked_wherever_an_annotation_names_them():
         assert type_checks.choose_check(function) == "shapes", annotation
 
     @decorated
-    def both(one: Float[Array, " n"], other: Float[Array, " n"]) -> Float[Array, " n"]:
+    def both(one: Road, other: Road) -> Road:
         return one + other
 
-    both(jnp.ones(3), jnp.ones(3))
+    both(jnp.ones((3, 2)), jnp.ones((3, 2)))
     with pytest.raises(TypeCheckError):
-        both(jnp.ones(3), jnp.ones(1))
+        both(jnp.ones((3, 2)), jnp.ones((1, 2)))
 
 
 def test_plain_types_are_checked_without_shapes():
