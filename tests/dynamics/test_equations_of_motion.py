@@ -274,6 +274,7 @@ def test_a_tyre_in_the_air_carries_nothing_however_its_wheel_turns(quick, moves,
         assert max(np.abs(part).max() for part in (after.normal, after.tangent, after.slip)) < 1e-3
 
 
+@pytest.mark.slow  # an experiment; test_contact_solver has the solver by itself
 def test_the_solver_converges_where_it_is_compiled_with_its_problem():
     """XLA may work a number out anew in every loop that needs it, rounded differently each time; the solver must stand that.
 
