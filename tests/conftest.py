@@ -2,18 +2,21 @@
 
 from pathlib import Path
 
-from support import compiler  # noqa: F401  # before anything imports JAX
+from support import compiler, type_checks  # noqa: F401  # before anything imports JAX or the package
 
 # isort: split
 import pytest
+from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
-    "test_study", "test_equations_of_motion", "test_train", "test_validation_run", "test_notebooks", "test_contact_solver",
-    "test_randomization", "test_traffic", "test_patches_and_rain", "test_sharding", "test_fault_isolation", "test_benchmark",
-    "test_validation", "test_digests", "test_environment", "test_optimization", "test_ppo", "test_unvectorised_baseline",
-    "test_extreme_states", "test_set_kernel", "test_dynamics", "test_collision", "test_adapters_gymnasium", "test_adapters_brax",
+    "test_train", "test_study", "test_digests", "test_adapters_gymnasium", "test_validation_run", "test_environment", "test_traffic",
+    "test_benchmark", "test_troubleshooting", "test_ppo", "test_adapters", "test_randomization", "test_equations_of_motion",
+    "test_operations", "test_dynamics", "test_validation", "test_film", "test_contact_solver", "test_docs", "test_gpu_processes",
+    "test_failures", "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
 )  # fmt: skip
+
+composing.share()
 
 
 def pytest_collection_modifyitems(items):

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
+from support.calls import bind_calls
 from support.pages import commands
 from support.running import ROOT
 
@@ -36,10 +37,21 @@ def test_commands_of_the_pages_compose(page):
         assert hydra_config.load_config(command, *launched)
 
 
-def test_the_python_of_the_library_page_runs(quickly):
-    """All but the adapters, in the order of the page, at a size that compiles in seconds."""
+def library_blocks():
+    """The Python of docs/library.md without the adapters, in its order."""
     page = (ROOT / "docs" / "library.md").read_text()
-    blocks = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "adapters.gymnasium" not in block]
+    return [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "adapters.gymnasium" not in block]
+
+
+def test_the_python_of_the_library_page_names_what_there_is():
+    called = bind_calls("\n".join(library_blocks()), "library.md")
+    assert {"sf.load_config", "sf.make", "sf.load_policy", "tree_where", "flatten_observation", "record"} <= set(called)
+
+
+@pytest.mark.slow
+def test_the_python_of_the_library_page_runs(quickly):
+    """At a size that compiles in seconds."""
+    blocks = library_blocks()
     small = {'"experiment=demo"': '"experiment=smoke"', '"scenes.count=4"': '"scenes.count=1", "dynamics=bicycle"', "steps=300": "steps=3"}
     code = "\n".join(blocks)
     assert all(code.count(line) for line in small) and len(blocks) == 3

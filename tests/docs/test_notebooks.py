@@ -1,14 +1,13 @@
-"""The notebooks run, and are kept with outputs that can be shown anywhere. `make test-slow` runs all of them, `make test` one."""
+"""The notebooks run (`make test-slow`), call what there is, and are kept with outputs that can be shown anywhere."""
 
-import ast
 import os
 import re
 
 import pytest
+from support.calls import bind_calls
 from support.running import ROOT
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-IN_EVERY_RUN = "06_own_parts"  # the others take three minutes together
 SHORT = '"timing.episode_s=2"'
 SHORTER = {  # how well it learns is for other tests: notebook -> what a test runs in place of a line, and what must be there in the end
     "01_quickstart": (
@@ -73,17 +72,13 @@ def test_names_no_machine(notebook):
     assert not found
 
 
-def test_what_it_imports_exists(path, notebook):
-    """Imports alone, so that a renamed function is found where the whole notebook does not run."""
+def test_what_it_imports_and_calls_exists(path, notebook):
+    """So that a renamed function or argument is found where the notebook does not run."""
     lines = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code").splitlines()
-    code = ast.parse("\n".join(line for line in lines if not line.lstrip().startswith(("%", "!"))))
-    imports = [node for node in code.body if isinstance(node, (ast.Import, ast.ImportFrom))]
-    exec(compile(ast.Module(imports, []), path.name, "exec"), {})
+    assert bind_calls("\n".join(line for line in lines if not line.lstrip().startswith(("%", "!"))), path.name)
 
 
-@pytest.mark.parametrize(
-    "path", [pytest.param(path, marks=[] if path.stem == IN_EVERY_RUN else pytest.mark.slow, id=path.stem) for path in NOTEBOOKS]
-)
+@pytest.mark.slow  # three minutes together
 def test_runs(path, notebook, tmp_path):
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient: pip install scenefactory_jax[dev]")
     pytest.importorskip("ipykernel", reason="needs ipykernel: pip install scenefactory_jax[dev]")

@@ -24,6 +24,11 @@ def sweep(folder, *arguments):
     return [hydra_config.read(run) for run in sorted((folder / "runs").iterdir()) if len(metrics_csv.read(run)) == 1]
 
 
+def test_the_first_job_of_a_sweep_and_what_varies():
+    assert hydra_config.sweep(["seed=0,1", "weather=wet"]) == (["weather=wet", "seed=0"], {"seed"})
+
+
+@pytest.mark.slow
 def test_values_that_commas_divide_are_runs_of_their_own(tmp_path):
     found = sweep(tmp_path, "seed=0,1", "weather=wet")
     assert sorted(run["seed"] for run in found) == [0, 1] and len({run["name"] for run in found}) == 1

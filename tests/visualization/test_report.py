@@ -361,6 +361,15 @@ def test_gif_of_a_still_picture(tmp_path):
         assert film.info["duration"] == 300 and (np.abs(np.asarray(film.convert("RGB")).astype(int) - 200) < 4).all()
 
 
+def test_a_gif_holds_a_background_once(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    pictures = [noise.copy() for _ in range(8)]
+    for row, picture in enumerate(pictures):
+        picture[[row, -1 - row]] = 0  # far apart: the box around what changes is large
+    sizes = [video_file.write(tmp_path / f"{n}.gif", pictures[:n], samples=pictures[:1], fps=10.0).stat().st_size for n in (1, 8)]
+    assert sizes[1] < 3 * sizes[0]
+
+
 def test_mp4_has_every_frame(tmp_path, trajectory):
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     import imageio_ffmpeg

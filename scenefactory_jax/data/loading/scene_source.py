@@ -23,7 +23,7 @@ from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading.scenes_config import check_config
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
-from scenefactory_jax.data.packing.summary import Summary, summarise_packed
+from scenefactory_jax.data.packing.summary import Summary, shorten_path, summarise_packed
 from scenefactory_jax.data.packing.summary import describe as describe_summary
 from scenefactory_jax.roadgraph import spatial_grid
 
@@ -86,7 +86,7 @@ def open_bank(bank: bank_reader.Bank | Path | str) -> SceneSource:
         shard, *place = bank.places[index].tolist()
         return functools.partial(_read_banked, bank.shards[shard], tuple(place))
 
-    what = f"{len(bank)} scenes of the bank {bank.path}{bank.unfinished}"
+    what = f"{len(bank)} scenes of the bank {shorten_path(bank.path)}{bank.unfinished}"
     return SceneSource("bank", what, len(bank), lambda index: escape_for_terminal(str(names[index])), reader, files, bank.rejects)
 
 

@@ -83,7 +83,7 @@ def describe(summary: Summary) -> list[str]:
     lines = []
     for reject in summary.rejects[:MAX_LISTED]:
         scene = f" ({reject['scene']})" if reject["scene"] else ""
-        lines.append(f"rejected {_shorten(reject['source'])}{scene}: {reject['reason']}")
+        lines.append(f"rejected {shorten_path(reject['source'])}{scene}: {reject['reason']}")
     if len(summary.rejects) > MAX_LISTED:
         lines.append(f"... and {len(summary.rejects) - MAX_LISTED} more, all in bank.json")
     if names := [Path(companion["source"]).name for companion in summary.companions]:
@@ -101,7 +101,7 @@ def describe(summary: Summary) -> list[str]:
     return [escape_for_terminal(line) for line in lines]
 
 
-def _shorten(source: str) -> Path:
+def shorten_path(source: Path | str) -> Path:
     """The path relative to the working directory, if it is below."""
     path, here = Path(source), Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path

@@ -14,7 +14,7 @@ MOVING: Colour = (105, 109, 115)
 PARKED: Colour = (214, 216, 219)
 OUTLINE: Colour = (84, 88, 94)
 PARKED_M = 0.5  # a road user that stays within this distance is parked
-PERSON_M, CYCLE_M = 1.2, 1.05  # a road user shorter than the first is a person; a longer one narrower than the second is a cycle
+PERSON_M, CYCLE_M = 1.2, 1.05  # lengths below the first are people's; of longer road users, widths below the second are cycles'
 
 CYCLE = np.array([[0.5, 0.0], [0.1, 0.5], [-0.1, 0.5], [-0.5, 0.0], [-0.1, -0.5], [0.1, -0.5]])
 VEHICLE = np.array([[0.42, 0.5], [0.5, 0.25], [0.5, -0.25], [0.42, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # its front is narrower
@@ -49,6 +49,16 @@ def find_parked(traffic: TrafficBoxes) -> Bool[np.ndarray, " O"]:
     return moved.max(axis=0, initial=0.0) < PARKED_M
 
 
+def is_person(size: Float[np.ndarray, "2"]) -> bool:
+    """Whether a road user of this length and width (m) is drawn as a person."""
+    return bool(size[0] < PERSON_M)
+
+
+def is_cycle(size: Float[np.ndarray, "2"]) -> bool:
+    """Whether a road user of this length and width (m) is drawn as a cycle."""
+    return not is_person(size) and bool(size[1] < CYCLE_M)
+
+
 def shapes(traffic: TrafficBoxes, step: int, parked: Bool[np.ndarray, " O"]) -> Iterator[Shape]:
     """Outlines at a step, bottom first.
 
@@ -57,8 +67,8 @@ def shapes(traffic: TrafficBoxes, step: int, parked: Bool[np.ndarray, " O"]) -> 
     """
     for row in np.flatnonzero(traffic.present[step]):
         size = traffic.size[step, row]
-        person = size[0] < PERSON_M
-        local = DISC * max(size[0], 0.7) if person else (CYCLE if size[1] < CYCLE_M else VEHICLE) * size
+        person = is_person(size)
+        local = DISC * max(size[0], 0.7) if person else (CYCLE if is_cycle(size) else VEHICLE) * size
         cos, sin = np.cos(traffic.yaw[step, row]), np.sin(traffic.yaw[step, row])
         points = local @ np.array([[cos, sin], [-sin, cos]]) + traffic.position[step, row]
         yield Shape(points, blend(PARKED, WHITE, 0.5) if parked[row] and not person else MOVING, OUTLINE)

@@ -15,11 +15,12 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
+from scenefactory_jax.visualization.birds_eye.traffic_shapes import is_cycle, is_person
 from scenefactory_jax.visualization.mujoco import scene_model
 from scenefactory_jax.visualization.recorded_episodes import cut_world, find_shown_steps
 
 FADE_S = 0.6  # a finished car disappears within this time
-VEHICLE_M, PERSON_M = 1.5, 1.75  # heights of traffic: wider, and narrower than a metre
+VEHICLE_M, PERSON_M = 1.5, 1.75  # heights of vehicles, and of people and cyclists
 TRAIL_HALF_M, TRAIL_M, GOAL_M = 0.12, 0.035, 0.04
 GREY, SKIN = (0.55, 0.56, 0.58, 1.0), (0.80, 0.55, 0.30, 1.0)
 
@@ -70,10 +71,11 @@ def add_geom(
 
 
 def add_traffic(scene: mujoco.MjvScene, traffic: TrafficBoxes, step: int) -> None:
-    """Adds the background traffic of a step as boxes; a road user narrower than a metre is as tall as a person."""
+    """Adds the background traffic of a step as boxes; people and cyclists are as tall as a person."""
     for row in np.flatnonzero(traffic.present[step]):
         (x, y), (length, width) = traffic.position[step, row].tolist(), traffic.size[step, row].tolist()
-        height, colour = (PERSON_M, SKIN) if min(length, width) < 1.0 else (VEHICLE_M, GREY)
+        on_foot_or_cycle = is_person(traffic.size[step, row]) or is_cycle(traffic.size[step, row])
+        height, colour = (PERSON_M, SKIN) if on_foot_or_cycle else (VEHICLE_M, GREY)
         size = (length / 2, width / 2, height / 2)
         add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, height / 2), float(traffic.yaw[step, row]), colour)
 

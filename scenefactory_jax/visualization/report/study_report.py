@@ -34,7 +34,7 @@ def write(folder: Path, result: Result) -> Path:
         format_headline(result),
         _format_missing(result["missing"]),
         *(document.picture(folder, path, caption) for caption, path in pictures.items()),
-        document.section("Results", *_results(result)),
+        document.section("Results", *_results(result, folder)),
         document.section("Differences", *_differences(result["differences"])),
         document.section("Each seed", document.fold("Rates of each seed", _each_seed(result["rows"]))),
         document.section("Trainings", *_trainings(result)),
@@ -65,8 +65,8 @@ def _format_missing(missing: Sequence[str]) -> str:
 # ---- results
 
 
-def _results(result: Result) -> list[str]:
-    """A table of rates and one of safety for each protocol, and links to the tables of agents."""
+def _results(result: Result, folder: Path) -> list[str]:
+    """A table of rates and one of safety for each protocol, and links to the tables of agents that stand in `folder`."""
     parts = []
     for protocol in result["study"]["protocols"]:
         rows = [row for row in result["rows"] if row["protocol"] == protocol]
@@ -79,12 +79,13 @@ def _results(result: Result) -> list[str]:
         "they resample scenes and agents alone, with few seeds they are too narrow. †: Wilson's or Newcombe's score interval over "
         "distinct agents, where a rate does not vary."
     )
-    return [_episodes(result["study"]), *parts, note, _agents(result["rows"])] if parts else []
+    return [_episodes(result["study"]), *parts, note, _agents(result["rows"], folder)] if parts else []
 
 
-def _agents(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Links to the tables of agents."""
-    if not any("agents_file" in row for row in rows):
+def _agents(rows: Sequence[Mapping[str, Any]], folder: Path) -> str:
+    """Links to the tables of agents that stand in `folder`."""
+    rows = [row for row in rows if "agents_file" in row and (folder / row["agents_file"]).is_file()]
+    if not rows:
         return "The tables of agents were not kept."
     places = ", ".join(f"[{row['row']}, {row['condition']}, {row['protocol']}]({row['agents_file']})" for row in rows)
     return f"Every agent with its events, one table a row, condition and protocol (CSV, `pandas.read_csv` opens it): {places}."
