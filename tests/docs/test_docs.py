@@ -97,6 +97,7 @@ def test_the_version_is_the_same_everywhere():
     assert f'version = "{__version__}"' in (ROOT / "pyproject.toml").read_text()
 
 
+@pytest.mark.slow  # links and names of the pages are checked above, one by one
 def test_the_site_builds_without_network(tmp_path):
     pytest.importorskip("mkdocs", reason="needs mkdocs: pip install scenefactory_jax[docs]")
     pytest.importorskip("mkdocstrings_handlers.python", reason="needs mkdocstrings: pip install scenefactory_jax[docs]")
