@@ -59,10 +59,10 @@ def test_the_python_of_the_library_page_runs(quickly):
     found = {}
     exec(code, found)
     samples = found["samples"]
-    seen, active = samples["seen"], samples["active"]
-    assert seen.shape == samples["next"].shape and seen.shape[:3] == active.shape == samples["done"].shape == (32, 16, 4)
+    observed, active = samples["seen"], samples["active"]
+    assert observed.shape == samples["next"].shape and observed.shape[:3] == active.shape == samples["done"].shape == (32, 16, 4)
     assert samples["action"].shape == (32, 16, 4, 3) and samples["truncated"].shape == (32, 16)
-    assert np.isfinite(seen).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
+    assert np.isfinite(observed).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
     assert found["recording"].shots.position.shape[:2] == (1, 3)
 
 
@@ -76,8 +76,8 @@ def test_the_task_page_has_the_numbers_of_the_configs(quickly):
     for experiment in ("paper", "quick", "demo"):
         settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=streets", "scenes.count=1", "dynamics=bicycle")
         scene = sf.load_scenes(settings["scenes"])[0]
-        _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
-        widths.append(max(columns.stop for columns in layout(seen).values()))
+        _, observed = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
+        widths.append(max(columns.stop for columns in layout(observed).values()))
     assert f"| flat | with the masks | {' | '.join(map(str, widths))} |" in page
 
 
