@@ -73,7 +73,7 @@ def patches(
     """
     context = {"physics_dt": 1.0 / physics_hz, "control_dt": 1.0 / control_hz}
     road = instantiate(grip, builtins="scenefactory_jax.weather.friction", where="weather.friction")
-    backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", grip=road, **context)()
+    backend = instantiate(entry, builtins="scenefactory_jax.dynamics", where="dynamics", friction=road, **context)()
     run = motion_laws.tracer(backend, control_hz=control_hz, width=6)
     size = motion_laws.footprint(entry)
     spot = [(ahead_m, 0.0), (ahead_m, 0.0)]
