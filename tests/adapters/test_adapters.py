@@ -45,18 +45,18 @@ def test_bounds_hold_for_what_cars_see_before_anything_is_clipped(observe):
         return (states, drawn), flatten_observation(outcome.observation)
 
     def drive(given, key):
-        states, seen = jax.vmap(env.reset)(jax.random.split(key, 4), given)
+        states, observed = jax.vmap(env.reset)(jax.random.split(key, 4), given)
         full = jnp.tile(jnp.array([1.0, 0.05, -1.0]), (4, 4, 1))
-        return flatten_observation(seen), jax.lax.scan(functools.partial(step, given), (states, full), jax.random.split(key, 120))[1]
+        return flatten_observation(observed), jax.lax.scan(functools.partial(step, given), (states, full), jax.random.split(key, 120))[1]
 
-    first, seen = jax.jit(drive)(given, jax.random.key(0))
+    first, observed = jax.jit(drive)(given, jax.random.key(0))
     observation = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 4), given)[1]
     low, high = bounds.flat_bounds(environment.make_parts(settings).groups, observation)
-    assert np.isfinite(low).all() and np.isfinite(high).all() and low.shape == seen.shape[-1:]
-    seen = np.concatenate([np.asarray(first)[None], np.asarray(seen)])
-    outside = (seen < low - 1e-5) | (seen > high + 1e-5)
-    assert not outside.any(), [(name, at, seen[..., at].min(), seen[..., at].max()) for name, at in layout(observation).items()]
-    assert np.ptp(seen, axis=(0, 1, 2))[layout(observation)["ego"]].min() > 0.2  # the cars went somewhere
+    assert np.isfinite(low).all() and np.isfinite(high).all() and low.shape == observed.shape[-1:]
+    observed = np.concatenate([np.asarray(first)[None], np.asarray(observed)])
+    outside = (observed < low - 1e-5) | (observed > high + 1e-5)
+    assert not outside.any(), [(name, at, observed[..., at].min(), observed[..., at].max()) for name, at in layout(observation).items()]
+    assert np.ptp(observed, axis=(0, 1, 2))[layout(observation)["ego"]].min() > 0.2  # the cars went somewhere
 
 
 def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were():
@@ -66,10 +66,10 @@ def test_columns_without_a_bound_are_clipped_and_the_others_are_what_they_were()
 
     unbound = lambda scene, state: SetObservation(jnp.array([[[-20.0, 20.0], [0.0, 1.0]]]), jnp.array([[True, True]]))  # noqa: E731
     groups = {"mine": functools.partial(mine, scale=2.0), "yours": unbound}
-    seen = {name: bounds.clip(group)(None, None) for name, group in groups.items()}
+    observed = {name: bounds.clip(group)(None, None) for name, group in groups.items()}
     limit = bounds.LIMIT
-    np.testing.assert_array_equal(flatten_observation(seen), [[0.5, limit, -8.0, -limit, limit, 0.0, 1.0, 1.0, 1.0]])
-    low, high = bounds.flat_bounds(groups, seen)
+    np.testing.assert_array_equal(flatten_observation(observed), [[0.5, limit, -8.0, -limit, limit, 0.0, 1.0, 1.0, 1.0]])
+    low, high = bounds.flat_bounds(groups, observed)
     np.testing.assert_array_equal(low, [0, -limit, -limit, *[-limit] * 4, 0, 0])
     np.testing.assert_array_equal(high, [1, limit, limit, *[limit] * 4, 1, 1])
 
@@ -78,10 +78,10 @@ def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
     pool = episodes.make_pool(None, ALONE, scenes(), alone=True)
     begin = jax.jit(jax.vmap(lambda key: episodes.begin_episode(pool.env, pool.scenes, key)))
     keys = jax.random.split(jax.random.key(0), 64)
-    episode, seen = begin(keys)
+    episode, observed = begin(keys)
     assert set(np.asarray(episode.scene)) == {0, 1, 2, 3} and pool.steps == 60 and len(pool.names) == 4
     again, same = begin(keys)
-    for one, other in zip(jax.tree.leaves((episode.state.motion, seen)), jax.tree.leaves((again.state.motion, same)), strict=True):
+    for one, other in zip(jax.tree.leaves((episode.state.motion, observed)), jax.tree.leaves((again.state.motion, same)), strict=True):
         np.testing.assert_array_equal(one, other)
     start = pool.scenes.agents.position[episode.scene]
     np.testing.assert_allclose(episode.state.motion.position[..., :2], start, atol=1e-5)
@@ -92,13 +92,13 @@ def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
 def test_a_step_of_an_episode_is_the_environments_own():
     settings = hydra_config.load_config("train", SMOKE, "~observations.road", "~observations.neighbours")  # less to compile
     pool = episodes.make_pool(settings, (), scenes(agents=4), alone=False)
-    episode, seen = jax.jit(lambda key: episodes.begin_episode(pool.env, pool.scenes, key, 2))(jax.random.key(3))
+    episode, observed = jax.jit(lambda key: episodes.begin_episode(pool.env, pool.scenes, key, 2))(jax.random.key(3))
     action = jnp.full((4, 3), 0.5)
     following, moment = jax.jit(lambda begun: episodes.step_world(pool.env, pool.scenes, begun, action))(episode)
     observation = episodes.observe(pool.env, pool.scenes, following)
     env, scene = environment.make_env(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
     after, outcome = jax.jit(env.step)(scene, episode.state, action)
-    assert seen.shape == (4, pool.columns)
+    assert observed.shape == (4, pool.columns)
     np.testing.assert_allclose(observation, flatten_observation(outcome.observation), atol=1e-5)
     driving = np.asarray(episode.state.active)
     assert 0 < driving.sum() < 4  # scene 2 leaves slots empty

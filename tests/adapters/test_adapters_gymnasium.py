@@ -94,26 +94,26 @@ def test_the_vector_environment_is_gymnasiums_own_over_single_ones(mode, alone):
     assert envs.metadata["autoreset_mode"] is mode
     for name in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
         assert getattr(envs, name) == getattr(oracle, name)
-    (seen, info), (wanted, told) = envs.reset(seed=7), oracle.reset(seed=7)
-    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+    (observed, info), (wanted, told) = envs.reset(seed=7), oracle.reset(seed=7)
+    np.testing.assert_allclose(observed, wanted, atol=1e-5)
     same(info, told)
     ended = np.zeros(WORLDS, int)
     for action in actions(STEPS, WORLDS):
-        (seen, *ours, info), (wanted, *theirs, told) = envs.step(action), oracle.step(action)
-        assert seen in envs.observation_space and seen.dtype == np.float32
-        np.testing.assert_allclose(seen, wanted, atol=1e-4)
+        (observed, *ours, info), (wanted, *theirs, told) = envs.step(action), oracle.step(action)
+        assert observed in envs.observation_space and observed.dtype == np.float32
+        np.testing.assert_allclose(observed, wanted, atol=1e-4)
         for own, one in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(own, one, atol=1e-4)
         same(info, told)
         ended += ours[1] | ours[2]
-        for array in (seen, *ours, *jax.tree.leaves(info)):
+        for array in (observed, *ours, *jax.tree.leaves(info)):
             array[...] = True  # a caller's own: none is read-only, and the worlds do not read it
     assert (ended >= 1).all() and envs._step._cache_size() == 1 and envs._begin._cache_size() == 1
-    (seen, info), (wanted, told) = envs.reset(), oracle.reset()  # the next episodes of the seeds before
-    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+    (observed, info), (wanted, told) = envs.reset(), oracle.reset()  # the next episodes of the seeds before
+    np.testing.assert_allclose(observed, wanted, atol=1e-5)
     same(info, told)
-    (seen, _), (wanted, _) = envs.reset(seed=[3, None, 7]), oracle.reset(seed=[3, None, 7])
-    np.testing.assert_allclose(seen, wanted, atol=1e-5)
+    (observed, _), (wanted, _) = envs.reset(seed=[3, None, 7]), oracle.reset(seed=[3, None, 7])
+    np.testing.assert_allclose(observed, wanted, atol=1e-5)
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_one_others():
@@ -131,16 +131,16 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_others():
 
 def test_arrays_of_jax_stay_on_the_device_and_hold_what_those_of_numpy_hold():
     envs, plain = many(AutoresetMode.SAME_STEP, arrays="jax"), many(AutoresetMode.SAME_STEP)
-    seen, _ = envs.reset(seed=2)
+    observed, _ = envs.reset(seed=2)
     plain.reset(seed=2)
     last = 0
     for action in actions(STEPS, WORLDS):
-        seen, reward, terminated, truncated, info = envs.step(jax.numpy.asarray(action))
+        observed, reward, terminated, truncated, info = envs.step(jax.numpy.asarray(action))
         wanted, expected, *_, told = plain.step(action)
-        assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((seen, reward, terminated, truncated, info)))
-        np.testing.assert_array_equal(seen, wanted)
+        assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((observed, reward, terminated, truncated, info)))
+        np.testing.assert_array_equal(observed, wanted)
         np.testing.assert_array_equal(reward, expected)
-        assert info["final_obs"].shape == seen.shape and ("final_obs" in told) == bool(info["_final_obs"].any())
+        assert info["final_obs"].shape == observed.shape and ("final_obs" in told) == bool(info["_final_obs"].any())
         for index in np.flatnonzero(info["_final_obs"]):
             np.testing.assert_array_equal(info["final_obs"][index], told["final_obs"][index])
             last += 1

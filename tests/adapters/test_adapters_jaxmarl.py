@@ -32,9 +32,9 @@ def rollout(env):
     actions = {name: off if slot == 0 else braking for slot, name in enumerate(env.agents)}
 
     def step(carry, key):
-        seen, state = carry
+        observed, state = carry
         after, now, reward, done, info = jax.vmap(worlds.step)(jax.random.split(key, WORLDS), state, actions)
-        return (after, now), (seen, after, state, now, reward, done, info)
+        return (after, now), (observed, after, state, now, reward, done, info)
 
     first = jax.jit(jax.vmap(worlds.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
     run = jax.jit(lambda first: jax.lax.scan(step, first, jax.random.split(jax.random.PRNGKey(1), STEPS)))
@@ -72,14 +72,14 @@ def test_a_world_that_is_over_shows_the_next_episodes_first_observation(env, rol
     step, world = np.argwhere(done["__all__"])[0]
     state = jax.tree.map(lambda leaf: leaf[step, world], now.env_state)
     assert state.state.step == 0 and before.env_state.state.step[step, world] > 0
-    for name, seen in jax.jit(env.get_obs)(state).items():
-        np.testing.assert_allclose(seen, after[name][step, world], atol=1e-5)
+    for name, observed in jax.jit(env.get_obs)(state).items():
+        np.testing.assert_allclose(observed, after[name][step, world], atol=1e-5)
     last = jax.tree.map(lambda leaf: leaf[step, world], before.env_state)
     actions = {name: jnp.array([1.0, 0.6, -1.0] if name == "car_0" else [0.0, 0.0, 1.0]) for name in env.agents}
-    seen, ended, _, told, _ = jax.jit(env.step_env)(jax.random.PRNGKey(5), last, actions)
+    observed, ended, _, told, _ = jax.jit(env.step_env)(jax.random.PRNGKey(5), last, actions)
     assert told["__all__"] and ended.state.step == last.state.step + 1  # the old one, as it ended
     alive = [name for slot, name in enumerate(env.agents) if info["truncated"][step, world, slot]]
-    assert alive and all(np.asarray(seen[name]).any() for name in alive)
+    assert alive and all(np.asarray(observed[name]).any() for name in alive)
     other = jax.jit(env.reset)(jax.random.PRNGKey(9))[1]
     shown, begun, *_ = env.step(jax.random.PRNGKey(5), last, actions, other)  # or begins where it is told to
     np.testing.assert_array_equal(begun.scene, other.scene)

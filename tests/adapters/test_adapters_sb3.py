@@ -38,8 +38,8 @@ def test_it_is_stable_baselines_own_over_single_environments():
     assert envs.reset_infos == oracle.reset_infos and envs.reset_infos[0] == {"scene": 2}
     ended = np.zeros(WORLDS, int)
     for action in actions(STEPS, WORLDS):
-        (seen, reward, done, infos), (wanted, paid, over, told) = envs.step(action), oracle.step(action)
-        np.testing.assert_allclose(seen, wanted, atol=1e-4)
+        (observed, reward, done, infos), (expected, paid, over, told) = envs.step(action), oracle.step(action)
+        np.testing.assert_allclose(observed, expected, atol=1e-4)
         np.testing.assert_allclose(reward, paid, atol=1e-4)
         np.testing.assert_array_equal(done, over)
         for ours, theirs in zip(infos, told, strict=True):
@@ -47,7 +47,7 @@ def test_it_is_stable_baselines_own_over_single_environments():
             assert ours.pop("terms") == pytest.approx(theirs.pop("terms"), abs=1e-4)
             assert ours == theirs  # scene, events, and whether the time was up
         ended += done
-        seen[...] = 0.0  # a caller's own
+        observed[...] = 0.0  # a caller's own
     assert (ended >= 1).all() and envs.reset_infos == oracle.reset_infos
     np.testing.assert_allclose(envs.reset(), oracle.reset(), atol=1e-5)  # the next episodes of the seeds before
 
@@ -67,8 +67,8 @@ def test_make_vec_env_makes_single_ones_that_render():
         check_env(gymnasium.Drive(None, ALONE, scenes(), render_mode="rgb_array"))
     envs = make_vec_env(NAME, n_envs=1, seed=3, env_kwargs={"overrides": ALONE, "scenes": scenes()})
     envs.reset()
-    seen, reward, _, _ = envs.step(np.zeros((1, 3), np.float32))
-    assert envs.observation_space.contains(seen[0]) and np.isfinite(reward).all()
+    observed, reward, _, _ = envs.step(np.zeros((1, 3), np.float32))
+    assert envs.observation_space.contains(observed[0]) and np.isfinite(reward).all()
     assert envs.render_mode == "rgb_array" and envs.render().shape == (400, 400, 3)
 
 

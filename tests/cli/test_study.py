@@ -420,8 +420,8 @@ def test_networks_of_the_studies_fit_their_observations(name, base):
     networks = {json.dumps([one.config["observations"], one.config["policy"]]): one.config for one in plan.trainings}
     for entry in networks.values():
         env, policy = environment.make_env(entry), training_loop.make_policy(entry)
-        seen = jax.eval_shape(env.reset, jax.random.key(0), scene)[1]
-        jax.eval_shape(policy.init, jax.random.key(0), seen)
+        observed = jax.eval_shape(env.reset, jax.random.key(0), scene)[1]
+        jax.eval_shape(policy.init, jax.random.key(0), observed)
 
 
 @pytest.mark.parametrize(

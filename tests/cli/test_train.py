@@ -140,8 +140,8 @@ def test_every_spawned_agent_has_a_record(whole):
         assert len(records["scene"]) == present.sum()
         assert list(zip(records["world"], records["agent"], strict=True)) == list(zip(*np.nonzero(present), strict=True))
         assert set(records["scene"]) == set(heldout.names)
-    seen = scene_source.load_training_scenes(whole.config["scenes"]).scene.agents.position
-    assert not any(np.array_equal(one, other) for one in seen for other in heldout.scene.agents.position)
+    observed = scene_source.load_training_scenes(whole.config["scenes"]).scene.agents.position
+    assert not any(np.array_equal(one, other) for one in observed for other in heldout.scene.agents.position)
 
 
 def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, prepared, tmp_path):
@@ -159,10 +159,10 @@ def test_a_killed_and_resumed_run_is_the_unbroken_one(whole, prepared, tmp_path)
     assert (
         len(metrics_csv.read(tmp_path / "run")) == 3 and checkpoint.latest(tmp_path / "run" / "checkpoints") == 2
     )  # a row past the checkpoint
-    seen = []
-    note = lambda state, row: seen.append(row["iteration"])  # noqa: E731
+    observed = []
+    note = lambda state, row: observed.append(row["iteration"])  # noqa: E731
     resumed = train(again("iterations=4", "resume=true"), on_iteration=note, prepared=prepared)
-    assert seen == [3, 4]
+    assert observed == [3, 4]
     same_numbers(resumed.folder, whole.folder)
     jax.tree.map(np.testing.assert_array_equal, resumed.state.parameters, whole.state.parameters)
 

@@ -75,11 +75,11 @@ def test_processes_end_with_the_first(how, tmp_path):
     os.kill(first.pid, how)
     first.join(timeout=60)
     assert first.exitcode == (143 if how == signal.SIGTERM else -9) and (tmp_path / "gathered").exists() == (how == signal.SIGTERM)
-    seen = {}
+    observed = {}
 
     def still():
-        before, now = seen.copy(), {beat: beat.stat().st_mtime_ns for beat in beats}
-        seen.update(now)
+        before, now = observed.copy(), {beat: beat.stat().st_mtime_ns for beat in beats}
+        observed.update(now)
         time.sleep(0.5)
         return before == now
 

@@ -41,12 +41,12 @@ def test_workers_end_with_their_parent(tmp_path):
     until(lambda: (tmp_path / "beat").is_file())
     first.kill()
     first.join(timeout=60)
-    seen = [0]
+    observed = [0]
 
     def still():
         time.sleep(0.5)
-        seen.append((tmp_path / "beat").stat().st_mtime_ns)
-        return seen[-1] == seen[-2]
+        observed.append((tmp_path / "beat").stat().st_mtime_ns)
+        return observed[-1] == observed[-2]
 
     until(still)
 

@@ -63,7 +63,7 @@ def put(file, content):
     os.utime(file, ns=(moment, moment))
 
 
-def outcome(path, wanted, file):
+def outcome(path, expected, file):
     """ "same" if every scene comes as it was written, "refused" if one line names the damaged file; nothing else may happen."""
     try:
         opened = bank_reader.open(path)
@@ -71,7 +71,7 @@ def outcome(path, wanted, file):
     except SceneError as error:
         assert file.name in str(error) and "\n" not in str(error) and len(str(error)) < 500, error
         return "refused"
-    assert found == wanted, "other scenes than were written"
+    assert found == expected, "other scenes than were written"
     return "same"
 
 
@@ -103,52 +103,52 @@ def damages(content, other, *, seed, flips):
 @pytest.mark.parametrize(("schema", "compression"), [(4, None), (4, "zstd"), (3, None)])
 def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, scenes, schema, compression):
     path = made(tmp_path / "bank", scenes, schema, compression)
-    wanted = list(map(arrow_codec.encode, scenes))
-    assert outcome(path, wanted, path) == "same"
+    expected = list(map(arrow_codec.encode, scenes))
+    assert outcome(path, expected, path) == "same"
     for name, other in (("scenes-00000.arrow", "scenes-00001.arrow"), ("metadata-00000.arrow", "metadata-00001.arrow")):
         content, counts = (path / name).read_bytes(), {"refused": 0, "same": 0}
         for what, damaged in damages(content, (path / other).read_bytes(), seed=schema, flips=80):
             put(path / name, damaged)
             try:
-                counts[outcome(path, wanted, path / name)] += 1
+                counts[outcome(path, expected, path / name)] += 1
             except Exception as error:
                 raise AssertionError(f"{name}, {what}: {type(error).__name__}: {error}") from error
         put(path / name, content)
         assert counts["refused"] > 50 and sum(counts.values()) > 90, counts  # the same: Arrow's table of contents is not needed
-    assert outcome(path, wanted, path) == "same"
+    assert outcome(path, expected, path) == "same"
     one, two = path / "scenes-00000.arrow", path / "scenes-00001.arrow"
     sizes = one.read_bytes(), two.read_bytes()
     put(one, sizes[1])
     put(two, sizes[0])
-    assert outcome(path, wanted, one) == "refused"
+    assert outcome(path, expected, one) == "refused"
     with pytest.raises(SceneError, match=r"^/.*/scenes-00000\.arrow: "):
         scene_source.pack_scenes(scene_source.open_bank(bank_reader.open(path)), [0], check=checker(), pack=packer(), workers=1)
 
 
 def test_a_damaged_index_is_refused(tmp_path, scenes):
     path = made(tmp_path / "bank", scenes, 4)
-    file, wanted = path / bank_reader.INDEX, list(map(arrow_codec.encode, scenes))
+    file, expected = path / bank_reader.INDEX, list(map(arrow_codec.encode, scenes))
     content, random = file.read_bytes(), np.random.default_rng(0)
     for _ in range(120):
         changed = bytearray(content)
         changed[int(random.integers(len(content)))] ^= 1 << int(random.integers(8))
         put(file, bytes(changed))
         told = bank_reader.is_bank(path)
-        assert outcome(path, wanted, file) == "refused" and told, bytes(changed)
+        assert outcome(path, expected, file) == "refused" and told, bytes(changed)
         with pytest.raises(SceneError, match=r"bank\.json: damaged"):
             bank_writer.check_target(path)  # it may be a bank of which something can be saved: nothing takes its place
     for place in (0, 1, len(content) // 2, len(content) - 3):
         put(file, content[:place])
-        assert outcome(path, wanted, file) == "refused"
+        assert outcome(path, expected, file) == "refused"
     entries = json.loads(content)
     for damaged in (entries | {"sha256": None}, {name: value for name, value in entries.items() if name != "sha256"}):
         put(file, json.dumps(damaged).encode())
-        assert outcome(path, wanted, file) == "refused"
+        assert outcome(path, expected, file) == "refused"
     for shards in (3, [3], [{"file": 3, "scenes": 2, "bytes": 1, "sha256": ""}], [{}]):
         put(file, json.dumps(entries | {"schema": 3, "sha256": None, "shards": shards}).encode())
-        assert outcome(path, wanted, file) == "refused"
+        assert outcome(path, expected, file) == "refused"
     put(file, b"[" * 200_000)
-    assert outcome(path, wanted, file) == "refused"
+    assert outcome(path, expected, file) == "refused"
 
 
 def test_an_older_bank_is_read_chosen_from_and_gone_on_with(tmp_path, scenes):

@@ -173,8 +173,8 @@ def test_a_bank_gives_back_what_it_was_given(tmp_path, made):
     assert table["letters"] == [6, 6, 5] and table["sdc"] == [7, None, 7] and table["lights"] == [0, 2, 0] and table["edges"] == [1, 1, 0]
     assert table["vehicles"] == [2, 2, 2] and table["cyclists"] == [0, 1, 0] and table["max_x"] == [40.0, 40.0, 40.0]
     stacked, report = stacked_scenes(moved, [2, 0, 2], capacity=NONE | {"road": 79}, **TOOLS)
-    wanted, _ = stack.stack([prepared(raws[i], agents=3).scene for i in (2, 0, 2)], capacity=NONE | {"road": 79})
-    for name, leaf in columns.flatten(wanted).items():
+    expected, _ = stack.stack([prepared(raws[i], agents=3).scene for i in (2, 0, 2)], capacity=NONE | {"road": 79})
+    for name, leaf in columns.flatten(expected).items():
         np.testing.assert_array_equal(columns.flatten(stacked)[name], leaf)
     assert sorted(cut.world for cut in report.cuts) == [0, 1, 2]
     with pytest.raises(SceneError, match="no scene 7; valid: 0 to 2"):
@@ -193,15 +193,15 @@ def test_views_refer_and_copies_do_not(tmp_path, made):
     raws, opened = made
     other = bank_reader.write(tmp_path / "b" / "other", raws[:2], settings={})
     both = bank_reader.join([bank_reader.view(opened, [2, 0]), other, bank_reader.view(opened, [2])])
-    wanted = [2, 0, 0, 1, 2]
-    assert both.names == tuple(raws[i].name for i in wanted) and both.metadata["letters"].to_pylist() == [5, 6, None, None, 5]
+    expected = [2, 0, 0, 1, 2]
+    assert both.names == tuple(raws[i].name for i in expected) and both.metadata["letters"].to_pylist() == [5, 6, None, None, 5]
     view = bank_reader.save(both, tmp_path / "views" / "both", copy=False, settings={"filter": "lanes > 1"})
     own = bank_reader.save(both, tmp_path / "copy", copy=True, settings={})
     assert sum(file.stat().st_size for file in view.path.iterdir()) < 20_000 and view.settings == {"filter": "lanes > 1"}
     assert [shard["file"] for shard in json.loads((view.path / bank_reader.INDEX).read_text())["shards"]] == [
         "../../bank/scenes-00000.arrow", "../../b/other/scenes-00000.arrow"]  # fmt: skip
     for found in (view, own, bank_reader.save(bank_reader.view(view, [4, 3]), view.path, copy=False, settings={})):
-        order = wanted if len(found) == 5 else [2, 1]
+        order = expected if len(found) == 5 else [2, 1]
         for index, place in enumerate(order):
             exactly(bank_reader.read_raw(found, index), raws[place])
     shutil.move(tmp_path / "bank", tmp_path / "gone")
@@ -319,9 +319,9 @@ def test_a_bad_file_is_listed_and_the_rest_goes_on(tmp_path):
     written(folder, document(objects=[thing(0, speed=0)]), "c.json")
     written(folder / "deep", scenefactory_document(), "d.json.gz", gzip.open)
     written(folder, "hidden", ".note")
-    seen = []
-    summary = conversion.convert(folder, tmp_path / "bank", **options(on_file=lambda done, total: seen.append((done, total))))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    observed = []
+    summary = conversion.convert(folder, tmp_path / "bank", **options(on_file=lambda done, total: observed.append((done, total))))
+    assert observed == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert (summary.files, summary.scenes, summary.agents_kept, summary.refused) == (4, 3, 3, {"no_agent_left": 1})
     [reject] = summary.rejects
     assert Path(reject["source"]).name == "b.json" and "cut short" in reject["reason"]

@@ -82,8 +82,8 @@ def test_roads_are_told_apart():
 @pytest.mark.parametrize("kind", [2, 15, 18])
 def test_lines_without_points_add_nothing_but_themselves(small, kind, places):
     roads = list(np.insert(np.array(small.roads, object), list(places), Polyline(kind=kind, xyz=np.zeros((0, 3)), id=99)))
-    found, wanted = FEATURES(replace(small, roads=tuple(roads))), FEATURES(small)
-    assert found == wanted | {"map_features": 7 + len(places)}
+    found, expected = FEATURES(replace(small, roads=tuple(roads))), FEATURES(small)
+    assert found == expected | {"map_features": 7 + len(places)}
 
 
 def test_order_and_place_change_nothing():

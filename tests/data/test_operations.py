@@ -69,19 +69,19 @@ def test_conditions_mean_what_they_mean_in_python():
     held = 0
     for _ in range(100):
         text = condition(rng)
-        wanted = [index for index, row in enumerate(rows) if eval(text, {}, dict(row))]
-        assert filter_expressions.rows(table, text, where="select.filter").tolist() == wanted, text
-        held += 0 < len(wanted) < len(rows)
+        expected = [index for index, row in enumerate(rows) if eval(text, {}, dict(row))]
+        assert filter_expressions.rows(table, text, where="select.filter").tolist() == expected, text
+        held += 0 < len(expected) < len(rows)
     assert held > 50
 
 
 def test_a_missing_value_meets_no_condition():
     table = pa.table({"sdc_distance_m": [5.0, None, 20.0], "vehicles": [1, 2, 3]})
-    for text, wanted in {
+    for text, expected in {
         "sdc_distance_m > 10": [2], "not sdc_distance_m > 10": [0], "sdc_distance_m > 10 or vehicles == 2": [1, 2],
         "sdc_distance_m in [5]": [0], "vehicles / 0 > 1 and 100 + 100 > vehicles": [0, 1, 2],
     }.items():  # fmt: skip
-        assert filter_expressions.rows(table, text, where="select.filter").tolist() == wanted, text
+        assert filter_expressions.rows(table, text, where="select.filter").tolist() == expected, text
 
 
 @pytest.mark.parametrize(
@@ -126,9 +126,9 @@ def test_groups_are_connected_by_shared_streets(block, monkeypatch):
         sets = [set(rng.integers(0, reach * 4, rng.integers(0, 9)).tolist()) for _ in range(40)]
         starts = np.cumsum([0, *map(len, sets)])
         found = geographic_split.find_groups(np.array([key for one in sets for key in one], int), starts, min_shared_places=least)
-        wanted = np.unique(components(sets, least), return_inverse=True)[1]
-        pairs = {(a, b) for a, b in zip(found.tolist(), wanted.tolist(), strict=True)}
-        assert len(pairs) == len(set(found.tolist())) == len(set(wanted.tolist())) > 1
+        expected = np.unique(components(sets, least), return_inverse=True)[1]
+        pairs = {(a, b) for a, b in zip(found.tolist(), expected.tolist(), strict=True)}
+        assert len(pairs) == len(set(found.tolist())) == len(set(expected.tolist())) > 1
 
 
 def test_groups_are_dealt_whole_and_shares_are_met():

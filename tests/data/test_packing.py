@@ -57,9 +57,9 @@ def assert_same(raw):
     scenes = []
     for changes in SETTINGS:
         scene, report = pack.pack(checked, **NUMBERS | changes)
-        wanted, account = plain_packing.pack(plain, **NUMBERS | changes)
+        expected, account = plain_packing.pack(plain, **NUMBERS | changes)
         assert report == account
-        for name, leaf in columns.flatten(wanted).items():
+        for name, leaf in columns.flatten(expected).items():
             found = columns.flatten(scene)[name]
             assert (found.dtype, found.shape, found.tobytes()) == (leaf.dtype, leaf.shape, leaf.tobytes()), name
         scenes.append((scene, report))
@@ -72,8 +72,8 @@ def assert_same_grid(scene, size_m=5.0, side=30):
     numbers = {"side": side, "radius_m": 10.0, "size_m": size_m}
     origin = midpoint.min(axis=0) - 4.0  # some cells lie outside the grid
     fast, plain = (lists(midpoint, valid, origin, **numbers) for lists in (spatial_grid._build_lists, plain_packing.lists))
-    for found, wanted in zip(fast, plain, strict=True):
-        np.testing.assert_array_equal(found, wanted)
+    for found, expected in zip(fast, plain, strict=True):
+        np.testing.assert_array_equal(found, expected)
         assert len(found)
 
 

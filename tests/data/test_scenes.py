@@ -333,10 +333,10 @@ def test_a_jitter_of_the_clock_is_resampled_and_counted(street):
     assert len(even.times) == 199 and even.times[even.current] == times[current] and even.lights[0].valid.sum() == 191
     np.testing.assert_allclose(np.diff(even.times), 0.1, atol=1e-9)
     for track in even.tracks:
-        seen = track.valid
-        np.testing.assert_allclose(track.xyz[seen, 0], 8.0 * even.times[seen], atol=1e-9)
-        np.testing.assert_allclose(wrap_angles(track.yaw - np.pi - 0.01 * even.times)[seen], -0.05, atol=1e-9)
-        assert not track.xyz[~seen].any() and (track.velocity[seen] == [8.0, 0.0]).all()
+        observed = track.valid
+        np.testing.assert_allclose(track.xyz[observed, 0], 8.0 * even.times[observed], atol=1e-9)
+        np.testing.assert_allclose(wrap_angles(track.yaw - np.pi - 0.01 * even.times)[observed], -0.05, atol=1e-9)
+        assert not track.xyz[~observed].any() and (track.velocity[observed] == [8.0, 0.0]).all()
     assert even.tracks[0].valid.all() and np.flatnonzero(even.tracks[1].valid)[[0, -1]].tolist() == [60, 149]
     once = 0.1 * steps
     once[120] += 0.01  # one stamp is late, the rest is in time
@@ -424,8 +424,8 @@ def test_agents_are_dropped_by_reason_and_ordered_from_the_centre(tmp_path, read
     raw = parsed(tmp_path, document(objects=objects), readers)
     scene, report = prepared(raw, agents=3)
     assert report.track_ids == (1, 4, 2)
-    wanted = {"overlaps": 1, "not_a_vehicle": 1, "absent_at_start": 1, "too_short": 1, "goal_outside_box": 1, "start_outside_box": 1}
-    assert report.agents_dropped == {name: wanted.get(name, 0) for name in pack.DROPS} | {"over_capacity": 1}
+    expected = {"overlaps": 1, "not_a_vehicle": 1, "absent_at_start": 1, "too_short": 1, "goal_outside_box": 1, "start_outside_box": 1}
+    assert report.agents_dropped == {name: expected.get(name, 0) for name in pack.DROPS} | {"over_capacity": 1}
     assert report.agents_kept + sum(report.agents_dropped.values()) == len(objects)
     assert report.centred_on == "sdc" and report.centre == (40.0, 0.0, 0.0)
     agents, log = scene.agents, scene.log
@@ -469,8 +469,8 @@ def test_box_overlap_agrees_with_shapely():
     boxes = [pack.box_corners(rng.uniform(-4, 4, 2), rng.uniform(-4, 4), *rng.uniform(0.5, 5, 2)) for _ in range(60)]
     polygons = [shapely.Polygon(box) for box in boxes]
     for box, polygon in zip(boxes, polygons, strict=True):
-        wanted = [polygon.intersection(other).area > 1e-9 for other in polygons]
-        assert pack.overlaps(box, np.array(boxes)).tolist() == wanted
+        expected = [polygon.intersection(other).area > 1e-9 for other in polygons]
+        assert pack.overlaps(box, np.array(boxes)).tolist() == expected
 
 
 def test_raw_scene_types_are_plain():

@@ -91,8 +91,8 @@ def test_a_swap_changes_no_other_world(swapped):
 def test_records_count_from_the_swap_on(swapped):
     """Lives of three steps: five end in sixteen, of the two agents of each world; what began before the swap does not count."""
     assert (swapped.before[0].scene_stats.episodes == 10).all() and (swapped.before[0].scene_stats.successes == 10).all()
-    wanted = np.where(np.isin(np.arange(WORLDS), swapped.worlds), 0, 10)
-    np.testing.assert_array_equal(swapped.after[0].scene_stats.episodes, wanted)
+    expected = np.where(np.isin(np.arange(WORLDS), swapped.worlds), 0, 10)
+    np.testing.assert_array_equal(swapped.after[0].scene_stats.episodes, expected)
     episodes = np.asarray(swapped.following.scene_stats.episodes)
     assert (episodes[swapped.worlds] >= 10).all() and (episodes[swapped.worlds] <= 14).all()  # at most one more by time
     assert (np.delete(episodes, swapped.worlds) >= 20).all() and (np.asarray(swapped.following.scene_stats.successes) <= episodes).all()
@@ -146,8 +146,8 @@ def test_failing_scenes_come_more_often_in_proportion_to_failure():
     for trial in range(3000):
         drawn = samplers.prioritize_failures(known, 2, seed=trial, floor=0.5)  # one in turn, one that fails
         counts[kind[drawn[0]]] += 1
-    wanted = 3000 * np.array([1.0, 10.5, 20.0, 39.0]) / 70.5
-    assert ((counts - wanted) ** 2 / wanted).sum() < 16.3  # chi-square with three degrees of freedom: 0.1 %
+    expected = 3000 * np.array([1.0, 10.5, 20.0, 39.0]) / 70.5
+    assert ((counts - expected) ** 2 / expected).sum() < 16.3  # chi-square with three degrees of freedom: 0.1 %
 
 
 @pytest.mark.parametrize("floor", [0.25, 1.0])
@@ -310,12 +310,12 @@ def test_room_for_more_changes_no_look_up():
     found = entry()
     sizes = measured(loader_of(found))
     places = np.random.default_rng(0).uniform(-90.0, 90.0, (200, 2)).astype(np.float32)
-    seen = []
+    observed = []
     for one in (sizes, sizes | {"side": 45, "rows": 30_000, "longest_list": 400}):
         grid = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), alone(found, 3, one).road_grid)
         rows, listed = map(np.asarray, spatial_grid.list_segments(grid, *spatial_grid.find_cell_bounds(grid, jnp.asarray(places))))
-        seen.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
-    assert seen[0] == seen[1] and any(seen[0])
+        observed.append([list(row[there]) for row, there in zip(rows, listed, strict=True)])
+    assert observed[0] == observed[1] and any(observed[0])
 
 
 @pytest.mark.parametrize(

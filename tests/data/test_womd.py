@@ -107,18 +107,18 @@ def sample(shared_data, name):
 def test_a_real_proto_against_its_bytes(shared_data, name):
     raw, data = sample(shared_data, name)
     top = records.walk(data)
-    (current,), (sdc,), (identity,) = ([value for field, value in top if field == wanted] for wanted in (10, 6, 5))
+    (current,), (sdc,), (identity,) = ([value for field, value in top if field == expected] for expected in (10, 6, 5))
     assert (raw.current, raw.sdc, raw.name.encode(), raw.metadata["format"]) == (current, sdc, identity, "womd_scenario")
     assert raw.times.tolist() == [value for field, value in top if field == 1]
-    wanted = []
+    expected = []
     for feature in (records.walk(value) for field, value in top if field == 8):
         place, body = next((field, records.walk(value)) for field, value in feature if field in KINDS)
         sort = dict(body).get(2 if place == 3 else 1, 0) if place in (3, 4, 5) else 0
         field = {3: 8, 4: 2, 5: 2, 7: 2}.get(place, 1)
         points = [[dict(records.walk(value))[axis] for axis in (1, 2, 3)] for number, value in body if number == field]
-        wanted.append((dict(feature)[1], KINDS[place][sort], points, body if place == 3 else []))
-    assert Counter(line.kind for line in raw.roads) == Counter(kind for _, kind, _, _ in wanted)
-    for line, (number, kind, points, body) in zip(raw.roads, wanted, strict=True):
+        expected.append((dict(feature)[1], KINDS[place][sort], points, body if place == 3 else []))
+    assert Counter(line.kind for line in raw.roads) == Counter(kind for _, kind, _, _ in expected)
+    for line, (number, kind, points, body) in zip(raw.roads, expected, strict=True):
         assert (line.id, line.kind) == (number, kind)
         np.testing.assert_array_equal(line.xyz, points)
         near = {field: [value for number, value in body if number == field] for field in (9, 10, 11, 12)}

@@ -60,10 +60,10 @@ def test_the_python_of_the_library_page_runs(quickly):
     found = {}
     exec(code, found)
     samples = found["samples"]
-    seen, active = samples["seen"], samples["active"]
-    assert seen.shape == samples["next"].shape and seen.shape[:3] == active.shape == samples["done"].shape == (32, 16, 4)
+    observed, active = samples["seen"], samples["active"]
+    assert observed.shape == samples["next"].shape and observed.shape[:3] == active.shape == samples["done"].shape == (32, 16, 4)
     assert samples["action"].shape == (32, 16, 4, 3) and samples["truncated"].shape == (32, 16)
-    assert np.isfinite(seen).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
+    assert np.isfinite(observed).all() and np.abs(samples["reward"][active]).sum() > 0 and not samples["reward"][~active].any()
     assert found["recording"].shots.position.shape[:2] == (1, 3)
 
 
@@ -91,8 +91,8 @@ def test_the_task_page_has_the_numbers_of_the_configs(quickly):
     for experiment in ("paper", "quick", "demo"):
         settings = hydra_config.load_config("train", f"experiment={experiment}", "scenes=streets", "scenes.count=1", "dynamics=bicycle")
         scene = sf.load_scenes(settings["scenes"])[0]
-        _, seen = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
-        widths.append(max(columns.stop for columns in layout(seen).values()))
+        _, observed = jax.eval_shape(sf.make(settings).reset, jax.random.key(0), scene)
+        widths.append(max(columns.stop for columns in layout(observed).values()))
     assert f"| flat | with the masks | {' | '.join(map(str, widths))} |" in page
 
 
@@ -112,6 +112,7 @@ def test_the_version_is_the_same_everywhere():
     assert f'version = "{__version__}"' in (ROOT / "pyproject.toml").read_text()
 
 
+@pytest.mark.slow  # links and names of the pages are checked above, one by one
 def test_the_site_builds_without_network(tmp_path):
     pytest.importorskip("mkdocs", reason="needs mkdocs: pip install scenefactory_jax[docs]")
     pytest.importorskip("mkdocstrings_handlers.python", reason="needs mkdocstrings: pip install scenefactory_jax[docs]")

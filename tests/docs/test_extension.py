@@ -158,10 +158,10 @@ def test_an_observation_group_is_one_file_and_one_entry(run):
         assert new["vector"]["layer_0"]["kernel"].shape[0] == vectors
         assert new["mates_rows"]["layer_0"]["kernel"].shape[0] == 2
         assert not np.array_equal(old["mates_rows"]["layer_0"]["kernel"], new["mates_rows"]["layer_0"]["kernel"])
-    seen = run.state.worlds.observation
-    assert seen["clock"].shape == (4, 4, 2) and seen["mates"].features.shape == (4, 4, 4, 2)
+    observed = run.state.worlds.observation
+    assert observed["clock"].shape == (4, 4, 2) and observed["mates"].features.shape == (4, 4, 4, 2)
     active = np.asarray(run.state.worlds.state.active)
-    np.testing.assert_allclose(np.linalg.norm(seen["clock"], axis=-1)[active], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(observed["clock"], axis=-1)[active], 1.0, rtol=1e-5)
 
 
 def test_a_logger_is_one_file_and_one_entry(run):

@@ -106,11 +106,11 @@ def test_the_page_shows_every_likely_mistake():
 
 @pytest.mark.parametrize(("command", "quoted"), SHOWN, ids=[command[:70] for command, _ in SHOWN])
 def test_the_page_quotes_what_is_printed(command, quoted, place, lacking, monkeypatch, capsys):
-    printed, wanted = normal(said(command, place, monkeypatch, capsys), place), normal(quoted, place)
-    if wanted.startswith("...\n"):  # the page leaves out what stands before
-        assert f"\n{printed}".endswith(wanted[3:])
+    printed, expected = normal(said(command, place, monkeypatch, capsys), place), normal(quoted, place)
+    if expected.startswith("...\n"):  # the page leaves out what stands before
+        assert f"\n{printed}".endswith(expected[3:])
     else:
-        assert printed == wanted
+        assert printed == expected
 
 
 def test_a_car_that_breaks_does_not_end_training():

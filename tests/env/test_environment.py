@@ -161,7 +161,7 @@ def test_encounters_by_hand_and_from_any_frame(env):
     numbers = scenefactory_jax.load_config("task", "observations=encounters")["observations"]["neighbours"]
     del numbers["_target_"]
 
-    def seen(turn, shift):
+    def observed(turn, shift):
         place = geometry.rotate(jnp.array([[0.0, 0], [20, 1], [-180, 0]]), jnp.float32(turn)) + jnp.array(shift)
         yaw = np.array([0, np.pi, 0]) + turn
         scene = scene_of(place, place + 50.0, yaws=yaw, speeds=[5.0, 5.0, 0.0])
@@ -169,7 +169,7 @@ def test_encounters_by_hand_and_from_any_frame(env):
         state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.1, 0.3, 0.0])))
         return jax.tree.map(np.asarray, jax.jit(functools.partial(observations.closest_approach, **numbers))(scene, state))
 
-    rows = seen(0.0, [0.0, 0.0])
+    rows = observed(0.0, [0.0, 0.0])
     squash = lambda length, scale: length / (scale + abs(length))  # noqa: E731
     meet = (20 - 2 * 1.12 - np.sqrt(2.2**2 - 1)) / 10
     gap = np.hypot(20 - 2.24, 1.0) - 2.2
@@ -177,7 +177,7 @@ def test_encounters_by_hand_and_from_any_frame(env):
     np.testing.assert_allclose(rows.features[0, 0], expected, atol=1e-4)
     np.testing.assert_allclose(rows.features[0, 1, :4], [-0.9, 0, -0.5, 0], atol=1e-4)
     assert rows.features.shape == (3, 16, 13) and rows.mask.sum(axis=1).tolist() == [2, 2, 2] and not rows.features[0, 2:].any()
-    moved = seen(0.9, [7.0, -3.0])
+    moved = observed(0.9, [7.0, -3.0])
     np.testing.assert_allclose(moved.features, rows.features, atol=1e-3)
 
 
@@ -266,8 +266,8 @@ def test_a_car_knows_how_it_turns(env):
     scene = scene_of([[0.0, 0], [0, 9]], [[50.0, 0]] * 2)
     state, _ = env.reset(jax.random.key(0), scene)
     state = replace(state, motion=replace(state.motion, yaw_rate=jnp.array([0.4, -1.0]), steer=jnp.array([-0.1, 0.2])))
-    seen = observations.yaw_rate_and_steer(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
-    np.testing.assert_allclose(seen, [[0.2, -0.2], [-0.5, 0.4]], rtol=1e-6)
+    observed = observations.yaw_rate_and_steer(scene, state, turn_scale_radps=2.0, steer_scale_rad=0.5)
+    np.testing.assert_allclose(observed, [[0.2, -0.2], [-0.5, 0.4]], rtol=1e-6)
 
 
 def test_the_lane_ahead_by_hand(env):
@@ -277,18 +277,18 @@ def test_the_lane_ahead_by_hand(env):
     yaws = [0.1, np.pi, 0.0]
     scene = scene_of([[0.2, 1.0], [0.0, -2.0], [48.0, 0.0]], [[9, 9]] * 3, yaws=yaws, speeds=[0.0, 0, 5])
     state, _ = env.reset(jax.random.key(0), scene)
-    seen = np.asarray(jax.jit(functools.partial(observations.lane, **numbers))(scene, state))
+    observed = np.asarray(jax.jit(functools.partial(observations.lane, **numbers))(scene, state))
     squash = lambda length, scale: length / (scale + np.abs(length))  # noqa: E731
-    assert seen.shape == (3, 15)
-    np.testing.assert_allclose(seen[0, :3], [squash(1.0, 2), np.sin(0.1), np.cos(0.1)], atol=1e-4)
-    np.testing.assert_allclose(seen[1, :3], [squash(-2.0, 2), 0, -1], atol=1e-4)
+    assert observed.shape == (3, 15)
+    np.testing.assert_allclose(observed[0, :3], [squash(1.0, 2), np.sin(0.1), np.cos(0.1)], atol=1e-4)
+    np.testing.assert_allclose(observed[1, :3], [squash(-2.0, 2), 0, -1], atol=1e-4)
     gap = 6 - 0.05 - 2.0 - 1.1
-    np.testing.assert_allclose(seen[1, 3:5], [squash(gap, 2), 0], atol=1e-3)
+    np.testing.assert_allclose(observed[1, 3:5], [squash(gap, 2), 0], atol=1e-3)
     ahead = np.array([5.0, 10, 20, 30, 45])
     places = np.stack([ahead, np.full(5, -1.0)], 1) @ np.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
-    np.testing.assert_allclose(seen[0, 5:].reshape(5, 2), squash(places, 20), atol=1e-4)
-    np.testing.assert_allclose(seen[1, 5:].reshape(5, 2), squash(np.stack([ahead, np.full(5, -2.0)], 1), 20), atol=1e-4)
-    np.testing.assert_allclose(seen[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
+    np.testing.assert_allclose(observed[0, 5:].reshape(5, 2), squash(places, 20), atol=1e-4)
+    np.testing.assert_allclose(observed[1, 5:].reshape(5, 2), squash(np.stack([ahead, np.full(5, -2.0)], 1), 20), atol=1e-4)
+    np.testing.assert_allclose(observed[2, 5:].reshape(5, 2)[:, 0], squash(np.array([5.0, 10, 10, 10, 10]), 20), atol=1e-4)
 
 
 def test_without_road_edges_every_observation_is_finite():
@@ -296,9 +296,9 @@ def test_without_road_edges_every_observation_is_finite():
     numbers = scenefactory_jax.load_config("task", "observations=lane_preview", "dynamics=bicycle")
     scene = scene_of([[0.0, 1.0], [9.0, 0.0]], [[50.0, 0]] * 2)
     scene = replace(scene, edges=replace(scene.edges, valid=jnp.zeros_like(scene.edges.valid)))
-    _, seen = jax.jit(environment.make_env(numbers).reset)(jax.random.key(0), scene)
-    assert set(seen) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
-    np.testing.assert_allclose(seen["lane"][:, 3:5], [[1.0, 0.0]] * 2)
+    _, observed = jax.jit(environment.make_env(numbers).reset)(jax.random.key(0), scene)
+    assert set(observed) > {"lane", "neighbours"} and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(observed))
+    np.testing.assert_allclose(observed["lane"][:, 3:5], [[1.0, 0.0]] * 2)
     slope = jax.grad(lambda length: compress_length(length, 2.0).sum())(jnp.array([jnp.inf, 1.0]))
     np.testing.assert_allclose(slope, [0.0, 2 / 9], rtol=1e-6)
 

@@ -92,8 +92,8 @@ def spoil(agents, field, value):
 def test_an_agent_with_unusable_numbers_is_absent(drive, name):
     scene = street()
     found = drive(replace(scene, agents=spoil(scene.agents, *UNUSABLE[name])))
-    wanted = drive(replace(scene, agents=spoil(scene.agents, "present", False)))
-    jax.tree.map(np.testing.assert_array_equal, without(found), without(wanted))
+    expected = drive(replace(scene, agents=spoil(scene.agents, "present", False)))
+    jax.tree.map(np.testing.assert_array_equal, without(found), without(expected))
     for outcome, motion, active in found[1:]:
         assert not outcome.events.goal_reached[BROKEN] and not active[BROKEN] and not outcome.reward[BROKEN]
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((outcome.observation, outcome.reward, motion)))
@@ -104,8 +104,8 @@ def test_numbers_spoilt_on_the_way_are_a_fault(drive, name):
     """Somebody writes into the state after the reset."""
     scene = street()
     found = drive(scene, lambda state: replace(state, agents=spoil(state.agents, *UNUSABLE[name])))
-    wanted = drive(scene, lambda state: replace(state, active=state.active.at[BROKEN].set(False)))
-    jax.tree.map(np.testing.assert_array_equal, without(found), without(wanted))
+    expected = drive(scene, lambda state: replace(state, active=state.active.at[BROKEN].set(False)))
+    jax.tree.map(np.testing.assert_array_equal, without(found), without(expected))
     assert [bool(outcome.events.numerical_error[BROKEN]) for outcome, _, _ in found[1:]] == [True, False, False]
     assert not any(outcome.events.goal_reached[BROKEN] or active[BROKEN] for outcome, _, active in found[1:])
 

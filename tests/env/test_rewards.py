@@ -87,10 +87,10 @@ def test_a_plain_step_by_hand(parts):
     distance = np.hypot(*apart.T)
     ttc = ((distance - 1.10) / np.maximum(apart @ [2.0, 0.0] / distance, 1e-9)).min()
     assert ttc > 0.5
-    wanted = {"progress": 2.0 * 0.5, "lane_keeping": keeping, "edge_ttc": -0.07 / ttc}
-    wanted |= dict.fromkeys(("goal", "collision", "crash", "road_edge", "off_lane", "idle", "ttc"), 0.0)
-    assert terms.keys() == wanted.keys() and len(terms) == 10
-    for name, value in wanted.items():
+    expected = {"progress": 2.0 * 0.5, "lane_keeping": keeping, "edge_ttc": -0.07 / ttc}
+    expected |= dict.fromkeys(("goal", "collision", "crash", "road_edge", "off_lane", "idle", "ttc"), 0.0)
+    assert terms.keys() == expected.keys() and len(terms) == 10
+    for name, value in expected.items():
         assert terms[name] == pytest.approx(value, abs=1e-4), name
 
 

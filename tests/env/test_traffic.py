@@ -93,12 +93,12 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
     trace = jax.device_get(run(jnp.arange(61)))
     for row in range(21):
         boxes = jax.tree.map(lambda leaf, row=row: leaf[3 * row], trace)
-        seen = np.asarray(log.valid[:, row]) & np.array([True, True, True, True, False])
+        observed = np.asarray(log.valid[:, row]) & np.array([True, True, True, True, False])
         assert not boxes.present[4], "animals are not asked for"
         for name in ("position", "velocity"):
-            np.testing.assert_array_equal(getattr(boxes, name)[seen], getattr(log, name)[seen, row])
-        np.testing.assert_allclose(boxes.yaw[seen], log.yaw[seen, row], atol=1e-6)
-        assert boxes.present[seen].all()
+            np.testing.assert_array_equal(getattr(boxes, name)[observed], getattr(log, name)[observed, row])
+        np.testing.assert_allclose(boxes.yaw[observed], log.yaw[observed, row], atol=1e-6)
+        assert boxes.present[observed].all()
     # 25 Hz meets every second row at 1.9999999, 3.9999998, ...: the last row too must be met
     others_at = jax.jit(jax.vmap(lambda step: bound("log_playback", control_dt=0.04)(street, step)))(5 * jnp.arange(11))
     np.testing.assert_array_equal(others_at.position[:, 1], log.position[1, ::2])
@@ -294,8 +294,8 @@ def logged(tmp_path):
 def test_everybody_is_kept_or_counted(logged):
     scene, report = prepared(logged)
     assert report.track_ids == (1,) and report.traffic_kept == 4
-    wanted = {"absent_from_start_on": 1, "outside_box": 1, "overlaps_agent": 1}
-    assert report.traffic_dropped == {reason: wanted.get(reason, 0) for reason in pack.TRAFFIC_DROPS}
+    expected = {"absent_from_start_on": 1, "outside_box": 1, "overlaps_agent": 1}
+    assert report.traffic_dropped == {reason: expected.get(reason, 0) for reason in pack.TRAFFIC_DROPS}
     assert report.agents_kept + report.traffic_kept + sum(report.traffic_dropped.values()) == len(logged.tracks)
     assert scene.traffic_log.kind.tolist() == [0, 1, 2, 3], "nearest to the agent's start first"
     np.testing.assert_allclose(scene.traffic_log.position[0, 10], [30 - 40, 3], atol=1e-5)
@@ -338,8 +338,8 @@ def assert_sound(packed):
         log = scene.traffic_log
         assert report.traffic_kept == len(log.kind) and log.valid.any(1).all() and np.isfinite(log.position).all()
         assert sum(report.agents_dropped.values()) == report.traffic_kept + sum(report.traffic_dropped.values())
-        seen = log.valid & (np.abs(log.position).max(-1) <= 100.0)
-        assert seen.any(1).all() and (log.size >= 0.3 - 1e-6).all()
+        observed = log.valid & (np.abs(log.position).max(-1) <= 100.0)
+        assert observed.any(1).all() and (log.size >= 0.3 - 1e-6).all()
     people = np.concatenate([one.scene.traffic_log.size[one.scene.traffic_log.kind == KINDS["pedestrian"]] for one in packed])
     assert not len(people) or np.median(people) < 1.1  # one of them may carry something
 

@@ -230,9 +230,9 @@ def test_pictures_show_the_place(played, settings, tmp_path):
 def test_a_film_shows_the_seconds_around_each_failure(played, settings, tmp_path):
     records, recording = played
     chosen = select_rows(records, np.isin(records["failure"], ["edge", "wrong_way"]))
-    wanted = {**settings["failures"], "pictures": {"enable": True, "panels": 1, "before_s": 1.0, "video": True}}
+    expected = {**settings["failures"], "pictures": {"enable": True, "panels": 1, "before_s": 1.0, "video": True}}
     look = {**settings["video"], "stride": 15, "fps": 5.0, "panel": 120}
-    paths = failure_pictures.draw(tmp_path, "strict, untrained", chosen, recording, {"failures": wanted, "video": look})
+    paths = failure_pictures.draw(tmp_path, "strict, untrained", chosen, recording, {"failures": expected, "video": look})
     assert set(paths) == {"edge", "wrong_way", "film"} and paths["film"].name == "failures-strict-untrained.gif"
     assert getattr(Image.open(paths["film"]), "n_frames", 1) == 7, "3 s at 30 steps a second, every 15th, and the last"
 

@@ -92,8 +92,8 @@ def test_the_running_mean_is_evaluated(saved, trainer):
     folder, third, fourth = saved
     second = checkpoint.restore(folder, begin(trainer), 2)
     for before, after in ((second, third), (third, fourth)):
-        wanted = jax.tree.map(lambda old, new: 0.5 * old + 0.5 * new, before.ema_parameters, after.parameters)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.ema_parameters, wanted)
+        expected = jax.tree.map(lambda old, new: 0.5 * old + 0.5 * new, before.ema_parameters, after.parameters)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.ema_parameters, expected)
         assert any((a != b).any() for a, b in zip(jax.tree.leaves(after.ema_parameters), jax.tree.leaves(after.parameters), strict=True))
     assert_same(get_policy_parameters(fourth), fourth.ema_parameters)
     alone = dataclasses.replace(third, ema_parameters=None)

@@ -66,9 +66,9 @@ def test_hidden_rows_and_their_order_change_nothing(tiny):
     poisoned = {**observation, "road": SetObservation(jnp.where(road.mask[..., None], road.features, 1e6), road.mask)}
     shuffled = {**observation, "road": SetObservation(road.features[..., order, :], road.mask[..., order])}
     longer = {**observation, "road": jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x)], axis=2), road)}
-    wanted = policy.apply(parameters, observation)
+    expected = policy.apply(parameters, observation)
     for other in (poisoned, shuffled, longer):
-        for a, b in zip(policy.apply(parameters, other), wanted, strict=True):
+        for a, b in zip(policy.apply(parameters, other), expected, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-6)
 
 
@@ -81,8 +81,8 @@ def test_empty_sets_read_zero_and_all_gradients_stay_finite(tiny):
         return jnp.sum(mean**2) + jnp.sum(value**2) + jnp.sum(log_std)
 
     derive = jax.jit(jax.grad(loss))
-    for seen in (observation, nothing):
-        gradient = derive(parameters, seen)
+    for observed in (observation, nothing):
+        gradient = derive(parameters, observed)
         assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(gradient))
     assert float(jnp.abs(gradient["params"]["actor"]["road_rows"]["layer_0"]["kernel"]).max()) == 0.0
     assert not late_fusion.pool(jnp.ones((2, 3, 4)), jnp.zeros((2, 3), bool)).any()

@@ -36,7 +36,7 @@ def test_advantages_equal_a_plain_loop():
     advantage, returns = estimate(reward, value, bootstrap, active, done, truncated)
 
     reward, value, bootstrap, active, done, truncated = map(np.asarray, (reward, value, bootstrap, active, done, truncated))
-    wanted = np.zeros((T, W, A))
+    expected = np.zeros((T, W, A))
     for index in np.ndindex(W, A):
         following, carried = float(bootstrap[index]), 0.0
         for t in reversed(range(T)):
@@ -47,16 +47,16 @@ def test_advantages_equal_a_plain_loop():
                 carried = 0.0
             else:
                 carried = float(reward[at]) + 0.9 * following - float(value[at]) + 0.9 * 0.8 * carried
-            following, wanted[at] = float(value[at]), carried
-    np.testing.assert_allclose(advantage, wanted, atol=1e-5)
-    np.testing.assert_allclose(returns, wanted + np.asarray(value), atol=1e-5)
+            following, expected[at] = float(value[at]), carried
+    np.testing.assert_allclose(advantage, expected, atol=1e-5)
+    np.testing.assert_allclose(returns, expected + np.asarray(value), atol=1e-5)
 
 
 def test_gaussians_agree_with_their_definitions():
     action, mean, other = jax.random.normal(jax.random.key(1), (3, 4, 3))
     log_std, log_std_old = jnp.array([-0.5, 0.0, 0.4]), jnp.array([-0.2, 0.1, 0.3])
-    wanted = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
-    np.testing.assert_allclose(gaussian.log_probability(action, mean, log_std), wanted, rtol=1e-5)
+    expected = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
+    np.testing.assert_allclose(gaussian.log_probability(action, mean, log_std), expected, rtol=1e-5)
 
     draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
     own = gaussian.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
@@ -253,9 +253,9 @@ def test_a_repeated_action_is_one_sample(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
     env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
     worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
-    seen = jax.vmap(env.observe)(stage, worlds)
-    parameters = policy.init(jax.random.key(1), seen)
-    begin = rollout.Worlds(worlds, seen, rollout.make_empty_episode_stats(worlds))
+    observed = jax.vmap(env.observe)(stage, worlds)
+    parameters = policy.init(jax.random.key(1), observed)
+    begin = rollout.Worlds(worlds, observed, rollout.make_empty_episode_stats(worlds))
     collect = jax.jit(functools.partial(rollout.collect_rollout, env, policy, horizon=4))
     after, samples, tally, record = collect(parameters, stage, begin, jax.random.key(2))
     lived = min(life, length)

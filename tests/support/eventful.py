@@ -37,12 +37,12 @@ def _convert(folder, out, formats, options):
 
 def convert_until(number, folder, out, options):
     """Convert, and die before a file."""
-    seen = []
+    observed = []
 
     def reader(path):
-        if len(seen) == number:
+        if len(observed) == number:
             os.kill(os.getpid(), signal.SIGKILL)
-        seen.append(Path(path))
+        observed.append(Path(path))
         yield from plainly(path)
 
     _convert(folder, out, {"dying": reader}, options)

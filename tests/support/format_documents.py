@@ -94,9 +94,9 @@ def in_spring_2023(document):
 
 def in_march_2023(document):
     """The layout of March 2023: no metadata, no `state` in tracks, sizes in one array, lights step by step."""
-    seen = document["dynamic_map_states"]["1"]["state"]["object_state"]
+    observed = document["dynamic_map_states"]["1"]["state"]["object_state"]
     names = {"TRAFFIC_LIGHT_GREEN": "LANE_STATE_GO"}
-    lights = [[{"lane": 1, "state": names.get(name, name), "stop_point": np.array([5.0, 0.0, 0.0])}] if name else [] for name in seen]
+    lights = [[{"lane": 1, "state": names.get(name, name), "stop_point": np.array([5.0, 0.0, 0.0])}] if name else [] for name in observed]
     tracks = {}
     for key, track in document["tracks"].items():
         state = track["state"]

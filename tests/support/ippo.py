@@ -13,9 +13,9 @@ class ActorCritic(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(self, seen):
-        actor = nn.tanh(nn.Dense(self.width)(nn.tanh(nn.Dense(self.width)(seen))))
-        critic = nn.tanh(nn.Dense(self.width)(nn.tanh(nn.Dense(self.width)(seen))))
+    def __call__(self, observed):
+        actor = nn.tanh(nn.Dense(self.width)(nn.tanh(nn.Dense(self.width)(observed))))
+        critic = nn.tanh(nn.Dense(self.width)(nn.tanh(nn.Dense(self.width)(observed))))
         mean = nn.Dense(3, kernel_init=nn.initializers.orthogonal(0.01))(actor)
         return mean, self.param("log_std", nn.initializers.constant(-0.5), (3,)), nn.Dense(1)(critic)[..., 0]
 
@@ -32,26 +32,26 @@ def make_train(env, *, worlds, horizon, updates, epochs=4, rate=1e-3, gamma=0.99
         return jnp.stack([named[name] for name in env.agents], axis=1)  # [W, A, ...]
 
     def act(carry, key):
-        parameters, seen, state = carry
+        parameters, observed, state = carry
         noise_key, step_key = jax.random.split(key)
-        mean, log_std, value = network.apply(parameters, stacked(seen))
+        mean, log_std, value = network.apply(parameters, stacked(observed))
         action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
         logp = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
         named = {name: action[:, slot] for slot, name in enumerate(env.agents)}
         after, state, reward, done, info = jax.vmap(env.step)(jax.random.split(step_key, worlds), state, named)
-        sample = (stacked(seen), action, logp, value, stacked(reward), stacked(done), info)
+        sample = (stacked(observed), action, logp, value, stacked(reward), stacked(done), info)
         return (parameters, after, state), sample
 
     def loss(parameters, batch):
-        seen, action, logp, advantage, target, weight = batch
-        mean, log_std, value = network.apply(parameters, seen)
+        observed, action, logp, advantage, target, weight = batch
+        mean, log_std, value = network.apply(parameters, observed)
         ratio = jnp.exp(norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1) - logp)
         gain = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
         return jnp.sum(weight * (0.5 * (value - target) ** 2 - gain)) / weight.sum()
 
     def update(carry, key):
-        parameters, memory, seen, state = carry
-        (_, seen, state), samples = jax.lax.scan(act, (parameters, seen, state), jax.random.split(key, horizon))
+        parameters, memory, observed, state = carry
+        (_, observed, state), samples = jax.lax.scan(act, (parameters, observed, state), jax.random.split(key, horizon))
         looked, action, logp, value, reward, done, info = samples
         weight = info["acted"].astype(jnp.float32)
 
@@ -61,7 +61,7 @@ def make_train(env, *, worlds, horizon, updates, epochs=4, rate=1e-3, gamma=0.99
             advantage = reward + gamma * after * ~done - value + gamma * lam * advantage * ~done
             return (advantage, value), advantage
 
-        last = network.apply(parameters, stacked(seen))[2]
+        last = network.apply(parameters, stacked(observed))[2]
         _, advantage = jax.lax.scan(back, (jnp.zeros_like(last), last), (value, reward, done), reverse=True)
         target, centre = advantage + value, jnp.sum(weight * advantage) / weight.sum()
         spread = jnp.sqrt(jnp.sum(weight * (advantage - centre) ** 2) / weight.sum())
@@ -74,13 +74,13 @@ def make_train(env, *, worlds, horizon, updates, epochs=4, rate=1e-3, gamma=0.99
 
         (parameters, memory), _ = jax.lax.scan(improve, (parameters, memory), None, epochs)
         told = jax.tree.map(lambda leaf: leaf[-1], {name: info[name] for name in info if name.startswith("returned")})
-        return (parameters, memory, seen, state), (jnp.sum(weight * reward) / weight.sum(), told)
+        return (parameters, memory, observed, state), (jnp.sum(weight * reward) / weight.sum(), told)
 
     def train(key):
         init_key, reset_key, key = jax.random.split(key, 3)
-        seen, state = jax.vmap(env.reset)(jax.random.split(reset_key, worlds))
-        parameters = network.init(init_key, stacked(seen))
-        carry = (parameters, optimiser.init(parameters), seen, state)
+        observed, state = jax.vmap(env.reset)(jax.random.split(reset_key, worlds))
+        parameters = network.init(init_key, stacked(observed))
+        carry = (parameters, optimiser.init(parameters), observed, state)
         (parameters, *_), (rewards, told) = jax.lax.scan(update, carry, jax.random.split(key, updates))
         return parameters, rewards, jax.tree.map(lambda leaf: leaf[-1], told)
 

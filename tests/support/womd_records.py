@@ -41,7 +41,7 @@ def positions(track):
     return np.stack([x, np.full(STEPS, 2.0 + track), np.full(STEPS, 30.5)], axis=1)
 
 
-def seen(track):
+def observed(track):
     return np.arange(STEPS) >= (0 if track == 0 else CURRENT + 2)
 
 
@@ -51,7 +51,7 @@ def scenario():
     message.timestamps_seconds.extend(TIMES_MICROS / 1e6)
     for index in range(2):
         track = message.tracks.add(id=7 + index, object_type=1 + index)
-        for (x, y, z), valid in zip(positions(index), seen(index), strict=True):
+        for (x, y, z), valid in zip(positions(index), observed(index), strict=True):
             length, width, height = SIZES[index]
             box = dict(length=length, width=width, height=height, heading=0.25, velocity_x=7.5, velocity_y=-0.5)
             track.states.add(center_x=x, center_y=y, center_z=z, valid=valid, **box)
@@ -85,7 +85,7 @@ def features(*, rows=4, lag=0):
     valid, stamps = np.zeros((rows, STEPS), int), np.full((rows, STEPS), -1)
     for row, index in ((0, 0), (2, 1)):  # a padding row between them
         found["state/id"][row], found["state/type"][row] = 7 + index, 1 + index
-        mask = seen(index)
+        mask = observed(index)
         values = (*positions(index).T, 0.25, 7.5, -0.5, *SIZES[index])
         for column, value in zip(table.values(), values, strict=True):
             column[row] = np.where(mask, value, -1.0)
