@@ -45,7 +45,7 @@ def test_both_encodings_give_the_same_scene(tmp_path):
     car, walker = one.tracks
     assert (car.kind, walker.kind, one.sdc, one.current) == ("vehicle", "pedestrian", 0, records.CURRENT)
     assert car.size == records.SIZES[0] and walker.size == records.SIZES[1]  # the walker's at her first valid step
-    assert not walker.xyz[~walker.valid].any() and walker.valid.tolist() == records.seen(1).tolist()
+    assert not walker.xyz[~walker.valid].any() and walker.valid.tolist() == records.observed(1).tolist()
     (light,) = one.lights
     assert light.lane == 4 and light.valid.tolist() == [step >= 5 for step in range(12)]
     assert light.state[5:].tolist() == [4, 4, 4, 6, 6, 6, 6]
