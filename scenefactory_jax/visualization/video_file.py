@@ -67,7 +67,7 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], *, fps: float | int) -> 
 
 
 def _write_gif(path: Path, pictures: Iterable[Picture], *, fps: float | int, palette: Image.Image) -> None:
-    """Writes frame times of whole hundredths of a second that add up to the right speed."""
+    """Writes a GIF; its frame times are whole hundredths of a second that add up to the right speed."""
     shown = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     ends = [round((index + 1) * 100 / fps) for index in range(len(shown))]
     times = [10 * (end - begin) for begin, end in itertools.pairwise([0, *ends])]
