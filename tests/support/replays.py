@@ -35,7 +35,7 @@ def made() -> Recording:
 def _dressed(recording: Recording) -> Recording:
     """With wheels, which bicycles have not, and two others: one that is there half of the time and drives, one that stands."""
     shots, generator = recording.shots, np.random.default_rng(0)
-    numbers = {name: generator.uniform(0.1, 1.1, (*shots.yaw.shape, 4)) for name in ("mu", "normal", "tangent", "slip")}
+    numbers = {name: generator.uniform(0.1, 1.1, (*shots.yaw.shape, 4)) for name in ("mu", "normal", "tangent", "slip", "forward", "left")}
     wheels = unchecked(Tyres, **numbers)
     zero, ahead = np.zeros((2, STEPS, 2)), np.linspace(-30.0, 30.0, STEPS)
     position = np.stack([np.stack([ahead, ahead * 0 + 3.0], -1), np.tile([20.0, 7.0], (STEPS, 1))], axis=1)
