@@ -269,6 +269,7 @@ def read(compiled: CompiledCar, body: Body) -> Motion:
     rotation = states.rotation_matrix(body.qpos[:, 3:7].T)
     tyres, limit = body.tyres, body.tyres.mu * body.tyres.normal
     loaded = limit > 1e-3  # N; at the start of an episode the friction coefficient is not known yet
+    used = jnp.where(loaded, tyres.tangent / jnp.where(loaded, limit, 1.0), 0.0)  # above 1 while load leaves a tyre: its force is of the load before
     return Motion(
         position=body.qpos[:, :3],
         velocity=body.qvel[:, :3],
@@ -278,6 +279,6 @@ def read(compiled: CompiledCar, body: Body) -> Motion:
         steer=body.qpos[:, compiled.addresses.steer_q].mean(-1),
         contact_force=body.contact_force,
         mu=tyres.mu.mean(-1),
-        friction_utilization=jnp.where(loaded, tyres.tangent / jnp.where(loaded, limit, 1.0), 0.0).max(-1),
+        friction_utilization=jnp.minimum(used, 1.0).max(-1),
         slip=jnp.where(loaded, tyres.slip, 0.0).max(-1),
     )
