@@ -269,7 +269,8 @@ def read(compiled: CompiledCar, body: Body) -> Motion:
     rotation = states.rotation_matrix(body.qpos[:, 3:7].T)
     tyres, limit = body.tyres, body.tyres.mu * body.tyres.normal
     loaded = limit > 1e-3  # N; at the start of an episode the friction coefficient is not known yet
-    used = jnp.where(loaded, tyres.tangent / jnp.where(loaded, limit, 1.0), 0.0)  # above 1 while load leaves a tyre: its force is of the load before
+    # Above 1 while load leaves a tyre, whose force is that of the load before
+    used = jnp.where(loaded, tyres.tangent / jnp.where(loaded, limit, 1.0), 0.0)
     return Motion(
         position=body.qpos[:, :3],
         velocity=body.qvel[:, :3],
