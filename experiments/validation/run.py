@@ -13,6 +13,7 @@ from experiments.validation import measurements, target_check, task_experiments
 from experiments.validation import validation_report as report
 from experiments.validation.measurements import Spread, spread_cases
 from scenefactory_jax.cli import entry, schema
+from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
@@ -54,6 +55,9 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     schema.check(config, schema.Validate)
     if unknown := [name for name in config["parts"] if name not in PARTS]:
         raise ConfigError(f"parts: {unknown[0]!r}; valid: {', '.join(PARTS)}")
+    fitted = Path(config["validation"]["fit"])
+    if not fitted.is_file():
+        raise ConfigError(f"validation.fit: no such file: {fitted}; expected result.json of `sysid`")
     scene_source.use_compilation_cache()
     out = Path(config["out"])
     (out / "results").mkdir(parents=True, exist_ok=True)
@@ -62,7 +66,9 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
             _measure(name, config, out, spread)
     found, targets = read(out), config["validation"]["targets"]
     if found:
-        print(f"{report.write(out, found, targets)}\n{verdicts.text(target_check.of(found, targets))}", flush=True)
+        fit = report.Fit(result_file.read(fitted), load_config("sysid")["sysid"])
+        judged = [*target_check.of(found, targets), *fit.verdicts()]
+        print(f"{report.write(out, found, targets, fit)}\n{verdicts.text(judged)}", flush=True)
     return found
 
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,30 +14,57 @@ from experiments.validation.motion_laws import LOCKED
 from experiments.validation.validation_figures import NAMES
 from scenefactory_jax.core import markdown
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.visualization.report import plots, verdicts
+from scenefactory_jax.visualization.report import plots, sysid_report, verdicts
+from scenefactory_jax.visualization.report.verdicts import Verdict
 
 Result = Mapping[str, Any]
 
 
-def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mapping[str, float]) -> Path:
+class Fit(NamedTuple):
+    """The fit of the car to the reference car: the contents of sysid's result.json, and its settings."""
+
+    result: Result
+    settings: Mapping[str, Any]  # `targets`, and `spins`: families whose final yaw angle is compared
+
+    def verdicts(self) -> list[Verdict]:
+        return sysid_report.response_verdicts(self.result, self.settings["targets"], self.settings["spins"])
+
+
+def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mapping[str, float], fit: Fit) -> Path:
     """Write `folder`/validation.md and its figures, and return its path. Parts that were not run are left out.
 
     Args:
         results: by part, as `validate` wrote them: `result`, and how it was made.
         targets: what the verdicts hold them to.
+        fit: its responses are shown, too.
     """
     folder.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[Result, Path], list[str]]] = {
         "drives": _drives, "laws": _laws, "handling": _handling, "collisions": _collisions,
         "extremes": robustness_report.extremes, "faults": robustness_report.faults, "costs": robustness_report.costs,
     }  # fmt: skip
-    lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(target_check.of(results, targets))]
+    lines = [
+        "# Validation of the physics",
+        _made(results),
+        "## Verdicts",
+        verdicts.table([*target_check.of(results, targets), *fit.verdicts()]),
+    ]
+    lines += ["# Against the reference car", _describe(fit), *sysid_report.response_sections(folder, fit.result, fit.settings["spins"])]
+    lines.append("# Against engines and laws of motion")
     for name, make in makers.items():
         if name in results:
             lines += make(results[name]["result"], folder)
     path = folder / "validation.md"
     path.write_text("\n\n".join(line for line in lines if line) + "\n", encoding="utf-8")
     return path
+
+
+def _describe(fit: Fit) -> str:
+    versions = fit.result["versions"]
+    return (
+        "CommonRoad's multi-body car and the shipped one (`fitted`), from the fit's results "
+        f"(`{fit.result['command']}` on {versions['device']}, jax {versions['jax']}); [sysid](../sysid/sysid.md) has all manoeuvres."
+    )
 
 
 def _made(results: Mapping[str, Mapping[str, Any]]) -> str:
@@ -52,8 +79,7 @@ def _made(results: Mapping[str, Mapping[str, Any]]) -> str:
     whole = sum(part["seconds"] for part in results.values())
     return "\n\n".join([
         f"The batched cars against the stock MuJoCo engine and against laws of motion. {versions}; {whole / 60:.1f} minutes in all, "
-        "compilation included. The numbers are in `results/`. Frequency responses, rise times, spins and other manoeuvres against the "
-        "reference car, CommonRoad's multi-body model, are in [sysid](../sysid/sysid.md).",
+        "compilation included. The numbers are in `results/`.",
         markdown.format_table(["Part", "Seconds", "Device", "Processes", "Command"], rows),
     ])  # fmt: skip
 

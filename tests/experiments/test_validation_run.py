@@ -12,6 +12,7 @@ from experiments.validation import validation_report as report
 from experiments.validation.measurements import spread_cases
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core import result_file
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.dynamics.articulated import parameters as cars
 
@@ -287,7 +288,9 @@ def test_the_committed_report_is_made_of_its_results(tmp_path):
     committed = configs.find_conf().parent / "experiments" / "validation"
     results = command.read(committed)
     assert list(results) == list(command.PARTS)
-    written = report.write(tmp_path, results, load_config("validate")["validation"]["targets"])
+    settings = load_config("validate")["validation"]
+    fit = report.Fit(result_file.read(configs.find_conf().parent / settings["fit"]), load_config("sysid")["sysid"])
+    written = report.write(tmp_path, results, settings["targets"], fit)
     assert written.read_text() == (committed / "validation.md").read_text()
     assert {path.name for path in tmp_path.glob("*.png")} == {path.name for path in committed.glob("*.png")}
 

@@ -20,7 +20,6 @@ PUBLISHED = {  # SceneFactory, arXiv:2605.08528, Table 8: candidates and best lo
     "brake_preservation": (49, 3.6938),
 }
 PICTURES = {  # name -> caption and figure
-    "frequency_response": ("Yaw rate over the angle of the front wheels", figures.bode),
     "tyre": ("Friction over slip in steady rolling at 20 m/s, dry road", figures.tyres),
     "paths": ("Teacher and cars, one held-out manoeuvre a row", figures.paths),
     "heldout": ("Errors of every held-out manoeuvre", figures.spread),
@@ -45,9 +44,7 @@ def write(folder: Path, result: Result, targets: Mapping[str, float], spins: Seq
         "# System identification of the articulated car",
         _overview(result),
         document.section("Verdicts", table(verdicts(result, targets, spins))),
-        document.section("Frequency response", *_frequency_response(result), pictures["frequency_response"]),
-        document.section("Step steer", *_rise_times(result)),
-        document.section("Spins", *_spins(result, spins)),
+        *response_sections(folder, result, spins),
         document.section("Manoeuvres kept out of the fit", *_families(result, "heldout"), pictures["heldout"], pictures["paths"]),
         document.section("Tyre", *_tyres(result), pictures["tyre"]),
         document.section("Parameters", *_parameters(result), pictures["slices"]),
@@ -56,9 +53,20 @@ def write(folder: Path, result: Result, targets: Mapping[str, float], spins: Seq
     )
 
 
+def response_sections(folder: Path, result: Result, spins: Sequence[str]) -> list[str]:
+    """Formats the sections on the responses of teacher and cars, and draws `folder`/frequency_response.png."""
+    path = plots.save(figures.bode(result), folder / "frequency_response.png", dpi=100)
+    picture = document.picture(folder, path, "Yaw rate over the angle of the front wheels")
+    return [
+        document.section("Frequency response", *_frequency_response(result), picture),
+        document.section("Step steer", *_rise_times(result)),
+        document.section("Spins", *_spins(result, spins)),
+    ]
+
+
 def verdicts(result: Result, targets: Mapping[str, float], spins: Sequence[str]) -> list[Verdict]:
     """Compares the fitted car with the targets."""
-    found = [*_response_verdicts(result, targets, spins), *_error_verdicts(result, targets)]
+    found = [*response_verdicts(result, targets, spins), *_error_verdicts(result, targets)]
     fitted = result["fits"]["fitted"]
     bound = [name for name, stuck in zip(fitted["space"]["names"], fitted["refined"]["at_bound"], strict=True) if stuck]
     found.append(Verdict("Parameters at a bound of their range", "0", ", ".join(bound) or "0", not bound))
@@ -66,7 +74,8 @@ def verdicts(result: Result, targets: Mapping[str, float], spins: Sequence[str])
     return [*found, Verdict("Both fits, compilation included", f"< {limit:g} min", f"{minutes:.1f} min", minutes < limit)]
 
 
-def _response_verdicts(result: Result, targets: Mapping[str, float], spins: Sequence[str]) -> list[Verdict]:
+def response_verdicts(result: Result, targets: Mapping[str, float], spins: Sequence[str]) -> list[Verdict]:
+    """Compares the fitted car's responses with the targets."""
     sines, steps, ends = figures.find_sines(result), _find_steps(result), _find_spins(result, spins)
     phase = np.abs(sines["fitted"]["phase_deg"] - sines["teacher"]["phase_deg"])
     gain = np.abs(sines["fitted"]["gain"] / sines["teacher"]["gain"] - 1.0)
