@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.validation import measurements, target_check, task_experiments
+from experiments.validation import measurements, task_experiments
 from experiments.validation import validation_report as report
 from experiments.validation.measurements import Spread, spread_cases
 from scenefactory_jax.cli import entry, schema
@@ -67,8 +67,7 @@ def validate(config: Mapping[str, Any]) -> dict[str, Any]:
     found, targets = read(out), config["validation"]["targets"]
     if found:
         fit = report.Fit(result_file.read(fitted), load_config("sysid")["sysid"])
-        judged = [*target_check.of(found, targets), *fit.verdicts()]
-        print(f"{report.write(out, found, targets, fit)}\n{verdicts.text(judged)}", flush=True)
+        print(f"{report.write(out, found, targets, fit)}\n{verdicts.text(report.judge(found, targets, fit))}", flush=True)
     return found
 
 

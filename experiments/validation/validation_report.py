@@ -26,8 +26,11 @@ class Fit(NamedTuple):
     result: Result
     settings: Mapping[str, Any]  # `targets`, and `spins`: families whose final yaw angle is compared
 
-    def verdicts(self) -> list[Verdict]:
-        return sysid_report.response_verdicts(self.result, self.settings["targets"], self.settings["spins"])
+
+def judge(results: Mapping[str, Mapping[str, Any]], targets: Mapping[str, float], fit: Fit) -> list[Verdict]:
+    """Verdicts on the parts that were run, and on the fit's responses."""
+    found = target_check.of(results, targets)
+    return [*found, *sysid_report.response_verdicts(fit.result, fit.settings["targets"], fit.settings["spins"])]
 
 
 def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mapping[str, float], fit: Fit) -> Path:
@@ -43,12 +46,7 @@ def write(folder: Path, results: Mapping[str, Mapping[str, Any]], targets: Mappi
         "drives": _drives, "laws": _laws, "handling": _handling, "collisions": _collisions,
         "extremes": robustness_report.extremes, "faults": robustness_report.faults, "costs": robustness_report.costs,
     }  # fmt: skip
-    lines = [
-        "# Validation of the physics",
-        _made(results),
-        "## Verdicts",
-        verdicts.table([*target_check.of(results, targets), *fit.verdicts()]),
-    ]
+    lines = ["# Validation of the physics", _made(results), "## Verdicts", verdicts.table(judge(results, targets, fit))]
     lines += ["# Against the reference car", _describe(fit), *sysid_report.response_sections(folder, fit.result, fit.settings["spins"])]
     lines.append("# Against engines and laws of motion")
     for name, make in makers.items():
