@@ -55,7 +55,8 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
         "size": np.broadcast_to([4.0, 2.0], (*shape, 2)),
     }
     columns = {name: jnp.asarray(column, jnp.float32) for name, column in columns.items()}
-    columns |= {"valid": jnp.ones((*shape, steps), bool), "kind": jnp.zeros(shape, jnp.int32)}
+    columns |= {"valid": jnp.ones((*shape, steps), bool), "has_route": jnp.zeros(shape, bool)}
+    columns |= {name: jnp.zeros(shape, jnp.int32) for name in ("kind", "route")}
     tracks = jax.vmap(lambda columns: TrafficLog(**columns))(columns)
     return replace(worlds, traffic_log=tracks)
 

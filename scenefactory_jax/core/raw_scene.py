@@ -5,18 +5,14 @@ from their origin; float32 comes after a centre is subtracted. Values at invalid
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from scenefactory_jax.core.types import LIGHT_STATES as LIGHT_STATES
+from scenefactory_jax.core.types import LightState as LightState
 from scenefactory_jax.core.types import RoadUser
-
-LightState = Literal[
-    "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution"
-]
-LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)  # the order of WOMD's TrafficSignalLaneState.State (map.proto)
-
 
 COMPANION = "companion"  # kind of a file that is not a fault: see `Companion`
 

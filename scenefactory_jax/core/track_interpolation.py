@@ -46,7 +46,8 @@ def interpolate_track(
 def make_empty_log(steps: int) -> TrafficLog:
     """A log without road users, over that many steps."""
     flat, pair = jnp.zeros((0, steps), jnp.float32), jnp.zeros((0, steps, 2), jnp.float32)
-    return TrafficLog(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, jnp.int32))
+    index = jnp.zeros(0, jnp.int32)
+    return TrafficLog(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), index, index, index.astype(bool))
 
 
 def make_empty_boxes() -> Boxes:

@@ -1,19 +1,33 @@
 """Types that several modules share.
 
-Axes: `A` agent slots, `O` road users of the traffic, `P` road segments, `L` logged steps, `K` rows of a set, `F` features. Code is
-written for one world and `jax.vmap` adds the world axis `W`. SI units and radians, +x forward, +y left, yaw counter-clockwise from
+Axes: `A` agent slots, `O` road users of the traffic, `P` road segments, `L` logged steps, `R` routes, `N` points of a route, `S` stop
+lines of a route, `C` traffic controls, `T` changes of a light, `K` rows of a set, `F` features. Code is written for one world and
+`jax.vmap` adds the world axis `W`. SI units and radians, +x forward, +y left, yaw counter-clockwise from
 world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass, static
 
+T = TypeVar("T")
+
 SurfaceName = Literal["AC", "SMA", "OGFC", "GRAVEL", "SNOW", "ICE"]  # the first three are asphalts: concrete, stone mastic, open-graded
 SURFACES: tuple[SurfaceName, ...] = get_args(SurfaceName)
+
+LightState = Literal[
+    "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution"
+]  # the order of WOMD's TrafficSignalLaneState
+LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)
+RED_STATES = (1, 4, 7)  # a car must not enter: arrow_stop, stop, flashing_stop
+YELLOW_STATES = (2, 5, 8)
+
+ROUTE_SPACING_M = 1.0  # between the points of a route
 
 RoadUser = Literal["vehicle", "pedestrian", "cyclist", "other"]
 ROAD_USERS: tuple[RoadUser, ...] = get_args(RoadUser)  # the order of `Tracks.kind`
@@ -52,6 +66,9 @@ class Agents:
     goal: Float[Array, "A 2"]
     route_length: Float[Array, " A"]  # from start to goal, m
     present: Bool[Array, " A"]
+    route: Int[Array, " A"]  # row of `Scene.routes`
+    route_start: Float[Array, " A"]  # arc length on the route at the start
+    route_end: Float[Array, " A"]  # at the goal; not above `route_start`: the agent has no route
 
 
 @pytree_dataclass
@@ -75,6 +92,40 @@ class TrafficLog:
     valid: Bool[Array, "O L"]
     size: Float[Array, "O 2"]  # length, width
     kind: Int[Array, " O"]  # index into ROAD_USERS
+    route: Int[Array, " O"]  # row of `Scene.routes`
+    has_route: Bool[Array, " O"]
+
+
+@pytree_dataclass
+class Routes:
+    """Routes of a world: of the agents (slot after slot, the best one first), of vehicles of the traffic, and drawn ones, in this order.
+
+    A route is sampled every ROUTE_SPACING_M along its length; the points behind its end repeat it.
+    """
+
+    position: Float[Array, "R N 2"]
+    length: Float[Array, " R"]  # 0: a row without a route
+    speed_limit: Float[Array, "R N"]  # m/s; inf where none is known
+    lane: Int[Array, "R N"]  # the lane's index into RawScene.roads, as `Road.polyline`; -1: beside lanes
+    along_lanes: Bool[Array, " R"]  # false: the logged track itself, because no chain of lanes follows it
+    agent: Int[Array, " R"]  # slot of the agent whose route it is; -1: of nobody
+    on_route: Bool[Array, " R"]  # it begins with the lanes of the logged track (planning facts: ScenarioMax)
+    stop_arc: Float[Array, "R S"]  # arc length at the stop lines, ascending; inf behind the last
+    stop_control: Int[Array, "R S"]  # row of `Scene.controls`
+
+
+@pytree_dataclass
+class TrafficControls:
+    """Traffic lights and stop signs: a row for each lane that one of them governs."""
+
+    position: Float[Array, "C 2"]  # where cars stop, on the lane
+    direction: Float[Array, "C 2"]  # of the lane there
+    lane: Int[Array, " C"]  # index into RawScene.roads
+    stop_sign: Bool[Array, " C"]  # false: a light
+    change_s: Float[Array, "C T"]  # times since the cars start at which the light takes its states, ascending; inf behind the last
+    state: Int[Array, "C T"]  # index into LIGHT_STATES
+    period_s: Float[Array, " C"]  # after which the states repeat; inf: never
+    valid: Bool[Array, " C"]
 
 
 @pytree_dataclass
@@ -143,6 +194,17 @@ class SpatialGrid:
     longest_list: int = static()  # entries of the longest list
 
 
+def make_empty_rows(kind: type[T]) -> T:
+    """Makes a part of a scene without rows."""
+    dtypes = {"float": jnp.float32, "int": jnp.int32, "bool": jnp.bool_}
+    leaves = {}
+    for entry in dataclasses.fields(kind):  # pyright: ignore[reportArgumentType]
+        dtype = next(dtype for name, dtype in dtypes.items() if entry.type.dtypes[0].startswith(name))  # pyright: ignore
+        shape = [int(axis) if axis.isdigit() else 0 for axis in entry.type.dim_str.split()]  # pyright: ignore
+        leaves[entry.name] = jnp.zeros(shape, dtype)
+    return kind(**leaves)
+
+
 @pytree_dataclass
 class Scene:
     """The data of one world: constant in an episode, except for agents and weather, which a reset may sample again, and the traffic boxes.
@@ -159,6 +221,8 @@ class Scene:
     weather: Weather
     traffic_log: TrafficLog
     traffic: Boxes  # at the present time; set by the environment
+    routes: Routes = dataclasses.field(default_factory=lambda: make_empty_rows(Routes))
+    controls: TrafficControls = dataclasses.field(default_factory=lambda: make_empty_rows(TrafficControls))
     road_grid: SpatialGrid | None = None  # of `road`, for queries within a radius; None: they read all of it
 
 
@@ -187,6 +251,9 @@ class Events:
     collision: Bool[Array, " A"]
     out_of_bounds: Bool[Array, " A"]
     road_edge_contact: Bool[Array, " A"]
+    red_light: Bool[Array, " A"]  # the car's front passed a stop line while its light was red
+    stop_sign: Bool[Array, " A"]  # the car's front passed the line of a stop sign without having stood before it
+    off_route: Bool[Array, " A"]  # the car is farther from its route than `step_metrics.off_route_m`
 
 
 @pytree_dataclass
@@ -214,7 +281,25 @@ class StepMetrics:
     slip: Float[Array, " A"]
     off_lane: Bool[Array, " A"]
     idle: Bool[Array, " A"]
+    has_route: Bool[Array, " A"]
+    route_arc: Float[Array, " A"]  # arc length on the route at the car's nearest point, m
+    route_progress: Float[Array, " A"]  # by which it grew in this step
+    route_remaining: Float[Array, " A"]  # from there to the goal
+    route_completion: Float[Array, " A"]  # part of the route between start and goal that the car has been on, 0 to 1
+    route_distance: Float[Array, " A"]  # from the route's line
+    route_alignment: Float[Array, " A"]  # cosine between the car and the route
+    wrong_way: Bool[Array, " A"]  # it drives against the direction of the lane that it is on
+    overspeed: Float[Array, " A"]  # speed above the limit, at least 0, m/s
     events: Events  # raw: several may be true at once
+
+
+@pytree_dataclass
+class RouteState:
+    """What an agent's way along its route so far decides; zeros without a route."""
+
+    arc: Float[Array, " A"]  # arc length on the route at the car's nearest point, m
+    farthest: Float[Array, " A"]  # the largest since the start
+    stood: Bool[Array, " A"]  # the car has stood before the next stop sign
 
 
 @pytree_dataclass
@@ -231,6 +316,9 @@ class State:
     previous_action: Float[Array, "A 3"]
     step: Int[Array, ""]
     key: PRNGKeyArray
+    route: RouteState
+    traffic: Any = ()  # the background traffic's own pytree
+    history: Any = ()  # past positions, where an observation needs them
 
 
 @pytree_dataclass
@@ -277,6 +365,14 @@ class Dynamics(NamedTuple):
     init: Callable[[PRNGKeyArray, Scene], Any]
     advance: Callable[[Scene, Any, Float[Array, "A 3"], Bool[Array, " A"]], Any]  # (scene, body, action, active) -> body
     read: Callable[[Any], Motion]
+
+
+class Traffic(NamedTuple):
+    """Background traffic of one world: its own state, what moves it by one control step, and its boxes on the road."""
+
+    init: Callable[[PRNGKeyArray, Scene, Int[Array, ""]], Any]  # (key, scene, control step) -> state
+    advance: Callable[[Scene, Any, Boxes, Int[Array, ""]], Any]  # (scene, state, active agents, control step) -> state one step later
+    read: Callable[[Scene, Any, Int[Array, ""]], Boxes]  # (scene, state, control step) -> its boxes
 
 
 class Env(NamedTuple):

@@ -42,6 +42,9 @@ def make_open_ground(
             goal=position,
             route_length=jnp.zeros_like(yaw),
             present=jnp.ones(count, bool),
+            route=jnp.zeros(count, jnp.int32),
+            route_start=jnp.zeros_like(yaw),
+            route_end=jnp.zeros_like(yaw),
         )
         standing = {"velocity": jnp.zeros((count, 1, 2), jnp.float32), "valid": jnp.zeros((count, 1), bool), "dt": jnp.float32(1.0)}
         log = AgentLog(position=position[:, None], yaw=yaw[:, None], **standing)

@@ -14,24 +14,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import schema
+from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import check, check_array, is_finite, replace, to_jax, to_strong_type, tree_where, unchecked
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative, Positive
 from scenefactory_jax.core.types import (
     Agents,
-    Boxes,
     Dynamics,
     Env,
     Events,
     Observation,
     RewardInput,
+    RouteState,
     Scene,
     State,
     StepMetrics,
     StepResult,
+    Traffic,
     Weather,
 )
-from scenefactory_jax.env import observations, rewards, spawning, step_metrics, termination
+from scenefactory_jax.env import observations, rewards, route_following, spawning, step_metrics, termination, traffic
 from scenefactory_jax.weather import friction, rain, road_condition
 
 
@@ -102,7 +104,8 @@ class EnvParts(NamedTuple):
     action_repeat: int  # control steps per action
     sample_agents: Callable[[PRNGKeyArray, Scene], Agents]
     sample_weather: Callable[[PRNGKeyArray, Scene], Weather]
-    traffic: Callable[[Scene, Int[Array, ""]], Boxes]  # (scene, control step) -> background traffic
+    traffic: Traffic
+    advance_route: Callable[..., RouteState]  # (scene, state before, motion after, speed=) -> state of the routes after
     compute_metrics: Callable[[Scene, State, State], StepMetrics]
     evaluate_termination: Callable[[StepMetrics, Events, Bool[Array, " A"]], tuple[Events, Bool[Array, " A"]]]
     terms: Mapping[str, tuple[float, rewards.Term]]
@@ -137,8 +140,9 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         action_repeat=read.actions.action_repeat,
         sample_agents=spawning.make(read.spawning.sampler),
         sample_weather=road_condition.make(read.weather),
-        traffic=instantiate(read.traffic, builtins=f"{package}.traffic", where="traffic", **context),
-        compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics),
+        traffic=traffic.make(read.traffic, **context),
+        advance_route=functools.partial(route_following.advance, config=read.step_metrics.route),
+        compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics, control_dt=context["control_dt"]),
         evaluate_termination=functools.partial(termination.evaluate, ending=read.termination.ending),
         terms=rewards.make(read.reward, **context),
         groups=observations.make(read.observations, **context),
@@ -247,14 +251,15 @@ def find_truncated_agents(result: StepResult, active: Bool[Array, "*W A"]) -> Bo
 
 def _scene_at(parts: EnvParts, scene: Scene, state: State) -> Scene:
     """Computes the scene at the time of a state: agents and weather of this episode, and the traffic at that time."""
-    return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic(scene, state.step))
+    return replace(scene, agents=state.agents, weather=state.weather, traffic=parts.traffic.read(scene, state.traffic, state.step))
 
 
 def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
     """Starts an episode, at its beginning or at a later control step with the rain and traffic of that time."""
     step = jnp.asarray(step, jnp.int32)
     agents_key, weather_key, key, body_key = jax.random.split(key, 4)
-    scene = replace(scene, traffic=parts.traffic(scene, step))
+    others = parts.traffic.init(jax.random.fold_in(body_key, 0), scene, step)
+    scene = replace(scene, traffic=parts.traffic.read(scene, others, step))
     agents = spawning.admit_cars(parts.sample_agents(agents_key, scene))
     weather = rain.advance_rain(parts.sample_weather(weather_key, scene), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
@@ -271,6 +276,8 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
         previous_action=jnp.zeros((count, 3), jnp.float32),
         step=step,
         key=key,
+        route=route_following.start_routes(agents),
+        traffic=others,
     )
     return to_strong_type(state)
 
@@ -279,7 +286,7 @@ def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Arr
     """Advances a world by one control step, without the observation."""
     scene = _scene_at(parts, scene, replace(state, weather=rain.advance_rain(state.weather, dt=parts.control_dt)))
     action = jnp.where(state.active[:, None], _hold_action(parts, state, action), 0.0)
-    after = _advance(parts.dynamics, scene, state, action)
+    after = _advance(parts, scene, state, action)
     scene = _scene_at(parts, scene, after)
     metrics, after = _restore_non_finite(parts.compute_metrics(scene, state, after), state, after)
     events, terminated = parts.evaluate_termination(metrics, state.past_events, state.active)
@@ -305,12 +312,16 @@ def _hold_action(parts: EnvParts, state: State, action: Float[Array, "A 3"]) -> 
     return new if parts.action_repeat == 1 else jnp.where(state.step % parts.action_repeat == 0, new, state.previous_action)
 
 
-def _advance(dynamics: Dynamics, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
-    body = dynamics.advance(scene, state.body, action, state.active)
+def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "A 3"]) -> State:
+    body = parts.dynamics.advance(scene, state.body, action, state.active)
+    motion = parts.dynamics.read(body)
+    cars = spawning.make_boxes(state.motion, state.agents, state.active)
     return replace(
         state,
         body=body,
-        motion=dynamics.read(body),
+        motion=motion,
+        route=parts.advance_route(scene, state, motion, speed=safe_norm(motion.velocity[:, :2])),
+        traffic=parts.traffic.advance(scene, state.traffic, cars, state.step),
         weather=scene.weather,
         steps_since_spawn=state.steps_since_spawn + state.active.astype(jnp.int32),
         previous_action=action,
@@ -349,6 +360,7 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
         active=state.active | starts,
         past_events=tree_where(starts, termination.make_empty_events(len(starts)), state.past_events),
         steps_since_spawn=jnp.where(starts, 0, state.steps_since_spawn),
+        route=tree_where(starts, route_following.start_routes(new), state.route),
         previous_action=jnp.where(starts[:, None], 0.0, state.previous_action),
         key=key,
     )

@@ -20,7 +20,8 @@ from scenefactory_jax.core.geometry import (
 from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace, tree_where
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, check_names
-from scenefactory_jax.core.types import Agents, Boxes, Scene
+from scenefactory_jax.core.types import Agents, Boxes, Motion, Scene
+from scenefactory_jax.env import route_following
 
 Sampler = Callable[[PRNGKeyArray, Scene], Agents]
 
@@ -130,6 +131,9 @@ def along_log(
         goal=jnp.where(present[:, None], cars.goal, 0.0),
         route_length=pick(length - read(travelled, row)),
         present=present,
+        route=cars.route,
+        route_start=route_following.project(scene, cars.route, pick(start)).arc,
+        route_end=cars.route_end,
     )
 
 
@@ -179,6 +183,9 @@ def random_pairs(
         goal=pick(goal),
         route_length=pick(travel),
         present=present,
+        route=jnp.zeros(slots, jnp.int32),
+        route_start=jnp.zeros(slots, jnp.float32),
+        route_end=jnp.zeros(slots, jnp.float32),
     )
 
 
@@ -211,6 +218,20 @@ def _pick(candidates: Float[Array, "A C *d"], *, chosen: Int[Array, " A"], prese
     pad = (1,) * (candidates.ndim - 2)
     picked = jnp.take_along_axis(candidates, chosen.reshape((-1, 1, *pad)), axis=1)[:, 0]
     return jnp.where(present.reshape((-1, *pad)), picked, 0.0).astype(jnp.float32)
+
+
+def make_boxes(motion: Motion, agents: Agents, active: Bool[Array, " A"]) -> Boxes:
+    """Makes the boxes of active agents, as background traffic sees them."""
+    return Boxes(
+        position=motion.position[:, :2],
+        elevation=motion.position[:, 2],
+        yaw=motion.yaw,
+        velocity=motion.velocity[:, :2],
+        yaw_rate=motion.yaw_rate,
+        size=agents.size,
+        mass=jnp.full_like(motion.yaw, jnp.inf),
+        present=active,
+    )
 
 
 def is_clear(

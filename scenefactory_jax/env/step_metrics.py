@@ -14,7 +14,8 @@ from scenefactory_jax.core.pytree import is_finite
 from scenefactory_jax.core.schema import NonNegative, Positive
 from scenefactory_jax.core.types import Agents, Events, Motion, Scene, State, StepMetrics
 from scenefactory_jax.dynamics.articulated.parameters import GRAVITY
-from scenefactory_jax.env import spawning, surrogate_safety
+from scenefactory_jax.env import route_following, spawning, surrogate_safety
+from scenefactory_jax.env.route_following import RouteConfig
 from scenefactory_jax.roadgraph import queries
 
 
@@ -47,10 +48,11 @@ class StepMetricsConfig:
     off_lane_distance_m: Positive
     idle_speed_mps: NonNegative
     drac_gap_floor_m: Positive
+    route: RouteConfig
     kernels: bool  # Triton kernels for the road on NVIDIA GPUs; False: plain JAX
 
 
-def compute(scene: Scene, before: State, after: State, *, config: StepMetricsConfig) -> StepMetrics:
+def compute(scene: Scene, before: State, after: State, *, config: StepMetricsConfig, control_dt: float) -> StepMetrics:
     """Computes the metrics of the step from `before` to `after`; rows of agents that were not active before mean nothing.
 
     Definitions follow the paper (arXiv:2605.08528, section 4): planar goal distance; nearest lane midpoint of the whole world, its tangent
@@ -65,6 +67,8 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
     edges = {"half_width_m": config.edge_half_width_m, "range_m": config.edge_range_m, "kernels": config.kernels}
     road = queries.query_road(scene, centres[:cars], radius[:cars], velocity, motion.yaw, position, active, **edges)
     lane, edge_clearance = _compute_lane_metrics(scene, before, road.lane, motion, to_goal), road.edge - config.edge_radius_m
+    beside_lane = {"lane_heading": lane["lane_heading"], "lane_offset": lane["lane_offset"]}
+    route = route_following.compute_metrics(scene, before, after, speed=speed, **beside_lane, config=config.route, control_dt=control_dt)
     start_distance = safe_norm(position - after.agents.position)
     events = Events(
         numerical_error=broken,
@@ -72,6 +76,9 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
         collision=(motion.contact_force >= config.collision_force_n) & (after.steps_since_spawn >= config.collision_grace_steps),
         out_of_bounds=_is_out_of_bounds(motion, after.agents, start_distance, config),
         road_edge_contact=edge_clearance <= 0,
+        red_light=route.red_light,
+        stop_sign=route.stop_sign,
+        off_route=route.off_route,
     )
     stopping_distance = speed**2 / (2 * GRAVITY * jnp.maximum(motion.mu, 1e-3))
     return StepMetrics(
@@ -89,6 +96,7 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
         off_lane=lane["has_lane"]
         & ((lane["lane_offset"] > config.off_lane_lateral_m) | (lane["lane_distance"] > config.off_lane_distance_m)),
         idle=speed < config.idle_speed_mps,
+        **route.values,
         events=events,
     )
 
@@ -98,9 +106,7 @@ def _find_non_finite(state: State) -> Bool[Array, " A"]:
     return ~(is_finite(state.motion) & spawning.find_usable(state.agents))
 
 
-def _is_out_of_bounds(
-    motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig
-) -> Bool[Array, " A"]:
+def _is_out_of_bounds(motion: Motion, agents: Agents, start_distance: Float[Array, " A"], config: StepMetricsConfig) -> Bool[Array, " A"]:
     """Whether a car tipped over or fell, is outside the scene, or is further from its start than any way to its goal requires."""
     fell = (motion.upright < config.upright_min) | (motion.position[:, 2] < config.height_min_m)
     outside = jnp.max(jnp.abs(motion.position[:, :2]), axis=1) > 0.5 * config.scene_size_m

@@ -9,7 +9,9 @@ from jaxtyping import Array, Bool
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import Events, StepMetrics
 
-EventName = Literal["numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact"]
+EventName = Literal[
+    "numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", "red_light", "stop_sign", "off_route"
+]
 EVENTS = tuple(field.name for field in dataclasses.fields(Events))
 
 

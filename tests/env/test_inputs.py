@@ -54,6 +54,8 @@ def street():
         valid=jnp.ones((1, 3), bool),
         size=jnp.array([[4.0, 2.0]]),
         kind=jnp.full((1,), ROAD_USERS.index("vehicle"), jnp.int32),
+        route=jnp.zeros(1, jnp.int32),
+        has_route=jnp.zeros(1, bool),
     )
     return replace(scene, traffic_log=parked)
 

@@ -17,7 +17,7 @@ from support.hand_scenes import scene_of
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import Events, Motion, RewardInput, State
-from scenefactory_jax.env import environment, rewards, termination
+from scenefactory_jax.env import environment, rewards, route_following, termination
 
 FAR = [[50.0, 0.0]]  # a goal that is ahead and not reached
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")  # in the order of precedence
@@ -57,6 +57,7 @@ def moment(scene, place, *, yaw=0.0, velocity=((5.0, 0.0),), height=0.6, upright
         previous_action=jnp.zeros((count, 3)),
         step=jnp.int32(age),
         key=jax.random.key(0),
+        route=route_following.start_routes(scene.agents),
     )
 
 

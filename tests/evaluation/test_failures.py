@@ -93,7 +93,16 @@ def scripted(first, goal, second):
     )
     place = jnp.tile(jnp.array([[[30.0, 8.0]]]), (1, len(TIME), 1))
     zero = jnp.zeros((1, len(TIME)))
-    box = TrafficLog(place, zero, jnp.zeros_like(place), jnp.ones(zero.shape, bool), jnp.array([[4.5, 2.0]]), jnp.zeros(1, jnp.int32))
+    box = TrafficLog(
+        place,
+        zero,
+        jnp.zeros_like(place),
+        jnp.ones(zero.shape, bool),
+        jnp.array([[4.5, 2.0]]),
+        jnp.zeros(1, jnp.int32),
+        jnp.zeros(1, jnp.int32),
+        jnp.zeros(1, bool),
+    )
     return replace(scene, log=log, traffic_log=box)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from scenefactory_jax.core import geometry, schema
 from scenefactory_jax.core.types import Dynamics, Motion
-from scenefactory_jax.env import actions, environment, observations, rewards, spawning, step_metrics, termination, traffic
+from scenefactory_jax.env import actions, environment, observations, rewards, route_following, spawning, step_metrics, termination, traffic
 from scenefactory_jax.weather.road_condition import keep_condition
 
 CIRCLES = {"radius_fraction": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
@@ -36,7 +36,7 @@ def glide() -> Dynamics:
     return Dynamics(init, advance, read)
 
 
-def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=traffic.no_traffic, hold=1):
+def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=None, beside=None, hold=1):
     metrics = schema.read(config["step_metrics"], step_metrics.StepMetricsConfig)
     parts = environment.EnvParts(
         dynamics=glide(),
@@ -44,8 +44,9 @@ def build_env(config, *, draw=spawning.logged, steps=1500, respawn=None, ending=
         action_repeat=hold,
         sample_agents=draw,
         sample_weather=keep_condition,
-        traffic=beside,
-        compute_metrics=functools.partial(step_metrics.compute, config=metrics),
+        traffic=beside or traffic.no_traffic(),
+        advance_route=functools.partial(route_following.advance, config=metrics.route),
+        compute_metrics=functools.partial(step_metrics.compute, config=metrics, control_dt=1 / 30),
         evaluate_termination=functools.partial(termination.evaluate, ending=ending or config["termination"]["ending"]),
         terms=rewards.make(config["reward"]),
         groups=observations.make({**config["observations"], "road": {**config["observations"]["road"], "count": 40}}),

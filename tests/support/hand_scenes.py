@@ -54,6 +54,9 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
         goal=jnp.asarray(goals),
         route_length=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
         present=jnp.ones(count, bool) if present is None else jnp.asarray(present, bool),
+        route=jnp.zeros(count, jnp.int32),
+        route_start=jnp.zeros(count, jnp.float32),
+        route_end=jnp.zeros(count, jnp.float32),
     )
     log = AgentLog(
         position=jnp.tile(agents.position[:, None], (1, steps, 1)),
@@ -63,6 +66,12 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
         dt=jnp.float32(0.1),
     )
     return Scene(
-        road=road_of([lane, *edges]), lanes=road_of([lane]), edges=road_of(edges), agents=agents, log=log,
-        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)), traffic_log=make_empty_log(steps), traffic=make_empty_boxes(),
+        road=road_of([lane, *edges]),
+        lanes=road_of([lane]),
+        edges=road_of(edges),
+        agents=agents,
+        log=log,
+        weather=make_uniform(jnp.float32(0.0), jnp.int32(0)),
+        traffic_log=make_empty_log(steps),
+        traffic=make_empty_boxes(),
     )

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from scenefactory_jax.core import schema
-from scenefactory_jax.core.types import Env, Events, Motion, Scene, State, StepMetrics, StepResult
+from scenefactory_jax.core.types import Env, Events, Motion, RouteState, Scene, State, StepMetrics, StepResult
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import train_iteration
 from scenefactory_jax.learning.ppo.config import PPOConfig
@@ -18,7 +18,7 @@ from scenefactory_jax.learning.trainer import Trainer
 from scenefactory_jax.weather.friction import make_uniform
 
 AGENTS = 3
-SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0}
+SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0, "R": 0, "N": 0, "S": 0, "C": 0, "T": 0}
 PRESENT = jnp.array([True, True, False])
 POISON = 1e6
 
@@ -122,6 +122,7 @@ def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:
             previous_action=jnp.zeros((AGENTS, 3), jnp.float32),
             step=jnp.asarray(step, jnp.int32),
             key=key,
+            route=blank(RouteState),
         )
 
     def control_step(scene, state, action):

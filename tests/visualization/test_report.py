@@ -74,7 +74,9 @@ def make_trajectory(agents: int = 3, steps: int = 61, title: str = "straight and
     goal = np.stack([position[30, 0], *np.tile([25.0, 20.0], (agents - 1, 1))]).astype(np.float32)
     zero = jnp.zeros(agents, f)
     size = jnp.tile(jnp.array([4.5, 2.0], f), (agents, 1))
-    cars = Agents(jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool))
+    cars = Agents(
+        jnp.asarray(position[0]), zero, zero, size, jnp.asarray(goal), zero + 50, jnp.ones(agents, bool), zero.astype(int), zero, zero
+    )
     row = jnp.zeros((agents, 1), f)
     log = AgentLog(jnp.zeros((agents, 1, 2), f), row, jnp.zeros((agents, 1, 2), f), jnp.zeros((agents, 1), bool), f(0.1))
     scene = jax.tree.map(

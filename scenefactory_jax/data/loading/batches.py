@@ -15,11 +15,11 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.loading.scene_source import Check, Pack, SceneSource
 from scenefactory_jax.data.packing import columns
 from scenefactory_jax.data.packing.pack import prepare
-from scenefactory_jax.data.packing.stack import AXES, describe, round_rows, stack
+from scenefactory_jax.data.packing.stack import AXES, MAY_BE_EMPTY, describe, round_rows, stack
 from scenefactory_jax.roadgraph import spatial_grid
 
 OnOverflow = Literal["cut", "skip"]
-VARIABLE = (*columns.ROADS, "traffic", *spatial_grid.SIZES)  # another scene may need more of these than any that was measured
+VARIABLE = (*columns.ROADS, *MAY_BE_EMPTY, *spatial_grid.SIZES)  # another scene may need more of these than any that was measured
 SHOWN = 3  # reasons in a message
 
 
@@ -85,9 +85,11 @@ def measure(loader: BatchLoader, *, sample: int, headroom: float, given: Mapping
         if rows is None:
             rows = int(np.ceil(high * headroom)) if name in VARIABLE else high
             rows = round_rows(name, rows)
-        elif rows < (name != "traffic"):
-            raise ConfigError(f"stream.capacity.{name}: expected 1 or more (traffic: 0), or null to measure it, got {rows!r}")
-        elif name in VARIABLE and name != "traffic" and rows < low:
+        elif rows < (name not in MAY_BE_EMPTY):
+            raise ConfigError(
+                f"stream.capacity.{name}: expected 1 or more ({', '.join(MAY_BE_EMPTY)}: 0), or null to measure it, got {rows!r}"
+            )
+        elif name in VARIABLE and name not in MAY_BE_EMPTY and rows < low:
             raise ConfigError(f"stream.capacity.{name}: {rows}; all {len(needs)} scenes of the sample need more: {low} to {high}")
         sizes[name] = rows
     return sizes

@@ -18,7 +18,9 @@ ROADS = ("road", "lanes", "edges")
 SAMPLED = (Patches, Rain, Boxes)  # parts of a scene that resets sample: no file has them, and packed scenes have none of their rows
 DERIVED = SpatialGrid | None  # computed from the other columns
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
-AXES = {"A": "agents", "O": "traffic", "L": "steps"}  # letter of an annotation -> name; P is the part itself
+AXES = {  # letter of an annotation -> name; P is the part itself
+    "A": "agents", "O": "traffic", "L": "steps", "R": "routes", "N": "route_points", "S": "stops", "C": "controls", "T": "changes",
+}  # fmt: skip
 
 
 class Column(NamedTuple):

@@ -15,7 +15,7 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns
+from scenefactory_jax.data.packing import columns, control_columns, route_columns
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -41,6 +41,8 @@ class PackReport:
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
+    controls_kept: int  # lights and stop signs
+    controls_dropped: dict[str, int]
     segments_kept: int
     segments_cut: dict[str, int]  # reason of CUTS -> count
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -121,7 +123,8 @@ def pack(
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
-    leaves |= beside
+    controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
+    leaves |= beside | controls | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -134,6 +137,8 @@ def pack(
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
+        controls_kept=len(controls["controls.lane"]),
+        controls_dropped=controls_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,

@@ -12,7 +12,10 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.packing import columns
 
-AXES = (*columns.ROADS, "agents", "steps", "traffic")
+ROUTE_AXES = ("routes", "route_points", "stops", "controls", "changes")
+AXES = (*columns.ROADS, "agents", "steps", "traffic", *ROUTE_AXES)
+MAY_BE_EMPTY = ("traffic", *ROUTE_AXES)
+ENDLESS = ("routes.stop_arc", "routes.speed_limit", "controls.change_s", "controls.period_s")  # padded with infinity
 ROW_MULTIPLE = 256
 Leaves = dict[str, np.ndarray]
 
@@ -27,6 +30,11 @@ class Capacity:
     agents: schema.Count | None = None
     steps: schema.Count | None = None
     traffic: Annotated[int, schema.Bounds(min=0)] | None = None
+    routes: Annotated[int, schema.Bounds(min=0)] | None = None
+    route_points: Annotated[int, schema.Bounds(min=0)] | None = None
+    stops: Annotated[int, schema.Bounds(min=0)] | None = None
+    controls: Annotated[int, schema.Bounds(min=0)] | None = None
+    changes: Annotated[int, schema.Bounds(min=0)] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,7 @@ def stack(scenes: Sequence[Scene], *, capacity: Mapping[str, int | None]) -> tup
     worlds = [_drop_padding(columns.flatten(scene)) for scene in scenes]
     sizes = asdict(schema.read(dict(capacity), Capacity, where="capacity"))
     for axis in [axis for axis, rows in sizes.items() if rows is None]:
-        sizes[axis] = round_rows(axis, max(int(axis != "traffic"), *(_count(world, axis) for world in worlds)))
+        sizes[axis] = round_rows(axis, max(int(axis not in MAY_BE_EMPTY), *(_count(world, axis) for world in worlds)))
     cuts: list[CutCounts] = []
     padded = [_fit(world, sizes, index, cuts) for index, world in enumerate(worlds)]
     stacked = {name: np.stack([world[name] for world in padded]) for name in columns.COLUMNS}
@@ -117,7 +125,7 @@ def _drop_padding(world: Leaves) -> Leaves:
 
 def _fit(world: Leaves, sizes: Mapping[str, int], index: int, cuts: list[CutCounts]) -> Leaves:
     """The world with exactly these rows; absent agents are cut before present ones."""
-    for axis in ("agents", "steps", "traffic", *columns.ROADS):
+    for axis in ("agents", "steps", *MAY_BE_EMPTY, *columns.ROADS):
         had, rows, nearest = _count(world, axis), sizes[axis], None
         if had <= rows:
             continue
@@ -151,4 +159,8 @@ def _pad(name: str, leaf: np.ndarray, sizes: Mapping[str, int]) -> np.ndarray:
         return leaf
     if name == "agents.size":
         return np.pad(leaf, missing, mode="edge") if len(leaf) else np.pad(leaf, missing, constant_values=1.0)
+    if name in ENDLESS:
+        return np.pad(leaf, missing, constant_values=np.inf)
+    if name == "routes.position" and leaf.shape[1]:  # the points behind a route's end repeat it
+        return np.pad(np.pad(leaf, [(0, 0), missing[1], (0, 0)], mode="edge"), [missing[0], (0, 0), (0, 0)])
     return np.pad(leaf, missing)

@@ -1,31 +1,36 @@
-"""Background traffic: functions (scene, control step) -> Boxes, the choices of the config group `traffic`.
+"""Background traffic that does not react: none, parked vehicles, and road users that follow their log.
 
-Logged traffic follows its log whatever happens: it neither brakes nor swerves for a car, and a collision does not move it.
+Logged traffic neither brakes nor swerves for a car, and a collision does not move it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative
-from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, TrafficLog
+from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, Traffic, TrafficLog
 
 Row = Annotated[int, Bounds(min=0)]
 VEHICLE = ROAD_USERS.index("vehicle")
 SNAP = 1e-3  # rows; a control step this near to a logged row is at it, since float32 times do not meet exactly
 
 
-def no_traffic(scene: Scene, step: Int[Array, ""]) -> Boxes:
+def make_stateless(read: Callable[[Scene, Int[Array, ""]], Boxes]) -> Traffic:
+    """Makes traffic whose boxes depend on the scene and the control step only."""
+    return Traffic(lambda key, scene, step: (), lambda scene, state, cars, step: (), lambda scene, state, step: read(scene, step))
+
+
+def no_traffic() -> Traffic:
     """No traffic; nothing is computed."""
-    return track_interpolation.make_empty_boxes()
+    return make_stateless(lambda scene, step: track_interpolation.make_empty_boxes())
 
 
-def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: NonNegative, start_row: Row, elevation_m: float) -> Boxes:
+def parked_traffic(*, parked_m: NonNegative, start_row: Row, elevation_m: float) -> Traffic:
     """Parked vehicles only, as immovable boxes at their logged position.
 
     Args:
@@ -33,6 +38,11 @@ def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: NonNegative,
         start_row: row of the log at which episodes begin; a vehicle that is not valid then is left out.
         elevation_m: of the boxes' centres.
     """
+    return make_stateless(lambda scene, step: read_parked(scene, parked_m=parked_m, start_row=start_row, elevation_m=elevation_m))
+
+
+def read_parked(scene: Scene, *, parked_m: float, start_row: int, elevation_m: float) -> Boxes:
+    """Reads the boxes of parked vehicles, see `parked_traffic`."""
     log = scene.traffic_log
     row = min(start_row, log.valid.shape[1] - 1)
     zero = jnp.zeros_like(log.yaw[:, row])
@@ -44,13 +54,11 @@ def parked_traffic(scene: Scene, step: Int[Array, ""], *, parked_m: NonNegative,
         yaw_rate=zero,
         size=log.size,
         mass=zero + jnp.inf,
-        present=log.valid[:, row] & _is_parked(log, parked_m),
+        present=log.valid[:, row] & is_parked(log, parked_m),
     )
 
 
 def log_traffic(
-    scene: Scene,
-    step: Int[Array, ""],
     *,
     kinds: list[RoadUser],
     parked_m: NonNegative,
@@ -59,7 +67,7 @@ def log_traffic(
     start_row: Row,
     elevation_m: float,
     control_dt: float,
-) -> Boxes:
+) -> Traffic:
     """Logged road users of these kinds, linear between rows of the log.
 
     Each is present from its first valid row to its last; gaps up to `gap_s` are bridged, in longer ones it is absent. Parked vehicles stay
@@ -77,6 +85,24 @@ def log_traffic(
     Raises:
         ConfigError: `mass_kg` does not name exactly ROAD_USERS, or a mass is not above 0.
     """
+    masses = make_masses(mass_kg)
+    numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
+    return make_stateless(lambda scene, step: read_log(scene, step, kinds=kinds, masses=masses, **numbers))
+
+
+def read_log(
+    scene: Scene,
+    step: Int[Array, ""],
+    *,
+    kinds: list[RoadUser],
+    masses: list[float],
+    parked_m: float,
+    gap_s: float,
+    start_row: int,
+    elevation_m: float,
+    control_dt: float,
+) -> Boxes:
+    """Reads the boxes of logged road users at a control step, see `log_traffic`; `masses` are in the order of ROAD_USERS."""
     log, dt = scene.traffic_log, scene.log.dt
     row = start_row + step.astype(jnp.float32) * (control_dt / dt)
     row = jnp.where(jnp.abs(row - jnp.round(row)) < SNAP, jnp.round(row), row)
@@ -86,7 +112,7 @@ def log_traffic(
 
     started, ahead, at_row = before >= 0, after < log.valid.shape[1], before == row
     bridged = ahead & ((after - before) * dt <= gap_s + SNAP * dt)
-    parked = _is_parked(log, parked_m)
+    parked = is_parked(log, parked_m)
     logged = jnp.take_along_axis(log.velocity, jnp.maximum(before, 0)[:, None, None], axis=1)[:, 0]
     velocity = jnp.where(at_row[:, None], logged, velocity)  # also at the last row
     boxes = Boxes(
@@ -96,7 +122,7 @@ def log_traffic(
         velocity=velocity,
         yaw_rate=yaw_rate,
         size=log.size,
-        mass=_make_masses(mass_kg)[log.kind],
+        mass=jnp.array(masses, jnp.float32)[log.kind],
         present=started & (at_row | bridged | parked) & jnp.array([kind in kinds for kind in ROAD_USERS])[log.kind],
     )
     return replace(
@@ -106,7 +132,7 @@ def log_traffic(
     )
 
 
-def _is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
+def is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
     """Mask of vehicles that never leave their first position."""
     first = jnp.argmax(log.valid, axis=1)
     begin = jnp.take_along_axis(log.position, first[:, None, None], axis=1)
@@ -114,11 +140,11 @@ def _is_parked(log: TrafficLog, within_m: float) -> Bool[Array, " O"]:
     return (log.kind == VEHICLE) & (moved < within_m**2)
 
 
-def _make_masses(mass_kg: Mapping[RoadUser, float | None]) -> Float[Array, " kinds"]:
+def make_masses(mass_kg: Mapping[RoadUser, float | None]) -> list[float]:
     """Masses in the order of ROAD_USERS; inf for immovable ones."""
     if set(mass_kg) != set(ROAD_USERS):
         raise ConfigError(f"traffic.mass_kg: expected exactly {', '.join(ROAD_USERS)}, got {', '.join(mass_kg) or 'nothing'}")
     for kind, mass in mass_kg.items():
         if mass is not None and not mass > 0:
             raise ConfigError(f"traffic.mass_kg.{kind}: expected a number > 0 or null, got {mass}")
-    return jnp.array([jnp.inf if (mass := mass_kg[kind]) is None else mass for kind in ROAD_USERS], jnp.float32)
+    return [float("inf") if (mass := mass_kg[kind]) is None else float(mass) for kind in ROAD_USERS]
