@@ -56,8 +56,8 @@ def find_track_routes(
 ) -> list[SampledRoute]:
     """Finds the routes that a track may have meant, the nearest to the track first.
 
-    A track that no chain of lanes follows within `max_distance_m` is a route itself, without alternatives. Routes begin at the point nearest
-    to the track's first position.
+    A track that no chain of lanes follows within `max_distance_m` is a route itself, without alternatives. Routes begin at the point
+    nearest to the track's first position.
 
     Args:
         track: valid positions in order; two different ones at least.

@@ -15,11 +15,12 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns
+from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
-    "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
+    "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "no_conflict", "overlaps", "over_capacity",
 )  # fmt: skip
 TRAFFIC_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
 REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
@@ -93,6 +94,8 @@ def pack(
     min_traffic_size_m: float,
     outline_m: Positive,
     routes: route_columns.RouteConfig | None,
+    starts: dict[str, Any] | None,
+    conflicts: Conflicts | None,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -109,6 +112,8 @@ def pack(
         min_traffic_size_m: minimum of their length and width.
         outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
         routes: null: no routes.
+        starts: a function of `drawn_starts` that draws the agents; null: they are tracks.
+        conflicts: null: all tracks; else those with a conflict.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -117,8 +122,10 @@ def pack(
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     logs = stack_tracks(raw.tracks, len(raw.times))
     logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
-    chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, agents, car_size_m)
-    if require_agents and not chosen:
+    allowed = np.ones(len(raw.tracks), bool) if conflicts is None else find_conflicts(raw, logs, conflicts)
+    slots = agents if starts is None else 0
+    chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, slots, car_size_m, allowed)
+    if starts is None and require_agents and not chosen:
         reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
         raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
     first = raw.current if log_from == "current" else 0
@@ -135,6 +142,10 @@ def pack(
         who = {"agents": chosen, "slots": agents, "traffic": others}
         columns_of_routes, counts = route_columns.pack_routes(raw, logs, origin, half, **who, controls=controls, config=routes)
         leaves |= columns_of_routes
+    if starts is not None:
+        leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
+        if require_agents and not leaves["agents.present"].any():
+            raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -143,7 +154,7 @@ def pack(
         steps=len(raw.times) - first,
         current=raw.current - first,
         track_ids=tuple(raw.tracks[i].id for i in chosen),
-        agents_kept=len(chosen),
+        agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
@@ -221,9 +232,9 @@ def _close_outline(line: Polyline, outline_m: float) -> Polyline:
 
 
 def _choose_agents(
-    raw: RawScene, logs: Logs, half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None
+    raw: RawScene, logs: Logs, half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None, allowed: np.ndarray
 ) -> tuple[list[int], dict[str, int]]:
-    """Indices of the tracks that become agents, nearest to the centre first, and the others counted by reason."""
+    """Indices of the allowed tracks that become agents, nearest to the centre first, and the others counted by reason."""
     if car_size_m is not None and len(car_size_m) != 2:
         raise ConfigError(f"scenes.pack.car_size_m: expected [length, width] or null, got {car_size_m}")
     current = raw.current
@@ -235,6 +246,7 @@ def _choose_agents(
         "start_outside_box": np.abs(start).max(axis=1) > half,
         "goal_outside_box": np.abs(goal).max(axis=1) > half,
         "too_short": np.hypot(*(goal - start).T) <= min_travel_m,
+        "no_conflict": ~allowed,
     }
     dropped, candidates = dict.fromkeys(DROPS, 0), np.ones(len(tracks), bool)
     for reason, objection in objections.items():  # the first one counts
