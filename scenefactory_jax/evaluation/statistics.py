@@ -140,7 +140,7 @@ def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[s
         interval = _compute_percentiles(draws[:, m])
         score = lambda m=m: wilson(min(max(float(values[m]), 0.0), 1.0), _count_agents(table, m))  # noqa: E731
         estimates[name] = _make_estimate(
-            metric, values[m], (table.counts[:, :, m] > 0).sum(), interval if _varies(interval) else None, agents, WILSON, score
+            metric, values[m], float((table.counts[:, :, m] > 0).sum()), interval if _varies(interval) else None, agents, WILSON, score
         )
     return _without_unused_routes(estimates)
 
@@ -157,7 +157,7 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
     draws, estimates = np.concatenate(draws), {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        interval, count = _compute_percentiles(draws[:, m]), min((table.counts[:, :, m] > 0).sum() for table in tables)
+        interval, count = _compute_percentiles(draws[:, m]), min(float((table.counts[:, :, m] > 0).sum()) for table in tables)
         is_one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
         if is_one_scene or (metric.rate and not _varies(interval)):
             interval = None

@@ -99,21 +99,7 @@ def pack(
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
-    Args:
-        scene_size_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
-        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
-        gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (SceneFactory).
-        agents, require_agents: slots, for the cars nearest to the centre; whether a scene in which none is left is refused.
-        min_travel_m: a car whose goal is not farther than that from its start is no agent.
-        car_size_m: length and width of every car; null: as logged.
-        start_speed: "logged": along the heading, never backwards; "zero".
-        log_from: first step of the packed log: the recording's first, or the current one.
-        traffic: maximum number of other tracks that are in the box at some step from the current one on, nearest to an agent's start first.
-        min_traffic_size_m: minimum of their length and width.
-        outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
-        routes: null: no routes.
-        starts: a function of `drawn_starts` that draws the agents; null: they are tracks.
-        conflicts: null: all tracks; else those with a conflict.
+    The numbers are described in `conf/scenes/base.yaml`.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -135,13 +121,9 @@ def pack(
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
     leaves |= beside | controls
-    counts = None
-    if routes is None:
-        leaves |= route_columns.make_no_routes(agents, len(others))
-    else:
-        who = {"agents": chosen, "slots": agents, "traffic": others}
-        columns_of_routes, counts = route_columns.pack_routes(raw, logs, origin, half, **who, controls=controls, config=routes)
-        leaves |= columns_of_routes
+    who = {"agents": chosen, "slots": agents, "traffic": others}
+    added, counts = _routes(raw, logs, origin, half, **who, controls=controls, config=routes)
+    leaves |= added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
         if require_agents and not leaves["agents.present"].any():
@@ -167,6 +149,15 @@ def pack(
         metadata=dict(raw.metadata),
     )
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _routes(
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], config: route_columns.RouteConfig | None, **who: Any
+) -> tuple[dict[str, np.ndarray], route_columns.RouteCounts | None]:
+    """Columns of the routes and their counts; without a config there are none."""
+    if config is None:
+        return route_columns.make_no_routes(slots, len(traffic)), None
+    return route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
