@@ -1,7 +1,7 @@
 """The traffic controls of a scene as columns: lights with their states over time, and stop signs, each on the lane that it governs."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene
 from scenefactory_jax.core.types import DRIVABLE
@@ -68,8 +68,7 @@ def _find_stop(lane: Polyline, light: Light) -> tuple[Float[np.ndarray, "2"], Fl
     """The stop place of a light, and the direction of its lane there."""
     line = lane.xyz[:, :2]
     place = line[0] if light.stop is None else light.stop[:2]
-    nearest: Int[np.ndarray, ""] = np.argmin(np.linalg.norm(line - place, axis=1))
-    segment = min(int(nearest), len(line) - 2)
+    segment = min(int(np.argmin(np.linalg.norm(line - place, axis=1))), len(line) - 2)
     along = line[segment + 1] - line[segment]
     length = float(np.linalg.norm(along))
     return place, along / length if length > 0 else np.array([1.0, 0.0])

@@ -129,12 +129,7 @@ def pack(
         if require_agents and not leaves["agents.present"].any():
             raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
-        name=raw.name,
-        source=raw.source,
-        centre=(float(origin[0]), float(origin[1]), float(origin[2])),
-        centred_on=centred_on,
-        steps=len(raw.times) - first,
-        current=raw.current - first,
+        **_describe_source(raw, origin, centred_on, first),
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped,
@@ -146,9 +141,21 @@ def pack(
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
-        metadata=dict(raw.metadata),
     )
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: str, first: int) -> dict[str, Any]:
+    """The entries of a report that say where a packed scene comes from."""
+    return {
+        "name": raw.name,
+        "source": raw.source,
+        "centre": (float(origin[0]), float(origin[1]), float(origin[2])),
+        "centred_on": centred_on,
+        "steps": len(raw.times) - first,
+        "current": raw.current - first,
+        "metadata": dict(raw.metadata),
+    }
 
 
 def _routes(
