@@ -16,6 +16,7 @@ from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns, control_columns, route_columns
+from scenefactory_jax.data.packing.control_columns import ControlsConfig
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -42,7 +43,8 @@ class PackReport:
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
     controls_kept: int  # lights and stop signs
-    controls_dropped: dict[str, int]
+    controls_dropped: dict[str, int]  # reason of CONTROL_DROPS -> count
+    signs_inferred: int  # stop signs whose lanes were inferred
     segments_kept: int
     segments_cut: dict[str, int]  # reason of CUTS -> count
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -91,6 +93,7 @@ def pack(
     traffic: Annotated[int, Bounds(min=0)],
     min_traffic_size_m: float,
     outline_m: Positive,
+    controls: ControlsConfig,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -106,6 +109,7 @@ def pack(
         traffic: maximum number of other tracks that are in the box at some step from the current one on, nearest to an agent's start first.
         min_traffic_size_m: minimum of their length and width.
         outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
+        controls: where cars stop for lights and stop signs.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -123,8 +127,8 @@ def pack(
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
-    controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
-    leaves |= beside | controls | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
+    stops = control_columns.pack_controls(raw, origin, half, controls)
+    leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -137,8 +141,9 @@ def pack(
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
-        controls_kept=len(controls["controls.lane"]),
-        controls_dropped=controls_dropped,
+        controls_kept=len(stops.columns["controls.lane"]),
+        controls_dropped=stops.dropped,
+        signs_inferred=stops.inferred,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
