@@ -1,6 +1,6 @@
 """Lights and stop signs of a scene: on which lane and where cars stop, and their states over time, also beyond the log."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -90,7 +90,7 @@ def test_lanes_of_a_sign_without_names_are_those_that_begin_beside_it():
     x, y = packed.columns["controls.position"][1]
     assert x < 1.0 and 1.0 < y < 3.5  # on the turn, which passes the sign again further on
     assert traffic_lights.read_light_states(controls(packed), jnp.float32(0)).tolist() == [0, 0]
-    rules = WOMD["pack"]["controls"]["signs"]
+    rules = asdict(CONFIG.signs)
     for place in ((-4.0, 1.5, 2.6), (4.0, 15.0, 2.6), (4.0, 1.5, 9.0)):  # to the left, far ahead, on another level
         roads, found = stop_signs.infer_sign_lanes((*junction(), line(17, 9, place)), **rules)
         assert found == 0 and roads[-1].lanes == ()
