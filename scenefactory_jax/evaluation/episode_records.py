@@ -54,9 +54,8 @@ def make_episode_runner(
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
-    course = CourseThresholds(**thresholds["course"])
-    limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": course, "control_dt": 1 / control_hz}
-    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], **limits)
+    limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -91,11 +90,7 @@ def make_episode_runner(
             if bool(episode.world_done.all()):
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
-        records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
-        route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
-        records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
-        signals = _make_signals(metrics, state, first.agents.present, control_hz)
-        records |= failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
+        records = _make_all_columns(metrics, first, state, distance, names, settings=settings, control_hz=control_hz)
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
@@ -103,6 +98,25 @@ def make_episode_runner(
         return records, Recording(batch, boxes, recorded, state, first.weather, names, control_hz, goal_radius_m)
 
     return run
+
+
+def _make_all_columns(
+    metrics: episodes.EpisodeMetrics,
+    first: State,
+    last: State,
+    distance: np.ndarray,
+    names: list[str],
+    *,
+    settings: Mapping[str, Any],
+    control_hz: float,
+) -> dict[str, np.ndarray]:
+    """Returns the records with the columns of routes and of failures."""
+    thresholds, course = settings["failures"], CourseThresholds(**settings["failures"]["course"])
+    records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
+    route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
+    records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
+    signals = _make_signals(metrics, last, first.agents.present, control_hz)
+    return records | failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
 
 
 def _make_records(

@@ -16,6 +16,7 @@ from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns
+from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
@@ -44,7 +45,8 @@ class PackReport:
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
     routes: route_columns.RouteCounts | None  # None: packed without routes
     controls_kept: int  # lights and stop signs
-    controls_dropped: dict[str, int]
+    controls_dropped: dict[str, int]  # reason of CONTROL_DROPS -> count
+    signs_inferred: int  # stop signs whose lanes were inferred
     segments_kept: int
     segments_cut: dict[str, int]  # reason of CUTS -> count
     relief_m: float  # height between the lowest and the highest kept road point: the packed scene is flat
@@ -96,6 +98,7 @@ def pack(
     routes: route_columns.RouteConfig | None,
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
+    controls: ControlsConfig,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -119,10 +122,10 @@ def pack(
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
-    controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
-    leaves |= beside | controls
+    stops = control_columns.pack_controls(raw, origin, half, controls)
+    leaves |= beside | stops.columns
     who = {"agents": chosen, "slots": agents, "traffic": others}
-    added, counts = _routes(raw, logs, origin, half, **who, controls=controls, config=routes)
+    added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
     leaves |= added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
@@ -136,8 +139,9 @@ def pack(
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
         routes=counts,
-        controls_kept=len(controls["controls.lane"]),
-        controls_dropped=controls_dropped,
+        controls_kept=len(stops.columns["controls.lane"]),
+        controls_dropped=stops.dropped,
+        signs_inferred=stops.inferred,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
