@@ -20,7 +20,7 @@ SETTINGS = [
     {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"},
 ]
 CHECK = {key: value for key, value in WOMD["check"].items() if key != "_target_"}
-NUMBERS = {key: value for key, value in WOMD["pack"].items() if key != "_target_"} | {"require_agents": False}
+NUMBERS = instantiate(WOMD["pack"], builtins=pack, where="scenes.pack").keywords | {"require_agents": False}
 
 
 def damaged(raw, seed):

@@ -115,8 +115,7 @@ def pack(
     slots = agents if starts is None else 0
     chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, slots, car_size_m, allowed)
     if starts is None and require_agents and not chosen:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
-        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
+        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_list_drops(dropped)}")
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
@@ -129,8 +128,8 @@ def pack(
     leaves |= added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
-        if require_agents and not leaves["agents.present"].any():
-            raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
+    if require_agents and not leaves["agents.present"].any():
+        raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
         **_describe_source(raw, origin, centred_on, first),
         track_ids=tuple(raw.tracks[i].id for i in chosen),
@@ -147,6 +146,10 @@ def pack(
         relief_m=relief,
     )
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _list_drops(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
 
 
 def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: str, first: int) -> dict[str, Any]:
