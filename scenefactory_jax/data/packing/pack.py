@@ -15,7 +15,7 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, route_columns, route_conflicts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -135,6 +135,7 @@ def pack(
         who = {"agents": chosen, "slots": agents, "traffic": others}
         columns_of_routes, counts = route_columns.pack_routes(raw, logs, origin, half, **who, controls=controls, config=routes)
         leaves |= columns_of_routes
+    leaves |= route_conflicts.find_zones(leaves)
     report = PackReport(
         name=raw.name,
         source=raw.source,

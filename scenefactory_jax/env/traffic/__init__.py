@@ -9,6 +9,7 @@ from typing import Any
 
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.types import Traffic
+from scenefactory_jax.env.traffic.idm import idm_traffic as idm_traffic
 from scenefactory_jax.env.traffic.log_playback import log_traffic as log_traffic
 from scenefactory_jax.env.traffic.log_playback import no_traffic as no_traffic
 from scenefactory_jax.env.traffic.log_playback import parked_traffic as parked_traffic
