@@ -8,7 +8,7 @@ a = acceleration (1 - (v / v0)^exponent - (s* / s)^2), s* = gap + max(0, v headw
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.schema import NonNegative, Positive
 
@@ -27,8 +27,8 @@ class IdmLaw:
 
 
 def compute_interaction(
-    speed: Float[Array, "*n"], gap: Float[Array, "*n"], leader_speed: Float[Array, "*n"], law: IdmLaw
-) -> Float[Array, "*n"]:
+    speed: Float[Array, "*#n"], gap: Float[Array, "*#n"], leader_speed: Float[Array, "*#n"], law: IdmLaw
+) -> Float[Array, "*#n"]:
     """Computes (s* / s)^2; 0 at an infinite gap. A gap below the one at rest counts as that one, as in nuPlan."""
     approach = speed * (speed - leader_speed) / (2.0 * (law.acceleration_mps2 * law.braking_mps2) ** 0.5)
     desired = law.gap_m + jnp.maximum(0.0, speed * law.headway_s + approach)
@@ -36,20 +36,20 @@ def compute_interaction(
 
 
 def compute_acceleration(
-    speed: Float[Array, "*n"], target_speed: Float[Array, "*n"], interaction: Float[Array, "*n"], law: IdmLaw
-) -> Float[Array, "*n"]:
+    speed: Float[Array, "*#n"], target_speed: Float[Array, "*#n"], interaction: Float[Array, "*#n"], law: IdmLaw
+) -> Float[Array, "*#n"]:
     """Computes the acceleration; a vehicle faster than its target brakes comfortably, unless a leader demands more."""
     free = 1.0 - (speed / jnp.maximum(target_speed, SMALLEST_SPEED)) ** law.exponent
     free = jnp.maximum(free, -law.braking_mps2 / law.acceleration_mps2)
     return law.acceleration_mps2 * (free - interaction)
 
 
-def compute_arrival(speed: Float[Array, "*n"], distance: Float[Array, "*n"], acceleration: float) -> Float[Array, "*n"]:
+def compute_arrival(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], acceleration: float) -> Float[Array, "*#n"]:
     """Computes the time in which a vehicle that accelerates covers a distance; 0 for one behind it, inf for an infinite one."""
     distance = jnp.maximum(distance, 0.0)
     return 2.0 * distance / (speed + jnp.sqrt(speed**2 + 2.0 * acceleration * distance) + 1e-6)
 
 
-def can_stop(speed: Float[Array, "*n"], distance: Float[Array, "*m"], braking: float) -> Array:
+def can_stop(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], braking: float) -> Bool[Array, "*#n"]:
     """Mask of vehicles that can stop within a distance."""
     return distance >= speed**2 / (2.0 * braking)
