@@ -91,6 +91,10 @@ class TrafficLog:
     kind: Int[Array, " O"]  # index into ROAD_USERS
     route: Int[Array, " O"]  # row of `Scene.routes`
     has_route: Bool[Array, " O"]
+    # The first two stretches where the row's route and the column's are too near for both vehicles, as arc lengths on the row's route
+    zone_enter: Float[Array, "O O 2"]  # inf: there is none
+    zone_leave: Float[Array, "O O 2"]
+    zone_match: Float[Array, "O O 2"]  # the same place as that of the column's row, where both routes lead the same way; inf: they cross
 
 
 @pytree_dataclass

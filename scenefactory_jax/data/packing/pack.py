@@ -15,7 +15,7 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
 
@@ -125,7 +125,7 @@ def pack(
     leaves |= beside | stops.columns
     who = {"agents": chosen, "slots": agents, "traffic": others}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
-    leaves |= added
+    leaves |= added | route_conflicts.find_zones(leaves | added)
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
     if require_agents and not leaves["agents.present"].any():
