@@ -108,7 +108,8 @@ class Routes:
     speed_limit: Float[Array, "R N"]  # m/s; inf where none is known
     lane: Int[Array, "R N"]  # the lane's index into RawScene.roads, as `Road.polyline`; -1: beside lanes
     along_lanes: Bool[Array, " R"]  # false: the logged track itself, because no chain of lanes follows it
-    agent: Int[Array, " R"]  # slot of the agent whose route it is; -1: of nobody
+    agent: Int[Array, " R"]  # slot of the agent whose route it is; -1: no agent's
+    drawn: Bool[Array, " R"]  # drawn at random for `spawning=routes`
     on_route: Bool[Array, " R"]  # it begins with the lanes of the logged track (planning facts: ScenarioMax)
     stop_arc: Float[Array, "R S"]  # arc length at the stop lines, ascending; inf behind the last
     stop_control: Int[Array, "R S"]  # row of `Scene.controls`

@@ -41,6 +41,7 @@ class PackReport:
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
+    routes: route_columns.RouteCounts | None  # None: packed without routes
     controls_kept: int  # lights and stop signs
     controls_dropped: dict[str, int]
     segments_kept: int
@@ -91,6 +92,7 @@ def pack(
     traffic: Annotated[int, Bounds(min=0)],
     min_traffic_size_m: float,
     outline_m: Positive,
+    routes: route_columns.RouteConfig | None,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -106,6 +108,7 @@ def pack(
         traffic: maximum number of other tracks that are in the box at some step from the current one on, nearest to an agent's start first.
         min_traffic_size_m: minimum of their length and width.
         outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
+        routes: null: no routes.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -122,9 +125,16 @@ def pack(
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
-    beside, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
+    beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
-    leaves |= beside | controls | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
+    leaves |= beside | controls
+    counts = None
+    if routes is None:
+        leaves |= route_columns.make_no_routes(agents, len(others))
+    else:
+        who = {"agents": chosen, "slots": agents, "traffic": others}
+        columns_of_routes, counts = route_columns.pack_routes(raw, logs, origin, half, **who, controls=controls, config=routes)
+        leaves |= columns_of_routes
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -137,6 +147,7 @@ def pack(
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
+        routes=counts,
         controls_kept=len(controls["controls.lane"]),
         controls_dropped=controls_dropped,
         segments_kept=len(road["road.kind"]),
@@ -247,8 +258,8 @@ def _choose_agents(
 
 def _traffic(
     raw: RawScene, logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], half: float, first: int, limit: int, min_size_m: float
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Columns of `traffic_log`, nearest to an agent's start (without agents: to the centre) first, and the other tracks by reason.
+) -> tuple[dict[str, np.ndarray], list[int], dict[str, int]]:
+    """Columns of `traffic_log` and its tracks, nearest to an agent's start (without agents: to the centre) first; the others by reason.
 
     A box that overlaps an agent's at the start is left out: the contact would throw both apart.
     """
@@ -276,7 +287,7 @@ def _traffic(
     rows = _recording("traffic_log", chosen, logs, first, len(chosen))
     rows["traffic_log.size"] = np.maximum(logs.size[chosen, :2], min_size_m)
     rows["traffic_log.kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
-    return rows, dropped
+    return rows, chosen, dropped
 
 
 def _find_overlaps(boxes: BoxSet, others: BoxSet) -> Bool[np.ndarray, "N M"]:
