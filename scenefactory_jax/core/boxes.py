@@ -15,12 +15,12 @@ def compute_corners(position: Float[Array, "*n 2"], yaw: Float[Array, "*n"], siz
 
 
 def find_overlaps(
-    position: Float[Array, "*n 2"],
-    yaw: Float[Array, "*n"],
-    size: Float[Array, "*n 2"],
-    other_position: Float[Array, "*m 2"],
-    other_yaw: Float[Array, "*m"],
-    other_size: Float[Array, "*m 2"],
+    position: Float[Array, "*a 2"],
+    yaw: Float[Array, "*b"],
+    size: Float[Array, "*c 2"],
+    other_position: Float[Array, "*d 2"],
+    other_yaw: Float[Array, "*e"],
+    other_size: Float[Array, "*f 2"],
 ) -> Bool[Array, "*k"]:
     """Finds the pairs of rectangles that overlap, by the separating axis theorem; leading axes broadcast.
 

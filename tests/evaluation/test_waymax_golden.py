@@ -15,11 +15,12 @@ from support.running import SHARED
 
 from scenefactory_jax.core.boxes import compute_corners, find_overlaps
 from scenefactory_jax.dynamics import bicycle_waymax
+from scenefactory_jax.env import planning_metrics
 from scenefactory_jax.evaluation.metrics import waymax_steps
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_signed_distance
 
 GOLDEN = SHARED.parent / "reference" / "golden"
-DISTANCE, ACTION, FLAGS = 5e-4, 5e-4, 2
+DISTANCE, ACTION, COMFORT, FLAGS = 5e-4, 5e-4, 6e-3, 2
 KINDS = ("log", "constant_velocity", "lateral_offset", "sped_up")
 POINTS, STEPS = 4096, 82  # of the padded road edges; 9 to 90
 pytestmark = pytest.mark.skipif(not GOLDEN.is_dir(), reason=f"needs the golden values in {GOLDEN}")
@@ -179,7 +180,20 @@ def measure(egos, size, others, edges, paths, lights):
 
     steps = jax.vmap(at_step, in_axes=(0, 0, None, None, 1, 1, 0))
     ends = egos[0, 0, :2], egos[0, -1, :2]
-    return jax.vmap(lambda ego: steps(ego[10:], ego[9:-1], *ends, other, valid, lights[1]))(egos)
+    found = jax.vmap(lambda ego: steps(ego[10:], ego[9:-1], *ends, other, valid, lights[1]))(egos)
+
+    def predict(cars, objects, present):
+        """Time to an overlap of the four egos at one step."""
+        split = lambda state: (state[:, :2], state[:, 3], state[:, 4:6])  # noqa: E731
+        sizes, seen = jnp.broadcast_to(size, (len(cars), 2)), jnp.broadcast_to(present, (len(cars), len(present)))
+        return planning_metrics.compute_time_to_overlap(*split(cars), sizes, *split(objects), other_size, seen, horizon_s=5.0)
+
+    found["ttc"] = jax.vmap(predict, in_axes=(1, 1, 1), out_axes=1)(egos[:, 10:], other, valid)
+    window = jnp.arange(1, 82)[:, None] + jnp.arange(10)
+    parts = planning_metrics.compute_comfort_parts(egos[:, window, 4:6], egos[:, window, 3], dt=0.1)
+    found["comfort_parts"] = jnp.stack(parts, axis=-1)
+    found["comfort_reward"] = planning_metrics.compute_comfort(parts)
+    return found | {"comfort": planning_metrics.is_comfortable(parts)}
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in GOLDEN.glob("planning_*.json")))
@@ -187,7 +201,7 @@ def test_scene(name):
     golden, operands = read_scene(name)
     found = jax.tree.map(np.asarray, measure(*operands))
     found["offroad"] = (found["edge_signed_distance"] > 0).any(axis=-1)
-    flags = {"overlap", "offroad", "run_red_light", "kinematic_infeasibility"}
+    flags = {"comfort", "overlap", "offroad", "run_red_light", "kinematic_infeasibility"}
     wrong = []
     for row, kind in enumerate(KINDS):
         for metric, values in found.items():
@@ -198,6 +212,6 @@ def test_scene(name):
                 wrong += [f"{kind} {metric}: {count} steps differ"] if count > FLAGS else []
             else:
                 error = np.abs(values[row] - expected) / np.maximum(1.0, np.abs(expected) / 100)
-                limit = ACTION if metric == "inverse_action" else DISTANCE
+                limit = {"inverse_action": ACTION, "comfort_parts": COMFORT}.get(metric, DISTANCE)
                 wrong += [f"{kind} {metric}: {error.max():.2g} at {np.argmax(error)}"] if error.max() > limit else []
     assert not wrong, "\n".join(wrong)
