@@ -10,7 +10,7 @@ from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.types import Boxes, Motion, Routes, Scene, State, TrafficControls, make_empty_rows
 from scenefactory_jax.env import route_following, termination
 from scenefactory_jax.env.history import History
-from support.hand_scenes import scene_of
+from support.hand_scenes import road_of, scene_of
 
 POINTS = 120  # of the route
 
@@ -18,6 +18,9 @@ POINTS = 120  # of the route
 def street(*, starts=((0.0, 0.0), (10.0, 0.0)), yaws=(0.0, 0.0), routes=True, lights=True, boxes=1) -> Scene:
     """Two cars of 4 x 2 m on a lane along x; a route of the first along it with a light at x = 20; a box of 2 x 2 m at (15, 5)."""
     scene = scene_of(starts, [[100.0, 0.0]] * len(starts), yaws=yaws)
+    x = np.arange(-60.0, 61.0)
+    lines = (2, np.stack([x, 0 * x], -1)), (15, np.stack([x[::-1], 0 * x + 6.0], -1)), (15, np.stack([x, 0 * x - 6.0], -1))
+    scene = replace(scene, road=road_of(lines), edges=road_of(lines[1:]))  # WOMD: the road is on the left of an edge
     count = len(starts)
     row = np.stack([np.arange(POINTS, dtype=np.float32), np.zeros(POINTS, np.float32)], -1)
     line = lambda *values: jnp.asarray(values)  # noqa: E731
