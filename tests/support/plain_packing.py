@@ -116,7 +116,7 @@ def pack(
     beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
     leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
-    leaves |= route_conflicts.find_zones(leaves)
+    leaves |= route_conflicts.make_no_zones(len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,

@@ -18,6 +18,7 @@ from scenefactory_jax.data.formats.polylines import densify
 from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
+from scenefactory_jax.data.packing.route_columns import RouteConfig, RouteCounts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -43,7 +44,7 @@ class PackReport:
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
-    routes: route_columns.RouteCounts | None  # None: packed without routes
+    routes: RouteCounts | None  # None: packed without routes
     controls_kept: int  # lights and stop signs
     controls_dropped: dict[str, int]  # reason of CONTROL_DROPS -> count
     signs_inferred: int  # stop signs whose lanes were inferred
@@ -95,7 +96,7 @@ def pack(
     traffic: Annotated[int, Bounds(min=0)],
     min_traffic_size_m: float,
     outline_m: Positive,
-    routes: route_columns.RouteConfig | None,
+    routes: RouteConfig | None,
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
     controls: ControlsConfig,
@@ -123,9 +124,9 @@ def pack(
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
     leaves |= beside | stops.columns
-    who = {"agents": chosen, "slots": agents, "traffic": others}
+    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"]}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
-    leaves |= added | route_conflicts.find_zones(leaves | added)
+    leaves |= added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
     if require_agents and not leaves["agents.present"].any():
@@ -166,12 +167,13 @@ def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: 
 
 
 def _routes(
-    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], config: route_columns.RouteConfig | None, **who: Any
-) -> tuple[dict[str, np.ndarray], route_columns.RouteCounts | None]:
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, config: RouteConfig | None, **who: Any
+) -> tuple[dict[str, np.ndarray], RouteCounts | None]:
     """Columns of the routes and their counts; without a config there are none."""
     if config is None:
-        return route_columns.make_no_routes(slots, len(traffic)), None
-    return route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
+        return route_columns.make_no_routes(slots, len(traffic)) | route_conflicts.make_no_zones(len(traffic)), None
+    found, counts = route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
+    return found | route_conflicts.find_zones(found | {"traffic_log.size": size}), counts
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
