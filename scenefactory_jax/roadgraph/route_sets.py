@@ -114,7 +114,9 @@ def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_l
 
 def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     """The chains whose lanes are no subset of another's."""
-    kept = {sum(1 << lane for lane in chain): chain for chain in chains}  # a set as the bits of an integer
+    kept: dict[int, tuple[int, ...]] = {}
+    for chain in chains:  # of chains with the same lanes the first, whose root is the better one
+        kept.setdefault(sum(1 << lane for lane in chain), chain)  # a set as the bits of an integer
     return [chain for bits, chain in kept.items() if not any(bits & other == bits and bits != other for other in kept)]
 
 
