@@ -1,6 +1,6 @@
 """Waymax's invertible bicycle: acceleration and curvature in place of pedals and a steering angle, and its inverse.
 
-Formulas: planning facts 1.1 (Waymax, V-Max). The speed is the length of the velocity, so a car that brakes below zero moves backwards in
+Formulas: Waymax (arXiv:2310.08710). The speed is the length of the velocity, so a car that brakes below zero moves backwards in
 that step and forwards in the next. Contact forces are computed as between articulated cars; they are reported and do not move the cars.
 """
 

@@ -1,4 +1,4 @@
-"""The reward of MetaDrive's ScenarioEnv (ScenarioNet) as one term, since its parts replace each other (planning facts 2.5)."""
+"""The reward of MetaDrive's ScenarioEnv (ScenarioNet, arXiv:2306.12241) as one term: its parts replace each other."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float

@@ -1,4 +1,4 @@
-"""Step metrics of planning benchmarks that rewards need, too: time to overlap, comfort, distance to routes (planning facts 1.5 and 1.6)."""
+"""Step metrics of V-Max (arXiv:2503.08388) that rewards need, too: time to overlap, comfort, distance to routes."""
 
 from typing import NamedTuple
 

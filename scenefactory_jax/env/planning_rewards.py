@@ -1,4 +1,4 @@
-"""Reward terms of V-Max: indicators of the state after a step (planning facts 1.5). `env.rewards` has those of the paper."""
+"""Reward terms of V-Max (arXiv:2503.08388): indicators of the state after a step. `env.rewards` has those of the paper."""
 
 from typing import Annotated
 

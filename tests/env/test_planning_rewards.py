@@ -70,11 +70,11 @@ def test_each_indicator_of_the_safety_reward():
     assert terms("vmax_safety", end=(0.5, -5.1))["off_road"] == -1
     assert terms("vmax_safety", end=(0.5, -4.9))["off_road"] == 0
     # the light at x = 20 turns green at 0.25 s; the step ends at 0.4 s
-    crossing = {"start": (17.5, 0.0), "end": (18.1, 0.0)}
-    assert terms("vmax_safety", **crossing)["red_light"] == 0
+    crossing = functools.partial(terms, "vmax_safety", start=(17.5, 0.0), end=(18.1, 0.0))
+    assert crossing()["red_light"] == 0
     scene = street(starts=((17.5, 0.0), (40.0, 3.0)))
     scene = replace(scene, controls=replace(scene.controls, change_s=jnp.array([[0.0, 9.0], [jnp.inf, jnp.inf]])))
-    assert terms("vmax_safety", scene=scene, **crossing)["red_light"] == -1
+    assert crossing(scene=scene)["red_light"] == -1
 
 
 def test_off_route_reads_the_distance_and_other_routes():

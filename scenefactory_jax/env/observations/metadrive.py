@@ -1,4 +1,4 @@
-"""The observation of MetaDrive's ScenarioEnv (ScenarioNet) as one vector in [0, 1] (planning facts 2.4)."""
+"""The observation of MetaDrive's ScenarioEnv (ScenarioNet, arXiv:2306.12241) as one vector in [0, 1]."""
 
 from typing import Annotated
 

@@ -1,8 +1,8 @@
 """V-Max's observations as flat vectors of the published sizes, and their division into blocks for encoders.
 
-Order: ego, others, road, lights, path (planning facts 1.3). With 10 points of the path: base 3,255, segment 1,281, lane 2,155, road 1,655
-numbers. Three differences of the data: points are those of the packed road, stop signs are at their lane's stop line, and V-Max's limit
-of 2,200 or 3,000 points in the box does not exist.
+V-Max: arXiv:2503.08388. Order: ego, others, road, lights, path. With 10 points of the path: base 3,255, segment 1,281, lane 2,155 and
+road 1,655 numbers. Three differences of the data: points are those of the packed road, stop signs are at their lane's stop line, and
+V-Max's limit of 2,200 or 3,000 points in the box does not exist.
 """
 
 from typing import Annotated, NamedTuple

@@ -1,4 +1,4 @@
-"""The five blocks of V-Max's observations: ego, others, road, lights, path. Features, frames and scales: planning facts 1.3.
+"""The five blocks of V-Max's observations: ego, others, road, lights, path. Features and scales of its code.
 
 A block is an array of rows whose last feature is the valid flag (a path has none). Invalid rows are zeros. Blocks with a time axis have the
 oldest step first.

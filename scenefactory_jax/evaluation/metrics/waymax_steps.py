@@ -1,7 +1,7 @@
 """Step metrics of Waymax and V-Max as functions of arrays, for one car at one step: `jax.vmap` adds cars and steps.
 
-Definitions: planning facts 1.1, 1.5 and 1.6. They follow the published code where it differs from the papers, so that golden values of it
-can be met. A path is a row of points about a metre apart; of several paths, an index of `lane` and `arc` belongs to each point.
+Definitions are those of the published code (Waymax, arXiv:2310.08710; V-Max, arXiv:2503.08388) where it differs from the papers, so that
+golden values of it can be met. A path is a row of points about a metre apart, each with its arc length and lane.
 """
 
 from typing import NamedTuple
