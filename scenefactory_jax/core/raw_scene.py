@@ -71,6 +71,7 @@ class Polyline:
     right: tuple[int, ...] = ()
     speed_limit: float | None = None  # m/s
     rebuilt: bool = False  # entry, exit, left and right were worked out from geometry: the source has none
+    lanes: tuple[int, ...] = ()  # of a stop sign: ids of the lanes that it governs
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,14 @@ class Track:
     valid: Bool[np.ndarray, " L"]
 
 
+class LightPlan(NamedTuple):
+    """The cycle of a light, which goes on before and after the log."""
+
+    start_s: Float[np.ndarray, " K"]  # on the clock of `RawScene.times`, modulo the period: ascending, from 0 on, below `period_s`
+    state: Int[np.ndarray, " K"]  # index into LIGHT_STATES; each holds until the next one begins, the last one into the next period
+    period_s: float  # after which the states repeat
+
+
 @dataclass(frozen=True, eq=False)
 class Light:
     """The traffic light of one lane over the whole log."""
@@ -94,6 +103,7 @@ class Light:
     state: Int[np.ndarray, " L"]  # index into LIGHT_STATES
     valid: Bool[np.ndarray, " L"]  # the steps at which the source says anything
     stop: Float[np.ndarray, "3"] | None = None  # where cars stop for it, if the source says so
+    plan: LightPlan | None = None  # None: nothing is known beyond the log
 
 
 @dataclass(frozen=True, eq=False)

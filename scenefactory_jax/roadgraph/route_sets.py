@@ -56,8 +56,8 @@ def find_track_routes(
 ) -> list[SampledRoute]:
     """Finds the routes that a track may have meant, the nearest to the track first.
 
-    A track that no chain of lanes follows within `max_distance_m` is a route itself, without alternatives. Routes begin at the point nearest
-    to the track's first position.
+    A track that no chain of lanes follows within `max_distance_m` is a route itself, without alternatives. Routes begin at the point
+    nearest to the track's first position.
 
     Args:
         track: valid positions in order; two different ones at least.
@@ -100,7 +100,7 @@ def _find_roots(lanes: LaneMap, place: Float[np.ndarray, "2"], yaw: float) -> li
 def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_length_m: float) -> Iterator[tuple[int, ...]]:
     """Lists chains of successors from a lane until they are long enough; a lane that repeats ends a chain."""
     behind = float(shapely.line_locate_point(lanes.shapes[root], shapely.Point(place)))
-    pending = deque([((root,), float(lanes.graph.length[root]) - behind)])
+    pending: deque[tuple[tuple[int, ...], float]] = deque([((root,), float(lanes.graph.length[root]) - behind)])
     listed = 0
     while pending and listed < MAX_CHAINS:
         chain, length = pending.popleft()  # breadth first, so that a limit leaves out late branches only
@@ -109,7 +109,7 @@ def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_l
             listed += 1
             yield chain
         else:
-            pending += [((*chain, lane), length + float(lanes.graph.length[lane])) for lane in further]
+            pending.extend(((*chain, lane), length + float(lanes.graph.length[lane])) for lane in further)
 
 
 def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:

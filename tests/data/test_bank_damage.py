@@ -100,7 +100,7 @@ def damages(content, other, *, seed, flips):
         yield f"flips {turn}", bytes(changed)
 
 
-@pytest.mark.parametrize(("schema", "compression"), [(4, None), (4, "zstd"), (3, None)])
+@pytest.mark.parametrize(("schema", "compression"), [(5, None), (5, "zstd"), (3, None)])
 def test_a_damaged_file_gives_the_same_scenes_or_is_refused_by_name(tmp_path, scenes, schema, compression):
     path = made(tmp_path / "bank", scenes, schema, compression)
     expected = list(map(arrow_codec.encode, scenes))

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pyarrow as pa
 import pytest
 import shapely
 from support import eventful
@@ -41,10 +42,10 @@ from scenefactory_jax.core import folder_lock
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.parallel import task_map as spreads
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.raw_scene import Light, Polyline, Reject, SceneError, Track
+from scenefactory_jax.core.raw_scene import Light, LightPlan, Polyline, Reject, SceneError, Track
 from scenefactory_jax.core.types import Boxes, Scene
 from scenefactory_jax.data import conversion
-from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader
+from scenefactory_jax.data.bank import arrow_codec, bank_index, bank_reader, bank_writer
 from scenefactory_jax.data.curation import operations
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading import scene_source
@@ -72,7 +73,8 @@ def street(tmp_path, readers):
 def test_stack_pads_with_masked_rows(street):
     small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
     stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "traffic": 0} and not report.cuts
+    rows = {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS}
+    assert report.capacity == rows | dict.fromkeys(stack.MAY_BE_EMPTY, 0) and not report.cuts
     assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
     for world, scene in enumerate((small, large)):
         for name, leaf in columns.flatten(scene).items():
@@ -116,6 +118,10 @@ def exactly(one, other):
             assert len(value) == len(there)
             for part, its in zip(value, there, strict=True):
                 exactly(part, its)
+        elif isinstance(value, LightPlan):
+            assert value.period_s == there.period_s
+            np.testing.assert_array_equal(value.start_s, there.start_s)
+            np.testing.assert_array_equal(value.state, there.state)
         elif isinstance(value, np.ndarray):
             assert value.shape == there.shape and value.astype(there.dtype).tobytes() == there.tobytes(), name
         else:
@@ -127,12 +133,14 @@ def whole(street):
     steps, rng = len(street.times), np.random.default_rng(0)
     lane = replace(street.roads[1], entry=(2**40, 7), exit=(3,), left=(1,), right=(5, 6), speed_limit=1 / 3, rebuilt=True)
     bare = Polyline(kind=19, xyz=np.zeros((0, 3)), id=-1)
-    lights = tuple(Light(lane=i, state=rng.integers(0, 9, steps), valid=rng.random(steps) > 0.5, stop=stop)
-                   for i, stop in enumerate((None, np.array([1 / 3, 2e4, -0.1]))))  # fmt: skip
+    plan = LightPlan(np.array([0.5, 1 / 3 + 1, 7.0]), np.array([6, 5, 4]), 20.5)
+    lights = tuple(Light(lane=i, state=rng.integers(0, 9, steps), valid=rng.random(steps) > 0.5, stop=stop, plan=known)
+                   for i, (stop, known) in enumerate(((None, plan), (np.array([1 / 3, 2e4, -0.1]), None))))  # fmt: skip
+    sign = Polyline(kind=17, xyz=np.zeros((1, 3)), id=70, lanes=(3, 2**40))
     track = replace(street.tracks[0], xyz=rng.normal(8e3, 1.0, (steps, 3)), kind="cyclist", size=(0.1, 1 / 7, 2.0))
     metadata = {"dataset": "WOMD", "tags": ["é", None, {"a": 1.5}]}
     changes = {"lights": lights, "origin": (0.1, -2e6, 1 / 3), "metadata": metadata, "sdc": None, "name": "straße"}
-    return replace(street, roads=(lane, bare, *street.roads), tracks=(*street.tracks, track), **changes)
+    return replace(street, roads=(lane, bare, sign, *street.roads), tracks=(*street.tracks, track), **changes)
 
 
 def test_a_row_gives_back_the_scene_exactly(street):
@@ -147,6 +155,39 @@ def test_a_row_gives_back_the_scene_exactly(street):
     }.items():
         with pytest.raises(SceneError, match=f"scene.json: street: no bank can hold it: .*{message}"):
             arrow_codec.encode(replace(street, **changes))
+
+
+def age(raw):
+    """A scene as banks of schema 4 hold it: stop signs name their lanes in the metadata, lights have no cycle."""
+    batch = arrow_codec.encode(replace(raw, metadata=raw.metadata | {"stop_sign_lanes": {"70": [3, 2**40]}}))
+    columns = [batch.column(name) for name in batch.schema.names]
+    for name, leaf in (("roads", "lanes"), ("lights", "plan"), ("lights", "period_s")):
+        place = batch.schema.names.index(name)
+        entries = columns[place].values
+        kept = [field for field in entries.type if field.name != leaf]
+        older = pa.StructArray.from_arrays([entries.field(field.name) for field in kept], fields=kept)
+        columns[place] = pa.ListArray.from_arrays(columns[place].offsets, older)
+    return pa.RecordBatch.from_arrays(columns, schema=arrow_codec.SCHEMA_4)
+
+
+def test_older_banks_are_read_and_their_copies_are_new_ones(tmp_path, street):
+    raw = whole(street)
+    expected = replace(raw, lights=tuple(replace(light, plan=None) for light in raw.lights))
+    path = bank_reader.write(tmp_path / "bank", [raw], settings={}).path
+    for file in path.iterdir():
+        file.unlink()
+    shard = ([age(raw)], bank_reader.catalogue.table([bank_reader.catalogue.row(raw)]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(arrow_codec, "SCHEMA", arrow_codec.SCHEMA_4)
+        patch.setattr(bank_index, "SCHEMA", 4)
+        bank_writer.fill(path, [shard], settings={}, compression=None)
+    older = bank_reader.open(path)
+    exactly(bank_reader.read_raw(older, 0), expected)
+    view = bank_reader.save(older, tmp_path / "view", copy=False, settings={})
+    copy = bank_reader.save(view, tmp_path / "copy", copy=True, settings={})
+    for bank in (view, copy):
+        exactly(bank_reader.read_raw(bank, 0), expected)
+    assert pa.ipc.open_file(copy.shards[0].file).schema == arrow_codec.SCHEMA
 
 
 TOOLS = {"check": checker(), "pack": packer(agents=3), "workers": 1}

@@ -104,10 +104,7 @@ def test_every_format_goes_out_in_every_other(readers, tmp_path):
 def test_the_lanes_of_stop_signs_go_out(readers, tmp_path):
     path = tmp_path / "scene.tfrecord"
     path.write_bytes(records.framed(records.scenario().SerializeToString()))
-    raw = one(path, readers)
-    older = replace(raw, metadata=raw.metadata | {"stop_sign_lanes": [{"sign": 12, "lanes": [4]}]})
-    for scene in (raw, older):  # as banks held them before
-        assert scenarionet.scenario(scene)["map_features"]["12"]["lane"] == ["4"]
+    assert scenarionet.scenario(one(path, readers))["map_features"]["12"]["lane"] == ["4"]
 
 
 def test_what_scenarionet_gets_back_is_what_it_gave(street, readers, tmp_path):

@@ -158,7 +158,9 @@ def test_every_layout_gives_the_same_scene(tmp_path, readers, layout):
     (light,) = raw.lights
     observed = [LIGHT_STATES[code] if ok else None for code, ok in zip(light.state, light.valid, strict=True)]
     assert observed == ["stop", None, "go", *["arrow_go"] * (STEPS - 3)] and light.lane == 1 and light.stop.tolist() == [5, 0, 0]
-    assert raw.metadata["left_out"] == {"ROAD_EDGE_SIDEWALK": 1} and raw.metadata["stop_sign_lanes"] == {"5": [1]}
+    assert raw.metadata["left_out"] == {"ROAD_EDGE_SIDEWALK": 1} and {line.id: line.lanes for line in raw.roads if line.kind == 17} == {
+        5: (1,)
+    }
     assert json.loads(json.dumps(raw.metadata)) == raw.metadata
     _, report = prepared(raw, require_agents=False)
     assert report.segments_kept

@@ -173,6 +173,20 @@ def test_cars_wait_at_red_lights(scenes):
     assert passed_green > 10 and waited > 3
 
 
+def test_cycles_of_lights_give_the_logged_states_and_signs_name_their_lanes(scenes):
+    for scene in scenes:
+        lanes = {lane.id: lane for lane in lanes_of(scene)}
+        for light in scene.lights:
+            start, state, period = light.plan
+            now = np.searchsorted(start, np.mod(scene.times, period), side="right") - 1
+            np.testing.assert_array_equal(state[now], light.state)
+        for sign in (road for road in scene.roads if road.kind == STOP_SIGN):
+            assert sign.lanes
+            for start in (lanes[lane].xyz[0, :2] for lane in sign.lanes):
+                assert np.linalg.norm(start - sign.xyz[0, :2]) < 20.0, scene.name
+    assert sum(len(scene.lights) for scene in scenes) > 20
+
+
 def test_conflicting_lights_are_never_green_together():
     street = Street(2, 3.5, 0.0, 13.0, 3, 0.0, 0.0, 12)
     arms = [Arm(yaw, street, 2, 2) for yaw in (0.0, 1.6, 3.1, 4.7)]

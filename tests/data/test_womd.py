@@ -49,7 +49,7 @@ def test_both_encodings_give_the_same_scene(tmp_path):
     (light,) = one.lights
     assert light.lane == 4 and light.valid.tolist() == [step >= 5 for step in range(12)]
     assert light.state[5:].tolist() == [4, 4, 4, 6, 6, 6, 6]
-    assert one.metadata["tracks_to_predict"] == [8] and one.metadata["stop_sign_lanes"] == {"12": [4]}
+    assert one.metadata["tracks_to_predict"] == [8] and {line.id: line.lanes for line in one.roads if line.kind == 17} == {12: (4,)}
 
 
 def test_the_proto_keeps_the_graph_of_lanes(tmp_path):

@@ -2,31 +2,36 @@
 
 The row is nested (`SCHEMA`): a list of roads, each with its list of points, and so on. Arrow keeps every leaf of it in one buffer, so that
 a scene that lies in a memory-mapped file is made of views of the file: no coordinate is copied. Such arrays cannot be written to.
+
+Shards of banks of schema 3 and 4 (`SCHEMA_4`) have no cycles of lights, and name the lanes of stop signs in the metadata.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from scenefactory_jax.core.raw_scene import Light, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.raw_scene import Light, LightPlan, Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.types import STOP_SIGN
 
 POINT, PLANE, IDS = pa.list_(pa.float64(), 3), pa.list_(pa.float64(), 2), pa.list_(pa.int64())
-ROAD = pa.struct(
-    {"id": pa.int64(), "kind": pa.int32(), "xyz": pa.list_(POINT), "entry": IDS, "exit": IDS, "left": IDS, "right": IDS}
-    | {"speed_limit": pa.float64(), "rebuilt": pa.bool_()}
-)
+ROAD_4 = {"id": pa.int64(), "kind": pa.int32(), "xyz": pa.list_(POINT), "entry": IDS, "exit": IDS, "left": IDS, "right": IDS}
+ROAD_4 |= {"speed_limit": pa.float64(), "rebuilt": pa.bool_()}
+ROAD = pa.struct(ROAD_4 | {"lanes": IDS})
 MOTION = pa.struct({"xyz": POINT, "yaw": pa.float64(), "velocity": PLANE, "valid": pa.bool_()})
 TRACK = pa.struct({"id": pa.int64(), "kind": pa.string(), "size": POINT, "log": pa.list_(MOTION)})
 SIGNAL = pa.struct({"state": pa.int8(), "valid": pa.bool_()})
-LIGHT = pa.struct({"lane": pa.int64(), "stop": POINT, "log": pa.list_(SIGNAL)})
-SCHEMA = pa.schema(
-    {"name": pa.string(), "source": pa.string(), "times": pa.list_(pa.float64()), "current": pa.int64(), "sdc": pa.int64()}
-    | {"origin": POINT, "metadata": pa.string()}  # JSON
-    | {"roads": pa.list_(ROAD), "tracks": pa.list_(TRACK), "lights": pa.list_(LIGHT)}
-)
+PHASE = pa.struct({"start_s": pa.float64(), "state": pa.int8()})
+LIGHT_4 = {"lane": pa.int64(), "stop": POINT, "log": pa.list_(SIGNAL)}
+LIGHT = pa.struct(LIGHT_4 | {"plan": pa.list_(PHASE), "period_s": pa.float64()})  # null: a light without a plan
+HEAD = {"name": pa.string(), "source": pa.string(), "times": pa.list_(pa.float64()), "current": pa.int64(), "sdc": pa.int64()}
+HEAD |= {"origin": POINT, "metadata": pa.string()}  # JSON
+SCHEMA = pa.schema(HEAD | {"roads": pa.list_(ROAD), "tracks": pa.list_(TRACK), "lights": pa.list_(LIGHT)})
+SCHEMA_4 = pa.schema(HEAD | {"roads": pa.list_(pa.struct(ROAD_4)), "tracks": pa.list_(TRACK), "lights": pa.list_(pa.struct(LIGHT_4))})
+READABLE = (SCHEMA, SCHEMA_4)
 LINKS = ("entry", "exit", "left", "right")
 
 
@@ -34,7 +39,8 @@ def encode(raw: RawScene) -> pa.RecordBatch:
     """The scene as a batch of one row.
 
     Raises:
-        SceneError: a track or light whose columns differ in length, metadata that JSON cannot hold, or a number beyond its column's range.
+        SceneError: a track, light or plan whose columns differ in length, metadata that JSON cannot hold, or a number out of its column's
+            range.
     """
     try:
         metadata = json.dumps(raw.metadata, default=_plain)
@@ -51,12 +57,15 @@ def encode(raw: RawScene) -> pa.RecordBatch:
 
 
 def decode(batch: pa.RecordBatch) -> RawScene:
-    """The scene of a batch of one row, as views of its buffers."""
+    """The scene of a batch of one row, of one of the READABLE schemas, as views of its buffers."""
     column = {name: batch.column(place) for place, name in enumerate(SCHEMA.names)}
     plain = {name: column[name][0].as_py() for name in ("name", "source", "current", "sdc", "metadata")}
+    metadata, roads = json.loads(plain["metadata"]), _read_roads(column["roads"].values)
+    if batch.schema.equals(SCHEMA_4):
+        roads = _name_lanes(roads, metadata.pop("stop_sign_lanes", {}))
     return RawScene(
-        **plain | {"metadata": json.loads(plain["metadata"])},
-        roads=_read_roads(column["roads"].values),
+        **plain | {"metadata": metadata},
+        roads=roads,
         tracks=_read_tracks(column["tracks"].values),
         times=column["times"].values.to_numpy(),
         lights=_read_lights(column["lights"].values),
@@ -65,7 +74,7 @@ def decode(batch: pa.RecordBatch) -> RawScene:
 
 
 def _roads(roads: Sequence[Polyline]) -> pa.StructArray:
-    links = {name: [getattr(line, name) for line in roads] for name in LINKS}
+    links = {name: [getattr(line, name) for line in roads] for name in (*LINKS, "lanes")}
     leaves = {
         "id": pa.array([line.id for line in roads], pa.int64()),
         "kind": pa.array([line.kind for line in roads], pa.int32()),
@@ -100,6 +109,8 @@ def _lights(lights: Sequence[Light]) -> pa.StructArray:
     for light in lights:
         if len(light.state) != len(light.valid):
             raise ValueError(f"the light of lane {light.lane}: state and valid differ in length")
+        if light.plan is not None and len(light.plan.start_s) != len(light.plan.state):
+            raise ValueError(f"the light of lane {light.lane}: start_s and state of its plan differ in length")
     missing = np.array([light.stop is None for light in lights], bool)
     stops = np.array([np.zeros(3) if light.stop is None else light.stop for light in lights], np.float64)
     log = {
@@ -110,15 +121,38 @@ def _lights(lights: Sequence[Light]) -> pa.StructArray:
         "lane": pa.array([light.lane for light in lights], pa.int64()),
         "stop": pa.FixedSizeListArray.from_arrays(_floats(stops), 3, mask=pa.array(missing)),
         "log": _list(_struct(SIGNAL, log), [len(light.valid) for light in lights]),
+        **_plans([light.plan for light in lights]),
     }
     return _struct(LIGHT, leaves)
+
+
+def _plans(plans: Sequence[LightPlan | None]) -> dict[str, pa.Array]:
+    """Cycles of lights, and their periods."""
+    known = [plan for plan in plans if plan is not None]
+    phases = {
+        "start_s": _floats(_rows([plan.start_s for plan in known])),
+        "state": pa.array(_rows([plan.state for plan in known], dtype=np.int64)).cast(pa.int8()),
+    }
+    counts = [0 if plan is None else len(plan.state) for plan in plans]
+    periods = [None if plan is None else float(plan.period_s) for plan in plans]
+    return {"plan": _list(_struct(PHASE, phases), counts), "period_s": pa.array(periods, pa.float64())}
 
 
 def _read_roads(roads: pa.StructArray) -> tuple[Polyline, ...]:
     ids, kinds, limits, rebuilt = (roads.field(name).to_pylist() for name in ("id", "kind", "speed_limit", "rebuilt"))
     points = _fixed_rows(roads.field("xyz").values, 3)
     xyz = [points[span] for span in _spans(roads.field("xyz"))]
-    return tuple(map(Polyline, kinds, xyz, ids, *[_links(roads.field(name)) for name in LINKS], limits, rebuilt))
+    names = [field.name for field in roads.type]
+    governed = _links(roads.field("lanes")) if "lanes" in names else [()] * len(roads)
+    return tuple(map(Polyline, kinds, xyz, ids, *[_links(roads.field(name)) for name in LINKS], limits, rebuilt, governed))
+
+
+def _name_lanes(roads: tuple[Polyline, ...], signs: Mapping[str, list[int]] | list[dict[str, Any]]) -> tuple[Polyline, ...]:
+    """Stop signs with the lanes that the metadata of an older bank names: by sign, or as a list of records."""
+    named = {str(record["sign"]): record["lanes"] for record in signs} if isinstance(signs, list) else signs
+    return tuple(
+        replace(line, lanes=tuple(named[str(line.id)])) if line.kind == STOP_SIGN and str(line.id) in named else line for line in roads
+    )
 
 
 def _read_tracks(tracks: pa.StructArray) -> tuple[Track, ...]:
@@ -137,7 +171,17 @@ def _read_lights(lights: pa.StructArray) -> tuple[Light, ...]:
     lanes, log, stops = lights.field("lane").to_pylist(), lights.field("log"), lights.field("stop")
     known, points = _flags(stops.is_valid()), _fixed_rows(stops, 3)
     state, valid = log.values.field("state").to_numpy(), _flags(log.values.field("valid"))
-    return tuple(Light(lanes[i], state[span], valid[span], points[i] if known[i] else None) for i, span in enumerate(_spans(log)))
+    plans = _read_plans(lights)
+    return tuple(Light(lanes[i], state[span], valid[span], points[i] if known[i] else None, plans[i]) for i, span in enumerate(_spans(log)))
+
+
+def _read_plans(lights: pa.StructArray) -> list[LightPlan | None]:
+    if "plan" not in [field.name for field in lights.type]:
+        return [None] * len(lights)
+    phases, periods = lights.field("plan"), lights.field("period_s").to_pylist()
+    start, state = (phases.values.field(name).to_numpy() for name in ("start_s", "state"))
+    spans = _spans(phases)
+    return [None if period is None else LightPlan(start[span], state[span], period) for period, span in zip(periods, spans, strict=True)]
 
 
 def _struct(kind: pa.StructType, leaves: dict[str, pa.Array]) -> pa.StructArray:

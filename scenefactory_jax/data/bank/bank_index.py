@@ -15,8 +15,9 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.data.formats.reader_selection import BANK_INDEX as INDEX
 
 FORMAT = "scenefactory_jax bank"
-SCHEMA = 4  # 4: checksums of `bank.json` and of each scene
-READABLE = (3, 4)
+SCHEMA = 5  # 4: checksums of `bank.json` and of each scene; 5: cycles of lights, lanes of stop signs (`arrow_codec`)
+READABLE = (3, 4, 5)
+CHECKED = (4, 5)  # with a checksum
 REMEDY = "copy or convert the bank again"
 DIGEST = "sha256"  # key of the checksum
 
@@ -71,7 +72,7 @@ def read(path: Path) -> Index:
         raise SceneError(f"{path}: {what}; make one with `convert source=FILES out={path}`")
     if found.get("schema") not in READABLE:
         what = "a bank of packed scenes, schema 2" if found.get("schema") == 2 else f"a bank of schema {found.get('schema')!r}"
-        ours = f"this version reads {' and '.join(map(str, READABLE))}, whole scenes"
+        ours = f"this version reads {', '.join(map(str, READABLE))}, whole scenes"
         raise SceneError(f"{path}: {what}; {ours}: convert its source again, to another folder")
     try:
         shards = {name: tuple(map(_shard, found[name])) for name in ("shards", "metadata")}
@@ -102,7 +103,7 @@ def _entries(path: Path) -> dict[str, Any] | None:
         return {}
     recorded = found.get(DIGEST)
     if recorded is None:
-        if found.get("schema") == SCHEMA:
+        if found.get("schema") in CHECKED:
             raise SceneError(f"{file}: damaged: no checksum; {REMEDY}")
         return found  # of a schema without one
     body = content.rpartition(f'"{DIGEST}"'.encode())[0]

@@ -202,8 +202,9 @@ def _scenes(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Re
 
 
 def _batches(shards: Sequence[Shard], places: Int[np.ndarray, "N 5"], readers: Readers) -> Iterator[pa.RecordBatch]:
-    """Scenes as they are encoded in their shards."""
-    return (_reader(shards, number, readers).batch(place) for number, *place in places.tolist())
+    """Scenes as they are encoded in their shards, those of earlier schemas encoded again."""
+    found = (_reader(shards, number, readers).batch(place) for number, *place in places.tolist())
+    return (batch if batch.schema.equals(arrow_codec.SCHEMA) else arrow_codec.encode(arrow_codec.decode(batch)) for batch in found)
 
 
 def _reader(shards: Sequence[Shard], number: int, readers: Readers) -> shard_files.Reader:

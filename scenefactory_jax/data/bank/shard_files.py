@@ -36,7 +36,7 @@ class Reader:
         self._shard, self._content = shard, _mapped(Path(shard.file))
 
     def batch(self, place: Sequence[int]) -> pa.RecordBatch:
-        """One scene as a batch of one row, whose buffers are views of the file.
+        """One scene as a batch of one row, of one of `arrow_codec.READABLE`, whose buffers are views of the file.
 
         Args:
             place: row in the shard, first byte, bytes and CRC-32.
@@ -52,7 +52,7 @@ class Reader:
                 span = self._content[max(first, 0) : first + size]
                 if zlib.crc32(span) != checksum:
                     raise self._damaged(row, "its checksum is another")
-                batch = pa.ipc.read_record_batch(span, arrow_codec.SCHEMA)
+                batch = pa.ipc.read_record_batch(span, self._schema)
             batch.validate(full=True)  # keeps memory safe if the checksum belongs to damaged bytes
         except (pa.ArrowException, OSError, EOFError) as error:
             raise self._damaged(row, str(error)) from error
@@ -73,9 +73,20 @@ class Reader:
         """The file by its own table of contents, after its checksum was compared."""
         _require_same(self._shard)
         reader = pa.ipc.open_file(pa.BufferReader(self._content))
-        if not reader.schema.equals(arrow_codec.SCHEMA):
-            raise SceneError(f"{self._shard.file}: damaged: other columns than a scene has; {bank_index.REMEDY}")
+        if reader.schema not in arrow_codec.READABLE:
+            raise self._other_columns()
         return reader
+
+    @functools.cached_property
+    def _schema(self) -> pa.Schema:
+        """The file's columns: those of this version, or of earlier ones."""
+        schema = pa.ipc.read_schema(self._content[MAGIC:])
+        if schema not in arrow_codec.READABLE:
+            raise self._other_columns()
+        return schema
+
+    def _other_columns(self) -> SceneError:
+        return SceneError(f"{self._shard.file}: damaged: other columns than a scene has; {bank_index.REMEDY}")
 
     def _damaged(self, row: int, why: str) -> SceneError:
         return SceneError(f"{self._shard.file}: damaged: scene {row} of {self._shard.scenes}: {why}; {bank_index.REMEDY}")

@@ -1,7 +1,7 @@
 """Writes scenes as GPUDrive's JSON, for GPUDrive, PufferDrive's converter and all other readers of it.
 
-The format has no lane links, speed limits, dataset name, origin, current step and times: its readers expect WOMD's 10 Hz and step 10, and
-GPUDrive itself 91 steps.
+The format has no lane links, speed limits, lanes of stop signs, cycles of lights beyond the log, dataset name, origin, current step and
+times: its readers expect WOMD's 10 Hz and step 10, and GPUDrive itself 91 steps.
 """
 
 import json

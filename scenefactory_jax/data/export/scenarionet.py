@@ -1,8 +1,8 @@
 """Writes scenes as ScenarioNet's pickles, for MetaDrive and all other readers of a ScenarioNet database.
 
 Files have only texts, numbers, containers and numpy arrays, under module names of both numpy 1 and 2. The format has no mark of inferred
-lane links, no origin and no metadata of other formats. A neighbour is an id without the stretch of lane; a light without a stop point gets
-its lane's first point, which MetaDrive requires. MetaDrive needs a recording car to simulate.
+lane links, no cycles of lights beyond the log, no origin and no metadata of other formats. A neighbour is an id without the stretch of
+lane; a light without a stop point gets its lane's first point, which MetaDrive requires. MetaDrive needs a recording car to simulate.
 """
 
 import pickle
@@ -63,13 +63,10 @@ def scenario(raw: RawScene) -> dict[str, Any]:
     keys = _make_keys([line.id for line in raw.roads], tokens.get("features", {}))
     lanes = {line.id: key for line, key in zip(raw.roads, keys, strict=True)}
     roads = {line.id: line for line in raw.roads}
-    signs = raw.metadata.get("stop_sign_lanes", {})
-    if isinstance(signs, list):  # in older banks of WOMD's protos
-        signs = {str(record["sign"]): record["lanes"] for record in signs}
     light_keys = [lanes.get(light.lane, str(light.lane)) for light in raw.lights]
     lights = {key: _light(light, key, roads.get(light.lane), dataset) for key, light in zip(light_keys, raw.lights, strict=True)}
     tracks = {name: _track(track, name, dataset) for name, track in zip(names, raw.tracks, strict=True)}
-    features = {key: _feature(line, lanes, signs, raw.source) for key, line in zip(keys, raw.roads, strict=True)}
+    features = {key: _feature(line, lanes, raw.source) for key, line in zip(keys, raw.roads, strict=True)}
     metadata = _metadata(raw, dataset, names, tracks) | {"number_summary": _count(tracks, lights, features)}
     return {
         "id": metadata["id"],
@@ -104,7 +101,7 @@ def _track(track: Track, name: str, dataset: str) -> dict[str, Any]:
     return {"type": kind, "state": {key: np.ascontiguousarray(table) for key, table in state.items()}, "metadata": metadata}
 
 
-def _feature(line: Polyline, lanes: Mapping[int, str], signs: Mapping[str, list[int]], source: str) -> dict[str, Any]:
+def _feature(line: Polyline, lanes: Mapping[int, str], source: str) -> dict[str, Any]:
     """One feature of the map; lanes are referred to by their keys."""
     if line.kind not in NAMES:
         raise SceneError(f"{source}: road {line.id}: MetaDrive has no type for the map element {line.kind}; expected {sorted(NAMES)}")
@@ -112,7 +109,7 @@ def _feature(line: Polyline, lanes: Mapping[int, str], signs: Mapping[str, list[
     feature: dict[str, Any] = {"type": NAMES[line.kind]}
     xyz = np.ascontiguousarray(line.xyz)
     if line.kind == STOP_SIGN:
-        return feature | {"position": xyz[0] if len(xyz) else np.zeros(3), "lane": keys(signs.get(str(line.id), ()))}
+        return feature | {"position": xyz[0] if len(xyz) else np.zeros(3), "lane": keys(line.lanes)}
     if line.kind in POLYGONS:
         return feature | {"polygon": xyz}
     feature["polyline"] = xyz

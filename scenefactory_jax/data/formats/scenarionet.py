@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, Companion, Light, OtherContent, Polyline, RawScene, SceneError, Track
-from scenefactory_jax.core.types import EDGE_BOUNDARY, EDGES, LINES, POLYGONS
+from scenefactory_jax.core.types import EDGE_BOUNDARY, EDGES, LINES, POLYGONS, STOP_SIGN
 from scenefactory_jax.data.formats import metadrive_map, polylines, safe_pickle, scenarionet_legacy, scene_parts, values
 from scenefactory_jax.data.formats.values import Node
 
@@ -141,9 +141,7 @@ def _track(track: Node, number: int, steps: int) -> Track:
     )
 
 
-def _roads(
-    features: Node, ids: Mapping[str, int], outlines_are_edges: bool, dataset: str
-) -> tuple[list[Polyline], Counter[str]]:
+def _roads(features: Node, ids: Mapping[str, int], outlines_are_edges: bool, dataset: str) -> tuple[list[Polyline], Counter[str]]:
     """The features of the map, and the number of features of each type that WOMD has no map element for, such as sidewalks."""
     roads, left_out = [], Counter()
     for key, feature in features.entries(dict).items():
@@ -167,7 +165,7 @@ def _polyline(feature: Node, number: int, kind: int, ids: Mapping[str, int], pos
     xyz = (_point if key == "position" else _points)(shape)
     values.check_finite(xyz, shape.where)
     if kind not in LANES:
-        return Polyline(kind=kind, xyz=xyz, id=number)
+        return Polyline(kind=kind, xyz=xyz, id=number, lanes=_lanes(feature.get("lane", []), ids) if kind == STOP_SIGN else ())
     keys = {"entry": "entry_lanes", "exit": "exit_lanes", "left": "left_neighbor", "right": "right_neighbor"}
     links: dict[str, Any] = {name: _lanes(feature.get(key, []), ids) for name, key in keys.items()}
     xyz = xyz * (1.0, 1.0, 0.0) if poses else xyz
@@ -237,9 +235,5 @@ def _metadata(document: Node, track_ids: Mapping[str, int], feature_ids: Mapping
         if key in source:
             chosen = source[key].expect(dict if isinstance(source[key].value, dict) else list)
             metadata[key] = [track_ids[str(track)] for track in chosen if str(track) in track_ids]
-    signs = {key: sign for key, sign in document["map_features"].entries(dict).items() if sign["type"].value == "STOP_SIGN"}
-    if signs:
-        lanes = {feature_ids[str(key)]: _lanes(sign.get("lane", []), feature_ids) for key, sign in signs.items()}
-        metadata["stop_sign_lanes"] = {str(sign): list(chosen) for sign, chosen in lanes.items() if chosen}
     tokens = {"tracks": scene_parts.list_tokens(track_ids), "features": scene_parts.list_tokens(feature_ids)}
     return metadata | ({"tokens": tokens} if any(tokens.values()) else {})

@@ -123,7 +123,8 @@ def _polyline(message: Message, where: str) -> Polyline | None:
     feature, where = getattr(message, name), f"{where}.{name}"
     if name == "stop_sign":
         _require(feature, "position", f"{where}.")
-        return Polyline(kind=STOP_SIGN, xyz=_table([feature.position], AXES, lambda _: f"{where}.position"), id=message.id)
+        xyz = _table([feature.position], AXES, lambda _: f"{where}.position")
+        return Polyline(kind=STOP_SIGN, xyz=xyz, id=message.id, lanes=tuple(feature.lane))
     elements, points = FEATURES[name]
     kind = elements[values.check_index(getattr(feature, "type", 0), elements, f"type of {name}", f"{where}.type")]
     line = Polyline(kind=kind, xyz=_table(getattr(feature, points), AXES, lambda row: f"{where}.{points}[{row}]"), id=message.id)
@@ -158,14 +159,12 @@ def _lights(moments: Sequence[Message], steps: int, where: str) -> tuple[Light, 
 
 
 def _metadata(message: Message, tracks: Sequence[Track], where: str) -> dict[str, Any]:
-    """Lists of tracks, by their ids (indices change when tracks are dropped), and the lanes of stop signs."""
+    """Lists of tracks, by their ids (indices change when tracks are dropped)."""
     chosen = message.tracks_to_predict
     for place, entry in enumerate(chosen):
         values.check_index(entry.track_index, tracks, "track", f"{where}tracks_to_predict[{place}].track_index")
-    signs = [feature for feature in message.map_features if feature.WhichOneof(womd_schema.CHOICE) == "stop_sign"]
     return {
         "objects_of_interest": list(message.objects_of_interest),
         "tracks_to_predict": [tracks[entry.track_index].id for entry in chosen],
         "difficulty_levels": [entry.difficulty for entry in chosen],  # of tracks_to_predict: 0 none, 1, 2
-        "stop_sign_lanes": {str(feature.id): list(feature.stop_sign.lane) for feature in signs},
     }

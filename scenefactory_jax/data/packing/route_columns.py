@@ -73,7 +73,8 @@ def pack_routes(
         slots: of agents.
         controls: columns of `controls`, whose stop places the routes pass.
     """
-    linked = instantiate(config.lanes["topology"], builtins="scenefactory_jax.roadgraph.lane_topology", where="scenes.pack.routes.lanes.topology")(raw)
+    entry = {"builtins": "scenefactory_jax.roadgraph.lane_topology", "where": "scenes.pack.routes.lanes.topology"}
+    linked = instantiate(config.lanes["topology"], **entry)(raw)
     graph = lane_graph.make(linked.roads)
     graph = graph._replace(xyz=graph.xyz - np.array([origin[0], origin[1], 0.0]))
     lanes = route_sets.make_lane_map(graph)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from scenefactory_jax.core.types import ROUTE_SPACING_M
 
+NAMES = ("zone_enter", "zone_leave", "zone_match")
 ZONES = 2  # of a pair of vehicles that are kept, the first ones
 MARGIN_M = 0.4  # between the sides of two vehicles
 SAME_WAY_COSINE = 0.6  # between two routes in a zone, on average: they lead the same way
@@ -31,14 +32,18 @@ def find_zones(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Computes `zone_enter`, `zone_leave` and `zone_match` of a scene's traffic from its columns."""
     has_route, size = leaves["traffic_log.has_route"], leaves["traffic_log.size"]
     lines = {int(row): _read_line(leaves, int(row)) for row in np.flatnonzero(has_route)}
-    names = ("zone_enter", "zone_leave", "zone_match")
-    found = {f"traffic_log.{name}": np.full((len(has_route), len(has_route), ZONES), np.inf) for name in names}
+    found = {f"traffic_log.{name}": np.full((len(has_route), len(has_route), ZONES), np.inf) for name in NAMES}
     for first, second in itertools.combinations(lines, 2):
         reach = (size[first, 1] + size[second, 1]) / 2 + MARGIN_M
         for place, zone in enumerate(find_pair_zones(lines[first], lines[second], reach)[:ZONES]):
-            for name, arcs in zip(names, zone, strict=True):
+            for name, arcs in zip(NAMES, zone, strict=True):
                 found[f"traffic_log.{name}"][first, second, place], found[f"traffic_log.{name}"][second, first, place] = arcs
     return found
+
+
+def make_no_zones(traffic: int) -> dict[str, np.ndarray]:
+    """The columns of a scene without routes."""
+    return {f"traffic_log.{name}": np.zeros((traffic, traffic, 0)) for name in NAMES}
 
 
 def find_pair_zones(line: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "M 2"], reach_m: float) -> list[Zone]:

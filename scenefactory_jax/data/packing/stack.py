@@ -12,7 +12,7 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.packing import columns
 
-ROUTE_AXES = ("routes", "route_points", "stops", "controls", "changes")
+ROUTE_AXES = ("routes", "route_points", "stops", "zones", "controls", "changes")
 AXES = (*columns.ROADS, "agents", "steps", "traffic", *ROUTE_AXES)
 MAY_BE_EMPTY = ("traffic", *ROUTE_AXES)
 ENDLESS = (
@@ -41,6 +41,7 @@ class Capacity:
     routes: Annotated[int, schema.Bounds(min=0)] | None = None
     route_points: Annotated[int, schema.Bounds(min=0)] | None = None
     stops: Annotated[int, schema.Bounds(min=0)] | None = None
+    zones: Annotated[int, schema.Bounds(min=0)] | None = None
     controls: Annotated[int, schema.Bounds(min=0)] | None = None
     changes: Annotated[int, schema.Bounds(min=0)] | None = None
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from scenefactory_jax.core.raw_scene import COMPANION, Reject
 from scenefactory_jax.core.safe_names import escape_for_terminal
+from scenefactory_jax.data.packing.control_columns import CONTROL_DROPS
 from scenefactory_jax.data.packing.pack import CUTS, DROPS, TRAFFIC_DROPS, PackReport
 
 MAX_LISTED = 10  # rejects, or companions, in a description
@@ -25,6 +26,9 @@ class Summary:
     agents_dropped: dict[str, int]  # reason -> count
     traffic_kept: int
     traffic_dropped: dict[str, int]  # reason -> count
+    controls_kept: int
+    controls_dropped: dict[str, int]  # reason -> count
+    signs_inferred: int  # stop signs whose lanes were inferred
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count
     refused: dict[str, int]  # reason of packing -> scenes; a bank holds them all the same
@@ -36,10 +40,11 @@ def count_results(results: Sequence[PackReport | str]) -> dict[str, Any]:
     """Counts that add up over scenes: of the report of each packed scene, or the kind of its refusal."""
     reports = [report for report in results if not isinstance(report, str)]
     add = lambda name, reasons: {reason: sum(getattr(report, name).get(reason, 0) for report in reports) for reason in reasons}  # noqa: E731
-    reasons = {"agents_dropped": DROPS, "traffic_dropped": TRAFFIC_DROPS, "segments_cut": CUTS}
+    reasons = {"agents_dropped": DROPS, "traffic_dropped": TRAFFIC_DROPS, "controls_dropped": CONTROL_DROPS, "segments_cut": CUTS}
+    numbers = ("agents_kept", "traffic_kept", "controls_kept", "signs_inferred", "segments_kept")
     return {
         "scenes": len(results),
-        **{name: sum(getattr(report, name) for report in reports) for name in ("agents_kept", "traffic_kept", "segments_kept")},
+        **{name: sum(getattr(report, name) for report in reports) for name in numbers},
         **{name: add(name, known) for name, known in reasons.items()},
         "refused": dict(Counter(kind for kind in results if isinstance(kind, str))),
         "repaired": dict(Counter(line.split(":")[0] for report in reports for line in report.repairs)),
@@ -92,6 +97,8 @@ def describe(summary: Summary) -> list[str]:
     lines += [f"in {number} scenes: {repair}" for repair, number in summary.repaired.items()]
     lines.append(f"centred on: {', '.join(f'{origin} in {number} scenes' for origin, number in summary.centred_on.items())}")
     lines.append(f"segments: {summary.segments_kept} kept; cut: {count(summary.segments_cut)}")
+    inferred = f"; lanes of {summary.signs_inferred} stop signs inferred" if summary.signs_inferred else ""
+    lines.append(f"lights and stop signs: {summary.controls_kept} kept; dropped: {count(summary.controls_dropped)}{inferred}")
     lines.append(f"traffic: {summary.traffic_kept} kept; dropped: {count(summary.traffic_dropped)}")
     lines.append(f"agents: {summary.agents_kept} kept; dropped: {count(summary.agents_dropped)}")
     if summary.refused:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenefactory_jax.core.raw_scene import Polyline, RawScene, SceneError, Track
+from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene, SceneError, Track
 from scenefactory_jax.core.scene_arrays import Logs, Points, grid, join_lines, sample_tracks, segment_lengths, stack_tracks
 from scenefactory_jax.core.types import DRIVABLE, STOP_SIGN
 
@@ -66,7 +66,7 @@ def check(
 
 
 def _check_steps(raw: RawScene, max_steps: int, step_s: Sequence[float]) -> None:
-    """Refuses times that do not rise by steps in `step_s`, a current step outside the log, and tracks and lights of other lengths."""
+    """Refuses times that do not rise by steps in `step_s`, a current step outside the log, tracks of other lengths, and damaged lights."""
     steps, span = len(raw.times), np.diff(raw.times)
     if steps > max_steps:
         raise SceneError(f"{raw.source}: times: expected up to {max_steps} steps (scenes.check.max_steps), got {steps}")
@@ -83,9 +83,28 @@ def _check_steps(raw: RawScene, max_steps: int, step_s: Sequence[float]) -> None
         if {len(track.valid), len(track.xyz), len(track.yaw), len(track.velocity)} != {steps}:
             raise SceneError(f"{_name_track(raw, index)}: expected {steps} steps, as the log has, got {len(track.valid)}")
     for index, light in enumerate(raw.lights):
-        if {len(light.valid), len(light.state)} != {steps}:
-            where = f"{raw.source}: lights[{index}] (lane {light.lane})"
-            raise SceneError(f"{where}: expected {steps} steps, as the log has, got {len(light.valid)}")
+        _check_light(light, f"{raw.source}: lights[{index}] (lane {light.lane})", steps)
+
+
+def _check_light(light: Light, where: str, steps: int) -> None:
+    """Refuses a light of another length than the log, unknown states, a stop point that is not finite, and a plan that is no cycle."""
+    if {len(light.valid), len(light.state)} != {steps}:
+        raise SceneError(f"{where}: expected {steps} steps, as the log has, got {len(light.valid)}")
+    if light.stop is not None and not np.isfinite(light.stop).all():
+        raise SceneError(f"{where}: stop: expected finite coordinates, got {np.asarray(light.stop).tolist()}")
+    states = {"state": np.where(light.valid, light.state, 0)}
+    if light.plan is not None:
+        start, period, states["plan.state"] = np.asarray(light.plan.start_s), light.plan.period_s, np.asarray(light.plan.state)
+        if not len(start) or len(start) != len(states["plan.state"]):
+            raise SceneError(f"{where}: plan: expected one state or more, each with its start, got {len(start)} starts")
+        if not (np.isfinite(period) and np.isfinite(start).all() and start[0] >= 0 and (np.diff(start) >= 0).all() and start[-1] < period):
+            raise SceneError(
+                f"{where}: plan: expected starts that rise from 0 on and end before the period, got {start.tolist()}, {period} s"
+            )
+    for name, codes in states.items():
+        if (bad := np.flatnonzero((codes < 0) | (codes >= len(LIGHT_STATES)))).size:
+            got = f"{name}[{bad[0]}]: expected an index into LIGHT_STATES, 0 to {len(LIGHT_STATES) - 1}, got {codes[bad[0]]}"
+            raise SceneError(f"{where}: {got}")
 
 
 def _check_map(raw: RawScene, points: Points, max_coordinate_m: float, max_segment_m: float, max_lanes_m: float) -> None:

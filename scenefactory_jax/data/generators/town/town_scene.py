@@ -175,8 +175,16 @@ def _to_polylines(
     features = [(kind, resample(points, line_spacing)) for kind, points in network.lines]
     features += [(EDGE_BOUNDARY, points) for points in outer] + [(EDGE_MEDIAN, points) for points in islands]
     features += [(CROSSWALK, walk.outline) for walk in network.crosswalks] + [(DRIVEWAY, outline) for outline in driveways]
-    features += [(STOP_SIGN, stop.post[None]) for stop in network.stops if stop.kind == "stop"]
-    return (*lanes, *(Polyline(kind, _flat(points), len(lanes) + i) for i, (kind, points) in enumerate(features)))
+    signs = [index for index, stop in enumerate(network.stops) if stop.kind == "stop"]
+    features += [(STOP_SIGN, network.stops[index].post[None]) for index in signs]
+    governed = [()] * (len(features) - len(signs)) + [
+        tuple(number for number, lane in enumerate(network.lanes) if lane.control == index) for index in signs
+    ]
+    rest = [
+        Polyline(kind, _flat(points), len(lanes) + i, lanes=ids)
+        for i, ((kind, points), ids) in enumerate(zip(features, governed, strict=True))
+    ]
+    return (*lanes, *rest)
 
 
 def _flat(points: Points) -> Float[np.ndarray, "N 3"]:
@@ -184,9 +192,15 @@ def _flat(points: Points) -> Float[np.ndarray, "N 3"]:
 
 
 def _to_lights(network: Network, gates: Gates, steps: int) -> tuple[Light, ...]:
-    """Lists the light of every lane that has one, with its stop position."""
+    """Lists the light of every lane that has one, with its stop position and its cycle."""
     return tuple(
-        Light(index, gates.light[lane.control, -steps:], np.ones(steps, bool), np.concatenate([lane.points[0], [0.0]]))
+        Light(
+            lane=index,
+            state=gates.light[lane.control, -steps:],
+            valid=np.ones(steps, bool),
+            stop=np.concatenate([lane.points[0], [0.0]]),
+            plan=gates.plans[lane.control],
+        )
         for index, lane in enumerate(network.lanes)
         if lane.control is not None and network.stops[lane.control].kind == "signal"
     )
