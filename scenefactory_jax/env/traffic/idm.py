@@ -156,26 +156,34 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
 
 
 def enter(scene: Scene, state: IdmState, cars: Boxes, row: Float[Array, ""], config: IdmConfig) -> IdmState:
-    """Puts waiting vehicles on the road whose time has come and whose place is free: no box is nearer than the gap and the distance of
-    their headway, ahead and behind, in the strip of their width."""
+    """Puts waiting vehicles on the road whose time has come and whose place is free: in the strip of their width ahead and behind, and in
+    the zones of their routes, nobody would have to brake hard. Of those that are due, one enters in a step."""
     log, law = scene.traffic_log, config.law
     due = (state.phase == WAITING) & (state.entry_row <= row)
-    own = replace(scene.traffic, position=state.position, yaw=state.yaw, velocity=state.velocity, size=log.size, present=due)
-    rows = [own, scene.traffic, cars]
-    others: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
+    others: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), scene.traffic, cars)
     relative = to_frame(others.position[None] - state.position[:, None], state.yaw[:, None])
     turn = others.yaw[None] - state.yaw[:, None]
     cosine, sine = jnp.abs(jnp.cos(turn)), jnp.abs(jnp.sin(turn))
     reach = 0.5 * (cosine * others.size[:, 0] + sine * others.size[:, 1] + log.size[:, :1])
     side = 0.5 * (sine * others.size[:, 0] + cosine * others.size[:, 1] + log.size[:, 1:])
-    ahead = reach + law.gap_m + law.headway_s * state.speed[:, None]
-    behind = reach + law.gap_m + law.headway_s * safe_norm(others.velocity)[None] * (jnp.cos(turn) > 0)
-    near = (jnp.abs(relative[..., 1]) < side + SIDE_M) & (relative[..., 0] < ahead) & (relative[..., 0] > -behind)
-    count = len(due)
-    index = jnp.arange(count + count + cars.mass.shape[0])
-    earlier = (index < jnp.arange(count)[:, None]) | (index >= count)  # of two that would enter at once the first does
-    free = ~jnp.any(near & others.present & earlier, axis=1)
-    return state._replace(phase=jnp.where(due & free, ON_ROAD, state.phase))
+    along = jnp.maximum(jnp.cos(turn) * safe_norm(others.velocity), 0.0)
+    speed = jnp.broadcast_to(state.speed[:, None], along.shape)
+    ahead, behind = idm_law.compute_safe_gap(speed, along, law), idm_law.compute_safe_gap(along, speed, law)
+    near = (jnp.abs(relative[..., 1]) < side + SIDE_M) & (relative[..., 0] < reach + ahead) & (relative[..., 0] > -reach - behind)
+    vehicles = Vehicles(
+        arc=state.arc,
+        speed=state.speed,
+        length=log.size[:, 0],
+        drives=find_drivers(scene) & (state.phase == ON_ROAD),
+        waited_s=state.waited_s,
+        blocked=jnp.zeros_like(due),
+        free_arc=state.arc,
+        room_arc=state.arc,
+    )
+    refused = right_of_way.find_refused_entries(log, vehicles, law, config.right_of_way) & find_drivers(scene)
+    enters = due & ~jnp.any(near & others.present, axis=1) & ~refused
+    first = jnp.cumsum(enters) == 1
+    return state._replace(phase=jnp.where(enters & first, ON_ROAD, state.phase))
 
 
 def advance(scene: Scene, state: IdmState, cars: Boxes, time_s: Float[Array, ""], config: IdmConfig, *, at_end: str, dt: float) -> IdmState:
@@ -227,6 +235,8 @@ def compute_accelerations(
     strip = {"arc": state.arc, "size": log.size, "margin_m": config.corridor_margin_m, "foresight_s": foresight}
     found = corridor.find_obstacles(places, boxes, **strip)
     gap = jnp.where(jnp.arange(len(boxes.mass)) == jnp.arange(count)[:, None], jnp.inf, found.gap)
+    blocked = (state.speed < config.stand_mps) & (state.acceleration < STARTS_MPS2) & drives
+    gap = gap.at[:, :count].set(_ignore_mutual(gap[:, :count], state, blocked, config.right_of_way.patience_s))
     speed = jnp.broadcast_to(state.speed[:, None], gap.shape)
     demand = jnp.max(idm_law.compute_interaction(speed, gap, found.speed, law), axis=1, initial=0.0)
 
@@ -236,7 +246,6 @@ def compute_accelerations(
     standing = jnp.min(jnp.where(found.speed < config.stand_mps, gap, jnp.inf), axis=1, initial=jnp.inf)
     rules = config.right_of_way
     room = jnp.min(gap + found.speed * rules.keep_clear_s, axis=1, initial=jnp.inf) - law.gap_m
-    blocked = (state.speed < config.stand_mps) & (state.acceleration < STARTS_MPS2)
     vehicles = Vehicles(
         arc=state.arc,
         speed=state.speed,
@@ -249,6 +258,16 @@ def compute_accelerations(
     )
     demand = jnp.maximum(demand, right_of_way.compute_interaction(log, vehicles, law, rules))
     return jnp.maximum(idm_law.compute_acceleration(state.speed, target, demand, law), -config.max_braking_mps2)
+
+
+def _ignore_mutual(gap: Float[Array, "O O"], state: IdmState, blocked: Bool[Array, " O"], patience_s: float) -> Float[Array, "O O"]:
+    """Returns the gaps without those of vehicles that stand in each other's corridor: the one that has stood longer goes, as far as the
+    boxes are apart (`find_held`)."""
+    mutual = jnp.isfinite(gap) & jnp.isfinite(gap.T) & blocked
+    index, waited = jnp.arange(len(blocked)), state.waited_s
+    first = (waited[:, None] > waited) | ((waited[:, None] == waited) & (index[:, None] < index))
+    goes = (waited > patience_s) | ((waited > 0.0) & ~blocked)
+    return jnp.where(mutual & first & goes[:, None], jnp.inf, gap)
 
 
 def find_stop_distance(

@@ -53,3 +53,9 @@ def compute_arrival(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], a
 def can_stop(speed: Float[Array, "*#n"], distance: Float[Array, "*#n"], braking: float) -> Bool[Array, "*#n"]:
     """Mask of vehicles that can stop within a distance."""
     return distance >= speed**2 / (2.0 * braking)
+
+
+def compute_safe_gap(speed: Float[Array, "*#n"], leader_speed: Float[Array, "*#n"], law: IdmLaw) -> Float[Array, "*#n"]:
+    """Computes the gap at which a vehicle can follow or stop behind a leader with comfortable braking."""
+    slower = jnp.minimum(speed, leader_speed)
+    return law.gap_m + law.headway_s * slower + jnp.maximum(speed**2 - leader_speed**2, 0.0) / (2.0 * law.braking_mps2)

@@ -102,6 +102,27 @@ def find_passage(log: TrafficLog, cars: Vehicles, law: IdmLaw, rules: RightOfWay
     return Passage(enter, first, claimed, ahead, yields)
 
 
+def find_refused_entries(log: TrafficLog, cars: Vehicles, law: IdmLaw, rules: RightOfWay) -> Bool[Array, " O"]:
+    """Mask of the vehicles that must not appear on the road where they are, because those on it would have to brake hard.
+
+    Where the routes lead the same way, there is room for the braking of the one behind; before a zone that crosses, an entering vehicle can
+    still stop, or is through it before the others arrive.
+    """
+    arc, speed, half = cars.arc[:, None, None], cars.speed[:, None, None], 0.5 * cars.length[:, None, None]
+    enter, leave, merges = log.zone_enter - arc - half, log.zone_leave - arc + half, jnp.isfinite(log.zone_match)
+    present = (cars.drives[None] & jnp.ones_like(cars.drives)[:, None])[..., None]
+    near = jnp.isfinite(log.zone_enter) & (leave > 0) & _swap(leave > 0) & present & ~idm_law.can_stop(speed, enter, law.braking_mps2)
+    arrive = idm_law.compute_arrival(speed, enter, law.acceleration_mps2)
+    clear = idm_law.compute_arrival(speed, leave, law.acceleration_mps2)
+    crosses = (_swap(arrive) < clear + rules.margin_s) & (_swap(clear) + rules.margin_s > arrive)
+    along = arc - _finite(log.zone_match, merges)
+    lead = _swap(along) - along
+    room = jnp.abs(lead) - half - _swap(half)
+    ahead = idm_law.compute_safe_gap(speed, _swap(speed), law)
+    needed = jnp.where(lead > 0, ahead, _swap(ahead))
+    return jnp.any(near & jnp.where(merges, room < needed, crosses), axis=(1, 2))
+
+
 def _find_kept_clear(log: TrafficLog, cars: Vehicles, passage: Passage, law: IdmLaw) -> Bool[Array, "O O 2"]:
     """Mask of crossing zones that a vehicle must not enter, because it would have to wait in them."""
     speed = cars.speed[:, None, None]
