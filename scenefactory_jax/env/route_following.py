@@ -62,10 +62,25 @@ def locate(scene: Scene, route: Int[Array, " K"], last_arc: Float[Array, " K"], 
     best = jnp.argmin(distance, axis=1)[:, None]
     pick = lambda table: jnp.take_along_axis(table, best, axis=1)[:, 0]  # noqa: E731
     chosen = jnp.take_along_axis(along, best[..., None], axis=1)[:, 0]
-    arc = ROUTE_SPACING_M * (pick(row[:, :-1]) + pick(fraction))
+    arc = ROUTE_SPACING_M * pick(row[:, :-1]) + pick(fraction) * safe_norm(chosen)
     length = scene.routes.length[route]
     direction = chosen / jnp.maximum(safe_norm(chosen), 1e-3)[:, None]
     return RoutePlace(jnp.minimum(arc, length), pick(distance), direction)
+
+
+def find_point(scene: Scene, route: Int[Array, "*k"], arc: Float[Array, "*k"]) -> tuple[Float[Array, "*k 2"], Float[Array, "*k 2"]]:
+    """Finds points and unit directions at lengths along routes; beyond an end, the end."""
+    points = scene.routes.position.shape[1]
+    length = scene.routes.length[route]
+    arc = jnp.clip(arc, 0.0, length)
+    # the last piece of a route is shorter than the others: a point within it is found from its own two ends
+    last = jnp.ceil(length / ROUTE_SPACING_M).astype(jnp.int32) - 1
+    row = jnp.clip(jnp.floor(arc / ROUTE_SPACING_M).astype(jnp.int32), 0, jnp.clip(last, 0, points - 2))
+    start, end = scene.routes.position[route, row], scene.routes.position[route, row + 1]
+    along = end - start
+    size = jnp.maximum(safe_norm(along), 1e-3)
+    direction = along / size[..., None]
+    return start + (arc - ROUTE_SPACING_M * row)[..., None] * direction, direction
 
 
 def project(scene: Scene, route: Int[Array, " K"], position: Float[Array, "K 2"]) -> RoutePlace:

@@ -19,8 +19,8 @@ from scenefactory_jax.core.geometry import (
 )
 from scenefactory_jax.core.instantiate import check_range, instantiate
 from scenefactory_jax.core.pytree import is_finite, replace, tree_where
-from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, check_names
-from scenefactory_jax.core.types import Agents, Boxes, Motion, Scene
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, Fraction, NonNegative, Positive, Range, check_names
+from scenefactory_jax.core.types import ROUTE_SPACING_M, Agents, Boxes, Motion, Scene
 from scenefactory_jax.env import route_following
 
 Sampler = Callable[[PRNGKeyArray, Scene], Agents]
@@ -186,6 +186,60 @@ def random_pairs(
         route=jnp.zeros(slots, jnp.int32),
         route_start=jnp.zeros(slots, jnp.float32),
         route_end=jnp.zeros(slots, jnp.float32),
+    )
+
+
+def routes(
+    key: PRNGKeyArray,
+    scene: Scene,
+    *,
+    travel_m: Range,
+    start_gap_m: NonNegative,
+    candidates: Count,
+    standing_fraction: Fraction,
+    speed_fraction: Range,
+    max_speed_mps: Positive,
+    car_size_m: Annotated[list[float], Bounds(above=0)],
+) -> Agents:
+    """Starts and goals along the drawn routes of the scene, in every slot where there is room.
+
+    A goal lies `travel` ahead on the route, or at its end if that is nearer but beyond the shortest travel. Starts keep `start_gap` from
+    other starts and half of it from the outlines of boxes. In a fraction of the episodes all agents start from rest, in the others at a
+    fraction of the speed limit, but of `max_speed` at most.
+
+    Raises:
+        ConfigError: the scenes have no drawn routes.
+    """
+    table = scene.routes
+    if table.length.shape[0] == 0:
+        raise ConfigError("spawning.sampler: routes needs drawn routes; give scenes/pack/routes=drawn")
+    slots = scene.agents.present.shape[0]
+    row_key, begin_key, travel_key, rest_key, speed_key = jax.random.split(key, 5)
+    usable_rows = table.drawn & (table.length >= travel_m[0])
+    chance = usable_rows / jnp.maximum(jnp.sum(usable_rows), 1)
+    row = jax.random.choice(row_key, table.length.shape[0], (slots, candidates), p=chance)
+    travel = jax.random.uniform(travel_key, row.shape, minval=travel_m[0], maxval=travel_m[1])
+    travel = jnp.minimum(travel, table.length[row])
+    begin = jax.random.uniform(begin_key, row.shape) * (table.length[row] - travel)
+    start, direction = route_following.find_point(scene, row, begin)
+    goal, _ = route_following.find_point(scene, row, begin + travel)
+    usable = usable_rows[row] & ~_beside(start, scene.traffic, within_m=0.5 * start_gap_m)
+    chosen, present = _choose(start, goal, usable, start_gap_m=start_gap_m, goal_gap_m=0.0)
+    pick = functools.partial(_pick, chosen=chosen, present=present)
+    limit = table.speed_limit[row, jnp.floor(begin / ROUTE_SPACING_M).astype(jnp.int32)]
+    part = jax.random.uniform(speed_key, (slots,), minval=speed_fraction[0], maxval=speed_fraction[1])
+    moving = ~jax.random.bernoulli(rest_key, standing_fraction)
+    return Agents(
+        position=pick(start),
+        yaw=pick(jnp.arctan2(direction[..., 1], direction[..., 0])),
+        speed=moving * part * pick(jnp.minimum(limit, max_speed_mps)),
+        size=jnp.broadcast_to(jnp.array(car_size_m, jnp.float32), (slots, 2)),
+        goal=pick(goal),
+        route_length=pick(travel),
+        present=present,
+        route=jnp.where(present, jnp.take_along_axis(row, chosen[:, None], axis=1)[:, 0], 0),
+        route_start=pick(begin),
+        route_end=pick(begin + travel),
     )
 
 

@@ -72,7 +72,7 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
     start_distance = safe_norm(position - after.agents.position)
     events = Events(
         numerical_error=broken,
-        goal_reached=safe_norm(to_goal) <= config.goal_radius_m,
+        goal_reached=(safe_norm(to_goal) <= config.goal_radius_m) & _is_route_driven(after, config.goal_radius_m),
         collision=(motion.contact_force >= config.collision_force_n) & (after.steps_since_spawn >= config.collision_grace_steps),
         out_of_bounds=_is_out_of_bounds(motion, after.agents, start_distance, config),
         road_edge_contact=edge_clearance <= 0,
@@ -99,6 +99,12 @@ def compute(scene: Scene, before: State, after: State, *, config: StepMetricsCon
         **route.values,
         events=events,
     )
+
+
+def _is_route_driven(after: State, goal_radius_m: float) -> Bool[Array, " A"]:
+    """Whether an agent's way along its route is at its goal, which a route that crosses itself passes earlier; true without a route."""
+    agents = after.agents
+    return (agents.route_end <= agents.route_start) | (after.route.arc >= agents.route_end - 2 * goal_radius_m)
 
 
 def _find_non_finite(state: State) -> Bool[Array, " A"]:

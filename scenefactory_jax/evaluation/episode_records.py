@@ -13,9 +13,10 @@ from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
-from scenefactory_jax.evaluation import episodes, failures
+from scenefactory_jax.evaluation import episodes, failures, route_signals
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
 from scenefactory_jax.evaluation.records import Records
+from scenefactory_jax.evaluation.route_signals import CourseThresholds
 from scenefactory_jax.learning.training_loop import make_policy
 
 
@@ -53,7 +54,9 @@ def make_episode_runner(
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
-    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], thresholds=SignalThresholds(**thresholds["signals"]))
+    course = CourseThresholds(**thresholds["course"])
+    limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": course, "control_dt": 1 / control_hz}
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], **limits)
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -89,6 +92,8 @@ def make_episode_runner(
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
         records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
+        route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
+        records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
         signals = _make_signals(metrics, state, first.agents.present, control_hz)
         records |= failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
         if not worlds:
@@ -117,6 +122,7 @@ def _make_records(
         "clean": events["goal_reached"] & ~np.any([events[name] for name in FAILURE_EVENTS], axis=0),
         "time_s": of(metrics.steps) / control_hz,
         "route_m": of(first.agents.route_length),
+        "has_route": of(first.agents.route_end) > of(first.agents.route_start),
         "start_distance_m": of(distance),
         "end_distance_m": of(metrics.goal_distance),
         "max_drac": largest["drac"],

@@ -12,7 +12,9 @@ from scenefactory_jax.core.pytree import pytree_dataclass
 from scenefactory_jax.core.types import Env, Events, State
 from scenefactory_jax.env import termination
 from scenefactory_jax.env.rollout import ControlStep, Hook
+from scenefactory_jax.evaluation import route_signals
 from scenefactory_jax.evaluation.failure_signals import FailureSignals, SignalThresholds, begin_signals, update_signals
+from scenefactory_jax.evaluation.route_signals import CourseThresholds, RouteSignals
 
 SUMS = ("ttc", "speed", "yaw_rate_change", "mu", "friction_utilization")
 LARGEST = ("drac", "contact_force")  # names of step metrics, as `SMALLEST`
@@ -31,6 +33,7 @@ class EpisodeMetrics:
     largest: dict[str, Float[Array, " A"]]
     smallest: dict[str, Float[Array, " A"]]
     signals: FailureSignals
+    route: RouteSignals
 
 
 @pytree_dataclass
@@ -59,10 +62,13 @@ def make_metrics(state: State) -> EpisodeMetrics:
         largest=dict.fromkeys(LARGEST, zero),
         smallest=dict.fromkeys(SMALLEST, zero + jnp.inf),
         signals=begin_signals(state, distance),
+        route=route_signals.begin_signals(state),
     )
 
 
-def make_hook(env: Env, *, ttc_limit_s: float, thresholds: SignalThresholds) -> Hook:
+def make_hook(
+    env: Env, *, ttc_limit_s: float, thresholds: SignalThresholds, course: CourseThresholds, control_dt: float
+) -> Hook:  # fmt: skip
     """Returns the hook of a rollout that updates `EpisodeMetrics` and gives an `EpisodeFrame` a step.
 
     Args:
@@ -73,14 +79,18 @@ def make_hook(env: Env, *, ttc_limit_s: float, thresholds: SignalThresholds) -> 
         before, state, result, lanes = step.before, step.after, step.result, step.scene.lanes
         boxes = env.current_scene(step.scene, state).traffic
         signals = update_signals(metrics.signals, metrics.past_events, lanes, boxes, before, state, result.metrics, thresholds)
+        numbers = {"course": course, "control_dt": control_dt}
+        route = route_signals.update_signals(metrics.route, before, state, result.metrics, **numbers)
         position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
         frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events)
-        return _update(metrics, step, signals, ttc_limit_s=ttc_limit_s), frame
+        return _update(metrics, step, signals, route, ttc_limit_s=ttc_limit_s), frame
 
     return hook
 
 
-def _update(metrics: EpisodeMetrics, step: ControlStep, signals: FailureSignals, *, ttc_limit_s: float) -> EpisodeMetrics:
+def _update(
+    metrics: EpisodeMetrics, step: ControlStep, signals: FailureSignals, route: RouteSignals, *, ttc_limit_s: float
+) -> EpisodeMetrics:
     before, after, now = step.before, step.after, step.result.metrics
     active = before.active & ~now.events.numerical_error  # metrics of a state that is not finite are not valid
     has_ttc = active & jnp.isfinite(now.ttc)
@@ -100,4 +110,5 @@ def _update(metrics: EpisodeMetrics, step: ControlStep, signals: FailureSignals,
         largest={name: jnp.maximum(old, jnp.where(active, getattr(now, name), 0.0)) for name, old in metrics.largest.items()},
         smallest={name: jnp.minimum(old, jnp.where(active, getattr(now, name), jnp.inf)) for name, old in metrics.smallest.items()},
         signals=signals,
+        route=route,
     )

@@ -14,7 +14,8 @@ Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # settings of the evaluation, beside the records
 FILES = (RESULT, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
 FILES += ("trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
-EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")
+ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: nobody had such an event
+EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", *ROUTE_EVENTS)
 COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown
     "scene": str, "world": int, "seed": int, "agent": int, **dict.fromkeys(EVENTS, bool), "clean": bool,
     "time_s": float, "route_m": float, "start_distance_m": float, "end_distance_m": float,
@@ -77,6 +78,7 @@ def read_records(path: Path) -> dict[str, np.ndarray]:
         if column is None:
             raise RecordsError(f"{path}: column {name!r}: expected cells of type {types[0].__name__}")
         records[name] = column
+    records |= {name: np.zeros(len(rows), bool) for name in ROUTE_EVENTS if name not in records}
     check_records(records)
     return records
 

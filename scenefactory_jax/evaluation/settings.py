@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
 from scenefactory_jax.evaluation.failures import TypeThresholds
+from scenefactory_jax.evaluation.route_signals import CourseThresholds
 
 Frequency = Annotated[float, Bounds(min=0.1)]
 
@@ -45,6 +46,7 @@ class Failures:
     """The group `failures`."""
 
     signals: SignalThresholds
+    course: CourseThresholds
     types: TypeThresholds
     pictures: FailurePictures
 

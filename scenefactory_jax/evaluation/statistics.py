@@ -39,7 +39,7 @@ class Table(NamedTuple):
     """Metrics of all runs by seed and agent. An agent is a scene, a world (a scene may have two), a seed of the episode and a slot."""
 
     sums: Float[np.ndarray, "S U M"]  # value of each metric, 0 where the agent does not count
-    counts: Float[np.ndarray, "S U M"]  # 1 where the agent counts, 0 where it does not or the seed has no such agent
+    counts: Float[np.ndarray, "S U M"]  # weight of the agent, 1 without one; 0 where it does not count or the seed has no such agent
     scene: Int[np.ndarray, " U"]  # ascending
     world: Int[np.ndarray, " U"]  # ascending
 
@@ -140,9 +140,9 @@ def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[s
         interval = _compute_percentiles(draws[:, m])
         score = lambda m=m: wilson(min(max(float(values[m]), 0.0), 1.0), _count_agents(table, m))  # noqa: E731
         estimates[name] = _make_estimate(
-            metric, values[m], table.counts[:, :, m].sum(), interval if _varies(interval) else None, agents, WILSON, score
+            metric, values[m], float((table.counts[:, :, m] > 0).sum()), interval if _varies(interval) else None, agents, WILSON, score
         )
-    return estimates
+    return _without_unused_routes(estimates)
 
 
 def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
@@ -157,14 +157,19 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         draws.append(_ratios(second, seeds[-1], scene, agent) - _ratios(first, seeds[0], scene, agent))
     draws, estimates = np.concatenate(draws), {}
     for m, (name, metric) in enumerate(METRICS.items()):
-        interval, count = _compute_percentiles(draws[:, m]), min(table.counts[:, :, m].sum() for table in tables)
+        interval, count = _compute_percentiles(draws[:, m]), min(float((table.counts[:, :, m] > 0).sum()) for table in tables)
         is_one_scene = not agents and any(len(np.unique(table.scene[table.counts[0, :, m] > 0])) == 1 for table in tables)
         if is_one_scene or (metric.rate and not _varies(interval)):
             interval = None
         rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
         score = lambda rates=rates: newcombe(*rates)  # noqa: E731
         estimates[name] = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
-    return estimates
+    return _without_unused_routes(estimates)
+
+
+def _without_unused_routes(estimates: dict[str, Estimate]) -> dict[str, Estimate]:
+    """The estimates without those of routes that no agent has."""
+    return {name: estimate for name, estimate in estimates.items() if estimate.count or not METRICS[name].routes}
 
 
 def _make_estimate(
@@ -233,12 +238,12 @@ def _tabulate(groups: Sequence[Runs]) -> list[Table]:
 
 
 def _values(metric: Metric, records: Records) -> tuple[np.ndarray, np.ndarray]:
-    """Value and weight of a metric in every row."""
+    """Value of a metric and weight in its mean, in every row."""
     counted = np.asarray(metric.counted(records), bool)
     values = np.where(counted, np.asarray(metric.value(records), float), 0.0)
     if not np.isfinite(values).all():
         raise RecordsError(f"records: {metric.label} is not finite in row {int(np.argmin(np.isfinite(values)))}")
-    return values, counted
+    return values, counted if metric.weight is None else np.where(counted, np.asarray(metric.weight(records), float), 0.0)
 
 
 def _ones(table: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

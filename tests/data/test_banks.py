@@ -73,7 +73,8 @@ def street(tmp_path, readers):
 def test_stack_pads_with_masked_rows(street):
     small, large = prepared(street, agents=2).scene, prepared(replace(street, roads=(*street.roads, curve(2, 20, 300))), agents=3).scene
     stacked, report = stack.stack([small, large], capacity=NONE)
-    assert report.capacity == {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS, "traffic": 0} and not report.cuts
+    rows = {"road": 512, "lanes": 512, "edges": 256, "agents": 3, "steps": STEPS}
+    assert report.capacity == rows | dict.fromkeys(stack.MAY_BE_EMPTY, 0) and not report.cuts
     assert stacked.road.midpoint.shape == (2, 512, 2) and stacked.log.position.shape == (2, 3, STEPS, 2) and stacked.log.dt.shape == (2,)
     for world, scene in enumerate((small, large)):
         for name, leaf in columns.flatten(scene).items():

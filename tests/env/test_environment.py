@@ -15,7 +15,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
 from scenefactory_jax.core.types import RewardInput
-from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety
+from scenefactory_jax.env import actions, environment, observations, rewards, rollout, spawning, step_metrics, surrogate_safety, traffic
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
@@ -308,7 +308,7 @@ def test_an_episode_may_begin_at_a_later_moment(config):
     one = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), make_empty_boxes())
     moving = lambda scene, step: replace(one, position=jnp.array([[1.0, 0.0]]) * step)  # noqa: E731
     beside = lambda key, scene: replace(scene.agents, goal=jnp.broadcast_to(scene.traffic.position[:1], scene.agents.goal.shape))  # noqa: E731
-    env, scene = build_env(config, draw=beside, beside=moving), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
+    env, scene = build_env(config, draw=beside, beside=traffic.log_playback.make_stateless(moving)), scene_of([[0.0, 0.0]], [[90.0, 0.0]])
     late = env.init_state(jax.random.key(0), scene, 60)
     assert int(late.step) == 60 and float(late.weather.rain.now_s) == pytest.approx(2.0) and float(late.agents.goal[0, 0]) == 60.0
     assert float(env.init_state(jax.random.key(0), scene).agents.goal[0, 0]) == 0.0

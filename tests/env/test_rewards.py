@@ -20,7 +20,9 @@ from scenefactory_jax.core.types import Events, Motion, RewardInput, State
 from scenefactory_jax.env import environment, rewards, route_following, termination
 
 FAR = [[50.0, 0.0]]  # a goal that is ahead and not reached
-EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact")  # in the order of precedence
+EVENTS = (  # in the order of precedence
+    "numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", "red_light", "stop_sign", "off_route",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -217,10 +219,11 @@ def test_who_did_not_drive_is_paid_nothing(parts):
 
 
 def test_an_agent_has_one_new_event_a_step_the_first_in_order(parts):
-    """All 32 sets of events that are true, after all 32 sets of events that have happened."""
+    """Sets of events that are true, after sets of events that have happened: all of the first five, and random ones of all."""
     assert tuple(field.name for field in dataclasses.fields(Events)) == termination.EVENTS == EVENTS
     rows = np.array(list(itertools.product([False, True], repeat=10)))
-    true, past_events = rows[:, :5], rows[:, 5:]
+    rng, further = np.random.default_rng(0), len(EVENTS) - 5
+    true, past_events = (np.concatenate([half, rng.random((len(rows), further)) < 0.3], axis=1) for half in (rows[:, :5], rows[:, 5:]))
     events = lambda table: Events(**{name: jnp.asarray(table[:, place]) for place, name in enumerate(EVENTS)})  # noqa: E731
     scene = scene_of([[0.0, 0.0]], FAR)
     metrics = judged(parts, moment(scene, [[0.0, 0.0]]), moment(scene, [[0.0, 0.0]]), scene).metrics
@@ -228,9 +231,9 @@ def test_an_agent_has_one_new_event_a_step_the_first_in_order(parts):
     new, done = parts.evaluate_termination(metrics, events(past_events), jnp.ones(len(rows), bool))
     found = np.stack([getattr(new, name) for name in EVENTS], axis=1)
     for row, (is_true, before) in enumerate(zip(true, past_events, strict=True)):
-        first = next((place for place in range(5) if is_true[place] and not before[place]), None)
+        first = next((place for place in range(len(EVENTS)) if is_true[place] and not before[place]), None)
         assert np.flatnonzero(found[row]).tolist() == ([] if first is None else [first])
-        assert done[row] == (first is not None)
+        assert done[row] == (first is not None and EVENTS[first] in parts.evaluate_termination.keywords["ending"])
     nobody, ended = parts.evaluate_termination(metrics, events(past_events), jnp.zeros(len(rows), bool))
     assert not any(leaf.any() for leaf in (*jax.tree.leaves(nobody), ended))
 

@@ -1,6 +1,5 @@
 """Everybody who is no agent: from the log into a scene, onto the road at the right time and place, seen and hit."""
 
-import functools
 from dataclasses import replace as amend
 
 import jax
@@ -33,10 +32,15 @@ def numbers_of(name, **changes):
     return {key: value for key, value in load_config("task", f"traffic={name}")["traffic"].items() if key != "_target_"} | changes
 
 
-def bound(name, *, control_dt=CONTROL, **changes):
+def made(name, *, control_dt=CONTROL, **changes):
     timing = {"control_dt": control_dt} if name == "log_playback" else {}
     function = getattr(traffic, load_config("task", f"traffic={name}")["traffic"]["_target_"])
-    return functools.partial(function, **numbers_of(name, **changes), **timing)
+    return function(**numbers_of(name, **changes), **timing)
+
+
+def bound(name, **changes):
+    """(scene, control step) -> boxes of traffic without a state."""
+    return lambda scene, step: made(name, **changes).read(scene, (), step)
 
 
 def track(start, velocity=(0.0, 0.0), *, kind="vehicle", valid=None, size=(4.5, 1.9), turn=0.0, steps=21):
@@ -169,7 +173,7 @@ def config():
 
 
 def test_neighbours_and_ttc_know_the_others(street, config):
-    env = build_env(config, beside=bound("log_playback"))
+    env = build_env(config, beside=made("log_playback"))
     _, history = drive(env, street, jnp.zeros((1, 3)), 12)
     metrics, rows = history[-1].metrics, history[-1].observation["neighbours"]
     features = np.asarray(rows.features[0])[np.asarray(rows.mask[0])]
@@ -198,7 +202,7 @@ def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, co
     for a, b in zip(jax.tree.leaves(drive(ignored, bare, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(ignored, street, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
         np.testing.assert_array_equal(a, b)
-    env = build_env(config, beside=bound("log_playback"))
+    env = build_env(config, beside=made("log_playback"))
     shuffled = replace(street, traffic_log=jax.tree.map(lambda leaf: leaf[jnp.array([3, 0, 4, 2, 1])], street.traffic_log))
     for a, b in zip(jax.tree.leaves(drive(env, street, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(env, shuffled, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
-from scenefactory_jax.data.packing import columns
+from scenefactory_jax.data.packing import columns, control_columns, route_columns
 from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _find_centre, overlaps
 from scenefactory_jax.data.packing.validation import DUPLICATE_M, list_ids
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
@@ -99,7 +99,11 @@ def pack(
     require_agents,
     traffic,
     min_traffic_size_m,
+    routes,
+    starts,
+    conflicts,
 ):
+    assert routes is None and starts is None and conflicts is None  # roadgraph tests have routes
     origin, centred_on = _find_centre(raw, centre)
     half = scene_size_m / 2
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
@@ -109,7 +113,8 @@ def pack(
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
-    leaves |= beside
+    controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
+    leaves |= beside | controls | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -122,6 +127,9 @@ def pack(
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
+        routes=None,
+        controls_kept=len(controls["controls.lane"]),
+        controls_dropped=controls_dropped,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,

@@ -15,12 +15,13 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
+from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
-    "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "overlaps", "over_capacity",
+    "not_a_vehicle", "absent_at_start", "start_outside_box", "goal_outside_box", "too_short", "no_conflict", "overlaps", "over_capacity",
 )  # fmt: skip
 TRAFFIC_DROPS: tuple[str, ...] = ("absent_from_start_on", "outside_box", "overlaps_agent", "over_capacity")
 REFUSALS: tuple[str, ...] = ("no_lane_in_box", "no_agent_left")  # why a scene is not packed
@@ -42,6 +43,7 @@ class PackReport:
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
+    routes: route_columns.RouteCounts | None  # None: packed without routes
     controls_kept: int  # lights and stop signs
     controls_dropped: dict[str, int]  # reason of CONTROL_DROPS -> count
     signs_inferred: int  # stop signs whose lanes were inferred
@@ -94,22 +96,13 @@ def pack(
     min_traffic_size_m: float,
     outline_m: Positive,
     controls: ControlsConfig,
+    routes: route_columns.RouteConfig | None,
+    starts: dict[str, Any] | None,
+    conflicts: Conflicts | None,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
-    Args:
-        scene_size_m: side of the square around the centre in which segments, starts and goals must lie (bounds included).
-        centre: "sdc": the recording car at the current step; "mean": of all points of polylines with two points or more (SceneFactory).
-        gap_m: longer steps between two points of a lane, line or edge are gaps, not segments (SceneFactory).
-        agents, require_agents: slots, for the cars nearest to the centre; whether a scene in which none is left is refused.
-        min_travel_m: a car whose goal is not farther than that from its start is no agent.
-        car_size_m: length and width of every car; null: as logged.
-        start_speed: "logged": along the heading, never backwards; "zero".
-        log_from: first step of the packed log: the recording's first, or the current one.
-        traffic: maximum number of other tracks that are in the box at some step from the current one on, nearest to an agent's start first.
-        min_traffic_size_m: minimum of their length and width.
-        outline_m: longest segment of a polygon's outline (crosswalk, speed bump, driveway).
-        controls: where cars stop for lights and stop signs.
+    The numbers are described in `conf/scenes/base.yaml`.
 
     Raises:
         Unpackable: no lane segment in the box, or no agent where one is required.
@@ -118,17 +111,26 @@ def pack(
     road, cut, relief = _segments(raw, origin, half, gap_m, outline_m)
     logs = stack_tracks(raw.tracks, len(raw.times))
     logs = logs._replace(xyz=logs.xyz - np.array([origin[0], origin[1], 0.0]))
-    chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, agents, car_size_m)
-    if require_agents and not chosen:
+    allowed = np.ones(len(raw.tracks), bool) if conflicts is None else find_conflicts(raw, logs, conflicts)
+    slots = agents if starts is None else 0
+    chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, slots, car_size_m, allowed)
+    if starts is None and require_agents and not chosen:
         reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
         raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     leaves["log.dt"] = np.median(np.diff(raw.times)) if len(raw.times) > 1 else np.ones(())
-    beside, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
+    beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
-    leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
+    leaves |= beside | stops.columns
+    who = {"agents": chosen, "slots": agents, "traffic": others}
+    added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
+    leaves |= added
+    if starts is not None:
+        leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
+        if require_agents and not leaves["agents.present"].any():
+            raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -137,10 +139,11 @@ def pack(
         steps=len(raw.times) - first,
         current=raw.current - first,
         track_ids=tuple(raw.tracks[i].id for i in chosen),
-        agents_kept=len(chosen),
+        agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped,
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
+        routes=counts,
         controls_kept=len(stops.columns["controls.lane"]),
         controls_dropped=stops.dropped,
         signs_inferred=stops.inferred,
@@ -150,6 +153,15 @@ def pack(
         metadata=dict(raw.metadata),
     )
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
+
+
+def _routes(
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], config: route_columns.RouteConfig | None, **who: Any
+) -> tuple[dict[str, np.ndarray], route_columns.RouteCounts | None]:
+    """Columns of the routes and their counts; without a config there are none."""
+    if config is None:
+        return route_columns.make_no_routes(slots, len(traffic)), None
+    return route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:
@@ -215,9 +227,9 @@ def _close_outline(line: Polyline, outline_m: float) -> Polyline:
 
 
 def _choose_agents(
-    raw: RawScene, logs: Logs, half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None
+    raw: RawScene, logs: Logs, half: float, min_travel_m: float, slots: int, car_size_m: list[float] | None, allowed: np.ndarray
 ) -> tuple[list[int], dict[str, int]]:
-    """Indices of the tracks that become agents, nearest to the centre first, and the others counted by reason."""
+    """Indices of the allowed tracks that become agents, nearest to the centre first, and the others counted by reason."""
     if car_size_m is not None and len(car_size_m) != 2:
         raise ConfigError(f"scenes.pack.car_size_m: expected [length, width] or null, got {car_size_m}")
     current = raw.current
@@ -229,6 +241,7 @@ def _choose_agents(
         "start_outside_box": np.abs(start).max(axis=1) > half,
         "goal_outside_box": np.abs(goal).max(axis=1) > half,
         "too_short": np.hypot(*(goal - start).T) <= min_travel_m,
+        "no_conflict": ~allowed,
     }
     dropped, candidates = dict.fromkeys(DROPS, 0), np.ones(len(tracks), bool)
     for reason, objection in objections.items():  # the first one counts
@@ -252,8 +265,8 @@ def _choose_agents(
 
 def _traffic(
     raw: RawScene, logs: Logs, agents: list[int], leaves: dict[str, np.ndarray], half: float, first: int, limit: int, min_size_m: float
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Columns of `traffic_log`, nearest to an agent's start (without agents: to the centre) first, and the other tracks by reason.
+) -> tuple[dict[str, np.ndarray], list[int], dict[str, int]]:
+    """Columns of `traffic_log` and its tracks, nearest to an agent's start (without agents: to the centre) first; the others by reason.
 
     A box that overlaps an agent's at the start is left out: the contact would throw both apart.
     """
@@ -281,7 +294,7 @@ def _traffic(
     rows = _recording("traffic_log", chosen, logs, first, len(chosen))
     rows["traffic_log.size"] = np.maximum(logs.size[chosen, :2], min_size_m)
     rows["traffic_log.kind"] = np.array([ROAD_USERS.index(raw.tracks[i].kind) for i in chosen], int)
-    return rows, dropped
+    return rows, chosen, dropped
 
 
 def _find_overlaps(boxes: BoxSet, others: BoxSet) -> Bool[np.ndarray, "N M"]:

@@ -1,24 +1,234 @@
-"""The routes of a scene as columns."""
+"""The routes of a scene as columns: the agents' own and their alternatives, those of moving vehicles of the traffic, and drawn ones."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float, Int
+
+from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.raw_scene import RawScene
+from scenefactory_jax.core.scene_arrays import Logs
+from scenefactory_jax.core.schema import Bounds, Count, Fraction, NonNegative, Positive, Range
+from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M
+from scenefactory_jax.roadgraph import lane_graph, route_sets
+from scenefactory_jax.roadgraph.route_sets import LaneMap, SampledRoute
+
+BEHIND_M = 10.0  # a stop place lies at most so far before the lane that its control governs
+
+
+@dataclass(frozen=True)
+class RouteConfig:
+    """The key `routes` of `scenes.pack`, described in `conf/scenes/pack/routes/lanes.yaml`."""
+
+    alternatives: Count  # routes of an agent
+    length_m: Positive  # at which routes end
+    max_distance_m: Positive  # of a track from the lanes of its route
+    traffic: bool  # vehicles of the traffic that move have routes
+    min_travel_m: NonNegative  # of these
+    drawn: Annotated[int, Bounds(min=0)]
+    drawn_length_m: Range
+    turn_fraction: Fraction
+    attempts: Count
+    stop_distance_m: Positive  # of a stop place from the line of a route
+    lanes: dict[str, Any]  # the config group `lanes`
+
+
+@dataclass(frozen=True)
+class RouteCounts:
+    """Counts of a scene's routes, for the report."""
+
+    along_lanes: int  # routes of agents and of traffic that follow lanes
+    along_log: int  # that are the logged track itself
+    drawn: int
+    links_rebuilt: bool  # the source has no links between lanes
 
 
 def make_no_routes(agents: int, traffic: int) -> dict[str, np.ndarray]:
     """The columns of a scene without routes."""
-    none = np.zeros(0)
+    return _assemble([], [], 0, agents, traffic)
+
+
+def pack_routes(
+    raw: RawScene,
+    logs: Logs,
+    origin: Float[np.ndarray, "3"],
+    half: float,
+    *,
+    agents: Sequence[int],
+    slots: int,
+    traffic: Sequence[int],
+    controls: Mapping[str, np.ndarray],
+    config: RouteConfig,
+) -> tuple[dict[str, np.ndarray], RouteCounts]:
+    """Packs the routes of a scene.
+
+    Args:
+        raw: checked.
+        logs: of its tracks, around `origin`.
+        half: half the side of the square at which routes end.
+        agents, traffic: tracks that became agents and background traffic.
+        slots: of agents.
+        controls: columns of `controls`, whose stop places the routes pass.
+    """
+    entry = {"builtins": "scenefactory_jax.roadgraph.lane_topology", "where": "scenes.pack.routes.lanes.topology"}
+    linked = instantiate(config.lanes["topology"], **entry)(raw)
+    graph = lane_graph.make(linked.roads)
+    graph = graph._replace(xyz=graph.xyz - np.array([origin[0], origin[1], 0.0]))
+    lanes = route_sets.make_lane_map(graph)
+    found: list[SampledRoute] = []
+    owner: list[int] = []
+    first = np.zeros(len(raw.tracks), int)  # row of the first route of each track
+    routed = np.zeros(len(raw.tracks), bool)
+    moving = [index for index in traffic if config.traffic and _is_moving(raw, logs, index, config.min_travel_m)]
+    for slot, index in [*enumerate(agents), *((-1, index) for index in moving)]:
+        options = _find_routes(lanes, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
+        first[index], routed[index] = len(found), bool(options)
+        found += options
+        owner += [slot] * len(options)
+    logged = len(found)
+    seed = np.random.default_rng(zlib.crc32(raw.name.encode()))
+    low, high = config.drawn_length_m
+    if config.drawn:
+        found += route_sets.draw_routes(
+            lanes, seed, count=config.drawn, half_m=half, centre=np.zeros(2), length_m=(low, min(high, config.length_m)),
+            turn_fraction=config.turn_fraction, attempts=config.attempts,
+        )  # fmt: skip
+    owner += [-1] * (len(found) - logged)
+    places = {line.id: index for index, line in enumerate(raw.roads) if line.kind in DRIVABLE}
+    index_of_lane = np.array([places[number] for number in graph.id.tolist()], int)
+    columns = _assemble(found, owner, len(found) - logged, slots, len(traffic))
+    columns |= _find_lanes(found, index_of_lane, raw, columns["routes.position"].shape[1])
+    columns |= _find_stops(columns, controls, config.stop_distance_m)
+    columns |= _place_agents(columns, raw, logs, agents, first, routed, slots)
+    columns["traffic_log.route"] = np.where(routed[list(traffic)], first[list(traffic)], 0)
+    columns["traffic_log.has_route"] = routed[list(traffic)]
+    along = sum(route.along_lanes for route in found[:logged])
+    rebuilt = any(line.rebuilt for line in linked.roads)
+    return columns, RouteCounts(along, logged - along, len(found) - logged, rebuilt)
+
+
+def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bool:
+    """Whether a track is a vehicle that gets farther than that from its first position, from the current step on."""
+    path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
+    return raw.tracks[index].kind == "vehicle" and len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m
+
+
+def _find_routes(lanes: LaneMap, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float) -> list[SampledRoute]:
+    """The routes of a track within the square; none for a track that does not move."""
+    valid = logs.valid[index]
+    track, yaw = logs.xyz[index, valid, :2], float(logs.yaw[index, valid][0])
+    if len(track) < 2 or np.linalg.norm(track - track[0], axis=1).max() < ROUTE_SPACING_M:
+        return []
+    options = route_sets.find_track_routes(
+        lanes, track, yaw, count=count, max_length_m=config.length_m, max_distance_m=config.max_distance_m
+    )
+    cut = [route_sets.cut_to_square(route, np.zeros(2), half) for route in options]
+    return [route for route in cut if route is not None]
+
+
+def _assemble(
+    found: Sequence[SampledRoute], owner: Sequence[int], drawn: int, slots: int, traffic: int
+) -> dict[str, np.ndarray]:
+    """The columns that depend on the routes alone, the last of which are drawn, and zeros in those of agents and traffic."""
+    points = max((len(route.xy) for route in found), default=0)
+    position = np.zeros((len(found), points, 2))
+    for row, route in enumerate(found):
+        position[row, : len(route.xy)] = route.xy
+        position[row, len(route.xy) :] = route.xy[-1]
     return {
-        "routes.position": np.zeros((0, 0, 2)),
-        "routes.length": none,
-        "routes.speed_limit": np.zeros((0, 0)),
-        "routes.lane": np.zeros((0, 0), int),
-        "routes.along_lanes": none.astype(bool),
-        "routes.agent": none.astype(int),
-        "routes.on_route": none.astype(bool),
-        "routes.stop_arc": np.zeros((0, 0)),
-        "routes.stop_control": np.zeros((0, 0), int),
-        "agents.route": np.zeros(agents, int),
-        "agents.route_start": np.zeros(agents),
-        "agents.route_end": np.zeros(agents),
+        "routes.position": position,
+        "routes.length": np.array([route.length for route in found], float),
+        "routes.speed_limit": np.full((len(found), points), np.inf),
+        "routes.lane": np.full((len(found), points), -1),
+        "routes.along_lanes": np.array([route.along_lanes for route in found], bool),
+        "routes.agent": np.array(owner, int),
+        "routes.drawn": np.arange(len(found)) >= len(found) - drawn,
+        "routes.on_route": np.array([route.on_route for route in found], bool),
+        "routes.stop_arc": np.zeros((len(found), 0)),
+        "routes.stop_control": np.zeros((len(found), 0), int),
+        "agents.route": np.zeros(slots, int),
+        "agents.route_start": np.zeros(slots),
+        "agents.route_end": np.zeros(slots),
         "traffic_log.route": np.zeros(traffic, int),
         "traffic_log.has_route": np.zeros(traffic, bool),
     }
+
+
+def _find_lanes(
+    found: Sequence[SampledRoute], index_of_lane: Int[np.ndarray, " N"], raw: RawScene, points: int
+) -> dict[str, np.ndarray]:
+    """Lane and speed limit at every point; behind a route's end those of the end."""
+    lane, limit = np.full((len(found), points), -1), np.full((len(found), points), np.inf)
+    known = np.array([np.inf if (line := raw.roads[index].speed_limit) is None else line for index in index_of_lane], float)
+    for row, route in enumerate(found):
+        if route.along_lanes:
+            rows = np.append(route.lane, np.full(points - len(route.lane), route.lane[-1]))
+            lane[row], limit[row] = index_of_lane[rows], known[rows]
+    return {"routes.lane": lane, "routes.speed_limit": limit}
+
+
+def _find_stops(columns: Mapping[str, np.ndarray], controls: Mapping[str, np.ndarray], distance_m: float) -> dict[str, np.ndarray]:
+    """The stop places that each route passes, in order: on a lane that their control governs, or just before it."""
+    position, lane = columns["routes.position"], columns["routes.lane"]
+    stops: list[list[tuple[float, int]]] = []
+    behind = round(BEHIND_M / ROUTE_SPACING_M)
+    for row in range(len(position)):
+        passed: list[tuple[float, int]] = []
+        for control, governed in enumerate(controls["controls.lane"].tolist()):
+            on_lane = np.flatnonzero(lane[row] == governed)
+            if not len(on_lane):
+                continue
+            first = max(int(on_lane[0]) - behind, 0)
+            stretch = position[row, first : int(on_lane[-1]) + 2]
+            arc, offset = _project(stretch, controls["controls.position"][control])
+            arc += ROUTE_SPACING_M * first
+            if offset <= distance_m and 0.0 < arc < columns["routes.length"][row]:
+                passed.append((arc, control))
+        stops.append(sorted(passed))
+    most = max(map(len, stops), default=0)
+    arcs, rows = np.full((len(stops), most), np.inf), np.zeros((len(stops), most), int)
+    for row, passed in enumerate(stops):
+        for place, (arc, control) in enumerate(passed):
+            arcs[row, place], rows[row, place] = arc, control
+    return {"routes.stop_arc": arcs, "routes.stop_control": rows}
+
+
+def _project(line: Float[np.ndarray, "N 2"], point: Float[np.ndarray, "2"]) -> tuple[float, float]:
+    """Arc length of the nearest place on a line, and the distance to it."""
+    along = np.diff(line, axis=0)
+    length = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
+    fraction = np.clip(np.sum((point - line[:-1]) * along, axis=1) / length**2, 0.0, 1.0)
+    distance = np.linalg.norm(line[:-1] + fraction[:, None] * along - point, axis=1)
+    best = int(np.argmin(distance)) if len(distance) else 0
+    if not len(distance):
+        return 0.0, float(np.linalg.norm(line[0] - point))
+    return float(length[:best].sum() + fraction[best] * length[best]), float(distance[best])
+
+
+def _place_agents(
+    columns: Mapping[str, np.ndarray], raw: RawScene, logs: Logs, agents: Sequence[int], first: np.ndarray, routed: np.ndarray, slots: int
+) -> dict[str, np.ndarray]:
+    """Route, start and end of each agent: its places on the route at the current step and at the end of its log."""
+    route, start, end = np.zeros(slots, int), np.zeros(slots), np.zeros(slots)
+    for slot, index in enumerate(agents):
+        if not routed[index]:
+            continue
+        route[slot] = first[index]
+        line = columns["routes.position"][route[slot]]
+        path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
+        start[slot] = _project(line, path[0])[0]
+        end[slot] = _follow(line, path, start[slot])
+    return {"agents.route": route, "agents.route_start": start, "agents.route_end": end}
+
+
+def _follow(line: Float[np.ndarray, "N 2"], path: Float[np.ndarray, "L 2"], arc: float) -> float:
+    """Arc length at the end of a path that follows a line from `arc` on, also where the line crosses itself."""
+    for point in path:
+        low = max(int(arc / ROUTE_SPACING_M) - 8, 0)
+        window = line[low : low + 34]
+        if len(window) > 1:
+            arc = ROUTE_SPACING_M * low + _project(window, point)[0]
+    return arc

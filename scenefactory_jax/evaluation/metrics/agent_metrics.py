@@ -17,7 +17,8 @@ FRACTION = "fraction"  # unit of a value in [0, 1], printed in per cent
 class Metric(NamedTuple):
     """A mean of `value` over the agents that are `counted`; of each world first, and then over worlds, if `by_world`.
 
-    A `rate` is a mean of Booleans.
+    A `rate` is a mean of Booleans. With a `weight` the metric is the sum of the values over the sum of the weights. A metric of `routes` is
+    left out where no agent has a route.
     """
 
     label: str
@@ -27,6 +28,8 @@ class Metric(NamedTuple):
     counted: Callable[[Records], np.ndarray]
     by_world: bool = False
     rate: bool = False
+    weight: Callable[[Records], np.ndarray] | None = None
+    routes: bool = False
 
 
 def _spawned(records: Records) -> np.ndarray:
@@ -41,8 +44,16 @@ def _column_is_true(name: str) -> Callable[[Records], np.ndarray]:
     return lambda records: np.asarray(records[name], bool)
 
 
+def _on_route(name: str) -> Callable[[Records], np.ndarray]:
+    """A column of the agents that have routes; records of before routes lack it."""
+    return lambda records: records.get(name, np.zeros(len(records["scene"]), bool))
+
+
+_has_route = _on_route("has_route")
+
+
 def _rate(label: str, definition: str, value: Callable[[Records], np.ndarray], counted=_spawned, *, by_world: bool = False) -> Metric:
-    return Metric(label, FRACTION, definition, value, counted, by_world, rate=True)
+    return Metric(label, FRACTION, definition, value, counted, by_world, rate=True, routes=counted is _has_route)
 
 
 METRICS: dict[str, Metric] = {
@@ -95,4 +106,21 @@ METRICS: dict[str, Metric] = {
         "Stopping margin", "m", "Free distance straight ahead less the stopping distance at the friction limit, v²/(2 µ g): each agent's "
         "smallest; mean over the agents with an obstacle ahead.", _column("stopping_margin_m"),
         lambda records: np.isfinite(records["stopping_margin_m"])),
+    "clean_completion_rate": _rate(
+        "Clean completion", "Agents that drove their route through all gates to its end, in time, without another event and without "
+        "driving against the lanes for more than a second, of the agents with a route.", _on_route("clean_completion"), _has_route),
+    "route_completion": Metric(
+        "Route completion", FRACTION, "Part of the route between start and goal that an agent has been on; mean over the agents with a "
+        "route.", _on_route("route_completion"), _has_route, routes=True),
+    "collisions_per_100_km": Metric(
+        "Collisions per 100 km", "1/100 km", "Agents with a route that had a collision, over the distance that all agents with a route "
+        "drove.", _column("collision"), _has_route, weight=lambda records: _on_route("driven_m")(records) / 1e5, routes=True),
+    "red_light_rate": _rate(
+        "Red lights run", "Agents whose front passed a stop line at a red light, of the agents with a route.", _column("red_light"),
+        _has_route),
+    "stop_sign_rate": _rate(
+        "Stop signs run", "Agents whose front passed the line of a stop sign without having stood before it, of the agents with a route.",
+        _column("stop_sign"), _has_route),
+    "off_route_rate": _rate(
+        "Off-route rate", "Agents that left their route, of the agents with a route.", _column("off_route"), _has_route),
 }  # fmt: skip

@@ -1,0 +1,91 @@
+"""How well agents follow their routes, computed on the device during an episode: gates, wrong way, completion, metres driven.
+
+A clean completion (suite `route100`): the car passes gates every 20 m along its route, 2.5 m to either side, and the last one, at the goal,
+within 30 degrees of the route's direction, in 10 s and a second for every 4 m of the route; it has no other event, and drives the wrong way
+for one second at most.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from scenefactory_jax.core.pytree import pytree_dataclass
+from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
+from scenefactory_jax.core.types import State, StepMetrics
+from scenefactory_jax.evaluation.records import EVENTS, Records
+
+
+@dataclass(frozen=True)
+class CourseThresholds:
+    """What a clean completion is: the group `failures.course`."""
+
+    gate_spacing_m: Positive
+    gate_half_width_m: Positive
+    goal_cosine: Annotated[float, Bounds(min=-1, max=1)]  # smallest between car and route at the goal
+    start_s: NonNegative  # time limit: this and the route's length over the speed
+    speed_mps: Positive
+    wrong_way_s: NonNegative
+
+
+@pytree_dataclass
+class RouteSignals:
+    """Of the episode so far; zeros for agents without a route."""
+
+    missed_gates: Int[Array, " A"]
+    wrong_way_steps: Int[Array, " A"]
+    completion: Float[Array, " A"]  # part of the route, 0 to 1
+    goal_alignment: Float[Array, " A"]  # cosine between car and route in the last step
+    driven: Float[Array, " A"]  # m
+    overspeed: Float[Array, " A"]  # largest, m/s
+
+
+def begin_signals(state: State) -> RouteSignals:
+    """Returns the signals at the start of an episode."""
+    zero, none = jnp.zeros(state.active.shape, jnp.float32), jnp.zeros(state.active.shape, jnp.int32)
+    return RouteSignals(none, none, zero, zero, zero, zero)
+
+
+def update_signals(
+    signals: RouteSignals, before: State, after: State, metrics: StepMetrics, *, course: CourseThresholds, control_dt: float
+) -> RouteSignals:
+    """Computes the signals after one more step, for the agents that are active in `before`."""
+    active = before.active & ~metrics.events.numerical_error
+    routed = active & metrics.has_route
+    start = after.agents.route_start
+    gate = lambda arc: jnp.floor((arc - start) / course.gate_spacing_m)  # noqa: E731
+    passes = gate(after.route.farthest) > gate(before.route.farthest)
+    at_goal = metrics.events.goal_reached
+    missed = routed & (passes | at_goal) & (metrics.route_distance > course.gate_half_width_m)
+    return RouteSignals(
+        missed_gates=signals.missed_gates + missed.astype(jnp.int32),
+        wrong_way_steps=signals.wrong_way_steps + (active & metrics.wrong_way).astype(jnp.int32),
+        completion=jnp.where(routed, metrics.route_completion, signals.completion),
+        goal_alignment=jnp.where(routed, metrics.route_alignment, signals.goal_alignment),
+        driven=signals.driven + jnp.where(active, metrics.speed * control_dt, 0.0),
+        overspeed=jnp.maximum(signals.overspeed, jnp.where(routed, metrics.overspeed, 0.0)),
+    )
+
+
+def make_columns(signals: RouteSignals, records: Records, *, course: CourseThresholds, control_hz: float) -> dict[str, np.ndarray]:
+    """Computes the columns of records: the signals, and whether each agent has cleanly completed its route.
+
+    Args:
+        signals: numpy rows, as those of `records`, which has `has_route`.
+    """
+    wrong_way_s = np.asarray(signals.wrong_way_steps) / control_hz
+    limit_s = course.start_s + records["route_m"] / course.speed_mps
+    others = np.any([records[name] for name in EVENTS if name != "goal_reached"], axis=0)
+    arrived = records["goal_reached"] & (records["time_s"] <= limit_s) & (signals.goal_alignment >= course.goal_cosine)
+    clean = arrived & (np.asarray(signals.missed_gates) == 0) & ~others & (wrong_way_s <= course.wrong_way_s)
+    return {
+        # an agent that reached its goal has driven its route; the goal's radius is what is left of it
+        "route_completion": np.where(records["goal_reached"] & records["has_route"], 1.0, signals.completion),
+        "missed_gates": np.asarray(signals.missed_gates),
+        "against_s": wrong_way_s,
+        "driven_m": np.asarray(signals.driven),
+        "max_overspeed_mps": np.asarray(signals.overspeed),
+        "clean_completion": clean & records["has_route"],
+    }
