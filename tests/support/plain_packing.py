@@ -99,6 +99,7 @@ def pack(
     require_agents,
     traffic,
     min_traffic_size_m,
+    controls,
     routes,
     starts,
     conflicts,
@@ -113,8 +114,8 @@ def pack(
     leaves = columns.with_subsets(road) | _agents(tracks, raw, origin, agents, car_size_m, start_speed)
     leaves |= _log(tracks, raw, origin, agents, first) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
     beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
-    controls, controls_dropped = control_columns.pack_controls(raw, origin, half)
-    leaves |= beside | controls | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
+    stops = control_columns.pack_controls(raw, origin, half, controls)
+    leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,
@@ -128,8 +129,9 @@ def pack(
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
         routes=None,
-        controls_kept=len(controls["controls.lane"]),
-        controls_dropped=controls_dropped,
+        controls_kept=len(stops.columns["controls.lane"]),
+        controls_dropped=stops.dropped,
+        signs_inferred=stops.inferred,
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
