@@ -28,6 +28,7 @@ class ShownWorld(NamedTuple):
     agents: Agents
     weather: Weather
     boxes: Boxes
+    step: Array  # control steps since the cars started
 
 
 class Painter:
@@ -60,6 +61,7 @@ class Painter:
             title="",
             weather="",
             traffic=TrafficBoxes(*(column[None] for column in TrafficBoxes.from_boxes(shown.boxes))),
+            start_s=float(shown.step) / (self._pool.step_hz * self._pool.env.action_repeat),
         )
         left, bottom = place[0] - _SIDE_M / 2
         return scenefactory_jax.draw_frame(trajectory, 0, window=(float(left), float(bottom), _SIDE_M), panel=_PIXELS)
@@ -74,4 +76,4 @@ def check_mode(mode: Any) -> None:
 def _shown(env: Env, scenes: Scene, world: Episode) -> ShownWorld:
     state = world.state
     now = env.current_scene(jax.tree.map(lambda leaf: leaf[world.scene], scenes), state)
-    return ShownWorld(world.scene, state.motion, state.active, state.past_events, state.agents, state.weather, now.traffic)
+    return ShownWorld(world.scene, state.motion, state.active, state.past_events, state.agents, state.weather, now.traffic, state.step)

@@ -60,6 +60,7 @@ class Check:
     max_pictures: Seed
     columns: Count
     inches: Annotated[float, Bounds(min=0.5)]
+    routes: bool
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,8 @@ def _draw(shown: list[tuple[str, Any]], folder: Path, config: Mapping[str, Any])
     """Writes a bird's-eye picture of each scene, and sheet.png with all of them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, scene in shown:
-        figure = figures.scene_figure(scene, goal_radius_m=config["step_metrics"]["goal_radius_m"], title=name)
+        look = {"goal_radius_m": config["step_metrics"]["goal_radius_m"], "routes": config["check"]["routes"]}
+        figure = figures.scene_figure(scene, title=name, **look)
         print(plots.save(figure, folder / f"{to_file_name(name)}.png"))
     sheet = figures.contact_sheet(shown, columns=config["check"]["columns"], inches=config["check"]["inches"])
     print(plots.save(sheet, folder / "sheet.png"), flush=True)

@@ -16,6 +16,7 @@ LightState = Literal[
 LIGHT_STATES: tuple[LightState, ...] = get_args(LightState)
 RED_STATES = (1, 4, 7)  # a car must not enter: arrow_stop, stop, flashing_stop
 YELLOW_STATES = (2, 5, 8)
+GREEN_STATES = (3, 6)
 
 ROUTE_SPACING_M = 1.0  # between the points of a route
 

@@ -49,6 +49,7 @@ class Trajectory(NamedTuple):
     title: str
     weather: str
     traffic: TrafficBoxes | None = None  # None: agents only
+    start_s: float = 0.0  # time of the first step since the cars start, by which lights are read
 
     def clip(self, first: int, last: int) -> "Trajectory":
         """Steps `first` to `last`, without `last`."""
@@ -58,4 +59,5 @@ class Trajectory(NamedTuple):
             goal=self.goal[first:last] if np.ndim(self.goal) == 3 else self.goal,
             events={name: new[first:last] for name, new in self.events.items()},
             traffic=self.traffic and self.traffic.clip(first, last),
+            start_s=self.start_s + max(first, 0) / self.control_hz,
         )

@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.pytree import pytree_dataclass, static
+from scenefactory_jax.core.route_types import GREEN_STATES as GREEN_STATES
 from scenefactory_jax.core.route_types import LIGHT_STATES as LIGHT_STATES
 from scenefactory_jax.core.route_types import RED_STATES as RED_STATES
 from scenefactory_jax.core.route_types import ROUTE_SPACING_M as ROUTE_SPACING_M

@@ -99,18 +99,22 @@ class StopLines(NamedTuple):
     control: Int[Array, "A S"]  # row of `Scene.controls`
     stop_sign: Bool[Array, "A S"]
     red: Bool[Array, "A S"]
+    state: Int[Array, "A S"]  # of the light, as an index into LIGHT_STATES; 0 for stop signs
 
 
 def find_stop_lines(scene: Scene, agents: Agents, arc: Float[Array, " A"], time_s: Float[Array, ""]) -> StopLines:
-    """Finds the stop lines of each agent's route, and whether their lights are red."""
+    """Finds the stop lines of each agent's route and the states of their lights; no lines in a world without routes."""
+    if scene.routes.length.shape[0] == 0:
+        none = jnp.zeros((len(arc), 0), bool)
+        return StopLines(none.astype(jnp.float32), none.astype(jnp.int32), none, none, none.astype(jnp.int32))
     control = scene.routes.stop_control[agents.route]
     front = arc + 0.5 * agents.size[:, 0]
     distance = scene.routes.stop_arc[agents.route] - front[:, None]
     if scene.controls.valid.shape[0] == 0:
         none = jnp.zeros(control.shape, bool)
-        return StopLines(jnp.full_like(distance, jnp.inf), control, none, none)
-    red = traffic_lights.find_red(traffic_lights.read_light_states(scene.controls, time_s))
-    return StopLines(distance, control, scene.controls.stop_sign[control], red[control])
+        return StopLines(jnp.full_like(distance, jnp.inf), control, none, none, jnp.zeros_like(control))
+    states = traffic_lights.read_light_states(scene.controls, time_s)
+    return StopLines(distance, control, scene.controls.stop_sign[control], traffic_lights.find_red(states)[control], states[control])
 
 
 def advance(scene: Scene, before: State, motion: Motion, *, speed: Float[Array, " A"], config: RouteConfig) -> RouteState:

@@ -206,6 +206,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         title=recording.names[index],
         weather=_format_weather(weather, seconds=end / control_hz),
         traffic=TrafficBoxes.from_boxes(boxes).clip(0, end),
+        start_s=1.0 / control_hz,  # the first state is that after a control step
     )
 
 

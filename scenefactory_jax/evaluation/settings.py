@@ -24,6 +24,7 @@ class Video:
     columns: Count
     panel: Annotated[int, Bounds(min=120)]
     trail_s: NonNegative
+    routes: bool
     suffix: Literal[".gif", ".mp4"]
 
     def __post_init__(self) -> None:

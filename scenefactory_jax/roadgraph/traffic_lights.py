@@ -3,7 +3,13 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.types import RED_STATES, TrafficControls
+from scenefactory_jax.core.types import GREEN_STATES, LIGHT_STATES, RED_STATES, YELLOW_STATES, TrafficControls
+
+COLOURS = ("red", "yellow", "green", "unknown")
+COLOUR_OF = tuple(
+    next((colour for colour, codes in enumerate((RED_STATES, YELLOW_STATES, GREEN_STATES)) if state in codes), COLOURS.index("unknown"))
+    for state in range(len(LIGHT_STATES))
+)  # index into COLOURS of each of LIGHT_STATES
 
 
 def read_light_states(controls: TrafficControls, time_s: Float[Array, ""]) -> Int[Array, " C"]:
@@ -26,3 +32,8 @@ def find_red(states: Int[Array, " C"]) -> Bool[Array, " C"]:
     for code in RED_STATES:
         red = red | (states == code)
     return red
+
+
+def encode_colour(states: Int[Array, "*n"]) -> Float[Array, "*n 4"]:
+    """Returns states as one-hot rows of COLOURS."""
+    return (jnp.array(COLOUR_OF)[states][..., None] == jnp.arange(len(COLOURS))).astype(jnp.float32)

@@ -6,6 +6,7 @@ import html
 import json
 import re
 import zlib
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from support.scene_documents import written
 
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.cli.view import replay
-from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, Polyline, RawScene
+from scenefactory_jax.core.raw_scene import LIGHT_STATES, Light, LightPlan, Polyline, RawScene
 from scenefactory_jax.core.types import SURFACES, Events
 from scenefactory_jax.visualization.web import replay_data, replay_page
 from scenefactory_jax.visualization.web.array_packing import Packer
@@ -162,7 +163,10 @@ def test_lights_stand_where_cars_stop_and_change_with_the_log():
     raw = RawScene("s", "s", (lane,), (), 0.5 * np.arange(5), 1, lights=lights)
     first, second = find_posts(raw, (10.0, 0.0, 0.0)).lights  # the third one's lane is on no map
     assert first.place == (0.0, 5.0) and second.place == (0.0, 8.0) and np.isclose(first.yaw, np.pi / 2)
-    assert first.shown == [(0.0, "go"), (0.5, "caution"), (1.0, "stop"), (1.5, "unknown")]
+    assert first.shown == [(0.0, "go"), (0.5, "caution"), (1.0, "stop"), (1.5, "unknown")] and first.period is None
+    cycle = LightPlan(np.array([0.0, 3.0]), np.array([LIGHT_STATES.index("go"), LIGHT_STATES.index("stop")]), 4.0)
+    [planned] = find_posts(replace(raw, lights=(replace(lights[0], plan=cycle),)), (10.0, 0.0, 0.0)).lights
+    assert planned.shown == [(0.0, "go"), (2.5, "stop"), (3.5, "go")] and planned.period == 4.0
 
 
 def test_what_cannot_be_shown_is_named(recording):

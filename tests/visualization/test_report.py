@@ -26,7 +26,7 @@ from scenefactory_jax.weather import patch_layouts
 from scenefactory_jax.weather.friction import make_uniform
 
 BOOTSTRAP = {"bootstrap": 400, "seed": 0}
-FILM = {"fps": 10.0, "stride": 3, "columns": 2, "panel": 160, "trail_s": 2.0}
+FILM = {"fps": 10.0, "stride": 3, "columns": 2, "panel": 160, "trail_s": 2.0, "routes": False}
 
 
 def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: int = 0) -> dict[str, np.ndarray]:

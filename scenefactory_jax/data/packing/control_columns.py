@@ -150,7 +150,8 @@ def read_changes(light: Light, times: Float[np.ndarray, " L"], current: int) -> 
     new = np.concatenate([[True], np.diff(state) != 0])
     changes = [(float(time), int(code)) for time, code in zip(since[new], state[new], strict=True)]
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    return [*changes, (float(since[-1]) + step, UNKNOWN)], np.inf
+    end = [] if state[-1] == UNKNOWN else [(float(since[-1]) + step, UNKNOWN)]
+    return changes + end, np.inf
 
 
 def _read_plan(plan: LightPlan, start: float) -> Changes:

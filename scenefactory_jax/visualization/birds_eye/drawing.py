@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from scenefactory_jax.core.trajectory import Trajectory
-from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, STOP_SIGN, Road
+from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, DRIVEWAY, LANE_BIKE, SPEED_BUMP, Road
 
 Colour = tuple[int, int, int]
 
@@ -44,8 +44,12 @@ MARKS: dict[str, Mark] = {
     "collision": Mark("collision", (208, 28, 40), "*"),
     "road_edge_contact": Mark("road edge", (230, 126, 0), "X"),
     "out_of_bounds": Mark("crash", (0, 0, 0), "D"),
+    "red_light": Mark("red light", (150, 0, 70), "v"),
+    "stop_sign": Mark("stop sign", (122, 52, 0), "8"),
+    "off_route": Mark("off route", (86, 60, 190), "P"),
     "numerical_error": Mark("numerical error", (198, 0, 190), "s"),
 }
+USUAL = ("goal_reached", "collision", "road_edge_contact", "out_of_bounds")  # events that legends and counts name even if there are none
 
 
 class TrajectoryError(ValueError):
@@ -187,7 +191,6 @@ _LOOKS: tuple[tuple[tuple[int, ...], Colour, float, float, bool], ...] = (
     ((9, 10, 13), YELLOW, 0.2, 1.0, True),
     ((11, 12), YELLOW, 0.25, 1.2, False),
     ((15, 16), EDGE, 0.35, 1.4, False),
-    ((STOP_SIGN,), STOP, 0.8, 3.0, False),
 )
 _DASH, _PERIOD = 3.0, 9.0  # m
 

@@ -88,7 +88,8 @@ def _find_step(case: Case) -> int:
 
 def _draw(axes: Axes, case: Case, window: tuple[float, float, float], *, before_s: float | int, overview: bool) -> None:
     trajectory, step, agent = case.trajectory, _find_step(case), case.failure.agent
-    figures.draw_road(axes, trajectory.scene, window, inches=_INCHES)
+    scale = figures.draw_road(axes, trajectory.scene, window, inches=_INCHES)
+    figures.draw_controls(axes, trajectory.scene, trajectory.start_s + step / trajectory.control_hz, scale)
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
     for spine in axes.spines.values():

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Polygon
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.core.types import Scene
-from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.birds_eye import control_marks, drawing, patch_overlay, traffic_shapes
 from scenefactory_jax.visualization.birds_eye.drawing import ASPHALT, GROUND, INK, MARKS, WHITE, Colour, rgb
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import MOVING, Shape
 from scenefactory_jax.visualization.report.plots import STYLE
@@ -22,17 +22,17 @@ _INCHES, _AXES_FRACTION = 6.4, 0.84  # side of the figure, and the axes' fractio
 _ROAD = (  # of the legend: label, colour, width
     ("lane", ASPHALT, 6.0), ("bike lane", drawing.BIKE_LANE, 6.0), ("road edge", drawing.EDGE, 1.5), ("yellow line", drawing.YELLOW, 1.5),
     ("crosswalk", drawing.CROSSWALK_LINE, 1.5), ("speed bump", drawing.BUMP, 1.5), ("driveway", drawing.DRIVEWAY_LINE, 1.5),
-    ("stop sign", drawing.STOP, 3.0),
 )  # fmt: skip
 
 
 @matplotlib.rc_context(STYLE)
-def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", all_road: bool = False) -> Figure:
-    """Draws a scene at its start: road, cars, goals of the same colour and number, logged traffic.
+def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", all_road: bool = False, routes: bool = False) -> Figure:
+    """Draws a scene at its start: road, lights and stop signs, cars, goals of the same colour and number, logged traffic.
 
     Args:
         scene: one packed world with numpy or JAX arrays.
         all_road: show the complete road; otherwise the square around starts and goals.
+        routes: draw the agents' routes.
     """
     agents = scene.agents
     present = np.flatnonzero(np.asarray(agents.present))
@@ -42,6 +42,9 @@ def scene_figure(scene: Scene, *, goal_radius_m: float | int, title: str = "", a
         points = np.concatenate([points, np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)], np.zeros((1, 2))])
     figure, axes, scale = _make_axes(scene, drawing.fit_view(points, margin=12.0, smallest=50.0), title=title)
     traffic = traffic_shapes.shapes_at_start(scene)
+    if routes:
+        _draw_routes(axes, scene, scale)
+    draw_controls(axes, scene, 0.0, scale)
     draw_traffic(axes, traffic)
     for agent in present.tolist():
         look = {"linewidth": 0.6, "alpha": 0.5, "linestyle": (0, (3, 3))}
@@ -71,7 +74,7 @@ def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: 
     for axes, (name, scene) in zip(grid.flat, scenes, strict=False):
         points = np.asarray(scene.road.midpoint, float)[np.asarray(scene.road.valid, bool)]
         window = drawing.fit_view(points if len(points) else np.zeros((1, 2)), margin=2.0, smallest=50.0)
-        draw_road(axes, scene, window, inches=inches)
+        draw_controls(axes, scene, 0.0, draw_road(axes, scene, window, inches=inches))
         draw_traffic(axes, traffic_shapes.shapes_at_start(scene), linewidth=0.15)
         agents = scene.agents
         for agent in np.flatnonzero(np.asarray(agents.present)).tolist():
@@ -83,7 +86,7 @@ def contact_sheet(scenes: Sequence[tuple[str, Scene]], *, columns: int, inches: 
 
 @matplotlib.rc_context(STYLE)
 def trajectory_figure(trajectory: Trajectory) -> Figure:
-    """Draws the trajectories of an episode's cars from outlined start to filled end, their goals, and events.
+    """Draws the trajectories of an episode's cars from outlined start to filled end, their goals, events, and the lights at the end.
 
     Raises:
         TrajectoryError: arrays that do not belong together.
@@ -94,6 +97,7 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     view = drawing.fit_view(drawing.shown_points(trajectory), margin=12.0, smallest=50.0)
     title = f"{trajectory.title} · {trajectory.weather}" if trajectory.weather else trajectory.title
     figure, axes, scale = _make_axes(trajectory.scene, view, title=title)
+    draw_controls(axes, trajectory.scene, trajectory.start_s + (len(trajectory.active) - 1) / trajectory.control_hz, scale)
     draw_traffic(axes, boxes)
     for agent in np.flatnonzero(trajectory.present).tolist():
         steps, active = np.flatnonzero(driven[:, agent]), np.flatnonzero(trajectory.active[:, agent])
@@ -141,6 +145,23 @@ def draw_car(axes: Axes, position: np.ndarray, yaw: float, size: np.ndarray, col
     axes.add_patch(Polygon(arrow, facecolor=rgb(colour) if hollow else "white", edgecolor="none", alpha=0.9, zorder=5))
 
 
+def draw_controls(axes: Axes, scene: Scene, time_s: float, scale: float) -> None:
+    """Draws stop lines in the colours of their lights at a time since the cars start, and stop signs; `scale` in points per metre."""
+    marks = control_marks.find_marks(scene, [time_s])
+    bars = control_marks.find_bars(marks, 0)
+    look = {"linewidths": max(0.7 * scale, 0.8), "capstyle": "butt", "zorder": 2.2}
+    axes.add_collection(LineCollection([bar for bar, _ in bars], colors=[rgb(colour) for _, colour in bars], **look))
+    for octagon in control_marks.make_octagons(marks):
+        edge = {"edgecolor": "white", "linewidth": max(0.15 * scale, 0.2)}
+        axes.add_patch(Polygon(octagon, facecolor=rgb(drawing.STOP), zorder=2.3, **edge))
+
+
+def _draw_routes(axes: Axes, scene: Scene, scale: float) -> None:
+    for stroke in control_marks.route_strokes(scene):
+        width = max(stroke.width * scale, stroke.thinnest)
+        axes.add_collection(LineCollection(list(stroke.lines), colors=[rgb(stroke.colour)], linewidths=width, zorder=2.1))
+
+
 def draw_traffic(axes: Axes, shapes: Iterable[Shape], *, linewidth: float = 0.6) -> None:
     """Draws background traffic."""
     for shape in shapes:
@@ -176,6 +197,11 @@ def _add_legend(figure: Figure, events: Iterable[str], *, car: str, scene: Scene
     if road:
         drawn = {stroke.colour for stroke in drawing.strokes(scene.road)}
         handles += [Line2D([], [], color=rgb(colour), linewidth=width, label=label) for label, colour, width in _ROAD if colour in drawn]
+    signs = np.asarray(scene.controls.stop_sign, bool)[np.asarray(scene.controls.valid, bool)]
+    if signs.any():
+        handles.append(point("8", drawing.STOP, "stop sign"))
+    if (~signs).any():
+        handles.append(Line2D([], [], color=rgb(control_marks.LIGHTS[0]), linewidth=3.0, label="light"))
     for area in {area.label: area for area in patch_overlay.areas(scene.weather)}.values():
         handles.append(point("s", area.colour, area.label, markeredgecolor=rgb(area.edge), markeredgewidth=0.6))
     if traffic:

@@ -16,16 +16,18 @@ from PIL import Image, ImageDraw, ImageFont
 
 from scenefactory_jax.core.trajectory import Trajectory
 from scenefactory_jax.visualization import video_file
-from scenefactory_jax.visualization.birds_eye import drawing, patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.birds_eye import control_marks, drawing, patch_overlay, traffic_shapes
+from scenefactory_jax.visualization.birds_eye.control_marks import ControlMarks
 from scenefactory_jax.visualization.birds_eye.drawing import GROUND, INK, MARKS, QUIET, WHITE, Colour, Stroke, View
 from scenefactory_jax.visualization.birds_eye.patch_overlay import Area
 from scenefactory_jax.visualization.video_file import VideoError
 
-SETTINGS = ("fps", "stride", "columns", "panel", "trail_s")  # of `write`
+SETTINGS = ("fps", "stride", "columns", "panel", "trail_s", "routes")  # of `write`
 _FINE = 2  # pictures are drawn at this many times their size and reduced
 _FLASH_S, _FADE_S = 1.2, 0.6  # duration of an event's flash, and of a finished car's fading
 _GAP = 14  # pixels between panels
 _BINS = 6  # steps of fading along a trail
+CORNERS = {"red_light": (3, np.pi / 2), "stop_sign": (8, np.pi / 8), "off_route": (6, 0.0)}  # of events: corners, and angle of the first
 
 
 class _Panel(NamedTuple):
@@ -43,11 +45,14 @@ class _Panel(NamedTuple):
     goals: list[Image.Image]  # the same for the fine picture
     labels: dict[str, Image.Image]  # event -> label
     parked: np.ndarray  # [O]
+    marks: ControlMarks
+    octagons: list[np.ndarray]  # of the stop signs
 
 
 def write(
-    path: Path, trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int
-) -> Path:
+    path: Path, trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int,
+    routes: bool,
+) -> Path:  # fmt: skip
     """Writes a video, one panel per world, left to right and top to bottom.
 
     Args:
@@ -57,20 +62,21 @@ def write(
         columns: panels in a row.
         panel: side of a panel in pixels.
         trail_s: length of the trails.
+        routes: draw the routes of the agents.
 
     Raises:
         VideoError: another suffix, no trajectory, a number out of range, or no ffmpeg for an .mp4.
         TrajectoryError: arrays that do not belong together.
     """
     video_file.check(path, fps=fps)
-    look = {"fps": fps, "columns": columns, "panel": panel, "trail_s": trail_s}
+    look = {"fps": fps, "columns": columns, "panel": panel, "trail_s": trail_s, "routes": routes}
     steps = max((len(t.active) for t in trajectories), default=0)
     samples = list(frames(trajectories, stride=max(steps // video_file.SAMPLES, 1), **look)) if path.suffix == ".gif" else []
     return video_file.write(path, frames(trajectories, stride=stride, **look), fps=fps, samples=samples, colours=_key_colours())
 
 
 def frames(
-    trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int
+    trajectories: Sequence[Trajectory], *, fps: float | int, stride: int, columns: int, panel: int, trail_s: float | int, routes: bool
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """Pictures of `write`; worlds of fewer steps repeat their last step.
 
@@ -83,7 +89,7 @@ def frames(
     if not trajectories:
         raise VideoError("trajectories: expected at least one recorded world")
     speed = fps * stride / trajectories[0].control_hz
-    panels = [_prepare(trajectory, panel) for trajectory in trajectories]
+    panels = [_prepare(trajectory, panel, routes=routes) for trajectory in trajectories]
     return _draw_sheets(panels, stride=stride, columns=min(columns, len(panels)), side=panel, trail_s=trail_s, speed=speed)
 
 
@@ -113,7 +119,8 @@ def _draw_sheets(panels: list[_Panel], *, stride: int, columns: int, side: int, 
     width, height = columns * across + _GAP, math.ceil(len(panels) / columns) * down + _GAP + bar
     sheet = Image.new("RGB", (width + width % 2, height + height % 2), WHITE)
     corners = [(_GAP + (i % columns) * across, _GAP + (i // columns) * down) for i in range(len(panels))]
-    _draw_legend(sheet, height - bar, side, speed=speed)
+    shown = [name for name in MARKS if name in drawing.USUAL or any(name in panel.counts and panel.counts[name][-1] for panel in panels)]
+    _draw_legend(sheet, height - bar, side, shown=shown, speed=speed)
     for panel, (left, top) in zip(panels, corners, strict=True):
         _draw_header(sheet, left, top, side, panel.trajectory)
     for step in shown_steps(max(len(panel.driven) for panel in panels), stride):
@@ -124,7 +131,7 @@ def _draw_sheets(panels: list[_Panel], *, stride: int, columns: int, side: int, 
         yield np.array(sheet)
 
 
-def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, float] | None = None) -> _Panel:
+def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, float] | None = None, *, routes: bool = False) -> _Panel:
     """Computes what does not change from frame to frame; without a window the view contains all positions and goals."""
     trajectory = drawing.sanitize_trajectory(trajectory)
     view = View(*(window or drawing.fit_view(drawing.shown_points(trajectory), margin=9.0, smallest=50.0)), side * _FINE)
@@ -133,11 +140,13 @@ def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, floa
     events = {name: new & trajectory.present for name, new in trajectory.events.items()}
     respawns = drawing.find_respawns(trajectory)
     small, bold = max(9, side // 44), _font(max(9, side // 44), bold=True)
+    lines = [*drawing.strokes(trajectory.scene.road), *(control_marks.route_strokes(trajectory.scene) if routes else [])]
+    marks = control_marks.find_marks(trajectory.scene, trajectory.start_s + np.arange(len(trajectory.active)) / trajectory.control_hz)
     numbers = [(str(agent), drawing.blend(drawing.colour_of(agent), INK, 0.7)) for agent in range(len(trajectory.present))]
     return _Panel(
         trajectory=trajectory,
         view=view,
-        background=road_image(drawing.strokes(trajectory.scene.road), view, patches=patch_overlay.areas(trajectory.scene.weather)),
+        background=road_image(lines, view, patches=patch_overlay.areas(trajectory.scene.weather)),
         track=drawing.to_pixels(view, trajectory.position),
         driven=drawing.is_moving(trajectory),
         opacity=np.clip(1 - (steps - last) / (_FADE_S * trajectory.control_hz), 0.0, 1.0) * trajectory.present,
@@ -147,6 +156,8 @@ def _prepare(trajectory: Trajectory, side: int, window: tuple[float, float, floa
         goals=[_label(number, _font(small * _FINE), colour) for number, colour in numbers],
         labels={name: _label(mark.label, bold, mark.colour) for name, mark in MARKS.items()},
         parked=np.zeros(0, bool) if trajectory.traffic is None else traffic_shapes.find_parked(trajectory.traffic),
+        marks=marks,
+        octagons=[drawing.to_pixels(view, octagon) - 0.5 for octagon in control_marks.make_octagons(marks)],
     )
 
 
@@ -190,6 +201,7 @@ def _draw_world(panel: _Panel, now: int, *, trail_s: float | int) -> Image.Image
     """Draws the picture between header and footer at one step."""
     trajectory, image = panel.trajectory, panel.background.copy()
     draw = ImageDraw.Draw(image)
+    _draw_controls(draw, panel, now)
     if trajectory.traffic is not None:
         for shape in traffic_shapes.shapes(trajectory.traffic, now, panel.parked):
             corners = (drawing.to_pixels(panel.view, shape.points) - 0.5).ravel().tolist()
@@ -208,6 +220,15 @@ def _draw_world(panel: _Panel, now: int, *, trail_s: float | int) -> Image.Image
     for x, y, name in flashes:
         _stamp(image, panel.labels[name], x / _FINE, y / _FINE + 22)
     return image
+
+
+def _draw_controls(draw: ImageDraw.ImageDraw, panel: _Panel, now: int) -> None:
+    """Stop lines in the colours of their lights, and stop signs."""
+    width = max(round(0.7 * panel.view.pixels / panel.view.side), 2 * _FINE)
+    for bar, colour in control_marks.find_bars(panel.marks, now):
+        draw.line((drawing.to_pixels(panel.view, bar) - 0.5).ravel().tolist(), fill=colour, width=width)
+    for octagon in panel.octagons:
+        draw.polygon(octagon.ravel().tolist(), fill=drawing.STOP, outline=WHITE, width=_FINE // 2)
 
 
 def _draw_trails(draw: ImageDraw.ImageDraw, panel: _Panel, now: int, length: int) -> None:
@@ -279,6 +300,10 @@ def _draw_mark(draw: ImageDraw.ImageDraw, name: str, x: float, y: float, size: f
                 draw.line((x - arm, y - side * arm, x + arm, y + side * arm), fill=fill, width=round(0.35 * size) + thick // 2 + extra)
     elif name == "out_of_bounds":
         draw.polygon([x, y - size, x + size, y, x, y + size, x - size, y], fill=colour, **edge)
+    elif name in CORNERS:
+        corners, turn = CORNERS[name]
+        angles = turn + np.arange(corners) * 2 * np.pi / corners
+        draw.polygon((np.array([x, y]) + size * np.stack([np.cos(angles), np.sin(angles)], axis=1)).ravel().tolist(), fill=colour, **edge)
     else:
         draw.rectangle((x - 0.8 * size, y - 0.8 * size, x + 0.8 * size, y + 0.8 * size), fill=colour, **edge)
 
@@ -301,7 +326,7 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, side: int, panel: _Pan
     clock = f"{now / panel.trajectory.control_hz:.1f} s"
     draw.text((left, top + bar // 2), clock, font=font, fill=INK, anchor="lm")
     counts = {name: int(panel.counts[name][now]) for name in MARKS if name in panel.counts}
-    entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name != "numerical_error"}
+    entries = {name: f"{MARKS[name].label} {count}" for name, count in counts.items() if count or name in drawing.USUAL}
     if "goal_reached" in entries and not drawing.find_respawns(panel.trajectory):
         entries["goal_reached"] += f" of {int(panel.trajectory.present.sum())}"
     while sum(font.getlength(entry) + 12 for entry in entries.values()) > side - font.getlength(clock) and len(entries) > 1:
@@ -313,11 +338,11 @@ def _draw_footer(sheet: Image.Image, left: int, top: int, side: int, panel: _Pan
         right -= round(font.getlength(entry)) + 12
 
 
-def _draw_legend(sheet: Image.Image, top: int, panel: int, *, speed: float) -> None:
+def _draw_legend(sheet: Image.Image, top: int, panel: int, *, shown: Sequence[str], speed: float) -> None:
     """Meaning of the marks, and the speed of the video, along the bottom."""
     draw, font = ImageDraw.Draw(sheet), _font(_text_size(panel) - 1)
     x, middle = _GAP + 8, top + _bar(panel) // 2 - 2
-    for name, mark in MARKS.items():
+    for name, mark in {name: MARKS[name] for name in shown}.items():
         patch = Image.new("RGB", (64, 64), WHITE)
         _draw_mark(ImageDraw.Draw(patch), name, 32.0, 32.0, 24.0, thick=7)
         sheet.paste(patch.reduce(4), (x - 7, middle - 8))
@@ -363,4 +388,4 @@ def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
 def _key_colours() -> list[Colour]:
     """Colours that a GIF must contain, however few pixels have them."""
     agents = [drawing.blend(colour, drawing.ASPHALT, opacity) for colour in drawing.AGENTS for opacity in (1.0, 0.7, 0.4)]
-    return [*agents, *(mark.colour for mark in MARKS.values()), INK, QUIET, GROUND, WHITE]
+    return [*agents, *(mark.colour for mark in MARKS.values()), *control_marks.LIGHTS, drawing.STOP, INK, QUIET, GROUND, WHITE]

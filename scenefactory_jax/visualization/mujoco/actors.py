@@ -14,9 +14,11 @@ from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
 from scenefactory_jax.env.rollout import Recording
+from scenefactory_jax.visualization.birds_eye import control_marks
+from scenefactory_jax.visualization.birds_eye.control_marks import ControlMarks
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
 from scenefactory_jax.visualization.birds_eye.traffic_shapes import is_cycle, is_person
-from scenefactory_jax.visualization.mujoco import scene_model
+from scenefactory_jax.visualization.mujoco import control_boxes, scene_model
 from scenefactory_jax.visualization.recorded_episodes import cut_world, find_shown_steps
 
 FADE_S = 0.6  # a finished car disappears within this time
@@ -36,6 +38,7 @@ class ActorTrajectories(NamedTuple):
     goal: Float[np.ndarray, "T A 2"]
     traffic: TrafficBoxes
     hz: float
+    marks: ControlMarks  # lights and stop signs
 
 
 def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTrajectories:
@@ -55,7 +58,8 @@ def make_actors(recording: Recording, index: int, car: CarParameters) -> ActorTr
     begun = np.maximum.accumulate(active, axis=0)
     opacity = np.where(begun, np.clip(1.0 - (steps - row) / (FADE_S * hz), 0.0, 1.0), 0.0)
     yaw, goal = shots.yaw[row, agents], shots.goal[row, agents]
-    return ActorTrajectories(scene, joints[row, agents], yaw, active, opacity, goal, TrafficBoxes.from_boxes(shots.traffic), hz)
+    boxes, marks = TrafficBoxes.from_boxes(shots.traffic), control_marks.find_marks(scene, shots.time_s)
+    return ActorTrajectories(scene, joints[row, agents], yaw, active, opacity, goal, boxes, hz, marks)
 
 
 def add_geom(
@@ -101,3 +105,9 @@ def add_trails(scene: mujoco.MjvScene, world: ActorTrajectories, step: int, *, t
             size = (float(np.hypot(dx, dy)) / 2, TRAIL_HALF_M, TRAIL_M / 2)
             yaw, colour = float(np.arctan2(dy, dx)), (*rgb(colour_of(agent)), opacity)
             add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, (x, y, TRAIL_M / 2), yaw, colour)
+
+
+def add_controls(scene: mujoco.MjvScene, marks: ControlMarks, step: int) -> None:
+    """Adds the lights of a step and the stop signs as boxes."""
+    for place, yaw, half, rgba in control_boxes.find_boxes(marks, step):
+        add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, half, place, yaw, rgba)

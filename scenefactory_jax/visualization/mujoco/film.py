@@ -105,6 +105,7 @@ def frames(
                 actors.add_goals(scene, world.goal[step], world.opacity[step], radius_m=goal_radius_m)
                 actors.add_trails(scene, world, step, trail_s=settings.trail_s)
                 actors.add_traffic(scene, world.traffic, step)
+                actors.add_controls(scene, world.marks, step)
 
             views = []
             for view in {"chase": [behind], "bird": [above], "both": [behind, above]}[settings.view]:

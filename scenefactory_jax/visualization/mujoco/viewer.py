@@ -20,6 +20,7 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.trajectory import TrafficBoxes
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters
+from scenefactory_jax.visualization.birds_eye import control_marks
 from scenefactory_jax.visualization.mujoco import actors, film, keyboard_control, scene_model
 from scenefactory_jax.visualization.mujoco.film import Camera
 from scenefactory_jax.visualization.mujoco.keyboard_control import PEDALS, Drive, KeyboardResponse, Keys, World
@@ -118,7 +119,7 @@ def drive(
                 turn = (float(now.shot.yaw[world.car]) - heading + np.pi) % (2 * np.pi) - np.pi
                 heading += turn / (1.0 + camera.lag_s / dt)
                 with viewer.lock():  # the camera moves at once, cars when synchronised
-                    joints = _place_actors(viewer, built, data, now, car, spin, world.car)
+                    joints = _place_actors(viewer, built, data, now, scene, car, spin, world.car)
                     if now.chasing:
                         view = film.look_from_behind(joints[world.car, :3], heading, camera)
                         viewer.cam.lookat[:], viewer.cam.distance = view.lookat, view.distance
@@ -130,9 +131,9 @@ def drive(
 
 
 def _place_actors(
-    viewer: Any, built: RenderModel, data: mujoco.MjData, now: Drive, car: CarParameters, spin: np.ndarray, slot: int
+    viewer: Any, built: RenderModel, data: mujoco.MjData, now: Drive, scene: Scene, car: CarParameters, spin: np.ndarray, slot: int
 ) -> np.ndarray:  # fmt: skip
-    """Places cars, light and traffic; returns the cars' joints."""
+    """Places cars, light, traffic, traffic lights and stop signs; returns the cars' joints."""
     shot = now.shot
     assert shot is not None
     level = scene_model.set_posture(car, np.asarray(shot.position), np.asarray(shot.yaw), np.asarray(shot.steer), spin)
@@ -142,6 +143,7 @@ def _place_actors(
     viewer.user_scn.ngeom = 0
     traffic = TrafficBoxes.from_boxes(shot.traffic)
     actors.add_traffic(viewer.user_scn, TrafficBoxes(*(column[None] for column in traffic)), 0)
+    actors.add_controls(viewer.user_scn, control_marks.find_marks(scene, [float(shot.time_s)]), 0)
     return joints
 
 

@@ -15,8 +15,9 @@ from scenefactory_jax.dynamics.articulated import model as models
 from scenefactory_jax.dynamics.articulated.equations_of_motion import total_mass
 from scenefactory_jax.dynamics.articulated.parameters import CarParameters, Solver
 from scenefactory_jax.dynamics.collision import ContactLaw
+from scenefactory_jax.visualization.birds_eye import control_marks
 from scenefactory_jax.visualization.birds_eye.drawing import colour_of, rgb
-from scenefactory_jax.visualization.mujoco import ground_meshes
+from scenefactory_jax.visualization.mujoco import control_boxes, ground_meshes
 from scenefactory_jax.visualization.road_lines import STRAIGHT_M, WHITE, YELLOW, join_segments
 
 PAINT = dict.fromkeys(LINES[:3], WHITE) | dict.fromkeys(LINES[3:], YELLOW)  # WOMD: 6-8 white, 9-13 yellow
@@ -139,9 +140,9 @@ def build_world(
     goal_radius_m: float | int,
     straight_m: float | None = STRAIGHT_M,
 ) -> mujoco.MjSpec:
-    """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}` and boxes `traffic{row}`.
+    """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}`, boxes `traffic{row}`, and lights and stop signs.
 
-    Lines and goals collide with nothing. Contacts that are explicit pairs, such as those of the tyres, are not added: `build` adds them.
+    Lines, goals, lights (in their states at the start) and signs collide with nothing. Contacts that are explicit pairs, such as those of the tyres, are not added: `build` adds them.
 
     Args:
         scene: one world.
@@ -171,6 +172,9 @@ def build_world(
     for row in np.flatnonzero(np.asarray(boxes.present)):
         half = np.r_[np.asarray(boxes.size, float)[row] / 2, TRAFFIC_M / 2]
         _add_box(model, np.asarray(boxes.position, float)[row], float(boxes.yaw[row]), half, GREY, name=f"traffic{row}")
+    for box in control_boxes.find_boxes(control_marks.find_marks(scene, [0.0]), 0):
+        shape, turn = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(box.half)}, _quaternion(box.yaw)
+        model.worldbody.add_geom(pos=list(box.place), quat=turn, rgba=list(box.rgba), **shape, **VISUAL)
     return model
 
 

@@ -1,4 +1,4 @@
-"""Traffic lights and stop signs of a raw scene, which no packed scene holds, in the packed scene's coordinates."""
+"""Traffic lights and stop signs of a raw scene, also those that no packed scene holds, in the packed scene's coordinates."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,14 +8,16 @@ from jaxtyping import Float
 
 from scenefactory_jax.core.raw_scene import LIGHT_STATES, RawScene
 from scenefactory_jax.core.types import STOP_SIGN
+from scenefactory_jax.data.packing.control_columns import read_changes
 
 
 class Light(NamedTuple):
-    """A logged traffic light."""
+    """A traffic light."""
 
     place: tuple[float, float]  # stop point of its lane
     yaw: float  # of the lane there
     shown: list[tuple[float, str]]  # (seconds since the episode began, one of LIGHT_STATES), at each change
+    period: float | None = None  # seconds after which the states repeat; None: never
 
 
 class RoadPosts(NamedTuple):
@@ -41,12 +43,12 @@ def find_posts(raw: RawScene, centre: Sequence[float]) -> RoadPosts:
         if place is None:
             continue
         ahead = np.array([1.0, 0.0]) if lane is None else _find_direction(lane, place)
-        states = np.where(light.valid, light.state, 0)[raw.current :]
-        times = raw.times[raw.current :] - raw.times[raw.current]
-        changes = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
+        changes, period = read_changes(light, raw.times, raw.current)
+        begun = max((index for index, (time, _) in enumerate(changes) if time <= 0), default=0)
+        shown = [(max(time, 0.0), LIGHT_STATES[state]) for time, state in changes[begun:]]
         x, y = place - origin
-        shown = [(float(times[i]), LIGHT_STATES[int(states[i])]) for i in changes]
-        lights.append(Light((float(x), float(y)), float(np.arctan2(ahead[1], ahead[0])), shown))
+        yaw = float(np.arctan2(ahead[1], ahead[0]))
+        lights.append(Light((float(x), float(y)), yaw, shown, period if np.isfinite(period) else None))
     return RoadPosts(tuple(lights), tuple((float(x), float(y)) for x, y in signs))
 
 

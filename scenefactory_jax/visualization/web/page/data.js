@@ -76,5 +76,9 @@ function opacity(world, car, time, fade = 0.6) {
 }
 
 const goalOf = (car, step) => car.goals.findLast(([from]) => from <= step) ?? car.goals[0];
-const lightState = (light, time) => (light.shown.findLast(([from]) => from <= time + 1e-6) ?? [0, "unknown"])[1];
+/** State of a light; before its first change it is unknown. */
+function lightState(light, time) {
+  const now = light.period === null ? time : time % light.period;
+  return (light.shown.findLast(([from]) => from <= now + 1e-6) ?? [0, "unknown"])[1];
+}
 const pastEvents = (world, step) => world.events.filter((event) => event.step <= step);

@@ -271,6 +271,9 @@ const GLYPHS = {
   collision: { corners: 10, inner: 0.45 },
   out_of_bounds: { corners: 4 },
   numerical_error: { corners: 4, turn: Math.PI / 4 },
+  red_light: { corners: 3, turn: Math.PI },
+  stop_sign: { corners: 8, turn: Math.PI / 8 },
+  off_route: { corners: 6 },
 };
 
 function drawGlyph(brush, name, x, y, radius, colour) {

@@ -1,0 +1,141 @@
+"""Observation groups of routes, lights and stop signs, on a route made by hand: 60 m east, then north."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.hand_scenes import scene_of
+
+from scenefactory_jax.adapters import bounds
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import LIGHT_STATES, Events, Motion, Routes, RouteState, SetObservation, State, TrafficControls
+from scenefactory_jax.env import observations
+from scenefactory_jax.env.observations.column_bounds import compress_length
+
+GO, CAUTION, STOP = (LIGHT_STATES.index(name) for name in ("go", "caution", "stop"))
+CORNER, LENGTH, DT = 60, 100, 1 / 30
+ENTRIES = load_config("train", "observations=drive")["observations"]
+NEAREST = {"_target_": "nearest_controls", "count": 3, "radius_m": 50.0, "distance_scale_m": 20.0}
+GROUPS = observations.make({name: ENTRIES[name] for name in ("route", "lights", "signs")} | {"nearest": NEAREST}, control_dt=DT)
+AHEAD = ENTRIES["route"]["ahead_m"]
+
+
+def world(place=(10.0, -1.0), yaw=0.0, arc=10.0, stood=False, step=0):
+    """A scene with a route, a light at its metre 20, a sign at 40, a light at 70, one beside it, and two cars: one with the route."""
+    along = np.arange(LENGTH + 1.0)
+    line = np.stack([np.minimum(along, CORNER), np.maximum(along - CORNER, 0.0)], axis=1)
+    routes = Routes(
+        position=jnp.asarray(line[None], jnp.float32),
+        length=jnp.array([float(LENGTH)]),
+        speed_limit=jnp.where(jnp.arange(LENGTH + 1) < 30, 10.0, jnp.inf)[None],
+        lane=jnp.zeros((1, LENGTH + 1), jnp.int32),
+        along_lanes=jnp.array([True]),
+        agent=jnp.array([0]),
+        drawn=jnp.array([False]),
+        on_route=jnp.array([True]),
+        stop_arc=jnp.array([[20.0, 40.0, 70.0, jnp.inf]]),
+        stop_control=jnp.array([[1, 2, 0, 0]]),
+    )
+    controls = TrafficControls(
+        position=jnp.array([[60.0, 10.0], [20.0, 0.0], [40.0, 0.0], [12.0, 8.0]]),
+        direction=jnp.array([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0], [0.0, -1.0]]),
+        lane=jnp.zeros(4, jnp.int32),
+        stop_sign=jnp.array([False, False, True, False]),
+        change_s=jnp.array([[0.0, jnp.inf], [0.0, 1.0], [jnp.inf, jnp.inf], [5.0, jnp.inf]]),
+        state=jnp.array([[GO, 0], [STOP, CAUTION], [0, 0], [GO, 0]]),
+        period_s=jnp.array([jnp.inf, 2.0, jnp.inf, jnp.inf]),
+        valid=jnp.ones(4, bool),
+    )
+    scene = scene_of([place, place], [(60.0, 30.0)] * 2)
+    agents = replace(scene.agents, route_start=jnp.full(2, 5.0), route_end=jnp.array([90.0, 0.0]))
+    scene = replace(scene, agents=agents, routes=routes, controls=controls)
+    zero, none = jnp.zeros(2), jnp.zeros(2, bool)
+    position = jnp.tile(jnp.array([*place, 0.5]), (2, 1))
+    motion = Motion(position, jnp.zeros((2, 3)), jnp.full(2, yaw), zero, zero + 1, zero, zero, zero + 1, zero, zero)
+    state = State(
+        body=None,
+        motion=motion,
+        agents=agents,
+        weather=scene.weather,
+        active=~none,
+        past_events=Events(*[none] * len(Events.__dataclass_fields__)),
+        steps_since_spawn=jnp.zeros(2, jnp.int32),
+        previous_action=jnp.zeros((2, 3)),
+        step=jnp.int32(step),
+        key=jax.random.key(0),
+        route=RouteState(jnp.array([arc, 0.0]), jnp.array([arc, 0.0]), jnp.array([stood, stood])),
+    )
+    return scene, state
+
+
+def observe(**changes):
+    scene, state = world(**changes)
+    return observations.observe(scene, state, GROUPS)
+
+
+def test_the_route_is_seen_from_the_car():
+    seen = np.asarray(observe(place=(10.0, -1.0), yaw=np.pi / 2)["route"])
+    head, points = seen[0, :5], seen[0, 5:].reshape(len(AHEAD), 5)
+    offset, remaining = -1.0 / 3.0, 80.0 / 130.0
+    np.testing.assert_allclose(head, [1.0, offset, remaining, 1.0, 0.0], atol=1e-6)
+    row = AHEAD.index(10.0)  # 10 m east of the car, which points north: on its right
+    np.testing.assert_allclose(points[row], [1 / 50, -10 / 50, 0.0, -1.0, 0.5], atol=1e-5)
+    row = AHEAD.index(60.0)  # at (60, 10), behind the corner, where no limit is known
+    np.testing.assert_allclose(points[row], [11 / 50, -50 / 50, 1.0, 0.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(points[AHEAD.index(90.0)], points[AHEAD.index(80.0)])  # the goal lies 80 m ahead
+    assert not seen[1].any()  # no route
+
+
+def test_lights_and_signs_ahead_of_the_front_come_in_the_order_of_the_route():
+    seen = observe()
+    lights, signs = np.asarray(seen["lights"].features[0]), np.asarray(seen["signs"].features[0])
+    front = compress_length(jnp.array([8.0, 58.0, 28.0]), 20.0)  # the car is 4 m long
+    np.testing.assert_allclose(lights[:, 0], front[:2], rtol=1e-5)
+    np.testing.assert_allclose(lights[0, 1:3], compress_length(jnp.array([10.0, 1.0]), 20.0), rtol=1e-5)
+    np.testing.assert_allclose(lights[:, 3:], [[1, 0, 0, 0], [0, 0, 1, 0]])
+    np.testing.assert_allclose(signs[0], [front[2], *compress_length(jnp.array([30.0, 1.0]), 20.0), 0.0], rtol=1e-5)
+    assert seen["lights"].mask.tolist() == [[True, True], [False, False]] and seen["signs"].mask.tolist() == [[True, False], [False, False]]
+    later = observe(step=round(1.5 / DT), stood=True)
+    np.testing.assert_allclose(later["lights"].features[0, 0, 3:], [0, 1, 0, 0])
+    assert later["signs"].features[0, 0, 3] == 1.0
+    passed = observe(arc=18.5, place=(18.5, 0.0))  # the front is half a metre behind the first line
+    np.testing.assert_allclose(passed["lights"].features[0, 0, 3:], [0, 0, 1, 0])
+    assert passed["lights"].mask.tolist()[0] == [True, False]
+
+
+def test_the_nearest_controls_are_seen_without_a_route():
+    seen = observe()["nearest"]
+    rows = np.asarray(seen.features[1])
+    assert seen.mask.tolist() == [[True, True, True]] * 2
+    np.testing.assert_allclose(rows[0], [*compress_length(jnp.array([2.0, 9.0]), 20.0), 0, -1, 0, 0, 0, 1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(rows[:, 8:], [[0, 0], [0, 0], [1, 0]])  # unknown light, red light, sign
+    np.testing.assert_allclose(seen.features[0, :, 9], [0, 1, 1])  # on the first car's route
+    assert not rows[2, 4:8].any()
+
+
+def test_worlds_without_routes_or_controls_give_the_same_shapes_without_rows():
+    scene, state = world()
+    whole = observations.observe(scene, state, GROUPS)
+    bare = scene_of([(0.0, 0.0)] * 2, [(9.0, 0.0)] * 2)
+    for empty in (bare, replace(scene, controls=bare.controls), replace(scene, routes=bare.routes)):
+        seen = observations.observe(empty, state, GROUPS)
+        assert list(map(jnp.shape, jax.tree.leaves(seen))) == list(map(jnp.shape, jax.tree.leaves(whole)))
+        assert not seen["lights"].mask.any() and not seen["signs"].mask.any()
+        assert seen["route"].any() == bool(len(empty.routes.length)) and seen["nearest"].mask.any() == bool(len(empty.controls.valid))
+
+
+@pytest.mark.parametrize("yaw", [0.3, 2.5])
+def test_columns_are_within_their_declared_bounds(yaw):
+    scene, state = world(yaw=yaw, place=(30.0, 5.0), arc=30.0)
+    seen = observations.observe(scene, state, GROUPS)
+    low, high = bounds.flat_bounds(GROUPS, seen)
+    flat = np.concatenate(
+        [
+            np.concatenate([np.asarray(group.features[0]).ravel(), np.asarray(group.mask[0], float)])
+            if isinstance(group, SetObservation)
+            else np.asarray(group[0])
+            for _, group in sorted(seen.items())
+        ]
+    )
+    assert len(low) == len(flat) and (flat >= low - 1e-6).all() and (flat <= high + 1e-6).all()
