@@ -47,8 +47,9 @@ def glide(env):
 
 
 def test_progress_is_the_way_along_the_route(glide):
-    scene = routed_scene([STRAIGHT, STRAIGHT + [0.0, 3.0]], starts=[0.0, 10.0], ends=[60.0, 90.0], speeds=[6.0, 9.0], limits=[5.0, np.inf])
-    state, metrics = glide(scene, 30)
+    lines = [STRAIGHT, STRAIGHT + np.array([0.0, 3.0])]
+    scene = routed_scene(lines, starts=[0.0, 10.0], ends=[60.0, 90.0], speeds=[6.0, 9.0], limits=[5.0, np.inf])
+    _, metrics = glide(scene, 30)
     np.testing.assert_allclose(metrics.route_arc[-1], [6.0, 19.0], atol=0.02)
     np.testing.assert_allclose(metrics.route_progress.sum(axis=0), [6.0, 9.0], atol=0.02)
     np.testing.assert_allclose(metrics.route_completion[-1], [0.1, 9 / 80], atol=1e-3)
@@ -105,7 +106,9 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
 
 def test_lights_follow_their_changes_and_periods():
     controls = controls_of(
-        ((0.0, 0.0), [(0.0, STOP), (2.0, GO), (5.0, CAUTION)], 6.0), ((0.0, 0.0), [(-1.0, GO), (3.0, 0)], np.inf), ((0.0, 0.0), None, np.inf)
+        ((0.0, 0.0), [(0.0, STOP), (2.0, GO), (5.0, CAUTION)], 6.0),
+        ((0.0, 0.0), [(-1.0, GO), (3.0, 0)], np.inf),
+        ((0.0, 0.0), None, np.inf),
     )
     states = [traffic_lights.read_light_states(controls, jnp.float32(time)).tolist() for time in (0.5, 2.5, 5.5, 6.5, 8.5, 61.0)]
     assert states == [[STOP, GO, 0], [GO, GO, 0], [CAUTION, 0, 0], [STOP, 0, 0], [GO, 0, 0], [STOP, 0, 0]]
@@ -129,7 +132,7 @@ def test_a_world_without_routes_reads_zeros(glide):
 
 def test_starts_on_drawn_routes():
     numbers = {key: value for key, value in load_config("task", "spawning=routes")["spawning"]["sampler"].items()}
-    lines = [STRAIGHT, STRAIGHT + [0.0, 12.0], STRAIGHT[::-1] + [0.0, -12.0]]
+    lines = [STRAIGHT, STRAIGHT + np.array([0.0, 12.0]), STRAIGHT[::-1] + np.array([0.0, -12.0])]
     scene = routed_scene([STRAIGHT] * 3)
     with pytest.raises(ConfigError, match="scenes/pack/routes=drawn"):
         bare = replace(scene, routes=type(scene.routes)(**{name: leaf[:0] for name, leaf in vars(scene.routes).items()}))

@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
-from support.hand_scenes import scene_of
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Routes, TrafficControls
 from scenefactory_jax.roadgraph.route_sets import _resample
+from support.hand_scenes import scene_of
 
 
 def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
