@@ -142,7 +142,8 @@ def build_world(
 ) -> mujoco.MjSpec:
     """Builds ground `ground`, road lines, cars `agent{slot}/...`, discs `goal{slot}`, boxes `traffic{row}`, and lights and stop signs.
 
-    Lines, goals, lights (in their states at the start) and signs collide with nothing. Contacts that are explicit pairs, such as those of the tyres, are not added: `build` adds them.
+    Lines, goals, lights (in their states at the start) and signs collide with nothing. Contacts that are explicit pairs, such as those of
+    the tyres, are not added: `build` adds them.
 
     Args:
         scene: one world.
