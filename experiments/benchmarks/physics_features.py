@@ -57,6 +57,7 @@ def _peopled(worlds: Scene, count: int, *, seed: int) -> Scene:
     columns = {name: jnp.asarray(column, jnp.float32) for name, column in columns.items()}
     columns |= {"valid": jnp.ones((*shape, steps), bool), "has_route": jnp.zeros(shape, bool)}
     columns |= {name: jnp.zeros(shape, jnp.int32) for name in ("kind", "route")}
+    columns |= {name: jnp.zeros((*shape, count, 0)) for name in ("zone_enter", "zone_leave", "zone_match")}
     tracks = jax.vmap(lambda columns: TrafficLog(**columns))(columns)
     return replace(worlds, traffic_log=tracks)
 

@@ -47,7 +47,13 @@ def make_empty_log(steps: int) -> TrafficLog:
     """A log without road users, over that many steps."""
     flat, pair = jnp.zeros((0, steps), jnp.float32), jnp.zeros((0, steps, 2), jnp.float32)
     index = jnp.zeros(0, jnp.int32)
-    return TrafficLog(pair, flat, pair, flat.astype(bool), jnp.zeros((0, 2), jnp.float32), index, index, index.astype(bool))
+    size, none = jnp.zeros((0, 2), jnp.float32), jnp.zeros(0, bool)
+    return TrafficLog(pair, flat, pair, flat.astype(bool), size, index, index, none, **make_no_zones(0))
+
+
+def make_no_zones(count: int) -> dict[str, Float[Array, "O O Z"]]:
+    """The columns of a log whose vehicles' routes do not meet."""
+    return {name: jnp.zeros((count, count, 0), jnp.float32) for name in ("zone_enter", "zone_leave", "zone_match")}
 
 
 def make_empty_boxes() -> Boxes:

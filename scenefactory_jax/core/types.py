@@ -1,9 +1,9 @@
 """Types that several modules share.
 
 Axes: `A` agent slots, `O` road users of the traffic, `P` road segments, `L` logged steps, `R` routes, `N` points of a route, `S` stop
-lines of a route, `C` traffic controls, `T` changes of a light, `K` rows of a set, `F` features. Code is written for one world and
-`jax.vmap` adds the world axis `W`. SI units and radians, +x forward, +y left, yaw counter-clockwise from
-world x; anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
+lines of a route, `Z` zones of two routes, `C` traffic controls, `T` changes of a light, `K` rows of a set, `F` features. Code is written
+for one world and `jax.vmap` adds the world axis `W`. SI units and radians, +x forward, +y left, yaw counter-clockwise from world x;
+anything else carries a suffix (`film_mm`). What is missing is masked by a boolean, never marked by NaN or -1.
 """
 
 import dataclasses
@@ -92,6 +92,10 @@ class TrafficLog:
     kind: Int[Array, " O"]  # index into ROAD_USERS
     route: Int[Array, " O"]  # row of `Scene.routes`
     has_route: Bool[Array, " O"]
+    # The first stretches where the row's route and the column's are too near for both vehicles, as arc lengths on the row's route
+    zone_enter: Float[Array, "O O Z"]  # inf: there is none
+    zone_leave: Float[Array, "O O Z"]
+    zone_match: Float[Array, "O O Z"]  # the same place as that of the column's row, where both routes lead the same way; inf: they cross
 
 
 @pytree_dataclass

@@ -28,3 +28,12 @@ def one_pedal(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
     """
     throttle, steer, brake = action.T
     return jnp.stack([jnp.maximum(throttle, 0.0), steer, jnp.maximum(brake, -throttle)], axis=1)
+
+
+def acceleration_and_steering(action: Float[Array, "A 3"]) -> Float[Array, "A 3"]:
+    """Acceleration and steering; the third number is not read. Below zero the acceleration brakes.
+
+    The action of Waymax and V-Max has these two numbers (`dynamics=bicycle_waymax`).
+    """
+    acceleration, steer, _ = action.T
+    return jnp.stack([jnp.maximum(acceleration, 0.0), steer, jnp.maximum(-acceleration, 0.0)], axis=1)

@@ -33,7 +33,8 @@ from scenefactory_jax.core.types import (
     Traffic,
     Weather,
 )
-from scenefactory_jax.env import observations, rewards, route_following, spawning, step_metrics, termination, traffic
+from scenefactory_jax.env import history, observations, rewards, route_following, spawning, step_metrics, termination, traffic
+from scenefactory_jax.env.history import HistorySpec
 from scenefactory_jax.weather import friction, rain, road_condition
 
 
@@ -113,6 +114,7 @@ class EnvParts(NamedTuple):
     episode_steps: int  # control steps after which a world is truncated
     control_dt: float  # s
     respawn_clearance_m: float | None  # see `Spawning`
+    history: HistorySpec | None = None  # rows of `State.history`; None: nothing reads it
 
 
 def make_env(config: Mapping[str, Any]) -> Env:
@@ -134,6 +136,8 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
     mu = friction.make(config["weather"]["friction"])
     package = __name__.rpartition(".")[0]
+    terms, groups = rewards.make(read.reward, **context), observations.make(read.observations, **context)
+    readers = [*groups.values(), *(term for _, term in terms.values())]
     return EnvParts(
         dynamics=instantiate(read.dynamics, builtins="scenefactory_jax.dynamics", where="dynamics", friction=mu, **context)(),
         map_action=instantiate(read.actions.command, builtins=f"{package}.actions", where="actions.command"),
@@ -144,11 +148,12 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         advance_route=functools.partial(route_following.advance, config=read.step_metrics.route),
         compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics, control_dt=context["control_dt"]),
         evaluate_termination=functools.partial(termination.evaluate, ending=read.termination.ending),
-        terms=rewards.make(read.reward, **context),
-        groups=observations.make(read.observations, **context),
+        terms=terms,
+        groups=groups,
         episode_steps=episode_steps(config["timing"]),
         control_dt=context["control_dt"],
         respawn_clearance_m=read.spawning.respawn_clearance_m,
+        history=history.make_spec(readers, control_dt=context["control_dt"]),
     )
 
 
@@ -278,6 +283,7 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
         key=key,
         route=route_following.start_routes(agents),
         traffic=others,
+        history=history.start_history(parts.history, scene, motion, agents, step, control_dt=parts.control_dt),
     )
     return to_strong_type(state)
 
@@ -322,6 +328,7 @@ def _advance(parts: EnvParts, scene: Scene, state: State, action: Float[Array, "
         motion=motion,
         route=parts.advance_route(scene, state, motion, speed=safe_norm(motion.velocity[:, :2])),
         traffic=parts.traffic.advance(scene, state.traffic, cars, state.step),
+        history=history.record(parts.history, state.history, state.motion, state.active, scene.traffic, state.step),
         weather=scene.weather,
         steps_since_spawn=state.steps_since_spawn + state.active.astype(jnp.int32),
         previous_action=action,
@@ -361,6 +368,7 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
         past_events=tree_where(starts, termination.make_empty_events(len(starts)), state.past_events),
         steps_since_spawn=jnp.where(starts, 0, state.steps_since_spawn),
         route=tree_where(starts, route_following.start_routes(new), state.route),
+        history=history.restart(state.history, starts),
         previous_action=jnp.where(starts[:, None], 0.0, state.previous_action),
         key=key,
     )

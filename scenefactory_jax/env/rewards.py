@@ -28,6 +28,26 @@ def progress(step: RewardInput, *, limit_m: NonNegative) -> Float[Array, " A"]:
     return jnp.clip(step.metrics.progress, -limit_m, limit_m)
 
 
+def route_progress(step: RewardInput, *, limit_m: NonNegative) -> Float[Array, " A"]:
+    """Metres along the agent's route, clamped to a plausible distance of a step; 0 without a route."""
+    return jnp.clip(step.metrics.route_progress, -limit_m, limit_m)
+
+
+def route_distance(step: RewardInput, *, limit_m: Positive) -> Float[Array, " A"]:
+    """Distance from the agent's route as a fraction of a limit, clamped to 1; 0 without a route."""
+    return jnp.clip(step.metrics.route_distance / limit_m, 0.0, 1.0)
+
+
+def overspeed(step: RewardInput, *, limit_mps: Positive) -> Float[Array, " A"]:
+    """Speed above the route's speed limit as a fraction of a limit, clamped to 1; 0 where no speed limit is known."""
+    return jnp.clip(step.metrics.overspeed / limit_mps, 0.0, 1.0)
+
+
+def against_traffic(step: RewardInput) -> Float[Array, " A"]:
+    """1 while the car drives against its lane or its route (`step_metrics.route`)."""
+    return step.metrics.wrong_way.astype(jnp.float32)
+
+
 def lane_keeping(step: RewardInput, *, sigma_m: Positive, heading_fraction: Fraction) -> Float[Array, " A"]:
     """exp(-(offset/sigma)^2) [(1 - f) + f max(0, cos heading error)] (arXiv:2605.08528, Table 7); 0 without a lane."""
     near = jnp.exp(-((step.metrics.lane_offset / sigma_m) ** 2))

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
-from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
+from scenefactory_jax.core.types import SURFACES, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
@@ -21,10 +21,9 @@ from scenefactory_jax.learning.training_loop import make_policy
 
 
 class Recording(NamedTuple):
-    """The first worlds of an evaluation, on the host. 30 bytes a slot and step: 46 MB for 64 worlds of 16 slots for 50 s."""
+    """The first worlds of an evaluation, on the host: 33 bytes a slot and step, 21 bytes a road user of the traffic and step."""
 
     batch: Scene  # of all worlds, on the device
-    boxes: Callable[[Scene, State], Boxes]  # background traffic over all steps of one world
     frames: episodes.EpisodeFrame  # numpy, [W, T, ...]
     state: State  # of all worlds at the end
     weather: Weather  # at the start
@@ -54,9 +53,8 @@ def make_episode_runner(
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
     worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
-    course = CourseThresholds(**thresholds["course"])
-    limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": course, "control_dt": 1 / control_hz}
-    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], **limits)
+    limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
+    hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -75,11 +73,6 @@ def make_episode_runner(
 
     run_chunks = jax.jit(run_chunks, donate_argnums=2)
 
-    @jax.jit
-    def boxes(scene, state):  # traffic depends on the scene and the step alone
-        at = lambda step: env.current_scene(scene, replace(state, step=step)).traffic  # noqa: E731
-        return jax.lax.map(at, jnp.arange(1, limit + 1, dtype=jnp.int32))
-
     def run(parameters):
         episode = start(keys, batch)
         first, distance = jax.device_get((episode.state, episode.carry.goal_distance))
@@ -91,18 +84,33 @@ def make_episode_runner(
             if bool(episode.world_done.all()):
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
-        records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
-        route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
-        records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
-        signals = _make_signals(metrics, state, first.agents.present, control_hz)
-        records |= failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
+        records = _make_all_columns(metrics, first, state, distance, names, settings=settings, control_hz=control_hz)
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
         goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
-        return records, Recording(batch, boxes, recorded, state, first.weather, names, control_hz, goal_radius_m)
+        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m)
 
     return run
+
+
+def _make_all_columns(
+    metrics: episodes.EpisodeMetrics,
+    first: State,
+    last: State,
+    distance: np.ndarray,
+    names: list[str],
+    *,
+    settings: Mapping[str, Any],
+    control_hz: float,
+) -> dict[str, np.ndarray]:
+    """Returns the records with the columns of routes and of failures."""
+    thresholds, course = settings["failures"], CourseThresholds(**settings["failures"]["course"])
+    records = _make_records(metrics, first, distance, names, seed=settings["seed"], control_hz=control_hz)
+    route = jax.tree.map(lambda leaf: leaf[records["world"], records["agent"]], metrics.route)
+    records |= route_signals.make_columns(route, records, course=course, control_hz=control_hz)
+    signals = _make_signals(metrics, last, np.asarray(first.agents.present), control_hz)
+    return records | failures.classify({**records, **signals}, failures.TypeThresholds(**thresholds["types"]))
 
 
 def _make_records(
@@ -176,7 +184,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
     scene = jax.device_get(jax.tree.map(lambda leaf: leaf[index], recording.batch))
     weather = jax.tree.map(lambda leaf: leaf[index], recording.weather)
     state = jax.tree.map(lambda leaf: leaf[index], recording.state)
-    agents, boxes = state.agents, recording.boxes(scene, state)
+    agents, traffic = state.agents, frames.traffic
     return Trajectory(
         scene=replace(scene, weather=weather),
         position=frames.position,
@@ -191,7 +199,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         control_hz=control_hz,
         title=recording.names[index],
         weather=_format_weather(weather, seconds=end / control_hz),
-        traffic=TrafficBoxes.from_boxes(boxes).clip(0, end),
+        traffic=TrafficBoxes(traffic.position, traffic.yaw, traffic.size, traffic.present),
         start_s=1.0 / control_hz,  # the first state is that after a control step
     )
 

@@ -37,6 +37,16 @@ class EpisodeMetrics:
 
 
 @pytree_dataclass
+class TrafficFrame:
+    """The background traffic after one control step."""
+
+    position: Float[Array, "O 2"]
+    yaw: Float[Array, " O"]
+    size: Float[Array, "O 2"]
+    present: Bool[Array, " O"]
+
+
+@pytree_dataclass
 class EpisodeFrame:
     """The agents in one control step, for pictures from above."""
 
@@ -46,6 +56,7 @@ class EpisodeFrame:
     active: Bool[Array, " A"]
     goal: Float[Array, "A 2"]
     events: Events
+    traffic: TrafficFrame
 
 
 def make_metrics(state: State) -> EpisodeMetrics:
@@ -82,7 +93,8 @@ def make_hook(
         numbers = {"course": course, "control_dt": control_dt}
         route = route_signals.update_signals(metrics.route, before, state, result.metrics, **numbers)
         position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
-        frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events)
+        traffic = TrafficFrame(boxes.position, boxes.yaw, boxes.size, boxes.present)
+        frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events, traffic)
         return _update(metrics, step, signals, route, ttc_limit_s=ttc_limit_s), frame
 
     return hook

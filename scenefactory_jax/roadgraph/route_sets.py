@@ -100,7 +100,7 @@ def _find_roots(lanes: LaneMap, place: Float[np.ndarray, "2"], yaw: float) -> li
 def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_length_m: float) -> Iterator[tuple[int, ...]]:
     """Lists chains of successors from a lane until they are long enough; a lane that repeats ends a chain."""
     behind = float(shapely.line_locate_point(lanes.shapes[root], shapely.Point(place)))
-    pending = deque([((root,), float(lanes.graph.length[root]) - behind)])
+    pending: deque[tuple[tuple[int, ...], float]] = deque([((root,), float(lanes.graph.length[root]) - behind)])
     listed = 0
     while pending and listed < MAX_CHAINS:
         chain, length = pending.popleft()  # breadth first, so that a limit leaves out late branches only
@@ -109,12 +109,14 @@ def _list_chains(lanes: LaneMap, root: int, place: Float[np.ndarray, "2"], max_l
             listed += 1
             yield chain
         else:
-            pending += [((*chain, lane), length + float(lanes.graph.length[lane])) for lane in further]
+            pending.extend(((*chain, lane), length + float(lanes.graph.length[lane])) for lane in further)
 
 
 def _drop_parts(chains: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     """The chains whose lanes are no subset of another's."""
-    kept = {sum(1 << lane for lane in chain): chain for chain in chains}  # a set as the bits of an integer
+    kept: dict[int, tuple[int, ...]] = {}
+    for chain in chains:  # of chains with the same lanes the first, whose root is the better one
+        kept.setdefault(sum(1 << lane for lane in chain), chain)  # a set as the bits of an integer
     return [chain for bits, chain in kept.items() if not any(bits & other == bits and bits != other for other in kept)]
 
 

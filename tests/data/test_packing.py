@@ -7,11 +7,9 @@ import pytest
 from support import plain_packing
 
 from scenefactory_jax.cli import hydra_config
-from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, validation
-from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.roadgraph import spatial_grid
 
 STREETS = hydra_config.load_config("scenes")["scenes"]
@@ -22,8 +20,7 @@ SETTINGS = [
     {"centre": "sdc", "scene_size_m": 60.0, "car_size_m": None, "traffic": 3, "agents": 4, "log_from": "start", "start_speed": "zero"},
 ]
 CHECK = {key: value for key, value in WOMD["check"].items() if key != "_target_"}
-NUMBERS = {key: value for key, value in WOMD["pack"].items() if key != "_target_"} | {"require_agents": False}
-NUMBERS |= {"controls": schema.read(WOMD["pack"]["controls"], ControlsConfig)}
+NUMBERS = instantiate(WOMD["pack"], builtins=pack, where="scenes.pack").keywords | {"require_agents": False}
 
 
 def damaged(raw, seed):
@@ -91,8 +88,8 @@ def test_generated_scenes_whole_and_damaged():
             for reasons in (report.agents_dropped, report.traffic_dropped, report.segments_cut):
                 dropped |= {reason: dropped.get(reason, 0) + count for reason, count in reasons.items()}
             assert_same_grid(scene)
-    none = [reason for reason, count in dropped.items() if not count]  # which checks removed, or nobody asked for
-    assert len(told) == 6 and none == ["no_conflict", "degenerate"]
+    unseen = ["no_conflict", "degenerate"]  # nobody asked for the first, checks removed the second
+    assert len(told) == 6 and [reason for reason, count in dropped.items() if not count] == unseen
     assert_same_grid(scenes[0][0], size_m=0.9, side=300)  # more cells than 16 bits can number
 
 

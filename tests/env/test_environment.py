@@ -19,6 +19,7 @@ from scenefactory_jax.env import actions, environment, observations, rewards, ro
 from scenefactory_jax.env.observations.column_bounds import compress_length
 from scenefactory_jax.evaluation import episodes
 from scenefactory_jax.evaluation.failure_signals import SignalThresholds
+from scenefactory_jax.evaluation.route_signals import CourseThresholds
 from scenefactory_jax.roadgraph import queries
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -376,11 +377,12 @@ def test_nan_becomes_a_fault_and_stays_alone(env, two_cars):
 
 def test_what_a_broken_car_last_read_is_no_measurement(env, two_cars):
     """It breaks in the first step: nothing is known of it but its start. Nor is a speed a number whose square is none."""
-    signals = scenefactory_jax.load_config("evaluate", "run=town")["failures"]["signals"]
+    failures = scenefactory_jax.load_config("evaluate", "run=town")["failures"]
+    limits = {"thresholds": SignalThresholds(**failures["signals"]), "course": CourseThresholds(**failures["course"])}
     broken = lambda parameters, observation, key: jnp.array([[1.0, 0, 0], [0.0, 0, 0]])  # noqa: E731
     state = env.init_state(jax.random.key(0), two_cars)
     start = rollout.start_rollout(state, episodes.make_metrics(state))
-    hook = episodes.make_hook(env, ttc_limit_s=10.0, thresholds=SignalThresholds(**signals))
+    hook = episodes.make_hook(env, ttc_limit_s=10.0, control_dt=1 / 30, **limits)
     end, _ = rollout.rollout(env, broken, None, two_cars, start, jax.random.key(0), steps=2, hook=hook)
     metrics = end.carry
     assert metrics.past_events.numerical_error.tolist() == [True, False] and metrics.steps.tolist() == [0, 2]

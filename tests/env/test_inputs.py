@@ -12,6 +12,7 @@ from scenefactory_jax.core import geometry
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.track_interpolation import make_no_zones
 from scenefactory_jax.core.types import ROAD_USERS, TrafficLog
 from scenefactory_jax.env import environment
 from scenefactory_jax.roadgraph import spatial_grid
@@ -56,6 +57,7 @@ def street():
         kind=jnp.full((1,), ROAD_USERS.index("vehicle"), jnp.int32),
         route=jnp.zeros(1, jnp.int32),
         has_route=jnp.zeros(1, bool),
+        **make_no_zones(1),
     )
     return replace(scene, traffic_log=parked)
 

@@ -57,7 +57,8 @@ def tracks_of(*rows) -> TrafficLog:
     position, yaw, velocity, valid, size, kind = (np.stack([row[i] for row in rows]) for i in range(6))
     f = jnp.float32
     return TrafficLog(jnp.asarray(position, f), jnp.asarray(yaw, f), jnp.asarray(velocity, f), jnp.asarray(valid), jnp.asarray(size, f),
-                  jnp.asarray(kind, jnp.int32), jnp.zeros(len(rows), jnp.int32), jnp.zeros(len(rows), bool))  # fmt: skip
+                  jnp.asarray(kind, jnp.int32), jnp.zeros(len(rows), jnp.int32), jnp.zeros(len(rows), bool),
+                  **track_interpolation.make_no_zones(len(rows)))  # fmt: skip
 
 
 def with_tracks(scene, *rows):

@@ -14,6 +14,7 @@ from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.cli import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.track_interpolation import make_no_zones
 from scenefactory_jax.core.types import AgentLog, TrafficLog
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
@@ -102,6 +103,7 @@ def scripted(first, goal, second):
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, jnp.int32),
         jnp.zeros(1, bool),
+        **make_no_zones(1),
     )
     return replace(scene, log=log, traffic_log=box)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenefactory_jax.core.scene_arrays import wrap_angles
 from scenefactory_jax.core.types import ROAD_USERS, STOP_SIGN, Scene
-from scenefactory_jax.data.packing import columns, control_columns, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, route_columns, route_conflicts
 from scenefactory_jax.data.packing.pack import CUTS, DEGENERATE_M, DROPS, TRAFFIC_DROPS, PackReport, _find_centre, overlaps
 from scenefactory_jax.data.packing.validation import DUPLICATE_M, list_ids
 from scenefactory_jax.roadgraph.spatial_grid import SLACK_M
@@ -99,10 +99,10 @@ def pack(
     require_agents,
     traffic,
     min_traffic_size_m,
-    controls,
     routes,
     starts,
     conflicts,
+    controls,
 ):
     assert routes is None and starts is None and conflicts is None  # roadgraph tests have routes
     origin, centred_on = _find_centre(raw, centre)
@@ -116,6 +116,7 @@ def pack(
     beside, traffic_dropped = _others(raw, chosen, leaves, origin, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
     leaves |= beside | stops.columns | route_columns.make_no_routes(agents, len(beside["traffic_log.kind"]))
+    leaves |= route_conflicts.make_no_zones(len(beside["traffic_log.kind"]))
     report = PackReport(
         name=raw.name,
         source=raw.source,

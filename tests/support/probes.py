@@ -18,7 +18,7 @@ from scenefactory_jax.learning.trainer import Trainer
 from scenefactory_jax.weather.friction import make_uniform
 
 AGENTS = 3
-SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0, "R": 0, "N": 0, "S": 0, "C": 0, "T": 0}
+SIZES = {"A": AGENTS, "P": 1, "L": 1, "O": 0, "B": 0, "R": 0, "N": 0, "S": 0, "Z": 0, "C": 0, "T": 0}
 PRESENT = jnp.array([True, True, False])
 POISON = 1e6
 

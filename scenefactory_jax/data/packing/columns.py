@@ -19,7 +19,8 @@ SAMPLED = (Patches, Rain, Boxes)  # parts of a scene that resets sample: no file
 DERIVED = SpatialGrid | None  # computed from the other columns
 DTYPES = {"float": np.dtype(np.float32), "int": np.dtype(np.int32), "bool": np.dtype(bool)}
 AXES = {  # letter of an annotation -> name; P is the part itself
-    "A": "agents", "O": "traffic", "L": "steps", "R": "routes", "N": "route_points", "S": "stops", "C": "controls", "T": "changes",
+    "A": "agents", "O": "traffic", "L": "steps", "R": "routes", "N": "route_points", "S": "stops", "Z": "zones", "C": "controls",
+    "T": "changes",
 }  # fmt: skip
 
 

@@ -15,9 +15,10 @@ from scenefactory_jax.core.scene_arrays import Logs, join_lines, segment_lengths
 from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
 from scenefactory_jax.core.types import DRIVABLE, POLYGONS, ROAD_USERS, Scene
 from scenefactory_jax.data.formats.polylines import densify
-from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns
+from scenefactory_jax.data.packing import columns, control_columns, drawn_starts, route_columns, route_conflicts
 from scenefactory_jax.data.packing.control_columns import ControlsConfig
 from scenefactory_jax.data.packing.drawn_starts import Conflicts, find_conflicts
+from scenefactory_jax.data.packing.route_columns import RouteConfig, RouteCounts
 
 DEGENERATE_M = 1e-6  # shorter segments have no direction
 DROPS: tuple[str, ...] = (
@@ -43,7 +44,7 @@ class PackReport:
     agents_dropped: dict[str, int]  # reason of DROPS -> count
     traffic_kept: int  # a track is an agent, or counted here or in the next
     traffic_dropped: dict[str, int]  # reason of TRAFFIC_DROPS -> count
-    routes: route_columns.RouteCounts | None  # None: packed without routes
+    routes: RouteCounts | None  # None: packed without routes
     controls_kept: int  # lights and stop signs
     controls_dropped: dict[str, int]  # reason of CONTROL_DROPS -> count
     signs_inferred: int  # stop signs whose lanes were inferred
@@ -95,10 +96,10 @@ def pack(
     traffic: Annotated[int, Bounds(min=0)],
     min_traffic_size_m: float,
     outline_m: Positive,
-    controls: ControlsConfig,
-    routes: route_columns.RouteConfig | None,
+    routes: RouteConfig | None,
     starts: dict[str, Any] | None,
     conflicts: Conflicts | None,
+    controls: ControlsConfig,
 ) -> tuple[Scene, PackReport]:
     """Packs a checked scene into numpy leaves of its own size, without padding but absent agent slots.
 
@@ -115,8 +116,7 @@ def pack(
     slots = agents if starts is None else 0
     chosen, dropped = _choose_agents(raw, logs, half, min_travel_m, slots, car_size_m, allowed)
     if starts is None and require_agents and not chosen:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
-        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {reasons}")
+        raise Unpackable("no_agent_left", f"{raw.source}: tracks: no agent is left of {len(raw.tracks)}: {_list_drops(dropped)}")
     first = raw.current if log_from == "current" else 0
     leaves = columns.with_subsets(road) | _agents(chosen, logs, raw.current, agents, car_size_m, start_speed)
     leaves |= _recording("log", chosen, logs, first, agents) | {"weather.film_mm": np.zeros(()), "weather.surface": np.zeros(())}
@@ -124,20 +124,15 @@ def pack(
     beside, others, traffic_dropped = _traffic(raw, logs, chosen, leaves, half, first, traffic, min_traffic_size_m)
     stops = control_columns.pack_controls(raw, origin, half, controls)
     leaves |= beside | stops.columns
-    who = {"agents": chosen, "slots": agents, "traffic": others}
+    who = {"agents": chosen, "slots": agents, "traffic": others, "size": beside["traffic_log.size"]}
     added, counts = _routes(raw, logs, origin, half, **who, controls=stops.columns, config=routes)
     leaves |= added
     if starts is not None:
         leaves |= drawn_starts.draw_agents(leaves, starts, row=raw.current - first, slots=agents, car_size_m=car_size_m)
-        if require_agents and not leaves["agents.present"].any():
-            raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
+    if require_agents and not leaves["agents.present"].any():
+        raise Unpackable("no_agent_left", f"{raw.source}: roads: no room for a start of scenes.pack.starts")
     report = PackReport(
-        name=raw.name,
-        source=raw.source,
-        centre=(float(origin[0]), float(origin[1]), float(origin[2])),
-        centred_on=centred_on,
-        steps=len(raw.times) - first,
-        current=raw.current - first,
+        **_describe_source(raw, origin, centred_on, first),
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=int(leaves["agents.present"].sum()),
         agents_dropped=dropped,
@@ -150,18 +145,35 @@ def pack(
         segments_kept=len(road["road.kind"]),
         segments_cut=cut,
         relief_m=relief,
-        metadata=dict(raw.metadata),
     )
     return columns.assemble_columns(Scene, {name: np.asarray(leaf, columns.COLUMNS[name].dtype) for name, leaf in leaves.items()}), report
 
 
+def _list_drops(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no tracks"
+
+
+def _describe_source(raw: RawScene, origin: Float[np.ndarray, "3"], centred_on: str, first: int) -> dict[str, Any]:
+    """The entries of a report that say where a packed scene comes from."""
+    return {
+        "name": raw.name,
+        "source": raw.source,
+        "centre": (float(origin[0]), float(origin[1]), float(origin[2])),
+        "centred_on": centred_on,
+        "steps": len(raw.times) - first,
+        "current": raw.current - first,
+        "metadata": dict(raw.metadata),
+    }
+
+
 def _routes(
-    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], config: route_columns.RouteConfig | None, **who: Any
-) -> tuple[dict[str, np.ndarray], route_columns.RouteCounts | None]:
+    raw: RawScene, logs: Logs, *place: Any, slots: int, traffic: list[int], size: np.ndarray, config: RouteConfig | None, **who: Any
+) -> tuple[dict[str, np.ndarray], RouteCounts | None]:
     """Columns of the routes and their counts; without a config there are none."""
     if config is None:
-        return route_columns.make_no_routes(slots, len(traffic)), None
-    return route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
+        return route_columns.make_no_routes(slots, len(traffic)) | route_conflicts.make_no_zones(len(traffic)), None
+    found, counts = route_columns.pack_routes(raw, logs, *place, slots=slots, traffic=traffic, config=config, **who)
+    return found | route_conflicts.find_zones(found | {"traffic_log.size": size}), counts
 
 
 def _find_centre(raw: RawScene, centre: str) -> tuple[Float[np.ndarray, "3"], str]:

@@ -12,10 +12,18 @@ from scenefactory_jax.core.raw_scene import SceneError
 from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.packing import columns
 
-ROUTE_AXES = ("routes", "route_points", "stops", "controls", "changes")
+ROUTE_AXES = ("routes", "route_points", "stops", "zones", "controls", "changes")
 AXES = (*columns.ROADS, "agents", "steps", "traffic", *ROUTE_AXES)
 MAY_BE_EMPTY = ("traffic", *ROUTE_AXES)
-ENDLESS = ("routes.stop_arc", "routes.speed_limit", "controls.change_s", "controls.period_s")  # padded with infinity
+ENDLESS = (
+    "routes.stop_arc",
+    "routes.speed_limit",
+    "controls.change_s",
+    "controls.period_s",
+    "traffic_log.zone_enter",
+    "traffic_log.zone_leave",
+    "traffic_log.zone_match",
+)  # padded with infinity
 ROW_MULTIPLE = 256
 Leaves = dict[str, np.ndarray]
 
@@ -33,6 +41,7 @@ class Capacity:
     routes: Annotated[int, schema.Bounds(min=0)] | None = None
     route_points: Annotated[int, schema.Bounds(min=0)] | None = None
     stops: Annotated[int, schema.Bounds(min=0)] | None = None
+    zones: Annotated[int, schema.Bounds(min=0)] | None = None
     controls: Annotated[int, schema.Bounds(min=0)] | None = None
     changes: Annotated[int, schema.Bounds(min=0)] | None = None
 
@@ -111,8 +120,11 @@ def _count(world: Leaves, axis: str) -> int:
 
 def _take(world: Leaves, axis: str, rows: np.ndarray) -> Leaves:
     """The world with only these rows of an axis."""
-    along = {name: column.axes.index(axis) for name, column in columns.COLUMNS.items() if axis in column.axes}
-    return world | {name: np.take(world[name], rows, axis=place) for name, place in along.items()}
+    taken = dict(world)
+    for name, column in columns.COLUMNS.items():
+        for place in [place for place, other in enumerate(column.axes) if other == axis]:
+            taken[name] = np.take(taken[name], rows, axis=place)
+    return taken
 
 
 def _drop_padding(world: Leaves) -> Leaves:

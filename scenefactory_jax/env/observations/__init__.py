@@ -16,14 +16,17 @@ from scenefactory_jax.core.types import Observation, Scene, SetObservation, Stat
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
 from scenefactory_jax.env.observations.control_sets import lights, nearest_controls, signs
 from scenefactory_jax.env.observations.lane_vector import lane
+from scenefactory_jax.env.observations.metadrive import metadrive
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_vector import route
 from scenefactory_jax.env.observations.state_vectors import ego, weather, yaw_rate_and_steer
+from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
 __all__ += ["closest_approach", "ego", "lane", "lights", "nearest_controls", "neighbours", "road", "route", "signs", "weather"]  # groups
 __all__ += ["yaw_rate_and_steer"]
+__all__ += ["metadrive", "vmax_base", "vmax_lane", "vmax_road", "vmax_segment"]
 
 Group = Callable[[Scene, State], Float[Array, "A F"] | SetObservation]
 

@@ -5,19 +5,39 @@ gives its boxes on the road.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 from scenefactory_jax.core.instantiate import instantiate
+from scenefactory_jax.core.schema import Bounds, ConfigError, check_names, read_value
 from scenefactory_jax.core.types import Traffic
+from scenefactory_jax.env.traffic.idm import idm_traffic as idm_traffic
 from scenefactory_jax.env.traffic.log_playback import log_traffic as log_traffic
 from scenefactory_jax.env.traffic.log_playback import no_traffic as no_traffic
 from scenefactory_jax.env.traffic.log_playback import parked_traffic as parked_traffic
+from scenefactory_jax.env.traffic.log_playback import static_traffic as static_traffic
+from scenefactory_jax.env.traffic.mixed import mix_traffic
+from scenefactory_jax.env.traffic.trajectory_idm import trajectory_idm_traffic as trajectory_idm_traffic
+
+MIXED = "mixed"  # an entry with parts, which are entries themselves
 
 
 def make(entry: Mapping[str, Any], *, where: str = "traffic", **context: Any) -> Traffic:
-    """Binds the numbers of an entry.
+    """Binds the numbers of an entry; the parts of a mixture are entries of `traffic` themselves, each with a weight, or null.
 
     Raises:
-        ConfigError: a key that does not fit, by name.
+        ConfigError: a key that does not fit, by name; a mixture without parts.
     """
-    return instantiate(entry, builtins=__name__, where=where, **context)()
+    if entry.get("_target_") != MIXED:
+        return instantiate(entry, builtins=__name__, where=where, **context)()
+    check_names(entry, ["_target_", "parts"], where=where, required=["parts"])
+    parts = {name: part for name, part in (entry["parts"] or {}).items() if part is not None}
+    if not parts:
+        raise ConfigError(f"{where}.parts: expected entries of the group `traffic` by name, got {entry['parts']!r}")
+    kinds, weights = [], []
+    for name, part in parts.items():
+        place = f"{where}.parts.{name}"
+        if not isinstance(part, Mapping) or "weight" not in part:
+            raise ConfigError(f"{place}: expected an entry of the group `traffic` with a weight, got {part!r}")
+        weights.append(float(read_value(part["weight"], Annotated[float, Bounds(above=0)], where=f"{place}.weight")))
+        kinds.append(make({key: value for key, value in part.items() if key != "weight"}, where=place, **context))
+    return mix_traffic(kinds, weights)

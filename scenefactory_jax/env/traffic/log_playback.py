@@ -41,9 +41,19 @@ def parked_traffic(*, parked_m: NonNegative, start_row: Row, elevation_m: float)
     return make_stateless(lambda scene, step: read_parked(scene, parked_m=parked_m, start_row=start_row, elevation_m=elevation_m))
 
 
-def read_parked(scene: Scene, *, parked_m: float, start_row: int, elevation_m: float) -> Boxes:
-    """Reads the boxes of parked vehicles, see `parked_traffic`."""
+def static_traffic(*, start_row: Row, elevation_m: float) -> Traffic:
+    """All vehicles that are on the road at the start, parked or not, as immovable boxes at their logged position.
+
+    Args:
+        start_row, elevation_m: as in `parked_traffic`.
+    """
+    return make_stateless(lambda scene, step: read_parked(scene, parked_m=None, start_row=start_row, elevation_m=elevation_m))
+
+
+def read_parked(scene: Scene, *, parked_m: float | None, start_row: int, elevation_m: float) -> Boxes:
+    """Reads the boxes of parked vehicles, see `parked_traffic`; with None of all vehicles."""
     log = scene.traffic_log
+    stands = log.kind == VEHICLE if parked_m is None else is_parked(log, parked_m)
     row = min(start_row, log.valid.shape[1] - 1)
     zero = jnp.zeros_like(log.yaw[:, row])
     return Boxes(
@@ -54,7 +64,7 @@ def read_parked(scene: Scene, *, parked_m: float, start_row: int, elevation_m: f
         yaw_rate=zero,
         size=log.size,
         mass=zero + jnp.inf,
-        present=log.valid[:, row] & is_parked(log, parked_m),
+        present=log.valid[:, row] & stands,
     )
 
 

@@ -1,0 +1,65 @@
+"""Distances along rays from a point to rectangles and to line segments."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame
+
+PARALLEL = 1e-6  # sine of the angle below which a ray and a segment are parallel
+
+
+def make_ray_directions(count: int) -> Float[Array, "{count} 2"]:
+    """Makes unit vectors all around, the first ahead, counter-clockwise."""
+    return heading_vector(2 * jnp.pi * jnp.arange(count) / count)
+
+
+def cast_to_boxes(
+    rays: Float[Array, "N 2"],
+    position: Float[Array, "A B 2"],
+    yaw: Float[Array, "A B"],
+    size: Float[Array, "A B 2"],
+    present: Bool[Array, "A B"],
+    *,
+    range_m: float,
+) -> Float[Array, "A N"]:
+    """Computes the distance to the first box on each ray from the origin, `range_m` without one; 0 inside a box."""
+    direction = to_frame(rays, yaw[..., None])  # [A, B, N, 2]
+    origin, half = to_frame(-position, yaw), size / 2
+    enter, leave = jnp.zeros(direction.shape[:-1]), jnp.full(direction.shape[:-1], range_m)
+    for axis in range(2):
+        along, start, reach = direction[..., axis], origin[..., axis, None], half[..., axis, None]
+        still = jnp.abs(along) < PARALLEL
+        inverse = 1.0 / jnp.where(still, 1.0, along)
+        first, second = (-reach - start) * inverse, (reach - start) * inverse
+        beside = still & (jnp.abs(start) > reach)
+        near = jnp.where(still, jnp.where(beside, jnp.inf, -jnp.inf), jnp.minimum(first, second))
+        far = jnp.where(still, jnp.inf, jnp.maximum(first, second))
+        enter, leave = jnp.maximum(enter, near), jnp.minimum(leave, far)
+    hit = (enter <= leave) & present[..., None]
+    return jnp.min(jnp.where(hit, enter, range_m), axis=1, initial=range_m)
+
+
+def cast_to_segments(
+    rays: Float[Array, "N 2"],
+    midpoint: Float[Array, "A C 2"],
+    direction: Float[Array, "A C 2"],
+    half_length: Float[Array, "A C"],
+    present: Bool[Array, "A C"],
+    *,
+    range_m: float,
+) -> Float[Array, "A N"]:
+    """Computes the distance to the first line segment on each ray from the origin, `range_m` without one."""
+    ray, middle, along = rays[None, None], midpoint[:, :, None], direction[:, :, None]
+    sine = cross(ray, along)
+    inverse = 1.0 / jnp.where(jnp.abs(sine) < PARALLEL, jnp.inf, sine)
+    distance, place = cross(middle, along) * inverse, cross(middle, ray) * inverse
+    hit = present[..., None] & (jnp.abs(sine) >= PARALLEL) & (distance >= 0) & (jnp.abs(place) <= half_length[..., None])
+    return jnp.min(jnp.where(hit, jnp.minimum(distance, range_m), range_m), axis=1, initial=range_m)
+
+
+def measure_segments(
+    midpoint: Float[Array, "A C 2"], direction: Float[Array, "C 2"], half_length: Float[Array, " C"]
+) -> Float[Array, "A C"]:
+    """Computes the squared distances from the origin to segments."""
+    beyond = jnp.maximum(jnp.abs(dot(midpoint, direction)) - half_length, 0.0)
+    return beyond**2 + cross(midpoint, direction) ** 2

@@ -1,0 +1,122 @@
+"""Step metrics of V-Max (arXiv:2503.08388) that rewards need, too: time to overlap, comfort, distance to routes."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.core.boxes import find_overlaps
+from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
+from scenefactory_jax.core.types import Scene
+
+PREDICTION_STEP_S = 0.1
+AXLE = 0.4  # of the length: from the centre back to the rear axle
+AHEAD_COSINE = 0.8660254  # 30 degrees
+COMFORT_ROWS = 10  # states of the window, 0.1 s apart
+LATERAL, LONGITUDINAL, JERK, YAW_ACCELERATION, YAW_RATE = 2.0, (-4.05, 2.4), 8.3, 2.2, 0.95  # bounds of V-Max's comfort, SI units
+
+
+def find_ahead(
+    position: Float[Array, "*a 2"], yaw: Float[Array, "*b"], length: Float[Array, "*c"], other_position: Float[Array, "*d 2"]
+) -> Bool[Array, "*k"]:
+    """Finds the others whose centres bear less than 30 degrees from the heading, seen from the rear axle; leading axes broadcast."""
+    facing = heading_vector(yaw)
+    bearing = other_position - (position - (AXLE * length)[..., None] * facing)
+    return dot(bearing, facing) > AHEAD_COSINE * safe_norm(bearing)
+
+
+def compute_time_to_overlap(
+    position: Float[Array, "A 2"],
+    yaw: Float[Array, " A"],
+    velocity: Float[Array, "A 2"],
+    size: Float[Array, "A 2"],
+    other_position: Float[Array, "B 2"],
+    other_yaw: Float[Array, " B"],
+    other_velocity: Float[Array, "B 2"],
+    other_size: Float[Array, "B 2"],
+    present: Bool[Array, "A B"],
+    *,
+    horizon_s: float,
+) -> Float[Array, " A"]:
+    """Computes the time to collision of V-Max: the first multiple of PREDICTION_STEP_S at which the rectangles of a car and of one ahead of
+    it overlap, at constant velocities and headings; 0 in an overlap, `horizon_s` without one before it."""
+    present = present & find_ahead(position[:, None], yaw[:, None], size[:, None, 0], other_position)
+    apart, closing = other_position - position[:, None], other_velocity - velocity[:, None]
+    time = PREDICTION_STEP_S * jnp.arange(round(horizon_s / PREDICTION_STEP_S), dtype=jnp.float32)[:, None, None]
+    place = apart + time[..., None] * closing  # [T, A, B, 2], in one loop with the minimum over it
+    overlap = find_overlaps(jnp.zeros(2), yaw[:, None], size[:, None], place, other_yaw, other_size)
+    return jnp.min(jnp.where(overlap & present, time, horizon_s), axis=(0, 2), initial=horizon_s)
+
+
+class ComfortParts(NamedTuple):
+    """Extremes over a window of states."""
+
+    lateral: Float[Array, "*a"]  # of the size of the lateral acceleration, m/s^2
+    lowest: Float[Array, "*a"]  # longitudinal acceleration
+    highest: Float[Array, "*a"]
+    jerk: Float[Array, "*a"]  # of the size of the longitudinal jerk, m/s^3
+    yaw_rate: Float[Array, "*a"]
+    yaw_acceleration: Float[Array, "*a"]
+
+
+def compute_comfort_parts(velocity: Float[Array, "*a K 2"], yaw: Float[Array, "*a K"], *, dt: float) -> ComfortParts:
+    """Computes the comfort parts of a window of states, the oldest first, by Savitzky-Golay filters of width 5.
+
+    Derivatives are those of the velocity in the frame of each state, and of the yaw.
+    """
+    turn = wrap_angle(jnp.diff(yaw, axis=-1))
+    unwrapped = jnp.concatenate([jnp.zeros_like(yaw[..., :1]), jnp.cumsum(turn, axis=-1)], axis=-1)
+    local = to_frame(velocity, yaw)
+    along, across = local[..., 0], local[..., 1]
+    acceleration = _filter(along, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)
+    largest = lambda values: jnp.max(jnp.abs(values), axis=-1)  # noqa: E731
+    return ComfortParts(
+        lateral=largest(_filter(across, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)),
+        lowest=jnp.min(acceleration, axis=-1),
+        highest=jnp.max(acceleration, axis=-1),
+        jerk=largest(_filter(along, (2.0, -1.0, -2.0, -1.0, 2.0), 7 * dt**2)),
+        yaw_rate=largest(_filter(unwrapped, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)),
+        yaw_acceleration=largest(_filter(unwrapped, (2.0, -1.0, -2.0, -1.0, 2.0), 7 * dt**2)),
+    )
+
+
+def _filter(values: Float[Array, "*a K"], weights: tuple[float, ...], divisor: float) -> Float[Array, "*a M"]:
+    """Weighted sums of all windows of five; the published end values repeat the first and last of these and change no extreme."""
+    count = values.shape[-1] - len(weights) + 1
+    return sum((weight * values[..., place : place + count] for place, weight in enumerate(weights)), start=jnp.float32(0.0)) / divisor
+
+
+def is_comfortable(parts: ComfortParts) -> Bool[Array, "*a"]:
+    """Whether all parts are within their bounds."""
+    low, high = LONGITUDINAL
+    within = (parts.lateral <= LATERAL) & (parts.lowest >= low) & (parts.highest <= high) & (parts.jerk <= JERK)
+    return within & (parts.yaw_acceleration <= YAW_ACCELERATION) & (parts.yaw_rate <= YAW_RATE)
+
+
+def compute_comfort(parts: ComfortParts) -> Float[Array, "*a"]:
+    """Computes V-Max's continuous comfort in (0, 1]: five values exp(-excess over the bound), averaged with the weights exp(-value)."""
+    fall = lambda excess: jnp.exp(-jnp.maximum(excess, 0.0))  # noqa: E731
+    low, high = LONGITUDINAL
+    values = jnp.stack(
+        [
+            fall(parts.lateral - LATERAL),
+            fall(parts.highest - high) * fall(low - parts.lowest),
+            fall(parts.jerk - JERK),
+            fall(parts.yaw_acceleration - YAW_ACCELERATION),
+            fall(parts.yaw_rate - YAW_RATE),
+        ]
+    )
+    weights = jnp.exp(-values)
+    return jnp.sum(weights * values, axis=0) / jnp.sum(weights, axis=0)
+
+
+def measure_route_distances(scene: Scene, position: Float[Array, "A 2"]) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
+    """Computes the distances of agents to the nearest points of their on-route and of their other routes; inf without such a route."""
+    routes, cars = scene.routes, len(position)
+    if routes.length.shape[0] == 0:
+        return jnp.full(cars, jnp.inf), jnp.full(cars, jnp.inf)
+    offset = routes.position - position[jnp.maximum(routes.agent, 0)][:, None]  # each route is compared with its own agent only
+    squared = jnp.min(dot(offset, offset), axis=1)
+    own = (routes.agent == jnp.arange(cars)[:, None]) & (routes.length > 0)
+    on, off = (jnp.min(jnp.where(own & kind, squared, jnp.inf), axis=1) for kind in (routes.on_route, ~routes.on_route))
+    return jnp.sqrt(on), jnp.sqrt(off)

@@ -1,0 +1,166 @@
+"""What lies on the route ahead of a vehicle: boxes in its corridor, bends, and the pose of a box that follows the route.
+
+A window of a route is read every few metres as chords; boxes are projected onto the nearest chord. All functions are for any number of
+vehicles of one world and do not depend on what drives them.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, wrap_angle
+from scenefactory_jax.core.types import ROUTE_SPACING_M, Boxes, Routes
+
+AXLES = 0.6  # distance of the two places that carry a box, over its length: a car's wheelbase
+SHORTEST_M = 0.2  # a shorter chord lies behind the route's end
+
+
+class Window(NamedTuple):
+    """A piece of each vehicle's route as points with a fixed spacing; those behind the end of the route repeat it."""
+
+    point: Float[Array, "V K 2"]
+    arc: Float[Array, "V K"]  # length along the route
+    row: Int[Array, "V K"]  # of the route's points
+
+
+class Projection(NamedTuple):
+    """Boxes along the routes of vehicles."""
+
+    arc: Float[Array, "V B"]  # of the box's centre
+    offset: Float[Array, "V B"]  # of the centre from the route, to the left
+    cosine: Float[Array, "V B"]  # between route and box
+    sine: Float[Array, "V B"]
+    speed: Float[Array, "V B"]  # of the box along the route
+    drift: Float[Array, "V B"]  # of the box to the left
+    valid: Bool[Array, "V B"]  # the box lies beside the window, neither behind its beginning nor beyond its end
+
+
+def read_window(routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"], *, points: int, stride: int) -> Window:
+    """Reads the routes from the point at or before `arc` on; `stride` counts the route's points."""
+    count = routes.position.shape[1]
+    first = jnp.clip(jnp.floor(arc / ROUTE_SPACING_M).astype(jnp.int32), 0, max(count - 2, 0))
+    row = jnp.minimum(first[:, None] + stride * jnp.arange(points), count - 1)
+    point = routes.position.reshape(-1, 2)[route[:, None] * count + row]
+    return Window(point, jnp.minimum(ROUTE_SPACING_M * row, routes.length[route][:, None]), row)
+
+
+def project_boxes(window: Window, boxes: Boxes) -> Projection:
+    """Projects boxes onto the nearest chords of windows."""
+    start, along = window.point[:, :-1], window.point[:, 1:] - window.point[:, :-1]  # [V, K-1, 2]
+    length = safe_norm(along)
+    usable = length > SHORTEST_M
+    direction = along / jnp.maximum(length, SHORTEST_M)[..., None]
+    relative = boxes.position[None, :, None] - start[:, None]  # [V, B, K-1, 2]
+    place = dot(relative, direction[:, None])
+    beyond = place - jnp.clip(place, 0.0, length[:, None])
+    distance = jnp.where(usable[:, None], cross(direction[:, None], relative) ** 2 + beyond**2, jnp.inf)
+    best = jnp.argmin(distance, axis=2)  # [V, B]
+    chord = lambda table: jnp.take_along_axis(table, best, axis=1)  # noqa: E731
+    ahead = jnp.stack([chord(direction[..., 0]), chord(direction[..., 1])], axis=-1)
+    from_start = boxes.position[None] - jnp.stack([chord(start[..., 0]), chord(start[..., 1])], axis=-1)
+    arc = chord(window.arc[:, :-1]) + dot(ahead, from_start)
+    heading = heading_vector(boxes.yaw)[None]
+    low, high = window.arc[:, :1], jnp.max(window.arc, axis=1, keepdims=True)
+    reach = 0.5 * boxes.size[None, :, 0]
+    return Projection(
+        arc=arc,
+        offset=cross(ahead, from_start),
+        cosine=dot(ahead, heading),
+        sine=cross(ahead, heading),
+        speed=dot(ahead, boxes.velocity[None]),
+        drift=cross(ahead, boxes.velocity[None]),
+        valid=boxes.present[None] & chord(usable) & (arc >= low - reach) & (arc <= high + reach),
+    )
+
+
+class Obstacles(NamedTuple):
+    """Boxes in the corridors of vehicles."""
+
+    gap: Float[Array, "V B"]  # from the vehicle's front to the box along the route; inf: not in the corridor
+    speed: Float[Array, "V B"]  # of the box along the route, at least 0
+
+
+def find_obstacles(
+    places: Projection,
+    boxes: Boxes,
+    *,
+    arc: Float[Array, " V"],
+    size: Float[Array, "V 2"],
+    margin_m: float,
+    foresight_s: Float[Array, " B"],
+) -> Obstacles:
+    """Finds the boxes whose centre is ahead of the vehicle's and that touch the strip of its width and a margin on both sides along its
+    route, now or within `foresight_s` at their present velocity."""
+    half = 0.5 * boxes.size[None]
+    across = jnp.abs(places.sine) * half[..., 0] + jnp.abs(places.cosine) * half[..., 1]
+    lengthwise = jnp.abs(places.cosine) * half[..., 0] + jnp.abs(places.sine) * half[..., 1]
+    later = places.offset + places.drift * foresight_s
+    offset = jnp.where(places.offset * later < 0, 0.0, jnp.minimum(jnp.abs(places.offset), jnp.abs(later)))
+    inside = places.valid & (places.arc > arc[:, None]) & (offset - across < 0.5 * size[:, 1:] + margin_m)
+    gap = places.arc - lengthwise - arc[:, None] - 0.5 * size[:, :1]
+    return Obstacles(jnp.where(inside, gap, jnp.inf), jnp.maximum(places.speed, 0.0))
+
+
+def compute_target_speed(
+    window: Window, limit: Float[Array, "V K"], arc: Float[Array, " V"], *, lateral_mps2: float, braking_mps2: float
+) -> Float[Array, " V"]:
+    """Computes the largest speed at which a vehicle can still keep to the limits and to a lateral acceleration in the bends ahead."""
+    along = window.point[:, 1:] - window.point[:, :-1]
+    length = safe_norm(along)
+    turn = jnp.abs(jnp.arctan2(cross(along[:, :-1], along[:, 1:]), dot(along[:, :-1], along[:, 1:])))
+    spacing = 0.5 * (length[:, :-1] + length[:, 1:])
+    sound = jnp.minimum(length[:, :-1], length[:, 1:]) > SHORTEST_M
+    radius = jnp.where(sound, spacing / jnp.maximum(turn, 1e-4), jnp.inf)
+    bend = jnp.sqrt(lateral_mps2 * jnp.minimum(radius, 1e6))
+    bend = jnp.concatenate([bend[:, :1], bend, bend[:, -1:]], axis=1)  # of the points
+    distance = jnp.maximum(window.arc - arc[:, None], 0.0)
+    return jnp.min(jnp.sqrt(jnp.minimum(bend, limit) ** 2 + 2.0 * braking_mps2 * distance), axis=1)
+
+
+def place_on_route(
+    routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"], length: Float[Array, " V"]
+) -> tuple[Float[Array, "V 2"], Float[Array, " V"]]:
+    """Computes centre and yaw of boxes whose axles are on their routes; beyond both ends a route goes on straight."""
+    reach = 0.5 * AXLES * length
+    rear, front = interpolate_points(routes, route, arc - reach), interpolate_points(routes, route, arc + reach)
+    along = front - rear
+    return 0.5 * (front + rear), jnp.arctan2(along[:, 1], along[:, 0])
+
+
+def interpolate_points(routes: Routes, route: Int[Array, " V"], arc: Float[Array, " V"]) -> Float[Array, "V 2"]:
+    """Computes points at lengths along routes."""
+    count = routes.position.shape[1]
+    last = jnp.floor(routes.length[route] / ROUTE_SPACING_M).astype(jnp.int32) - 1
+    row = jnp.clip(jnp.floor(arc / ROUTE_SPACING_M).astype(jnp.int32), 0, jnp.clip(last, 0, max(count - 2, 0)))
+    table = routes.position.reshape(-1, 2)
+    start, end = table[route * count + row], table[route * count + jnp.minimum(row + 1, count - 1)]
+    return start + (arc / ROUTE_SPACING_M - row)[:, None] * (end - start)
+
+
+def project_points(routes: Routes, route: Int[Array, " V"], position: Float[Array, "V 2"], yaw: Float[Array, " V"]) -> Float[Array, " V"]:
+    """Computes the length along whole routes at the points nearest to positions; points that lead the other way are not taken."""
+    count = routes.position.shape[1]
+    line = routes.position[route]
+    ahead = jnp.concatenate([line[:, 1:], line[:, -1:]], axis=1) - line
+    opposed = dot(ahead, heading_vector(yaw)[:, None]) < 0
+    inside = ROUTE_SPACING_M * jnp.arange(count) <= routes.length[route][:, None] + ROUTE_SPACING_M
+    distance = safe_norm(line - position[:, None]) + jnp.where(inside, 0.0, 1e6) + jnp.where(opposed, 1e3, 0.0)
+    row = jnp.argmin(distance, axis=1)
+    start = jnp.take_along_axis(line, row[:, None, None], axis=1)[:, 0]
+    direction = jnp.take_along_axis(ahead, row[:, None, None], axis=1)[:, 0]
+    along = dot(position - start, direction) / jnp.maximum(safe_norm(direction), SHORTEST_M)
+    return jnp.clip(ROUTE_SPACING_M * row + along, 0.0, routes.length[route])
+
+
+def find_overlaps(first: Boxes, second: Boxes) -> Bool[Array, "B C"]:
+    """Mask of the pairs of present boxes that share area: no side of either separates them."""
+    delta = second.position[None] - first.position[:, None]
+    turn = wrap_angle(second.yaw[None] - first.yaw[:, None])
+    cosine, sine = jnp.abs(jnp.cos(turn)), jnp.abs(jnp.sin(turn))
+    half, other = 0.5 * first.size[:, None], 0.5 * second.size[None]
+    apart = jnp.zeros(turn.shape, bool)
+    for axes, own, guest in ((heading_vector(first.yaw)[:, None], half, other), (heading_vector(second.yaw)[None], other, half)):
+        apart |= jnp.abs(dot(axes, delta)) >= own[..., 0] + cosine * guest[..., 0] + sine * guest[..., 1]
+        apart |= jnp.abs(cross(axes, delta)) >= own[..., 1] + sine * guest[..., 0] + cosine * guest[..., 1]
+    return ~apart & first.present[:, None] & second.present[None]

@@ -1,0 +1,232 @@
+"""MetaDrive's reactive traffic: some logged vehicles follow their own track by an intelligent driver model, the others replay it.
+
+Facts of MetaDrive 0.4.3 (`policy/idm_policy.py`, `manager/scenario_traffic_manager.py`); its model works in km/h and metres and gives an
+action between -1 and 1. Here the track is followed exactly; MetaDrive steers along it with two PID controllers.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame, wrap_angle
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
+from scenefactory_jax.core.types import Boxes, RoadUser, Scene, Traffic, TrafficLog
+from scenefactory_jax.env.traffic import corridor, idm_law
+from scenefactory_jax.env.traffic.corridor import Window
+from scenefactory_jax.env.traffic.idm_law import IdmLaw
+from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, make_masses, read_log
+
+KMH = 3.6
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackDriving:
+    """How vehicles follow their tracks; described in `conf/traffic/trajectory_idm.yaml`."""
+
+    law: IdmLaw  # in km/h
+    target_kmh: Positive
+    look_ahead_m: Positive
+    point_m: Positive
+    strip_m: Positive
+    hold_s: Positive
+    full_throttle_mps2: Positive
+    full_brake_mps2: Positive
+    end_m: NonNegative
+
+
+@dataclasses.dataclass(frozen=True)
+class Selection:
+    """Which vehicles react, and which are left out, where `reactive` is metadrive."""
+
+    spread_m: NonNegative
+    travel_m: NonNegative
+    behind_m: NonNegative
+    side_m: Positive
+    heading_deg: Annotated[float, Bounds(above=0, max=180)]
+    clear_m: tuple[float, float]
+    min_rows: Count
+
+
+class TrackState(NamedTuple):
+    """State of the vehicles that follow their tracks; of the others it means nothing."""
+
+    reacts: Bool[Array, " O"]
+    skipped: Bool[Array, " O"]  # not on the road at all
+    first: Int[Array, " O"]  # row of the log at which the vehicle enters
+    arc: Float[Array, " O"]  # along the track from that row on
+    speed: Float[Array, " O"]
+    action: Float[Array, " O"]  # -1: full brake, 1: full throttle
+
+
+class Track(NamedTuple):
+    """Logged tracks as lines from the first row on; before it and in gaps a track stays where it is."""
+
+    position: Float[Array, "O L 2"]
+    yaw: Float[Array, "O L"]
+    arc: Float[Array, "O L"]
+
+
+def trajectory_idm_traffic(
+    *,
+    driving: TrackDriving,
+    selection: Selection,
+    reactive: Literal["metadrive", "all"],
+    kinds: list[RoadUser],
+    parked_m: NonNegative,
+    gap_s: NonNegative,
+    mass_kg: dict[RoadUser, float | None],
+    start_row: Row,
+    elevation_m: float,
+    control_dt: float,
+) -> Traffic:
+    """Traffic of logged vehicles that follow their tracks by MetaDrive's model; those that do not react replay their log.
+
+    Args:
+        driving: how vehicles follow their tracks.
+        selection: see `reactive`.
+        reactive: metadrive: vehicles that move and begin behind the first agent, with its heading; all: every vehicle that moves.
+        kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`.
+
+    Raises:
+        ConfigError: as `log_traffic`.
+    """
+    masses = make_masses(mass_kg)
+    numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
+    hold = max(round(driving.hold_s / control_dt), 1)
+
+    def start(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""]) -> TrackState:
+        row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
+        return init(scene, jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1), selection, choose=reactive)
+
+    def move(scene: Scene, state: TrackState, cars: Boxes, step: Int[Array, ""]) -> TrackState:
+        if scene.traffic_log.kind.shape[0] == 0:
+            return state
+        row = start_row + step * (control_dt / scene.log.dt)
+        due = (step + jnp.arange(len(state.arc))) % hold == 0
+        boxes: Boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.traffic, cars)
+        return advance(scene, state, boxes, row, due, driving, dt=control_dt)
+
+    def read(scene: Scene, state: TrackState, step: Int[Array, ""]) -> Boxes:
+        logged = read_log(scene, step, kinds=kinds, masses=masses, **numbers)
+        if scene.traffic_log.kind.shape[0] == 0:
+            return logged
+        row = start_row + step * (control_dt / scene.log.dt)
+        return read_boxes(scene.traffic_log, state, logged, row, driving.end_m)
+
+    return Traffic(start, move, read)
+
+
+def init(scene: Scene, row: Int[Array, ""], selection: Selection, *, choose: str) -> TrackState:
+    """Finds the vehicles that react from a row of the log on, at their logged places and speeds."""
+    log = scene.traffic_log
+    rows = jnp.arange(log.valid.shape[1])
+    later = log.valid & (rows >= row)
+    first = jnp.argmax(later, axis=1)
+    read = lambda table: jnp.take_along_axis(table, first.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]  # noqa: E731
+    count = jnp.maximum(jnp.sum(later, axis=1), 1)
+    mean = jnp.sum(jnp.where(later[..., None], log.position, 0.0), axis=1) / count[:, None]
+    square = jnp.where(later[..., None], (log.position - mean[:, None]) ** 2, 0.0)
+    spread = jnp.sqrt(jnp.sum(square, axis=1) / count[:, None])
+    last = log.valid.shape[1] - 1 - jnp.argmax(later[:, ::-1], axis=1)
+    end = jnp.take_along_axis(log.position, last[:, None, None], axis=1)[:, 0]
+    place, yaw = read(log.position), read(log.yaw)
+    moves = jnp.any(spread > selection.spread_m, axis=1) & (safe_norm(end - place) > selection.travel_m)
+    reacts = (log.kind == VEHICLE) & jnp.any(later, axis=1) & moves
+    skipped = jnp.zeros_like(reacts)
+    if choose == "metadrive":
+        chosen, near = _compare_with_first_agent(scene, first, place, yaw, selection)
+        reacts &= chosen
+        skipped = (log.kind == VEHICLE) & (near | (jnp.sum(log.valid, axis=1) < selection.min_rows))
+    zero = jnp.zeros(len(reacts), jnp.float32)
+    return TrackState(reacts & ~skipped, skipped, first.astype(jnp.int32), zero, safe_norm(read(log.velocity)), zero)
+
+
+def _compare_with_first_agent(
+    scene: Scene, row: Int[Array, " O"], place: Float[Array, "O 2"], yaw: Float[Array, " O"], selection: Selection
+) -> tuple[Bool[Array, " O"], Bool[Array, " O"]]:
+    """Masks of the places behind the first agent at that time, and of those too near to it; nothing in a world without agents."""
+    if scene.agents.present.shape[0] == 0:
+        none = jnp.zeros(row.shape, bool)
+        return none, none
+    row = jnp.minimum(row, scene.log.valid.shape[1] - 1)
+    known = scene.agents.present[0] & scene.log.valid[0, row]
+    relative = to_frame(place - scene.log.position[0, row], scene.log.yaw[0, row])
+    alike = jnp.abs(wrap_angle(yaw - scene.log.yaw[0, row])) < jnp.deg2rad(selection.heading_deg)
+    behind = (relative[:, 0] < -selection.behind_m) & (jnp.abs(relative[:, 1]) < selection.side_m)
+    near = jnp.all(jnp.abs(relative) < jnp.array(selection.clear_m) / 2, axis=1)
+    return known & alike & behind, known & near
+
+
+def make_track(log: TrafficLog, first: Int[Array, " O"]) -> Track:
+    """Joins the valid rows of the log, from `first` on, to lines."""
+    rows = jnp.arange(log.valid.shape[1])
+    known = log.valid & (rows >= first[:, None])
+    held = jnp.maximum(jax.lax.cummax(jnp.where(known, rows, -1), axis=1), first[:, None])
+    position = jnp.take_along_axis(log.position, held[..., None], axis=1)
+    steps = safe_norm(position[:, 1:] - position[:, :-1])
+    return Track(position, jnp.take_along_axis(log.yaw, held, axis=1), jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0))))
+
+
+def interpolate_track(track: Track, arc: Float[Array, "O K"]) -> tuple[Float[Array, "O K 2"], Float[Array, "O K"]]:
+    """Computes positions and yaws at lengths along tracks; the ends beyond them."""
+    last = track.arc.shape[1] - 1
+    if last == 0:
+        return jnp.broadcast_to(track.position, (*arc.shape, 2)), jnp.broadcast_to(track.yaw, arc.shape)
+    arc = jnp.clip(arc, 0.0, track.arc[:, -1:])
+    row = jnp.clip(jnp.sum(track.arc[:, None] <= arc[..., None], axis=2) - 1, 0, last - 1)
+    pick: Callable[[Array, Array], Array] = lambda table, at: jnp.take_along_axis(table, at, axis=1)  # noqa: E731
+    start, end = pick(track.arc, row), pick(track.arc, row + 1)
+    fraction = jnp.clip((arc - start) / jnp.maximum(end - start, 1e-6), 0.0, 1.0)
+    position, following = pick(track.position, row[..., None]), pick(track.position, row[..., None] + 1)
+    yaw = pick(track.yaw, row)
+    turn = wrap_angle(pick(track.yaw, row + 1) - yaw)
+    return position + fraction[..., None] * (following - position), wrap_angle(yaw + fraction * turn)
+
+
+def advance(
+    scene: Scene, state: TrackState, boxes: Boxes, row: Float[Array, ""], due: Bool[Array, " O"], driving: TrackDriving, *, dt: float
+) -> TrackState:
+    """Moves the vehicles that react by one control step; those that are due choose a new action."""
+    log, law = scene.traffic_log, driving.law
+    track = make_track(log, state.first)
+    ahead = jnp.arange(int(driving.look_ahead_m // driving.point_m) + 1) * driving.point_m
+    arc = jnp.minimum(state.arc[:, None] + ahead, track.arc[:, -1:])
+    window = Window(interpolate_track(track, arc)[0], arc, jnp.zeros(arc.shape, jnp.int32))
+    places = corridor.project_boxes(window, boxes)
+    strip = {"size": log.size, "margin_m": driving.strip_m, "foresight_s": jnp.zeros(len(boxes.mass))}
+    found = corridor.find_obstacles(places, boxes, arc=state.arc, **strip)
+    own = jnp.arange(len(boxes.mass)) == jnp.arange(len(due))[:, None]
+    distance = jnp.where(jnp.isfinite(found.gap) & ~own, places.arc - state.arc[:, None], jnp.inf)  # between the centres
+    speed = KMH * jnp.broadcast_to(state.speed[:, None], distance.shape)
+    demand = jnp.max(idm_law.compute_interaction(speed, distance, KMH * found.speed, law), axis=1, initial=0.0)
+    target = jnp.full_like(state.speed, driving.target_kmh)
+    wanted = jnp.clip(idm_law.compute_acceleration(KMH * state.speed, target, demand, law), -1.0, 1.0)
+    drives = state.reacts & (state.first <= row)
+    action = jnp.where(due & drives, wanted, state.action)
+    acceleration = jnp.where(action > 0, driving.full_throttle_mps2, driving.full_brake_mps2) * action
+    new = jnp.maximum(state.speed + acceleration * dt, 0.0)
+    way = 0.5 * (state.speed + new) * dt
+    return state._replace(arc=jnp.where(drives, state.arc + way, state.arc), speed=jnp.where(drives, new, state.speed), action=action)
+
+
+def read_boxes(log: TrafficLog, state: TrackState, logged: Boxes, row: Float[Array, ""], end_m: float) -> Boxes:
+    """Reads the boxes of the vehicles that react, and of the others from their log."""
+    track = make_track(log, state.first)
+    position, yaw = (values[:, 0] for values in interpolate_track(track, state.arc[:, None]))
+    present = (state.first <= row) & (state.arc < track.arc[:, -1] - end_m)
+    boxes = replace(
+        logged,
+        position=position,
+        yaw=yaw,
+        velocity=state.speed[:, None] * heading_vector(yaw),
+        yaw_rate=jnp.zeros_like(yaw),
+        present=present,
+    )
+    pick = lambda a, b: jnp.where(state.reacts.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
+    chosen: Boxes = jax.tree.map(pick, boxes, logged)
+    return replace(chosen, present=chosen.present & ~state.skipped)

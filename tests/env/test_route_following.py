@@ -1,0 +1,153 @@
+"""Agents on their routes: place and progress, bends and crossings, red lights, stop signs, wrong way."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.gliding import build_env
+from support.hand_scenes import scene_of
+from support.route_scenes import controls_of, routed_scene, routes_of
+
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.instantiate import ConfigError
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import LIGHT_STATES
+from scenefactory_jax.env import route_following, spawning
+from scenefactory_jax.roadgraph import traffic_lights
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+GO, STOP, CAUTION = (LIGHT_STATES.index(name) for name in ("go", "stop", "caution"))
+STRAIGHT = np.stack([np.linspace(-50, 50, 2), [0.0, 0.0]], axis=1)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return build_env(load_config("task", "dynamics=bicycle"), ending=["numerical_error", "goal_reached"])
+
+
+@pytest.fixture(scope="module")
+def glide(env):
+    """Drives all agents for some steps without turning: state, and the metrics of every step [T, A]."""
+
+    @jax.jit
+    def step(state, scene):
+        state, result = env.step(scene, state, jnp.zeros((len(state.active), 3)))
+        return state, result.metrics
+
+    def run(scene, steps, state=None):
+        state = env.reset(jax.random.key(0), scene)[0] if state is None else state
+        found = []
+        for _ in range(steps):
+            state, metrics = step(state, scene)
+            found.append(metrics)
+        return state, jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+
+    return run
+
+
+def test_progress_is_the_way_along_the_route(glide):
+    lines = [STRAIGHT, STRAIGHT + np.array([0.0, 3.0])]
+    scene = routed_scene(lines, starts=[0.0, 10.0], ends=[60.0, 90.0], speeds=[6.0, 9.0], limits=[5.0, np.inf])
+    _, metrics = glide(scene, 30)
+    np.testing.assert_allclose(metrics.route_arc[-1], [6.0, 19.0], atol=0.02)
+    np.testing.assert_allclose(metrics.route_progress.sum(axis=0), [6.0, 9.0], atol=0.02)
+    np.testing.assert_allclose(metrics.route_completion[-1], [0.1, 9 / 80], atol=1e-3)
+    np.testing.assert_allclose(metrics.route_remaining[-1], [54.0, 71.0], atol=0.02)
+    np.testing.assert_allclose(metrics.overspeed[-1], [1.0, 0.0], atol=1e-4)
+    assert np.abs(metrics.route_distance).max() < 1e-3 and (metrics.route_alignment > 0.999).all() and metrics.has_route.all()
+    assert not any(getattr(metrics.events, name).any() for name in ("red_light", "stop_sign", "off_route"))
+
+
+def test_a_car_that_leaves_its_route_is_off_it(glide):
+    bend = np.array([[-50.0, 0.0], [-40.0, 0.0], [-40.0, 60.0]])  # the car goes straight on
+    _, metrics = glide(routed_scene([bend], speeds=[10.0]), 60)
+    off = metrics.events.off_route[:, 0]
+    first = int(np.flatnonzero(off)[0])
+    assert metrics.route_distance[first, 0] == pytest.approx(5.0, abs=0.35) and off[first:].all()
+    assert metrics.route_completion[-1, 0] < 0.2
+
+
+def test_a_route_that_crosses_itself_is_followed_in_order():
+    """A figure of eight: at the crossing the arc length goes on and does not jump to the other branch."""
+    t = np.linspace(0, 2 * np.pi, 400)
+    eight = 30 * np.stack([np.sin(t), np.sin(t) * np.cos(t)], axis=1)
+    scene = routed_scene([eight])
+    arc = jnp.zeros(1)
+    for point in eight[::4]:
+        place = route_following.locate(scene, jnp.zeros(1, jnp.int32), arc, jnp.asarray(point[None], jnp.float32))
+        assert float(place.arc[0]) >= float(arc[0]) - 0.5 and float(place.arc[0] - arc[0]) < 4.0 and float(place.distance[0]) < 0.2
+        arc = place.arc
+    assert float(arc[0]) == pytest.approx(float(scene.routes.length[0]), abs=3.0)
+
+
+@pytest.mark.parametrize(("state", "runs"), [(STOP, True), (GO, False), (CAUTION, False)])
+def test_the_front_passes_a_line_at_red(glide, state, runs):
+    """The line is 10 m ahead of the centre, 8 m ahead of the front: at 8 m/s it is passed in the 30th step."""
+    lights = [((-40.0, 0.0), [(0.0, state)], np.inf)]
+    _, metrics = glide(routed_scene([STRAIGHT], speeds=[8.0], controls=lights, stops=[[(10.0, 0)]]), 40)
+    steps = np.flatnonzero(metrics.events.red_light[:, 0])
+    assert (abs(steps - 29) <= 1).all() and len(steps) == runs
+
+
+def test_a_stop_sign_asks_for_standing_before_it(glide):
+    signs = [((-40.0, 0.0), None, np.inf)]
+    scene = routed_scene([STRAIGHT], speeds=[8.0], controls=signs, stops=[[(10.0, 0)]])
+    _, metrics = glide(scene, 40)
+    assert metrics.events.stop_sign[:, 0].sum() == 1 and not metrics.events.red_light.any()
+    near = routed_scene([STRAIGHT], starts=[6.0], speeds=[0.0], controls=signs, stops=[[(10.0, 0)]])
+    state, _ = glide(near, 2)
+    assert bool(state.route.stood[0])
+    moving = replace(state, body={**state.body, "v": jnp.array([5.0])})
+    moving, metrics = glide(near, 20, moving)
+    assert metrics.route_arc[-1, 0] > 9.0 and not metrics.events.stop_sign.any()
+    assert not bool(moving.route.stood[0]), "the next sign asks anew"
+
+
+def test_lights_follow_their_changes_and_periods():
+    controls = controls_of(
+        ((0.0, 0.0), [(0.0, STOP), (2.0, GO), (5.0, CAUTION)], 6.0),
+        ((0.0, 0.0), [(-1.0, GO), (3.0, 0)], np.inf),
+        ((0.0, 0.0), None, np.inf),
+    )
+    states = [traffic_lights.read_light_states(controls, jnp.float32(time)).tolist() for time in (0.5, 2.5, 5.5, 6.5, 8.5, 61.0)]
+    assert states == [[STOP, GO, 0], [GO, GO, 0], [CAUTION, 0, 0], [STOP, 0, 0], [GO, 0, 0], [STOP, 0, 0]]
+    assert traffic_lights.read_light_states(controls, jnp.float32(-2.0)).tolist()[1] == 0, "unknown before the first change"
+    assert traffic_lights.find_red(jnp.array([STOP, GO, CAUTION, 1, 7])).tolist() == [True, False, False, True, True]
+
+
+def test_against_the_route_is_the_wrong_way(glide):
+    scene = routed_scene([STRAIGHT, STRAIGHT[::-1]], starts=[20.0, 50.0], speeds=[6.0, 6.0])
+    turned = replace(scene, agents=replace(scene.agents, yaw=jnp.zeros(2)))
+    _, metrics = glide(turned, 3)
+    assert metrics.wrong_way[-1].tolist() == [False, True] and metrics.route_alignment[-1, 1] < -0.99
+
+
+def test_a_world_without_routes_reads_zeros(glide):
+    _, metrics = glide(scene_of([[0.0, 0.0]], [[40.0, 0.0]], speeds=[5.0]), 2)
+    for name in ("route_arc", "route_progress", "route_remaining", "route_completion", "route_distance", "overspeed"):
+        assert not np.asarray(getattr(metrics, name)).any(), name
+    assert not metrics.has_route.any()
+
+
+def test_starts_on_drawn_routes():
+    numbers = {key: value for key, value in load_config("task", "spawning=routes")["spawning"]["sampler"].items()}
+    lines = [STRAIGHT, STRAIGHT + np.array([0.0, 12.0]), STRAIGHT[::-1] + np.array([0.0, -12.0])]
+    scene = routed_scene([STRAIGHT] * 3)
+    with pytest.raises(ConfigError, match="scenes/pack/routes=drawn"):
+        bare = replace(scene, routes=type(scene.routes)(**{name: leaf[:0] for name, leaf in vars(scene.routes).items()}))
+        spawning.make(numbers)(jax.random.key(0), bare)
+    drawn = replace(scene, routes=routes_of(lines, owners=[-1, -1, -1], drawn=[False, True, True], limits=[10.0, 10.0, 10.0]))
+    agents = jax.jit(jax.vmap(spawning.make(numbers), in_axes=(0, None)))(jax.random.split(jax.random.key(1), 64), drawn)
+    present = np.asarray(agents.present)
+    assert present.mean() > 0.6 and set(np.asarray(agents.route)[present].tolist()) == {1, 2}
+    travel = np.asarray(agents.route_end - agents.route_start)[present]
+    assert travel.min() >= 50.0 - 1e-3 and travel.max() <= 100.0 + 1e-3 and travel.std() > 5
+    x, y = np.asarray(agents.position)[present].T
+    east = np.asarray(agents.route)[present] == 1
+    np.testing.assert_allclose(np.where(east, x + 50, 50 - x), np.asarray(agents.route_start)[present], atol=1e-3)
+    np.testing.assert_allclose(y, np.where(east, 12.0, -12.0), atol=1e-4)
+    np.testing.assert_allclose(np.abs(np.asarray(agents.yaw)[present]), np.where(east, 0.0, np.pi), atol=1e-5)
+    speed = np.asarray(agents.speed)
+    rest = (speed == 0).all(axis=1)
+    assert 0.3 < rest.mean() < 0.7 and speed[present & ~rest[:, None]].min() >= 3.0 - 1e-4 and speed.max() <= 9.0 + 1e-4

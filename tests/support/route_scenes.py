@@ -1,0 +1,75 @@
+"""Scenes with routes made by hand: polylines as routes, stop lines on them, and agents that start on them."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import ROUTE_SPACING_M, Routes, TrafficControls
+from scenefactory_jax.roadgraph.route_sets import _resample
+from support.hand_scenes import scene_of
+
+
+def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
+    """Polylines [N, 2] as routes; `stops`: for each route (arc, control) pairs; `limits` m/s."""
+    sampled = [_resample(np.asarray(line, float), 1e6) for line in lines]
+    points = max(len(xy) for xy, *_ in sampled)
+    position = np.stack([np.concatenate([xy, np.tile(xy[-1], (points - len(xy), 1))]) for xy, *_ in sampled])
+    count, stops = len(lines), stops or [[] for _ in lines]
+    most = max(map(len, stops))
+    arc, control = np.full((count, most), np.inf), np.zeros((count, most), int)
+    for row, passed in enumerate(stops):
+        for place, (at, which) in enumerate(passed):
+            arc[row, place], control[row, place] = at, which
+    limit = np.full((count, points), np.inf) if limits is None else np.repeat(np.asarray(limits, float)[:, None], points, axis=1)
+    f, i = jnp.float32, jnp.int32
+    return Routes(
+        position=jnp.asarray(position, f),
+        length=jnp.asarray([length for _, length, _ in sampled], f),
+        speed_limit=jnp.asarray(limit, f),
+        lane=jnp.zeros((count, points), i),
+        along_lanes=jnp.ones(count, bool),
+        agent=jnp.asarray(np.arange(count) if owners is None else owners, i),
+        drawn=jnp.zeros(count, bool) if drawn is None else jnp.asarray(drawn, bool),
+        on_route=jnp.ones(count, bool),
+        stop_arc=jnp.asarray(arc, f),
+        stop_control=jnp.asarray(control, i),
+    )
+
+
+def controls_of(*rows):
+    """Rows of (position, [(time, state), ...] of a light or None for a stop sign, period)."""
+    most = max([len(changes or []) for _, changes, _ in rows], default=0)
+    change, state = np.full((len(rows), most), np.inf), np.zeros((len(rows), most), int)
+    for row, (_, changes, _) in enumerate(rows):
+        for place, (time, code) in enumerate(changes or []):
+            change[row, place], state[row, place] = time, code
+    f, i = jnp.float32, jnp.int32
+    return TrafficControls(
+        position=jnp.asarray([place for place, *_ in rows], f).reshape(-1, 2),
+        direction=jnp.tile(jnp.array([1.0, 0.0], f), (len(rows), 1)),
+        lane=jnp.zeros(len(rows), i),
+        stop_sign=jnp.asarray([changes is None for _, changes, _ in rows], bool),
+        change_s=jnp.asarray(change, f),
+        state=jnp.asarray(state, i),
+        period_s=jnp.asarray([period for *_, period in rows], f),
+        valid=jnp.ones(len(rows), bool),
+    )
+
+
+def routed_scene(lines, *, starts=None, ends=None, speeds=None, controls=(), stops=None, limits=None, **scene):
+    """Agents at arc lengths `starts` of their routes, one route each."""
+    routes = routes_of(lines, stops=stops, limits=limits)
+    begin = np.zeros(len(lines)) if starts is None else np.asarray(starts, float)
+    end = np.asarray(routes.length) if ends is None else np.asarray(ends, float)
+    position = np.asarray(routes.position)
+    place = lambda arc: np.stack([position[row, round(at / ROUTE_SPACING_M)] for row, at in enumerate(arc)])  # noqa: E731
+    along = np.stack([position[row, round(at) + 1] - position[row, round(at)] for row, at in enumerate(begin)])
+    made = scene_of(place(begin), place(end), yaws=np.arctan2(along[:, 1], along[:, 0]), speeds=speeds, length=120.0, **scene)
+    agents = replace(
+        made.agents,
+        route=jnp.arange(len(lines), dtype=jnp.int32),
+        route_start=jnp.asarray(begin, jnp.float32),
+        route_end=jnp.asarray(end, jnp.float32),
+        route_length=jnp.asarray(end - begin, jnp.float32),
+    )
+    return replace(made, agents=agents, routes=routes, controls=controls_of(*controls))
