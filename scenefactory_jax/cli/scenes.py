@@ -16,6 +16,7 @@ from scenefactory_jax.core.raw_scene import RawScene, SceneError
 from scenefactory_jax.core.safe_names import to_file_name
 from scenefactory_jax.data.curation import distribution_distance, quality_gate
 from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing import agent_table
 from scenefactory_jax.evaluation import scene_simulation
 from scenefactory_jax.visualization.birds_eye import figures
 from scenefactory_jax.visualization.report import plots, scene_comparison, scene_quality
@@ -38,7 +39,7 @@ def scenes(config: Mapping[str, Any]) -> Any:
 
 
 def check(config: Mapping[str, Any]) -> scene_source.Scenes:
-    """Packs the scenes and prints what was kept, dropped and refused; with `out`, also draws them and a sheet of all pictures."""
+    """Packs the scenes and prints what was kept, dropped and refused; with `out`, also draws them and lists their agents."""
     loaded = scene_source.load_training_scenes(config["scenes"])
     shown = [(name, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene)) for index, name in enumerate(loaded.names)]
     table = [[name, *_describe_scene(scene)] for name, scene in shown]
@@ -46,6 +47,8 @@ def check(config: Mapping[str, Any]) -> scene_source.Scenes:
     print(loaded.account, flush=True)
     if config["out"] is not None:
         _draw(shown[: config["check"]["max_pictures"]], Path(config["out"]), config)
+        rows = (row for name, scene in shown for row in agent_table.list_agents(name, scene))
+        agent_table.write(Path(config["out"]) / "agents.csv", rows)
     return loaded
 
 

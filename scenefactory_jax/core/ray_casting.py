@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame
+from scenefactory_jax.core.geometry import cross, heading_vector, to_frame
 
 PARALLEL = 1e-6  # sine of the angle below which a ray and a segment are parallel
 
@@ -55,11 +55,3 @@ def cast_to_segments(
     distance, place = cross(middle, along) * inverse, cross(middle, ray) * inverse
     hit = present[..., None] & (jnp.abs(sine) >= PARALLEL) & (distance >= 0) & (jnp.abs(place) <= half_length[..., None])
     return jnp.min(jnp.where(hit, jnp.minimum(distance, range_m), range_m), axis=1, initial=range_m)
-
-
-def measure_segments(
-    midpoint: Float[Array, "A C 2"], direction: Float[Array, "C 2"], half_length: Float[Array, " C"]
-) -> Float[Array, "A C"]:
-    """Computes the squared distances from the origin to segments."""
-    beyond = jnp.maximum(jnp.abs(dot(midpoint, direction)) - half_length, 0.0)
-    return beyond**2 + cross(midpoint, direction) ** 2

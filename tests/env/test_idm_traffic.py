@@ -9,6 +9,7 @@ import pytest
 from support.hand_scenes import scene_of
 
 from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.track_interpolation import make_empty_boxes
@@ -96,19 +97,19 @@ def entry_of(name="idm", **changes):
 
 @functools.cache
 def simulation(at_end="leave", steps=600):
-    """Runs idm traffic: (scene) -> states and boxes of every step; compiled once for each kind of end."""
+    """Runs idm traffic in two worlds: (scenes) -> states and boxes of every step; compiled once for each kind of end."""
     kind = traffic.make(entry_of(at_end=at_end), control_dt=DT)
 
     def run(scene):
         def body(state, step):
             boxes = kind.read(scene, state, step)
             state = kind.advance(replace(scene, traffic=boxes), state, car_far_away(), step)
-            return state, (state, kind.read(scene, state, step + 1))
+            return state, (state, boxes)
 
         first = kind.init(jax.random.key(0), scene, jnp.int32(0))
         return jax.lax.scan(body, first, jnp.arange(steps))[1]
 
-    return jax.jit(run)
+    return jax.jit(jax.vmap(run))
 
 
 def car_far_away() -> Boxes:
@@ -116,8 +117,10 @@ def car_far_away() -> Boxes:
     return jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), replace(make_empty_boxes(), size=jnp.ones((0, 2))))
 
 
-def run(scene, **how):
-    states, boxes = jax.device_get(simulation(**how)(scene))
+def run(scene, beside=None, **how):
+    """States after and boxes before every step of a world, which does not depend on the world beside it."""
+    scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), scene, beside or scene)
+    states, boxes = jax.tree.map(lambda leaf: leaf[0], jax.device_get(simulation(**how)(scenes)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states)), "no NaN, whatever happens"
     return states, boxes
 
@@ -262,19 +265,32 @@ def test_zones_are_where_routes_are_near():
 def test_vehicles_enter_at_their_time_where_there_is_room():
     scene = world({"route": "east", "arc": 50, "speed": 6.0, "first": 10}, {"route": "east", "arc": 120, "first": 5}, {"at": [20.0, 0.0]})
     _, boxes = run(scene)
-    assert np.argmax(boxes.present[:, 0]) == 9, "the boxes of step k + 1"
+    assert np.argmax(boxes.present[:, 0]) == 10
     assert not boxes.present[:, 1].any(), "its place is taken by one that stands"
 
 
 def test_routes_end_as_the_config_says():
     scene = world({"route": "east", "arc": 150, "speed": 8.0})
-    states, _ = run(scene, at_end="park")
-    assert states.phase[-1, 0] == idm.ON_ROAD
-    assert states.arc[-1, 0] == pytest.approx(200.0, abs=0.3)
     states, boxes = run(scene, at_end="restart")
     again = np.flatnonzero(np.diff(states.arc[:, 0]) < 0)
     assert len(again) >= 2, "it drives the route again and again"
-    assert boxes.position[again[0] + 1, 0, 0] < -90.0
+    assert boxes.position[again[0] + 2, 0, 0] < -90.0
+
+
+def test_a_vehicle_that_parks_stands_at_its_routes_end():
+    scene = world({"route": "east", "arc": 199}, {"route": "east", "arc": 150})
+    driving = schema.read(entry_of()["driving"], idm.IdmConfig)
+
+    @jax.jit
+    def ends(scene):
+        state = idm.init(scene, jnp.int32(0))
+        distance = idm.find_stop_distance(scene, state, state.arc, jnp.float32(0.0), driving, at_end="park")
+        beyond = state._replace(arc=state.arc + 1.5)
+        return distance, idm.end_routes(scene, beyond, idm.find_drivers(scene), driving, at_end="park").phase
+
+    distance, phase = ends(scene)
+    np.testing.assert_allclose(distance[:2], [1.0 + 1.0, 50.0 + 1.0], atol=0.01, err_msg="as if the gap behind the end were a leader")
+    assert phase[0] == idm.ON_ROAD
 
 
 def test_worlds_without_vehicles_or_routes_are_sound():
@@ -364,16 +380,8 @@ def test_trajectory_idm_follows_the_track_and_brakes():
     assert chosen.reacts.tolist()[:3] == [True, False, False], "the first agent is at (20, 0): only the first is behind it within 15 m"
 
 
-def test_steps_are_deterministic_and_mapped_over_worlds():
-    scenes = [
-        world({"route": "east", "arc": 60, "speed": 8.0}),
-        world({"route": "north", "arc": 90, "speed": 3.0}, {"route": "east", "arc": 90}),
-    ]
-    single = [run(scene)[0] for scene in scenes]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
-    both = jax.device_get(jax.jit(jax.vmap(simulation()))(stacked)[0])
-    for row, alone in enumerate(single):
-        for name in ("arc", "speed", "phase"):
-            np.testing.assert_allclose(getattr(both, name)[row], getattr(alone, name), atol=1e-3)
-    again = run(scenes[1])[0]
-    np.testing.assert_array_equal(again.arc, single[1].arc)
+def test_steps_are_deterministic_and_worlds_do_not_depend_on_each_other():
+    scene = world({"route": "north", "arc": 90, "speed": 3.0}, {"route": "east", "arc": 90})
+    alone, beside = run(scene)[0], run(scene, world({"route": "east", "arc": 60, "speed": 8.0}))[0]
+    for first, second in zip(alone, beside, strict=True):
+        np.testing.assert_array_equal(first, second)

@@ -12,9 +12,10 @@ from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.env import observations
+from scenefactory_jax.env.observations import vmax_blocks
 from scenefactory_jax.env.observations.vmax import split_observation
 from scenefactory_jax.env.observations.vmax_blocks import View
-from scenefactory_jax.roadgraph.nearest_rows import select_nearest
+from scenefactory_jax.roadgraph import nearest_rows
 
 SIZES = {"base": 3255, "segment": 1281, "lane": 2155, "road": 1655}
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -136,8 +137,29 @@ def test_worlds_without_routes_lights_and_traffic(kind):
 def test_nearest_rows_are_those_of_a_sort():
     squared = jax.random.uniform(jax.random.key(1), (5, 400), minval=0.0, maxval=5000.0)
     squared = jnp.where(jax.random.uniform(jax.random.key(2), (5, 400)) < jnp.array([[0.0], [0.5], [0.9], [0.99], [1.0]]), jnp.inf, squared)
-    index, mask = jax.jit(lambda table: select_nearest(table, count=30))(squared)
+    index, mask = jax.jit(lambda table: nearest_rows.select_nearest(table, count=30))(squared)
     expected = np.argsort(np.asarray(squared), axis=1)[:, :30]
     finite = np.isfinite(np.take_along_axis(np.asarray(squared), expected, axis=1))
     np.testing.assert_array_equal(mask, finite)
     np.testing.assert_array_equal(np.asarray(index)[finite], expected[finite])
+
+
+def test_a_large_map_is_searched_by_chunks(monkeypatch):
+    """Random walks of 40 points: the points that few chunks hold are those of a search through all."""
+    rng = np.random.default_rng(3)
+    walks = [np.cumsum(rng.normal(0, 0.7, (40, 2)), axis=0) + rng.uniform(-60, 60, 2) for _ in range(30)]
+    position = jnp.asarray(np.concatenate(walks), jnp.float32)
+    count, line = len(position), jnp.repeat(jnp.arange(30), 40)
+    valid = jnp.asarray(rng.uniform(size=count) < 0.9)
+    points = vmax_blocks.MapPoints(position, position, jnp.zeros(count, jnp.int32), line, valid)
+    view = schema.read(entry("base")["vmax"]["view"], View)
+    place, yaw = rng.uniform(-30, 30, (6, 2)), rng.uniform(-3, 3, 6)
+    frame = vmax_blocks.Frame(jnp.asarray(place, jnp.float32), jnp.asarray(yaw, jnp.float32), view, False)
+    found = []
+    for chunks in (200, 30):  # all rows; 30 of the 75 chunks
+        monkeypatch.setattr(vmax_blocks, "SEARCHED_CHUNKS", chunks)
+        found.append(jax.jit(lambda: vmax_blocks.select_points_in_box(frame, points, count=25))())
+    (index, mask), (few, few_mask) = jax.tree.map(np.asarray, found)
+    np.testing.assert_array_equal(mask, few_mask)
+    assert mask.sum() > 60
+    np.testing.assert_array_equal(np.where(mask, index, 0), np.where(mask, few, 0))

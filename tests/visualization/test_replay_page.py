@@ -68,7 +68,7 @@ def test_the_page_reads_what_there_is(page):
     assert set(re.findall(r"\bworld\.(\w+)", scripts)) <= set(unpacked(page)[0]) | derived
     glyphs = re.search(r"const GLYPHS = \{(.+?)\n\};", scripts, re.DOTALL).group(1)
     named = set(re.findall(r"^  (\w+):", glyphs, re.MULTILINE)) | set(re.findall(r'name === "(\w+_\w+)"', scripts))
-    assert len(named) == 5 and named <= {field.name for field in dataclasses.fields(Events)}
+    assert len(named) == 8 and named <= {field.name for field in dataclasses.fields(Events)}
 
 
 @pytest.mark.parametrize("values", [

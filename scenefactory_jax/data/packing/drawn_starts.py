@@ -15,7 +15,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.core.scene_arrays import Logs, wrap_angles
 from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, Range
-from scenefactory_jax.core.types import ROUTE_SPACING_M
+from scenefactory_jax.core.types import ROAD_USERS, ROUTE_SPACING_M
 from scenefactory_jax.roadgraph import route_sets
 
 
@@ -35,18 +35,26 @@ def route100(
     length_m: Range,
     start_gap_m: NonNegative,
     winding_fraction: Fraction,
+    standing_m: NonNegative,
+    clearance_m: NonNegative,
 ) -> Starts:
     """Chooses drawn routes of a length, from rest, with a part or more that turns, starts apart from each other and from road users.
+
+    Routes that a standing vehicle blocks are left out: within the gates of the suite nobody could pass it.
 
     Args:
         columns: of the scene: its routes, its traffic, and `row`, the row of its log at the start.
         length_m: shortest route, and where longer ones end.
         start_gap_m: between starts; the outlines of road users are half of it away, or more.
+        standing_m: a vehicle that moves less in its log stands.
+        clearance_m: between the line of a route and the outline of a standing vehicle: half a car and a margin.
         winding_fraction: smallest part of routes that turn by 45 degrees or are 1.15 times longer than their chord.
     """
     rows = np.flatnonzero(columns["routes.drawn"] & (columns["routes.length"] >= length_m[0]))
     length = np.minimum(columns["routes.length"][rows], length_m[1])
     lines = [columns["routes.position"][row, : int(end / ROUTE_SPACING_M) + 1] for row, end in zip(rows, length, strict=True)]
+    free = [place for place, line in enumerate(lines) if not _is_blocked(line, columns, standing_m, clearance_m)]
+    rows, length, lines = rows[free], length[free], [lines[place] for place in free]
     winding = np.array([route_sets.is_winding(line) for line in lines], bool)
     chosen: list[int] = []
     # winding routes first, and then straight ones as far as the fraction allows
@@ -65,14 +73,28 @@ def _is_free(
     """Whether a start is far enough from the chosen ones and from the outlines of road users at the current step."""
     if any(np.hypot(*(start - other)) < gap_m for other in others):
         return False
+    present = columns["traffic_log.valid"][:, int(columns["row"])]
+    return not bool((_measure_distances(start[None], columns, present) < gap_m / 2).any())
+
+
+def _is_blocked(line: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], standing_m: float, clearance_m: float) -> bool:
+    """Whether a vehicle that stands for the whole log is in the way of a route."""
+    row, valid, position = int(columns["row"]), columns["traffic_log.valid"], columns["traffic_log.position"]
+    first = position[np.arange(len(valid)), np.argmax(valid, axis=1)]
+    moved = np.where(valid, np.hypot(*(position - first[:, None]).transpose(2, 0, 1)), 0.0).max(axis=1, initial=0.0)
+    stands = valid[:, row] & (columns["traffic_log.kind"] == ROAD_USERS.index("vehicle")) & (moved < standing_m)
+    return bool((_measure_distances(line, columns, stands) < clearance_m).any())
+
+
+def _measure_distances(points: Float[np.ndarray, "N 2"], columns: Mapping[str, np.ndarray], users: np.ndarray) -> Float[np.ndarray, "N K"]:
+    """Distances of points from the outlines of road users at the start; 0 inside."""
     row = int(columns["row"])
-    present = columns["traffic_log.valid"][:, row]
-    offset = start - columns["traffic_log.position"][present, row]
-    yaw = columns["traffic_log.yaw"][present, row]
-    along = np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]
-    across = -np.sin(yaw) * offset[:, 0] + np.cos(yaw) * offset[:, 1]
-    beyond = np.maximum(np.abs(np.stack([along, across], axis=1)) - columns["traffic_log.size"][present] / 2, 0.0)
-    return not bool((np.hypot(*beyond.T) < gap_m / 2).any())
+    offset = points[:, None] - columns["traffic_log.position"][users, row]
+    yaw = columns["traffic_log.yaw"][users, row]
+    along = np.cos(yaw) * offset[..., 0] + np.sin(yaw) * offset[..., 1]
+    across = -np.sin(yaw) * offset[..., 0] + np.cos(yaw) * offset[..., 1]
+    beyond = np.maximum(np.abs(np.stack([along, across], axis=-1)) - columns["traffic_log.size"][users] / 2, 0.0)
+    return np.hypot(beyond[..., 0], beyond[..., 1])
 
 
 def draw_agents(

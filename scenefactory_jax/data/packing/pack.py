@@ -135,7 +135,7 @@ def pack(
         **_describe_source(raw, origin, centred_on, first),
         track_ids=tuple(raw.tracks[i].id for i in chosen),
         agents_kept=int(leaves["agents.present"].sum()),
-        agents_dropped=dropped,
+        agents_dropped=dropped if starts is None else dict.fromkeys(DROPS, 0),
         traffic_kept=len(beside["traffic_log.kind"]),
         traffic_dropped=traffic_dropped,
         routes=counts,

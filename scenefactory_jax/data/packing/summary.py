@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ class Summary:
     controls_kept: int
     controls_dropped: dict[str, int]  # reason -> count
     signs_inferred: int  # stop signs whose lanes were inferred
+    routes: dict[str, int]  # kind of route -> count; empty: packed without routes
     segments_kept: int
     segments_cut: dict[str, int]  # reason -> count
     refused: dict[str, int]  # reason of packing -> scenes; a bank holds them all the same
@@ -46,6 +47,7 @@ def count_results(results: Sequence[PackReport | str]) -> dict[str, Any]:
         "scenes": len(results),
         **{name: sum(getattr(report, name) for report in reports) for name in numbers},
         **{name: add(name, known) for name, known in reasons.items()},
+        "routes": dict(sum((Counter(asdict(report.routes)) for report in reports if report.routes), Counter())),
         "refused": dict(Counter(kind for kind in results if isinstance(kind, str))),
         "repaired": dict(Counter(line.split(":")[0] for report in reports for line in report.repairs)),
         "centred_on": dict(Counter(report.centred_on for report in reports)),
@@ -99,6 +101,8 @@ def describe(summary: Summary) -> list[str]:
     lines.append(f"segments: {summary.segments_kept} kept; cut: {count(summary.segments_cut)}")
     inferred = f"; lanes of {summary.signs_inferred} stop signs inferred" if summary.signs_inferred else ""
     lines.append(f"lights and stop signs: {summary.controls_kept} kept; dropped: {count(summary.controls_dropped)}{inferred}")
+    if summary.routes:
+        lines.append(f"routes: {count(summary.routes)}")
     lines.append(f"traffic: {summary.traffic_kept} kept; dropped: {count(summary.traffic_dropped)}")
     lines.append(f"agents: {summary.agents_kept} kept; dropped: {count(summary.agents_dropped)}")
     if summary.refused:

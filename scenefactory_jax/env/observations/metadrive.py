@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, to_frame, wrap_angle
-from scenefactory_jax.core.ray_casting import cast_to_boxes, cast_to_segments, make_ray_directions, measure_segments
+from scenefactory_jax.core.ray_casting import cast_to_boxes, cast_to_segments, make_ray_directions
 from scenefactory_jax.core.schema import Bounds, Count, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import FRACTION, bound_observation
-from scenefactory_jax.roadgraph.nearest_rows import select_nearest
+from scenefactory_jax.roadgraph import nearest_rows
 
 NAVIGATION_POINTS, POINT_GAP, NAVIGATION_RANGE_M = 10, 2, 30.0  # points 2 m apart; longer vectors are shortened
 
@@ -42,7 +42,7 @@ def metadrive(
     `lidar_edges`, at road edges.
 
     Args:
-        edge_segments: the nearest segments of road edges that rays can meet.
+        edge_segments: of road edges, the nearest ones, that rays can meet; in whole chunks of `nearest_rows`.
         max_lateral_m: offset from the route that reads 0 or 1.
         lane_width_m: twice the offset that reads 0 or 1 in the lane column.
         as_published: MetaDrive's code leaves the last point of the route zero.
@@ -111,13 +111,14 @@ def _gather_boxes(
 def _gather_edges(
     scene: Scene, position: Float[Array, "A 2"], yaw: Float[Array, " A"], *, count: int, range_m: float
 ) -> tuple[Float[Array, "A C 2"], Float[Array, "A C 2"], Float[Array, "A C"], Bool[Array, "A C"]]:
-    """The nearest road-edge segments within a range, in the frame of each car."""
-    edges = scene.edges
-    offset = edges.midpoint - position[:, None]
-    squared = measure_segments(offset, edges.direction, edges.half_length)
-    index, mask = select_nearest(jnp.where(edges.valid & (squared <= range_m**2), squared, jnp.inf), count=count)
-    if edges.valid.shape[0] == 0:
-        zero = jnp.zeros((*index.shape, 2))
-        return zero, zero, zero[..., 0], mask
+    """About the `count` nearest road-edge segments that reach into a range, in the frame of each car."""
+    edges, rows = scene.edges, scene.edges.valid.shape[0]
+    if rows == 0:
+        zero = jnp.zeros((len(yaw), 0, 2))
+        return zero, zero, zero[..., 0], zero[..., 0] > 0
+    chunks = nearest_rows.make_chunks(edges.midpoint, edges.half_length, edges.polyline, edges.valid)
+    near = safe_norm(chunks.centre - position[:, None, None]) <= chunks.radius + range_m
+    index, mask = nearest_rows.gather_chunks(chunks, position, near, count=-(-count // nearest_rows.CHUNK), rows=rows)
     turn = lambda vectors: to_frame(vectors, yaw[:, None])  # noqa: E731
-    return turn(edges.midpoint[index] - position[:, None]), turn(edges.direction[index]), edges.half_length[index], mask
+    middle = turn(edges.midpoint[index] - position[:, None])
+    return middle, turn(edges.direction[index]), edges.half_length[index], mask & edges.valid[index]

@@ -18,9 +18,11 @@ from scenefactory_jax.env.history import need_history
 from scenefactory_jax.env.observations import vmax_blocks
 from scenefactory_jax.env.observations.agent_routes import sample_route_ahead, select_routes
 from scenefactory_jax.env.observations.vmax_blocks import LIGHT_FEATURES, OBJECT_FEATURES, ONE_HOT, STEPS, Frame, View
+from scenefactory_jax.roadgraph.queries import find_first_true
 
 Row = Annotated[int, Bounds(min=0)]
 SLICE, SLICE_POINTS = 100, 20  # points of a lane around the nearest one; points of these that are shown
+NEAREST_POINTS = 256  # of all lanes, among which the nearest lanes are found
 
 
 class Block(NamedTuple):
@@ -138,21 +140,18 @@ def _find_controls_on_route(scene: Scene, route: Array) -> Bool[Array, "A C"]:
 def _build_segments(scene: Scene, frame: Frame, count: int) -> Float[Array, "A K 89"]:
     """Builds the rows of the nearest lanes in the box: 20 x (x, y), the kind's one-hot, 20 x direction, valid.
 
-    The points are spaced equally along the SLICE points of the lane around its nearest one, fewer at its ends.
+    The points are spaced equally along the SLICE points of the lane around its nearest one, fewer at its ends. The nearest point is one of
+    every second, and among the NEAREST_POINTS of all lanes.
     """
-    points, lanes = vmax_blocks.list_points(scene.lanes), scene.lanes
+    lanes = scene.lanes
     if lanes.valid.shape[0] == 0:
         return jnp.zeros((len(frame.yaw), count, 4 * SLICE_POINTS + len(ONE_HOT) + 1), jnp.float32)
-    inside, squared = vmax_blocks.find_points_in_box(frame, points)
-
-    def take_lane(squared: Float[Array, "A P"], _: None) -> tuple[Array, tuple[Array, Array]]:
-        """Takes the nearest lane that is left."""
-        row = jnp.argmin(squared, axis=1)
-        found = jnp.isfinite(jnp.take_along_axis(squared, row[:, None], axis=1)[:, 0])
-        return jnp.where(lanes.polyline == lanes.polyline[row][:, None], jnp.inf, squared), (row, found)
-
-    _, (row, mask) = jax.lax.scan(take_lane, jnp.where(inside, squared, jnp.inf), None, length=count)
-    row, mask = row.T, mask.T  # [A, K]
+    nearest, found = vmax_blocks.select_points_in_box(frame, vmax_blocks.list_points(lanes), count=NEAREST_POINTS)
+    nearest = 2 * nearest
+    line = jnp.where(found, lanes.polyline[nearest], -1)  # nearest first
+    again = jnp.any((line[:, :, None] == line[:, None]) & jnp.tri(line.shape[1], k=-1, dtype=bool), axis=2)
+    place, mask = find_first_true(found & ~again, count=count)
+    row = jnp.take_along_axis(nearest, place, axis=1)  # [A, K]
     numbers = jnp.arange(len(lanes.polyline))
     change = (lanes.polyline[1:] != lanes.polyline[:-1]) | ~lanes.valid[1:]
     first = jax.lax.cummax(jnp.where(jnp.pad(change, (1, 0), constant_values=True), numbers, 0))
@@ -161,8 +160,9 @@ def _build_segments(scene: Scene, frame: Frame, count: int) -> Float[Array, "A K
     end = jnp.minimum(row + SLICE // 2 - 1, last[row])
     spaced = jnp.linspace(0.0, 1.0, SLICE_POINTS)
     index = begin[..., None] + jnp.round((end - begin)[..., None] * spaced).astype(jnp.int32)
-    place = vmax_blocks.scale_place(frame, points.position[index] - frame.position[:, None, None])
-    direction = to_frame(points.direction[index], frame.yaw[:, None, None])
-    parts = [part.reshape(*mask.shape, -1) for part in (place, vmax_blocks.make_one_hot(points.kind[row], ONE_HOT), direction)]
+    start = lanes.midpoint[index] - lanes.half_length[index][..., None] * lanes.direction[index]
+    place = vmax_blocks.scale_place(frame, start - frame.position[:, None, None])
+    direction = to_frame(lanes.direction[index], frame.yaw[:, None, None])
+    parts = [part.reshape(*mask.shape, -1) for part in (place, vmax_blocks.make_one_hot(lanes.kind[row], ONE_HOT), direction)]
     rows = jnp.concatenate([*parts, jnp.ones((*mask.shape, 1), jnp.float32)], axis=-1)
     return jnp.where(mask[..., None], rows, 0.0)

@@ -11,15 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import dot, to_frame, wrap_angle
+from scenefactory_jax.core.geometry import dot, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Bounds, Count, Positive
 from scenefactory_jax.core.types import CROSSWALK, DRIVABLE, EDGES, LANE_BIKE, LINES, SPEED_BUMP, STOP_SIGN, Road, Scene, State
 from scenefactory_jax.env.history import SPACING_S
+from scenefactory_jax.roadgraph import nearest_rows
 from scenefactory_jax.roadgraph.nearest_rows import select_nearest
 from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 
 STEPS = 5  # the present and 4 past ones
 OBJECT_FEATURES, LIGHT_FEATURES = 8, 11
+SEARCHED_CHUNKS = 128  # 2,048 points; V-Max looks through 2,200 or 3,000 before it takes every second
 ONE_HOT = (DRIVABLE[:1], DRIVABLE[1:], (LANE_BIKE,), LINES, EDGES, (STOP_SIGN,), (CROSSWALK,), (SPEED_BUMP,))  # kinds of each column
 
 
@@ -90,42 +92,63 @@ def build_object_blocks(scene: Scene, state: State, frame: Frame) -> tuple[Float
 
 
 class MapPoints(NamedTuple):
-    """Points of the map: the first points of segments in storage order, then the stop lines of stop signs."""
+    """Points of the map in storage order: every second first point of a segment, and the stop lines of stop signs."""
 
     position: Float[Array, "P 2"]
     direction: Float[Array, "P 2"]
     kind: Int[Array, " P"]
+    line: Int[Array, " P"]  # the polyline
     valid: Bool[Array, " P"]
 
 
 def list_points(road: Road, scene: Scene | None = None) -> MapPoints:
-    """Lists the points of segments, and of the scene's stop signs if it is given."""
-    points = MapPoints(road.midpoint - road.half_length[:, None] * road.direction, road.direction, road.kind, road.valid)
+    """Lists every second point of a road, and the stop signs of a scene if it is given."""
+    start = road.midpoint - road.half_length[:, None] * road.direction
+    points = MapPoints(*(table[::2] for table in (start, road.direction, road.kind, road.polyline, road.valid)))
     if scene is None:
         return points
     controls = scene.controls
-    signs = (controls.position, controls.direction, jnp.full_like(controls.lane, STOP_SIGN), controls.valid & controls.stop_sign)
+    kind = jnp.full_like(controls.lane, STOP_SIGN)
+    signs = (controls.position, controls.direction, kind, controls.lane, controls.valid & controls.stop_sign)
     return MapPoints(*(jnp.concatenate(pair) for pair in zip(points, signs, strict=True)))
 
 
-def find_points_in_box(frame: Frame, points: MapPoints) -> tuple[Bool[Array, "A P"], Float[Array, "A P"]]:
-    """Finds the valid points inside the box around each agent, and the squared distances of all points."""
-    offset = points.position - frame.position[:, None]
-    local = to_frame(offset, frame.yaw[:, None])
+def measure_box_distance(frame: Frame, position: Float[Array, "A *n 2"]) -> Float[Array, "A *n"]:
+    """Computes the distances of points from the boxes around the agents; 0 inside."""
+    shape = (-1,) + (1,) * (position.ndim - 2)
+    local = to_frame(position - frame.position.reshape(*shape, 2), frame.yaw.reshape(shape))
     front, back, left, right = frame.view.box_m
-    x, y = local[..., 0], local[..., 1]
-    inside = (x <= front) & (x >= -back) & (y <= left) & (y >= -right) & points.valid
-    return inside, dot(offset, offset)
+    beyond_x = jnp.maximum(local[..., 0] - front, -back - local[..., 0])
+    beyond_y = jnp.maximum(local[..., 1] - left, -right - local[..., 1])
+    return safe_norm(jnp.maximum(jnp.stack([beyond_x, beyond_y], axis=-1), 0.0))
+
+
+def select_points_in_box(frame: Frame, points: MapPoints, *, count: int) -> tuple[Int[Array, "A K"], Bool[Array, "A K"]]:
+    """Selects the nearest points inside the box around each agent, nearest first, and a mask of those that exist.
+
+    Of a large map only the SEARCHED_CHUNKS nearest chunks that reach into the box are looked through.
+    """
+    rows = points.valid.shape[0]
+    if rows <= SEARCHED_CHUNKS * nearest_rows.CHUNK:
+        place, valid = jnp.broadcast_to(points.position, (len(frame.yaw), rows, 2)), points.valid
+        index = None
+    else:
+        chunks = nearest_rows.make_chunks(points.position, jnp.zeros(rows), points.line, points.valid)
+        centres = jnp.broadcast_to(chunks.centre, (len(frame.yaw), *chunks.centre.shape))
+        near = measure_box_distance(frame, centres) <= chunks.radius
+        index, exists = nearest_rows.gather_chunks(chunks, frame.position, near, count=SEARCHED_CHUNKS, rows=rows)
+        place, valid = points.position[index], points.valid[index] & exists
+    offset = place - frame.position[:, None]
+    inside = (measure_box_distance(frame, place) <= 0) & valid
+    chosen, mask = nearest_rows.select_nearest(jnp.where(inside, dot(offset, offset), jnp.inf), count=count)
+    return (chosen if index is None else jnp.take_along_axis(index, chosen, axis=1)), mask
 
 
 def build_road_block(frame: Frame, points: MapPoints, *, count: int, with_kind: bool) -> Float[Array, "A K F"]:
-    """Builds the road block: of the points in the box every second one in storage order, the nearest first.
-
-    Columns: x, y, direction x, y, the kind's one-hot if asked for, valid.
-    """
-    inside, squared = find_points_in_box(frame, points)
-    second = jnp.cumsum(inside, axis=1, dtype=jnp.int32) % 2 == 1
-    index, mask = select_nearest(jnp.where(inside & second, squared, jnp.inf), count=count)
+    """Builds the road block of the points in the box, nearest first: x, y, direction x, y, the kind's one-hot if asked for, valid."""
+    index, mask = select_points_in_box(frame, points, count=count)
+    if points.valid.shape[0] == 0:
+        return jnp.zeros((*mask.shape, 5 + with_kind * len(ONE_HOT)), jnp.float32)
     columns = [scale_place(frame, points.position[index] - frame.position[:, None]), to_frame(points.direction[index], frame.yaw[:, None])]
     columns += [make_one_hot(points.kind[index], ONE_HOT)] if with_kind else []
     columns += [jnp.ones((*mask.shape, 1), jnp.float32)]

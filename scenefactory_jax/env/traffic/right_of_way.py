@@ -53,11 +53,11 @@ class Vehicles(NamedTuple):
 class Passage(NamedTuple):
     """Pairs of vehicles before their zones; `[i, j]` is about vehicle i, where its route meets that of j."""
 
-    enter: Float[Array, "O O 2"]  # from i's front; negative: i is in the zone
-    first: Bool[Array, "O O 2"]  # i goes before j
-    claimed: Bool[Array, "O O 2"]  # i claims the zone
-    ahead: Bool[Array, "O O 2"]  # neither has left it
-    yields: Bool[Array, "O O 2"]  # i gives way to j
+    enter: Float[Array, "O O Z"]  # from i's front; negative: i is in the zone
+    first: Bool[Array, "O O Z"]  # i goes before j
+    claimed: Bool[Array, "O O Z"]  # i claims the zone
+    ahead: Bool[Array, "O O Z"]  # neither has left it
+    yields: Bool[Array, "O O Z"]  # i gives way to j
 
 
 def compute_interaction(log: TrafficLog, cars: Vehicles, law: IdmLaw, rules: RightOfWay) -> Float[Array, " O"]:
@@ -123,7 +123,7 @@ def find_refused_entries(log: TrafficLog, cars: Vehicles, law: IdmLaw, rules: Ri
     return jnp.any(near & jnp.where(merges, room < needed, crosses), axis=(1, 2))
 
 
-def _find_kept_clear(log: TrafficLog, cars: Vehicles, passage: Passage, law: IdmLaw) -> Bool[Array, "O O 2"]:
+def _find_kept_clear(log: TrafficLog, cars: Vehicles, passage: Passage, law: IdmLaw) -> Bool[Array, "O O Z"]:
     """Mask of crossing zones that a vehicle must not enter, because it would have to wait in them."""
     speed = cars.speed[:, None, None]
     room = cars.room_arc[:, None, None] > log.zone_leave + cars.length[:, None, None]
