@@ -1,4 +1,4 @@
-"""The intelligent driver model on the agent's route: it follows cars and stops for lights and stop signs. A baseline for learnt policies."""
+"""The intelligent driver model on the agent's route, with lights and stop signs. A baseline for learnt policies."""
 
 from collections.abc import Mapping
 from typing import Any
