@@ -616,6 +616,9 @@ RUNS = (
 )
 
 
+SUITES = ("route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
+
+
 @pytest.mark.parametrize("name", names("protocol"))
 def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(name):
     """Two runs with nothing in common are judged alike; `trained` leaves each as it is."""
@@ -630,6 +633,11 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     own = ("observations", "actions", "termination")  # what the policy learnt to see and to do; how agents end is `protocol.termination`
     for group in set(environment.GROUPS) - set(own):
         assert judged[0][group] == judged[1][group], group
+    assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"]
+    if name in SUITES:
+        assert judged[0]["scenes"]["pack"]["routes"]
+        assert name != "grip_hidden" or judged[1]["observations"]["weather"]["_target_"] == "hidden_weather"
+        return
     assert judged[0]["scenes"]["pack"] == judged[1]["scenes"]["pack"] == hydra_config.load_config("train", "scenes=womd")["scenes"]["pack"]
     told = circumstances.describe(judged[0])
     assert told["Starts"] == ("as recorded, from rest" if name == "paper" else "as recorded, at the recorded speed")
