@@ -5,8 +5,7 @@ Vehicles without a route stand at their first logged place. People, cyclists and
 still where its next place would overlap a box that it does not overlap yet: so vehicles of this traffic never collide with each other.
 """
 
-import dataclasses
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
+from scenefactory_jax.core.schema import NonNegative
 from scenefactory_jax.core.types import YELLOW_STATES, Boxes, RoadUser, Scene, Traffic, TrafficLog
 from scenefactory_jax.env.traffic import corridor, idm_law, right_of_way
 from scenefactory_jax.env.traffic.corridor import Projection
-from scenefactory_jax.env.traffic.idm_law import IdmLaw
+from scenefactory_jax.env.traffic.idm_config import IdmConfig
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, make_masses, read_log
-from scenefactory_jax.env.traffic.right_of_way import RightOfWay, Vehicles
+from scenefactory_jax.env.traffic.right_of_way import Vehicles
 from scenefactory_jax.roadgraph import traffic_lights
 
 WAITING, ON_ROAD, GONE = 0, 1, 2
@@ -28,37 +27,6 @@ MOVING_MPS = 1.5  # from which a vehicle no longer counts as waiting
 STARTS_MPS2 = 0.05  # a vehicle that stands and accelerates less is blocked
 BEHIND_M = 8.0  # of a vehicle's centre, from where its route is read: for boxes that it is just passing
 SIDE_M = 0.3  # beside a box whose entry place is free
-
-
-@dataclasses.dataclass(frozen=True)
-class SideStep:
-    """The key `side_step` of `idm`: how vehicles pass boxes that stand at the side of their corridor."""
-
-    most_m: NonNegative  # from the route
-    slope: Positive  # across per metre along the route
-    ahead_m: NonNegative  # distance of the box at which it begins
-    margin_m: NonNegative  # between the sides
-
-
-@dataclasses.dataclass(frozen=True)
-class IdmConfig:
-    """The numbers of `idm` that concern driving; described in `conf/traffic/idm.yaml`."""
-
-    law: IdmLaw
-    target_mps: Positive
-    lateral_mps2: Positive
-    max_braking_mps2: Positive
-    look_ahead_m: Positive
-    chord_m: Count
-    corridor_margin_m: NonNegative
-    foresight_s: NonNegative
-    settle_m: Positive
-    side_step: SideStep
-    stop_sign_s: NonNegative
-    stand_mps: Positive
-    stand_distance_m: Positive
-    stuck_s: Annotated[float, Bounds(above=0)] | None
-    right_of_way: RightOfWay
 
 
 class IdmState(NamedTuple):
