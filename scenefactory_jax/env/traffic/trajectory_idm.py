@@ -198,7 +198,12 @@ def advance(
     arc = jnp.minimum(state.arc[:, None] + ahead, track.arc[:, -1:])
     window = Window(interpolate_track(track, arc)[0], arc, jnp.zeros(arc.shape, jnp.int32))
     places = corridor.project_boxes(window, boxes)
-    strip = {"size": log.size, "margin_m": driving.strip_m, "foresight_s": jnp.zeros(len(boxes.mass))}
+    strip = {
+        "size": log.size,
+        "margin_m": driving.strip_m,
+        "foresight_s": jnp.zeros(len(boxes.mass)),
+        "shift": jnp.zeros_like(places.offset),
+    }
     found = corridor.find_obstacles(places, boxes, arc=state.arc, **strip)
     own = jnp.arange(len(boxes.mass)) == jnp.arange(len(due))[:, None]
     distance = jnp.where(jnp.isfinite(found.gap) & ~own, places.arc - state.arc[:, None], jnp.inf)  # between the centres
