@@ -205,11 +205,12 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
         if not separator:
             raise ConfigError(f"overrides: expected key=value, got {override!r}")
         if not parents and (find_conf() / last).is_dir():
-            *outer, inner = last.split("/")  # `dynamics/randomization=spread`: a group within a group
-            fresh, node = copy.deepcopy(_task(override)), result
-            for name in outer:
-                fresh, node = fresh[name], node[name]
-            node[inner] = fresh[inner]
+            fresh = copy.deepcopy(_task(override))
+            for *outer, inner in _find_package(last, value):
+                source, node = fresh, result
+                for name in outer:
+                    source, node = source[name], node[name]
+                node[inner] = source[inner]
             continue
         node: Any = result
         for depth, key in enumerate([*parents, last]):
@@ -224,8 +225,19 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
 
 @functools.lru_cache(maxsize=64)
 def _task(override: str) -> dict[str, Any]:
-    """Composes the environment with one other setting, or with another policy; a study needs the same ones many times."""
-    return load_config("train", "~experiment", override) if override.startswith("policy=") else load_config("task", override)
+    """Composes the environment with one other setting, or with another policy or packing; a study needs the same ones many times."""
+    whole = override.startswith(("policy=", "scenes/"))
+    return load_config("train", "~experiment", override) if whole else load_config("task", override)
+
+
+def _find_package(group: str, option: str) -> list[list[str]]:
+    """Finds the paths of what an option sets: its group's own (`dynamics/randomization=spread` sets that key of `dynamics`), or all keys of
+    an option that goes elsewhere (`# @package scenes.pack`)."""
+    file = find_conf() / group / f"{option}.yaml"
+    head = re.match(r"# @package (\S+)", file.read_text()) if file.is_file() else None
+    if head is None or head.group(1) == group.replace("/", "."):
+        return [group.split("/")]
+    return [[*head.group(1).split("."), key] for key in yaml.safe_load(file.read_text()) if key != "defaults"]
 
 
 def quote_override(override: str) -> str:

@@ -16,6 +16,7 @@ from scenefactory_jax.core.types import Observation, Scene, SetObservation, Stat
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
 from scenefactory_jax.env.observations.control_sets import lights, nearest_controls, signs
 from scenefactory_jax.env.observations.lane_vector import lane
+from scenefactory_jax.env.observations.leader_vector import leader
 from scenefactory_jax.env.observations.metadrive import metadrive
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
 from scenefactory_jax.env.observations.road_set import road
@@ -24,7 +25,19 @@ from scenefactory_jax.env.observations.state_vectors import ego, weather, yaw_ra
 from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
-__all__ += ["closest_approach", "ego", "lane", "lights", "nearest_controls", "neighbours", "road", "route", "signs", "weather"]  # groups
+__all__ += [
+    "closest_approach",
+    "ego",
+    "lane",
+    "leader",
+    "lights",
+    "nearest_controls",
+    "neighbours",
+    "road",
+    "route",
+    "signs",
+    "weather",
+]  # groups
 __all__ += ["yaw_rate_and_steer"]
 __all__ += ["metadrive", "vmax_base", "vmax_lane", "vmax_road", "vmax_segment"]
 

@@ -1,0 +1,74 @@
+"""The intelligent driver model on the agent's route, with lights and stop signs. A baseline for learnt policies."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.schema import Positive
+from scenefactory_jax.core.types import Observation, Policy
+from scenefactory_jax.env.traffic import idm_law
+from scenefactory_jax.env.traffic.idm_law import IdmLaw
+from scenefactory_jax.evaluation.planners import route_tracking
+from scenefactory_jax.evaluation.planners.route_tracking import Tracker
+
+RED, YELLOW = 3, 4  # columns of `observations.lights`
+STOOD = 3  # column of `observations.signs`
+
+
+def make(*, tracker: Tracker, law: IdmLaw, target_mps: Positive, max_braking_mps2: Positive, observations: dict[str, Any]) -> Policy:
+    """Pure pursuit of the agent's route, with the speed of the intelligent driver model.
+
+    It follows the nearest box on its route (`observations.leader`) and stands before red lights, before yellow ones where it can stop
+    comfortably, and before stop signs until it has stood. It gives no right of way. The policy has no parameters, and its values are zero.
+
+    Args:
+        tracker: how the route is followed.
+        law: numbers of the model.
+        target_mps: speed on a free road where the lane has no limit.
+        max_braking_mps2: a red light before which the car could not even stop with this is passed.
+        observations: entries of the groups that it reads, `ego`, `route`, `leader`, `lights` and `signs`, with their scales.
+
+    Raises:
+        ConfigError: at `apply`, an observation without these groups.
+    """
+
+    def init(key, observation):
+        return {}
+
+    def apply(parameters, observation):
+        route_tracking.require_groups(observation, "ego", "route", "leader", "lights", "signs", planner="idm_route")
+        route = route_tracking.read_route(observation["route"], observations["route"])
+        speed = jnp.maximum(observations["ego"]["speed_scale_mps"] * observation["ego"][..., 5], 0.0)
+        limit = jnp.where(route.limit > 0, route.limit, target_mps)
+        target = route_tracking.compute_target_speed(route, limit, tracker)
+        gap, leader_speed = read_leader(observation["leader"], observations["leader"])
+        line = find_stop_distance(observation, observations, speed, comfortable=law.braking_mps2, hardest=max_braking_mps2)
+        demand = idm_law.compute_interaction(speed, gap, leader_speed, law)
+        demand = jnp.maximum(demand, idm_law.compute_interaction(speed, line, jnp.zeros_like(line), law))
+        acceleration = jnp.maximum(idm_law.compute_acceleration(speed, target, demand, law), -max_braking_mps2)
+        steer = route_tracking.compute_steering(route, speed, tracker)
+        return route_tracking.make_action(acceleration, steer, route.known, tracker), jnp.zeros(3), jnp.zeros_like(steer)
+
+    return Policy(init, apply)
+
+
+def read_leader(vector: Float[Array, "*n 4"], scales: Mapping[str, Any]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Reads gap and speed from `observations.leader`; the gap is inf without one."""
+    gap = route_tracking.expand_length(vector[..., 1], scales["gap_scale_m"])
+    return jnp.where(vector[..., 0] > 0, gap, jnp.inf), scales["speed_scale_mps"] * vector[..., 2]
+
+
+def find_stop_distance(
+    observation: Observation, scales: Mapping[str, Any], speed: Float[Array, "*n"], *, comfortable: float, hardest: float
+) -> Float[Array, "*n"]:
+    """Finds the distance of the car's front from the nearest line at which it has to stand; inf if there is none."""
+    lights, signs = observation["lights"], observation["signs"]
+    line = route_tracking.expand_length(lights.features[..., 0], scales["lights"]["distance_scale_m"])
+    stops = (lights.features[..., RED] > 0) & idm_law.can_stop(speed[..., None], line, hardest)
+    stops |= (lights.features[..., YELLOW] > 0) & idm_law.can_stop(speed[..., None], line, comfortable)
+    light = jnp.min(jnp.where(stops & lights.mask, line, jnp.inf), axis=-1, initial=jnp.inf)
+    line = route_tracking.expand_length(signs.features[..., 0], scales["signs"]["distance_scale_m"])
+    waits = signs.mask & (signs.features[..., STOOD] == 0)
+    return jnp.minimum(light, jnp.min(jnp.where(waits, line, jnp.inf), axis=-1, initial=jnp.inf))

@@ -1,0 +1,40 @@
+"""Pure pursuit of the route at a speed of its own, past cars and lights. A baseline for learnt policies."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from scenefactory_jax.core.schema import Positive
+from scenefactory_jax.core.types import Policy
+from scenefactory_jax.evaluation.planners import route_tracking
+from scenefactory_jax.evaluation.planners.route_tracking import Tracker
+
+
+def make(*, tracker: Tracker, speed_mps: Positive, response_s: Positive, observations: dict[str, Any]) -> Policy:
+    """Pure pursuit of a point ahead on the agent's route, slower in bends. Cars, lights and stop signs are not looked at.
+
+    The policy has no parameters, and its values are zero. It drives with `actions` of one pedal or of two and with every car.
+
+    Args:
+        tracker: how the route is followed.
+        speed_mps: to hold where no bend demands less.
+        response_s: in which a difference to that speed would vanish.
+        observations: entries of the groups that it reads, `ego` and `route`, with their scales.
+
+    Raises:
+        ConfigError: at `apply`, an observation without these groups.
+    """
+
+    def init(key, observation):
+        return {}
+
+    def apply(parameters, observation):
+        route_tracking.require_groups(observation, "ego", "route", planner="route_pursuit")
+        route = route_tracking.read_route(observation["route"], observations["route"])
+        speed = observations["ego"]["speed_scale_mps"] * observation["ego"][..., 5]
+        target = route_tracking.compute_target_speed(route, jnp.full_like(route.limit, speed_mps), tracker)
+        steer = route_tracking.compute_steering(route, speed, tracker)
+        action = route_tracking.make_action((target - speed) / response_s, steer, route.known, tracker)
+        return action, jnp.zeros(3), jnp.zeros_like(steer)
+
+    return Policy(init, apply)

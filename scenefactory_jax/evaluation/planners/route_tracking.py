@@ -1,0 +1,143 @@
+"""What planners on routes share: they read the observation `route`, steer along it, slow down for bends, and press the pedals.
+
+Everything is elementwise over leading axes and concerns the car's own frame.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from scenefactory_jax.core.geometry import cross, dot, safe_norm
+from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
+
+HEAD, POINT = 5, 5  # columns of `observations.route` before the first point, and of a point
+SHORTEST_M = 0.2  # nearer points have no bend between them
+GENTLEST_RADPM = 1e-4  # a bend of 10 km radius is none
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracker:
+    """How cars are made to follow a route; described in `conf/policy/route_pursuit.yaml`."""
+
+    wheelbase_m: Positive
+    steering_limit_rad: Annotated[float, Bounds(above=0, below=math.pi / 2)]
+    rear_m: NonNegative
+    look_ahead_m: Positive
+    look_ahead_s: NonNegative
+    lateral_mps2: Positive
+    braking_mps2: Positive
+    throttle_mps2: Positive
+    brake_mps2: Positive
+
+
+class RouteAhead(NamedTuple):
+    """Points of the route ahead; the first is the car's place on it, and those behind the goal repeat it."""
+
+    arc: Float[Array, "*n P"]  # from the car's place
+    point: Float[Array, "*n P 2"]
+    direction: Float[Array, "*n P 2"]  # unit
+    limit: Float[Array, "*n P"]  # m/s; 0 where none is known; the first point has that of the second
+    known: Float[Array, "*n"]  # 1: the agent has a route
+    remaining: Float[Array, "*n"]  # along the route to the goal
+
+
+def require_groups(observation: Mapping[str, Any], *names: str, planner: str) -> None:
+    """Raises a ConfigError that names the observation groups that a planner needs and does not find."""
+    if missing := [name for name in names if name not in observation]:
+        has = ", ".join(sorted(observation)) or "none"
+        groups = " and ".join(f"`{name}`" for name in missing)
+        raise ConfigError(
+            f"policy: {planner} needs the observation groups of observations=drive; {groups} missing; the observation has: {has}"
+        )
+
+
+def expand_length(compressed: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:
+    """Inverse of `compress_length`; inf for 1."""
+    rest = 1.0 - jnp.abs(compressed)
+    return jnp.where(rest > 0, scale * compressed / jnp.maximum(rest, 1e-6), jnp.copysign(jnp.inf, compressed))
+
+
+def read_route(vector: Float[Array, "*n F"], scales: Mapping[str, Any]) -> RouteAhead:
+    """Reads the observation group `route`.
+
+    Args:
+        scales: entry of `observations.route`.
+
+    Raises:
+        ConfigError: a vector of another length than the entry's.
+    """
+    ahead = jnp.array(scales["ahead_m"], jnp.float32)
+    if vector.shape[-1] != (expected := HEAD + POINT * len(ahead)):
+        raise ConfigError(f"policy.observations.route.ahead_m: expected as observations.route, {expected} columns, got {vector.shape[-1]}")
+    offset, remaining = expand_length(vector[..., 1], scales["offset_scale_m"]), expand_length(vector[..., 2], scales["remaining_scale_m"])
+    remaining = jnp.maximum(remaining, 0.0)
+    sine, cosine = vector[..., 3], vector[..., 4]  # of the car relative to the route
+    rows = vector[..., HEAD:].reshape(*vector.shape[:-1], len(ahead), POINT)
+    here = -offset[..., None] * jnp.stack([sine, cosine], axis=-1)
+    join = lambda first, rest: jnp.concatenate([first[..., None, :], rest], axis=-2)  # noqa: E731
+    limit = scales["speed_scale_mps"] * rows[..., 4]
+    return RouteAhead(
+        arc=jnp.concatenate([jnp.zeros_like(remaining)[..., None], jnp.minimum(ahead, remaining[..., None])], axis=-1),
+        point=join(here, scales["distance_scale_m"] * rows[..., :2]),
+        direction=join(jnp.stack([cosine, -sine], axis=-1), rows[..., 2:4]),
+        limit=jnp.concatenate([limit[..., :1], limit], axis=-1),
+        known=vector[..., 0],
+        remaining=remaining,
+    )
+
+
+def find_point(route: RouteAhead, arc: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
+    """Finds the point at a distance along the route: cubic between two points with their directions, straight on behind the goal."""
+    inside = jnp.minimum(arc, jnp.minimum(route.remaining, route.arc[..., -1]))
+    row = jnp.clip(jnp.sum(route.arc <= inside[..., None], axis=-1) - 1, 0, route.arc.shape[-1] - 2)
+    pick = lambda table, at: jnp.take_along_axis(table, at.reshape(*at.shape, *[1] * (table.ndim - at.ndim)), axis=at.ndim)  # noqa: E731
+    squeeze = lambda table, at: jnp.squeeze(pick(table, at), axis=at.ndim)  # noqa: E731
+    low, high = squeeze(route.arc, row), squeeze(route.arc, row + 1)
+    start, end = squeeze(route.point, row), squeeze(route.point, row + 1)
+    first, second = squeeze(route.direction, row), squeeze(route.direction, row + 1)
+    length = safe_norm(end - start)[..., None]
+    t = jnp.clip((inside - low) / jnp.maximum(high - low, 1e-3), 0.0, 1.0)[..., None]
+    bent = (1 - t) ** 2 * ((1 + 2 * t) * start + t * length * first) + t**2 * ((3 - 2 * t) * end - (1 - t) * length * second)
+    return bent + jnp.maximum(arc - inside, 0.0)[..., None] * second
+
+
+def compute_steering(route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n"]:
+    """Computes the steering action by pure pursuit (Coulter 1992): the circle along the rear axle's direction through a point ahead.
+
+    The point is `look_ahead_m` and the way of `look_ahead_s` ahead along the route. Full steering for a point behind the car.
+    """
+    target = find_point(route, tracker.look_ahead_m + tracker.look_ahead_s * speed)
+    x, y = target[..., 0] + tracker.rear_m, target[..., 1]
+    curvature = 2.0 * y / jnp.maximum(x**2 + y**2, 1.0)
+    steer = jnp.arctan(tracker.wheelbase_m * curvature) / tracker.steering_limit_rad
+    return jnp.clip(jnp.where(x > 0.0, steer, jnp.copysign(1.0, y)), -1.0, 1.0)
+
+
+def compute_target_speed(route: RouteAhead, limit: Float[Array, "*n P"], tracker: Tracker) -> Float[Array, "*n"]:
+    """Computes the largest speed with which the car can keep to the limits and to `lateral_mps2` in the bends ahead, braking with
+    `braking_mps2` before them."""
+    along = route.arc[..., 1:] - route.arc[..., :-1]
+    turn = jnp.arctan2(
+        cross(route.direction[..., :-1, :], route.direction[..., 1:, :]), dot(route.direction[..., :-1, :], route.direction[..., 1:, :])
+    )
+    curvature = jnp.where(along > SHORTEST_M, jnp.abs(turn) / jnp.maximum(along, SHORTEST_M), 0.0)
+    bend = jnp.sqrt(tracker.lateral_mps2 / jnp.maximum(curvature, GENTLEST_RADPM))
+    slowest = jnp.minimum(limit, jnp.concatenate([bend, bend[..., -1:]], axis=-1))  # a bend begins at the first of its two points
+    return jnp.min(jnp.sqrt(slowest**2 + 2.0 * tracker.braking_mps2 * route.arc), axis=-1)
+
+
+def make_action(
+    acceleration: Float[Array, "*n"], steer: Float[Array, "*n"], known: Float[Array, "*n"], tracker: Tracker
+) -> Float[Array, "*n 3"]:
+    """Makes the action for an acceleration; an agent without a route brakes.
+
+    A throttle below zero and the brake say the same, so that actions with one pedal and with two do the same.
+    """
+    acceleration = jnp.where(known > 0, acceleration, -tracker.brake_mps2)
+    brake = jnp.clip(-acceleration / tracker.brake_mps2, 0.0, 1.0)
+    throttle = jnp.clip(acceleration / tracker.throttle_mps2, 0.0, 1.0)
+    return jnp.stack([throttle - brake, jnp.where(known > 0, steer, 0.0), jnp.where(brake > 0, brake, -1.0)], axis=-1)
