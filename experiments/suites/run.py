@@ -75,7 +75,8 @@ def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def write_report(folder: Path) -> Path:
     """Writes `suites.md` from all results in a folder."""
-    lines = ["# Suites", "", "`python -m experiments.suites.run --scenes SCENES --name NAME`; articulated car, dry road, one episode a scene."]
+    command = "`python -m experiments.suites.run --scenes SCENES --name NAME`"
+    lines = ["# Suites", "", f"{command}; articulated car, dry road, one episode a scene."]
     lines += ["Brackets are 95 % intervals over scenes. Planners learn nothing. A turn on red counts as a red light run.", ""]
     for path in sorted(folder.glob("result-*.json")):
         result = result_file.read(path)
@@ -112,6 +113,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
     path = given.out / f"result-{given.name}.json"
     result = result_file.read(path) if path.exists() else {"name": given.name, "lists": {}, "rows": {}}
     for suite in given.protocols:
