@@ -1,7 +1,8 @@
 """MetaDrive's reactive traffic: some logged vehicles follow their own track by an intelligent driver model, the others replay it.
 
-Facts of MetaDrive 0.4.3 (`policy/idm_policy.py`, `manager/scenario_traffic_manager.py`); its model works in km/h and metres and gives an
-action between -1 and 1. Here the track is followed exactly; MetaDrive steers along it with two PID controllers.
+After MetaDrive 0.4.3 (`policy/idm_policy.py`, `manager/scenario_traffic_manager.py`), whose model works in km/h and metres and gives an
+action between -1 and 1. Distances are taken between the centres of vehicles. The track is followed exactly; MetaDrive steers along it with
+two PID controllers.
 """
 
 import dataclasses
