@@ -548,12 +548,15 @@ def test_what_a_user_can_mend_is_one_line(arguments, message, monkeypatch, capsy
 # ---- every option composes and builds
 
 
+PLANNERS = ("policy=pure_pursuit", "policy=route_pursuit", "policy=idm_route")
+
+
 def option_sets():
     """Sets of options, one of each group, which together have every option of every group once or more."""
     others = ("command", "hydra_settings", "task", "experiment", "protocol", "spread", "study", "suite", "sysid", "validation")
     folders = [folder for folder in sorted(hydra_config.find_conf().iterdir()) if folder.is_dir() and folder.name not in others]
     groups = [[f"{folder.name}={path.stem}" for path in sorted(folder.glob("*.yaml")) if path.stem != "base"] for folder in folders]
-    groups = [[option for option in options if option != "policy=pure_pursuit"] for options in groups]  # not trained; see below
+    groups = [[option for option in options if option not in PLANNERS] for options in groups]  # not trained; see below
     return [[options[i % len(options)] for options in groups if options] for i in range(max(map(len, groups)))]
 
 
@@ -574,8 +577,18 @@ def test_every_option_builds(options):
     builds(hydra_config.load_config("train", *options))
 
 
-def test_a_policy_that_does_not_learn_replaces_the_trained_one():
-    builds(hydra_config.apply_overrides(hydra_config.load_config("train", "dynamics=bicycle"), ["policy=pure_pursuit"]))
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_policy_that_does_not_learn_replaces_the_trained_one(planner):
+    builds(hydra_config.apply_overrides(hydra_config.load_config("train", "dynamics=bicycle"), ["observations=drive", planner]))
+
+
+def test_an_override_of_a_group_in_the_scenes_sets_what_the_option_sets():
+    config = hydra_config.load_config("train", "scenes/pack/starts=route100")
+    changed = hydra_config.apply_overrides(config, ["scenes/pack/starts=conflict", "scenes/pack/routes=route100"])["scenes"]["pack"]
+    assert changed["starts"] is None and changed["conflicts"]["distance_m"] == 2.5
+    assert changed["routes"]["attempts"] == 1500
+    assert hydra_config.apply_overrides(config, ["scenes/pack/routes=none"])["scenes"]["pack"]["routes"] is None
+    assert config["scenes"]["pack"]["starts"]["_target_"] == "route100"
 
 
 def names(group):

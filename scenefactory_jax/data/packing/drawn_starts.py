@@ -6,7 +6,7 @@ same scene always gives the same agents.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,9 +14,12 @@ from jaxtyping import Bool, Float, Int
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.raw_scene import RawScene
 from scenefactory_jax.core.scene_arrays import Logs, wrap_angles
-from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, Range
+from scenefactory_jax.core.schema import Bounds, ConfigError, Fraction, NonNegative, Positive, Range
 from scenefactory_jax.core.types import ROAD_USERS, ROUTE_SPACING_M
-from scenefactory_jax.roadgraph import route_sets
+from scenefactory_jax.roadgraph import route_bends, route_sets
+
+GRAVITY_MPS2 = 9.81
+Uses = Annotated[list[float], Bounds(above=0)]  # parts of the friction; one or more
 
 
 class Starts(NamedTuple):
@@ -26,6 +29,9 @@ class Starts(NamedTuple):
     start: Float[np.ndarray, " K"]  # arc length on it
     end: Float[np.ndarray, " K"]
     speed: Float[np.ndarray, " K"]
+    line: Float[np.ndarray, " K"] | None = None  # arc length of the only line before which the agent must have stood; inf: there is none;
+    # None: lights and stop signs are those of the scene
+    parked: Float[np.ndarray, " K"] | None = None  # of the rear of a car that is parked behind the line
 
 
 def route100(
@@ -67,9 +73,120 @@ def route100(
     return Starts(rows[chosen], zero, length[chosen], zero)
 
 
-def _is_free(
-    start: Float[np.ndarray, "2"], others: list[Float[np.ndarray, "2"]], columns: Mapping[str, np.ndarray], gap_m: float
-) -> bool:
+def grip(
+    columns: Mapping[str, np.ndarray],
+    *,
+    slots: int,
+    mu: Positive,
+    use: Uses,
+    radius_m: Range,
+    turn_deg: Positive,
+    window_m: Positive,
+    approach_m: NonNegative,
+    beyond_m: NonNegative,
+    way_gap_m: NonNegative,
+) -> Starts:
+    """Chooses bends of drawn routes that agents enter with a part of the friction: v = sqrt(u mu g R).
+
+    Args:
+        columns: as in `route100`.
+        mu: friction coefficient of the road, which the weather must have, too.
+        use: u, in turns over the agents.
+        radius_m: of the bends, at their tightest place, as mean over `window_m`; they turn by `turn_deg` or more.
+        approach_m: between start and bend; the goal lies `beyond_m` behind it.
+        way_gap_m: between the ways of two agents, so that each drives as if alone.
+    """
+    ways, speeds = _Ways(columns, way_gap_m), []
+    _check_uses(use)
+    for row in np.flatnonzero(columns["routes.drawn"]).tolist():
+        line, length = _read_line(columns, row), float(columns["routes.length"][row])
+        for bend in route_bends.find_bends(line, window_m=window_m, radius_m=radius_m, turn_deg=turn_deg):
+            start, end = bend.start - approach_m, bend.end + beyond_m
+            if start >= 0.0 and end <= length and len(speeds) < slots and ways.add(row, start, end, beyond=0.0):
+                speeds.append(np.sqrt(use[len(speeds) % len(use)] * mu * GRAVITY_MPS2 * bend.radius))
+                break
+    route, start, end = ways.read()
+    nothing = np.full(len(route), np.inf)
+    return Starts(route, start, end, np.array(speeds, float), nothing, nothing)
+
+
+def grip_stops(
+    columns: Mapping[str, np.ndarray],
+    *,
+    slots: int,
+    mu: Positive,
+    use: Uses,
+    distance_m: Positive,
+    parked_m: Positive,
+    goal_m: NonNegative,
+    radius_m: Positive,
+    window_m: Positive,
+    way_gap_m: NonNegative,
+    car_size_m: list[float],
+) -> Starts:
+    """Chooses straight stretches of drawn routes on which agents have to stop before a parked car with a part of the friction.
+
+    v^2 / (2 mu g) = u x the distance between the car's front and the line of a stop sign. A car is parked behind the line, the goal lies
+    between: an agent passes if it stands before the line, drives on to the goal, and touches nothing.
+
+    Args:
+        columns, mu, use, window_m, way_gap_m: as in `grip`.
+        distance_m: between the front at the start and the line.
+        parked_m: between the line and the parked car's rear.
+        goal_m: between the line and the goal, which an agent reaches with its centre within `step_metrics.goal_radius_m`.
+        radius_m: smallest radius of a straight stretch.
+    """
+    ways, speeds = _Ways(columns, way_gap_m), []
+    _check_uses(use)
+    half = 0.5 * car_size_m[0]
+    to_line = half + distance_m
+    whole = to_line + parked_m + car_size_m[0]
+    for row in np.flatnonzero(columns["routes.drawn"]).tolist():
+        line = _read_line(columns, row)
+        start = route_bends.find_straight(line, window_m=window_m, radius_m=radius_m, length_m=whole)
+        if start is not None and len(speeds) < slots and ways.add(row, start, start + to_line + goal_m, beyond=whole - to_line - goal_m):
+            speeds.append(np.sqrt(2.0 * use[len(speeds) % len(use)] * mu * GRAVITY_MPS2 * distance_m))
+    route, begin, end = ways.read()
+    return Starts(route, begin, end, np.array(speeds, float), begin + to_line, begin + to_line + parked_m)
+
+
+def _check_uses(use: list[float]) -> None:
+    """Raises a ConfigError for an empty list."""
+    if not use:
+        raise ConfigError("scenes.pack.starts.use: expected one number or more, got []")
+
+
+class _Ways:
+    """The ways of the chosen agents, which keep a distance from each other and from road users at their starts."""
+
+    def __init__(self, columns: Mapping[str, np.ndarray], gap_m: float) -> None:
+        self.columns, self.gap_m = columns, gap_m
+        self.rows: list[tuple[int, float, float]] = []
+        self.points: list[Float[np.ndarray, "N 2"]] = []
+
+    def add(self, row: int, start: float, end: float, *, beyond: float) -> bool:
+        """Adds a way, and what lies `beyond` its end, if it is free."""
+        line = _read_line(self.columns, row)
+        way = line[int(start / ROUTE_SPACING_M) : int(np.ceil((end + beyond) / ROUTE_SPACING_M)) + 1]
+        near = any((np.hypot(*(way[:, None] - other).transpose(2, 0, 1)) < self.gap_m).any() for other in self.points)
+        if near or not _is_free(way[0], [], self.columns, self.gap_m):
+            return False
+        self.rows.append((row, start, end))
+        self.points.append(way)
+        return True
+
+    def read(self) -> tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+        """Reads routes, starts and ends."""
+        table = np.array(self.rows, float).reshape(-1, 3)
+        return table[:, 0].astype(int), table[:, 1], table[:, 2]
+
+
+def _read_line(columns: Mapping[str, np.ndarray], row: int) -> Float[np.ndarray, "N 2"]:
+    """The points of a route without those that repeat its end."""
+    return columns["routes.position"][row, : int(columns["routes.length"][row] / ROUTE_SPACING_M) + 1]
+
+
+def _is_free(start: Float[np.ndarray, "2"], others: list[Float[np.ndarray, "2"]], columns: Mapping[str, np.ndarray], gap_m: float) -> bool:
     """Whether a start is far enough from the chosen ones and from the outlines of road users at the current step."""
     if any(np.hypot(*(start - other)) < gap_m for other in others):
         return False
@@ -112,8 +229,54 @@ def draw_agents(
         raise ConfigError("scenes.pack.starts: needs drawn routes; give scenes/pack/routes=route100 or another with `drawn` above 0")
     if car_size_m is None:
         raise ConfigError("scenes.pack.car_size_m: null; drawn agents have no log to take their size from; give [length, width]")
-    choose = instantiate(entry, builtins=__name__, where="scenes.pack.starts", slots=slots)
-    return _make_agents(columns, choose({**columns, "row": np.array(row)}), slots=slots, car_size_m=car_size_m)
+    choose = instantiate(entry, builtins=__name__, where="scenes.pack.starts", slots=slots, car_size_m=car_size_m)
+    starts = choose({**columns, "row": np.array(row)})
+    added = {} if starts.line is None or starts.parked is None else _add_parked_cars(columns, starts, car_size_m)
+    return _make_agents(columns, starts, slots=slots, car_size_m=car_size_m) | added
+
+
+def _add_parked_cars(columns: Mapping[str, np.ndarray], starts: Starts, car_size_m: list[float]) -> dict[str, np.ndarray]:
+    """The columns of traffic with a parked car, and those of controls with a stop sign before it, for the agents that have a line; no other
+    controls."""
+    assert starts.line is not None and starts.parked is not None
+    stopping = np.isfinite(starts.line)
+    routes, line_arc, rear_arc = starts.route[stopping], starts.line[stopping], starts.parked[stopping]
+    count, steps = len(routes), columns["traffic_log.valid"].shape[1]
+    lines = [columns["routes.position"][row] for row in routes]
+    parked = [_point_at(line, arc + 0.5 * car_size_m[0]) for line, arc in zip(lines, rear_arc, strict=True)]
+    stops = [_point_at(line, arc) for line, arc in zip(lines, line_arc, strict=True)]
+    place, yaw = np.array([at for at, _ in parked]).reshape(-1, 2), np.array([turn for _, turn in parked], float)
+    direction = np.array([turn for _, turn in stops], float)
+    rows = {
+        "position": np.repeat(place[:, None], steps, axis=1),
+        "yaw": np.repeat(yaw[:, None], steps, axis=1),
+        "velocity": np.zeros((count, steps, 2)),
+        "valid": np.ones((count, steps), bool),
+        "size": np.tile(np.asarray(car_size_m, float), (count, 1)),
+        "kind": np.full(count, ROAD_USERS.index("vehicle")),
+        "route": np.zeros(count, int),
+        "has_route": np.zeros(count, bool),
+    }
+    added = {f"traffic_log.{name}": np.concatenate([columns[f"traffic_log.{name}"], leaf]) for name, leaf in rows.items()}
+    for name in ("zone_enter", "zone_leave", "zone_match"):
+        pad = ((0, count), (0, count), (0, 0))
+        added[f"traffic_log.{name}"] = np.pad(columns[f"traffic_log.{name}"], pad, constant_values=np.inf)
+    stop_arc = np.full((len(columns["routes.length"]), 1), np.inf)
+    stop_arc[routes, 0] = line_arc
+    stop_control = np.zeros(stop_arc.shape, int)
+    stop_control[routes, 0] = np.arange(count)
+    return added | {
+        "controls.position": np.array([at for at, _ in stops]).reshape(-1, 2),
+        "controls.direction": np.stack([np.cos(direction), np.sin(direction)], axis=1),
+        "controls.lane": columns["routes.lane"][routes, (line_arc / ROUTE_SPACING_M).astype(int)],
+        "controls.stop_sign": np.ones(count, bool),
+        "controls.change_s": np.zeros((count, 0)),
+        "controls.state": np.zeros((count, 0), int),
+        "controls.period_s": np.full(count, np.inf),
+        "controls.valid": np.ones(count, bool),
+        "routes.stop_arc": stop_arc,
+        "routes.stop_control": stop_control,
+    }
 
 
 def _make_agents(columns: Mapping[str, np.ndarray], starts: Starts, *, slots: int, car_size_m: list[float]) -> dict[str, np.ndarray]:

@@ -41,6 +41,16 @@ def weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: li
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
 
 
+@bound_observation(LENGTH, FRACTION)
+def hidden_weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: list[str]) -> Float[Array, "A F"]:
+    """The columns of `weather` as they read on dry asphalt concrete, whatever the road is like: for a road that the policy must feel.
+
+    `observations.weather._target_=hidden_weather` hides the road from a policy that learnt to see it.
+    """
+    row = [0.0, *(float(name == "AC") for name in surfaces)]
+    return jnp.broadcast_to(jnp.array(row, jnp.float32), (len(state.active), len(row)))
+
+
 def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:
     """Yaw rate, and the mean angle of the front wheels."""
     return jnp.stack([state.motion.yaw_rate / turn_scale_radps, state.motion.steer / steer_scale_rad], axis=1)

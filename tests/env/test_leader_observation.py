@@ -1,0 +1,91 @@
+"""Observation group `leader`: two agents on one straight route, one on a crossing one, and boxes of the traffic."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.hand_scenes import scene_of
+from support.route_scenes import routed_scene
+
+from scenefactory_jax.adapters import bounds
+from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.types import Boxes, Events, Motion, RouteState, State
+from scenefactory_jax.env import observations
+
+ENTRY = load_config("train", "observations=drive")["observations"]["leader"]
+GROUPS = observations.make({"leader": ENTRY})
+OBSERVE = jax.jit(lambda scene, state: observations.observe(scene, state, GROUPS))
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+EAST, NORTH = [(0.0, 0.0), (100.0, 0.0)], [(50.0, -60.0), (50.0, 60.0)]
+
+
+def boxes_of(*rows):
+    """Rows of (x, y, yaw, velocity x, velocity y), 4 x 2 m."""
+    far = [(500.0, 500.0, 0.0, 0.0, 0.0)] * (3 - len(rows))
+    table = jnp.asarray([*rows, *far], jnp.float32)
+    zero = jnp.zeros(len(table))
+    return Boxes(table[:, :2], zero, table[:, 2], table[:, 3:], zero, jnp.tile(jnp.array([4.0, 2.0]), (len(table), 1)), zero, zero == 0)
+
+
+def observe(speeds, boxes, active=(True, True, True)):
+    """The leaders of agents at 10 and 30 m of the road east, and at 20 m of the road north."""
+    scene = replace(routed_scene([EAST, EAST, NORTH], starts=[10.0, 30.0, 20.0]), traffic=boxes_of(*boxes))
+    agents, zero = scene.agents, jnp.zeros(3)
+    place = jnp.concatenate([agents.position, zero[:, None]], axis=1)
+    along = jnp.stack([jnp.cos(agents.yaw), jnp.sin(agents.yaw), zero], axis=1)
+    velocity = jnp.asarray(speeds, jnp.float32)[:, None] * along
+    motion = Motion(place, velocity, agents.yaw, zero, zero + 1, zero, zero, zero + 1, zero, zero)
+    none = jnp.zeros(3, bool)
+    state = State(
+        body=None,
+        motion=motion,
+        agents=agents,
+        weather=scene.weather,
+        active=jnp.array(active),
+        past_events=Events(*[none] * len(Events.__dataclass_fields__)),
+        steps_since_spawn=jnp.zeros(3, jnp.int32),
+        previous_action=jnp.zeros((3, 3)),
+        step=jnp.int32(0),
+        key=jax.random.key(0),
+        route=RouteState(agents.route_start, agents.route_start, none),
+    )
+    seen = OBSERVE(scene, state)
+    low, high = bounds.flat_bounds(GROUPS, seen)
+    flat = np.asarray(seen["leader"][0])
+    assert (flat >= low).all() and (flat <= high).all()
+    return np.asarray(seen["leader"])
+
+
+def test_the_nearest_box_on_the_route_leads():
+    seen = observe([8.0, 5.0, 0.0], [(30.0, 8.0, 0.0, 0.0, 0.0), (60.0, 1.0, 0.0, 2.0, 0.0), (70.0, 0.0, 0.0, 0.0, 0.0)])
+    gap = lambda metres: metres / (ENTRY["gap_scale_m"] + metres)  # noqa: E731
+    np.testing.assert_allclose(seen[0], [1.0, gap(16.0), 0.5, 0.3], rtol=1e-5)  # the other agent, 20 m ahead
+    np.testing.assert_allclose(seen[1], [1.0, gap(26.0), 0.2, 0.3], rtol=1e-5)  # the box beside the route's line that is within its width
+    np.testing.assert_allclose(seen[2], [0.0, 1.0, 0.0, 0.0])
+
+
+def test_a_box_that_crosses_within_the_foresight_leads_and_one_that_has_left_does_not():
+    seen = observe([8.0, 8.0, 0.0], [(50.0, 7.0, -np.pi / 2, 0.0, -6.0)], active=(True, False, True))
+    assert seen[0, 0] == 1.0 and seen[0, 2] < 0.01 and not seen[1].any()  # an inactive agent neither leads nor sees
+    away = observe([8.0, 8.0, 0.0], [(50.0, 7.0, np.pi / 2, 0.0, 6.0)], active=(True, False, True))
+    assert away[0, 0] == 0.0 and away[0, 1] == 1.0
+
+
+@pytest.mark.parametrize("behind", [5.0, 95.0])
+def test_boxes_behind_the_car_or_beyond_the_look_ahead_do_not_lead(behind):
+    assert observe([8.0, 8.0, 0.0], [(behind, 0.0, 0.0, 0.0, 0.0)], active=(True, False, True))[0, 0] == 0.0
+
+
+def test_a_world_without_routes_has_no_leaders():
+    scene = scene_of([(0.0, 0.0)] * 3, [(9.0, 0.0)] * 3)
+    routed = routed_scene([EAST, EAST, NORTH])
+    zero = jnp.zeros(3)
+    motion = Motion(jnp.zeros((3, 3)), jnp.zeros((3, 3)), zero, zero, zero, zero, zero, zero, zero, zero)
+    none = jnp.zeros(3, bool)
+    parts = {"body": None, "motion": motion, "agents": scene.agents, "weather": routed.weather, "active": ~none}
+    parts |= {"past_events": Events(*[none] * len(Events.__dataclass_fields__)), "steps_since_spawn": jnp.zeros(3, jnp.int32)}
+    parts |= {"previous_action": jnp.zeros((3, 3)), "step": jnp.int32(0), "key": jax.random.key(0), "route": RouteState(zero, zero, none)}
+    np.testing.assert_array_equal(OBSERVE(scene, State(**parts))["leader"], [[0, 1, 0, 0]] * 3)
