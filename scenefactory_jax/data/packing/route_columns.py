@@ -113,7 +113,7 @@ def pack_routes(
 def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bool:
     """Whether a track is a vehicle that gets farther than that from its first position, from the current step on."""
     path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
-    return raw.tracks[index].kind == "vehicle" and len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m
+    return bool(raw.tracks[index].kind == "vehicle" and len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m)
 
 
 def _find_routes(lanes: LaneMap, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float) -> list[SampledRoute]:
