@@ -9,7 +9,15 @@ STARTS = {
     "along_log": "somewhere on the recorded way",
     "random_pairs": "random, start and goal along lanes",
 }
-TRAFFIC = {"no_traffic": "none", "parked_traffic": "parked cars stand", "log_traffic": "as recorded, it does not react"}
+TRAFFIC = {
+    "no_traffic": "none",
+    "parked_traffic": "parked cars stand",
+    "static_traffic": "all vehicles of the start stand",
+    "log_traffic": "as recorded, it does not react",
+    "idm_traffic": "vehicles with a route drive and react (IDM), people and cyclists as recorded",
+    "trajectory_idm_traffic": "as recorded, some vehicles react along their tracks (MetaDrive's IDM)",
+    "mixed": "one kind of several in each episode",
+}
 
 
 def describe(config: Mapping[str, Any]) -> dict[str, str]:

@@ -117,7 +117,7 @@ def test_metadrive_by_hand():
     box = replace(box, traffic=replace(box.traffic, position=jnp.array([[15.0, 2.5]])))
     moves = {"start": (14.5, 1.0), "end": (15.0, 1.0)}
     assert reward("metadrive_nuplan", scene=box, **moves) == -2  # a box of unknown kind counts as a vehicle
-    log = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), box.traffic_log)
+    log = jax.tree.map(lambda leaf: jnp.zeros([size or 1 for size in leaf.shape], leaf.dtype), box.traffic_log)  # one road user
     box = replace(box, traffic_log=replace(log, kind=jnp.array([ROAD_USERS.index("other")])))
     assert reward("metadrive_nuplan", scene=box, **moves) == -0.5
     line = street(starts=((0.0, 0.0), (40.0, 3.0)))

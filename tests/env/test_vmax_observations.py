@@ -13,6 +13,7 @@ from scenefactory_jax.core import schema
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.env import observations
 from scenefactory_jax.env.observations import vmax_blocks
+from scenefactory_jax.env.observations.agent_routes import select_routes
 from scenefactory_jax.env.observations.vmax import split_observation
 from scenefactory_jax.env.observations.vmax_blocks import View
 from scenefactory_jax.roadgraph import nearest_rows
@@ -105,6 +106,16 @@ def test_segments_of_the_nearest_lane(scene):
     unrouted = replace(scene, agents=replace(scene.agents, route_end=jnp.zeros(2)), routes=replace(scene.routes, agent=jnp.array([1])))
     found = blocks("segment", unrouted, state_of(unrouted))
     assert not found["lights"][1].any() and not found["path"][0].any()
+
+
+def test_a_drawn_route_is_shown_in_place_of_the_agents_own(scene):
+    """Row 0 is of no agent and is driven; a second row of the agent's own leads elsewhere."""
+    two = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), scene.routes)
+    own = replace(two, agent=jnp.array([0, 0]), position=two.position.at[1].add(3.0), length=two.length.at[1].add(1.0))
+    for agents, aside in (([0, 0], 3.0), ([-1, 0], 0.0)):  # the longest of its own; the one that it drives
+        state = state_of(scene)
+        route, mask = select_routes(replace(scene, routes=replace(own, agent=jnp.array(agents))), state.agents)
+        assert mask.tolist() == [True, False] and own.position[route[0], 0, 1] == aside
 
 
 @pytest.mark.parametrize("kind", ["base", "segment"])

@@ -55,6 +55,8 @@ def test_lights_have_the_colour_of_their_time(scene):
     shown = [dict(zip(("sign", "light"), (colour for _, colour in control_marks.find_bars(marks, step)), strict=True)) for step in range(4)]
     assert [colours["light"] for colours in shown] == [GREEN, RED, GREEN, RED]
     assert all(colours["sign"] == control_marks.STOP_LINE for colours in shown)
+    beside = replace(scene.controls, position=jnp.array([[20.0, 3.5], [20.0, 0.0], [0.0, 0.0]]), stop_sign=jnp.array([True, True, False]))
+    assert len(control_marks.find_marks(replace(scene, controls=replace(beside, direction=jnp.array([[1.0, 0.0]] * 3))), [0.0]).signs) == 1
     bare = control_marks.find_marks(scene_of([(0.0, 0.0)], [(9.0, 0.0)]), [0.0])
     assert not len(bare.bars) and not len(bare.signs) and control_marks.find_bars(bare, 0) == []
 

@@ -41,7 +41,8 @@ def make_records(scenes: int = 12, agents: int = 6, success: float = 0.7, seed: 
     return {
         "scene": np.array([f"scene, {i:03d}" for i in scene]), "world": scene, "seed": np.full(n, 7),
         "agent": np.tile(np.arange(agents), scenes),
-        "goal_reached": reached, **events, "numerical_error": np.zeros(n, bool),
+        "goal_reached": reached, **events,
+        **dict.fromkeys(("numerical_error", "red_light", "stop_sign", "off_route"), np.zeros(n, bool)),
         "clean": clean, "failure": np.where(clean, "none", np.where(events["collision"], "struck", "out_of_time")), **failed,
         **{name: np.ones(n) for name in ("failure_s", "failure_x_m", "failure_y_m", "severity")},
         "time_s": rng.uniform(3, 50, n).astype(np.float32), "route_m": rng.uniform(10, 90, n), "start_distance_m": rng.uniform(10, 90, n),

@@ -28,6 +28,7 @@ class RouteConfig:
     max_distance_m: Positive  # of a track from the lanes of its route
     traffic: bool  # vehicles of the traffic that move have routes
     min_travel_m: NonNegative  # of these
+    waiting_m: NonNegative  # from a lane's line: vehicles of the traffic that stand nearer wait there and have routes, too
     drawn: Annotated[int, Bounds(min=0)]
     drawn_length_m: Range
     turn_fraction: Fraction
@@ -82,9 +83,12 @@ def pack_routes(
     owner: list[int] = []
     first = np.zeros(len(raw.tracks), int)  # row of the first route of each track
     routed = np.zeros(len(raw.tracks), bool)
-    moving = [index for index in traffic if config.traffic and _is_moving(raw, logs, index, config.min_travel_m)]
-    for slot, index in [*enumerate(agents), *((-1, index) for index in moving)]:
-        options = _find_routes(lanes, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
+    vehicles = [index for index in traffic if config.traffic and raw.tracks[index].kind == "vehicle"]
+    for slot, index in [*enumerate(agents), *((-1, index) for index in vehicles)]:
+        if slot < 0 and not _is_moving(raw, logs, index, config.min_travel_m):
+            options = _find_waiting_route(lanes, raw, logs, index, config, half=half)
+        else:
+            options = _find_routes(lanes, logs, index, config, count=config.alternatives if slot >= 0 else 1, half=half)
         first[index], routed[index] = len(found), bool(options)
         found += options
         owner += [slot] * len(options)
@@ -113,7 +117,7 @@ def pack_routes(
 def _is_moving(raw: RawScene, logs: Logs, index: int, min_travel_m: float) -> bool:
     """Whether a track is a vehicle that gets farther than that from its first position, from the current step on."""
     path = logs.xyz[index, raw.current :][logs.valid[index, raw.current :], :2]
-    return bool(raw.tracks[index].kind == "vehicle" and len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m)
+    return bool(len(path) > 1 and np.linalg.norm(path - path[0], axis=1).max() > min_travel_m)
 
 
 def _find_routes(lanes: LaneMap, logs: Logs, index: int, config: RouteConfig, *, count: int, half: float) -> list[SampledRoute]:
@@ -127,6 +131,20 @@ def _find_routes(lanes: LaneMap, logs: Logs, index: int, config: RouteConfig, *,
     )
     cut = [route_sets.cut_to_square(route, np.zeros(2), half) for route in options]
     return [route for route in cut if route is not None]
+
+
+def _find_waiting_route(
+    lanes: LaneMap, raw: RawScene, logs: Logs, index: int, config: RouteConfig, *, half: float
+) -> list[SampledRoute]:
+    """The route of a vehicle that stands on a lane: it waits, at a light or in a queue, and has somewhere to go; none for a parked one."""
+    if not logs.valid[index, raw.current]:
+        return []
+    place, yaw = logs.xyz[index, raw.current, :2], float(logs.yaw[index, raw.current])
+    ahead = place + ROUTE_SPACING_M * np.array([np.cos(yaw), np.sin(yaw)])
+    numbers = {"max_length_m": config.length_m, "max_distance_m": config.waiting_m}
+    (route, *_) = route_sets.find_track_routes(lanes, np.stack([place, ahead]), yaw, count=1, **numbers)
+    cut = route_sets.cut_to_square(route, np.zeros(2), half) if route.along_lanes else None
+    return [] if cut is None else [cut]
 
 
 def _assemble(

@@ -45,8 +45,9 @@ def leader(
     points = max(int(look_ahead_m // chord_m), 1) + 1
     arc = state.route.arc
     window = corridor.read_window(scene.routes, agents.route, arc, points=points, stride=chord_m)
+    places = corridor.project_boxes(window, boxes)
     strip = {"arc": arc, "size": agents.size, "margin_m": margin_m, "foresight_s": jnp.full(len(boxes.mass), foresight_s)}
-    found = corridor.find_obstacles(corridor.project_boxes(window, boxes), boxes, **strip)
+    found = corridor.find_obstacles(places, boxes, **strip, shift=jnp.zeros_like(places.offset))
     own = jnp.arange(len(boxes.mass)) == jnp.arange(len(arc))[:, None]
     gap = jnp.where(own, jnp.inf, found.gap)
     nearest = jnp.argmin(gap, axis=1)[:, None]

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame
 from scenefactory_jax.core.schema import Positive
-from scenefactory_jax.core.types import Scene, State
+from scenefactory_jax.core.types import ROUTE_SPACING_M, Scene, State
 from scenefactory_jax.env import route_following
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation, compress_length
 
@@ -48,7 +48,8 @@ def route(
         cross(along, facing),
         dot(along, facing),
     ]
-    limit = jnp.take_along_axis(scene.routes.speed_limit[agents.route], jnp.ceil(arc[:, 1:]).astype(jnp.int32), axis=1, mode="clip")
+    place = jnp.clip(jnp.ceil(arc[:, 1:] / ROUTE_SPACING_M).astype(jnp.int32), 0, scene.routes.speed_limit.shape[1] - 1)
+    limit = scene.routes.speed_limit[row[:, 1:], place]
     limit = jnp.where(jnp.isfinite(limit), limit, 0.0) / speed_scale_mps
     yaw = motion.yaw[:, None]
     ahead = to_frame(points[:, 1:] - motion.position[:, None, :2], yaw) / distance_scale_m

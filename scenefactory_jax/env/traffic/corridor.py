@@ -87,19 +87,48 @@ def find_obstacles(
     *,
     arc: Float[Array, " V"],
     size: Float[Array, "V 2"],
+    shift: Float[Array, "V B"],
     margin_m: float,
     foresight_s: Float[Array, " B"],
 ) -> Obstacles:
     """Finds the boxes whose centre is ahead of the vehicle's and that touch the strip of its width and a margin on both sides along its
-    route, now or within `foresight_s` at their present velocity."""
-    half = 0.5 * boxes.size[None]
-    across = jnp.abs(places.sine) * half[..., 0] + jnp.abs(places.cosine) * half[..., 1]
-    lengthwise = jnp.abs(places.cosine) * half[..., 0] + jnp.abs(places.sine) * half[..., 1]
-    later = places.offset + places.drift * foresight_s
-    offset = jnp.where(places.offset * later < 0, 0.0, jnp.minimum(jnp.abs(places.offset), jnp.abs(later)))
+    route, now or within `foresight_s` at their present velocity. `shift` is the vehicle's own offset from the route when it gets there."""
+    across, lengthwise = find_extents(places, boxes)
+    now = places.offset - shift
+    later = now + places.drift * foresight_s
+    offset = jnp.where(now * later < 0, 0.0, jnp.minimum(jnp.abs(now), jnp.abs(later)))
     inside = places.valid & (places.arc > arc[:, None]) & (offset - across < 0.5 * size[:, 1:] + margin_m)
     gap = places.arc - lengthwise - arc[:, None] - 0.5 * size[:, :1]
     return Obstacles(jnp.where(inside, gap, jnp.inf), jnp.maximum(places.speed, 0.0))
+
+
+def find_extents(places: Projection, boxes: Boxes) -> tuple[Float[Array, "V B"], Float[Array, "V B"]]:
+    """Finds half the extents of boxes across and along routes."""
+    half, sine, cosine = 0.5 * boxes.size[None], jnp.abs(places.sine), jnp.abs(places.cosine)
+    return sine * half[..., 0] + cosine * half[..., 1], cosine * half[..., 0] + sine * half[..., 1]
+
+
+def find_side_step(
+    places: Projection,
+    boxes: Boxes,
+    stands: Bool[Array, " B"],
+    *,
+    arc: Float[Array, " V"],
+    size: Float[Array, "V 2"],
+    margin_m: float,
+    ahead_m: float,
+    most_m: float,
+) -> Float[Array, " V"]:
+    """Finds the offset from the route, to the left, with which a vehicle passes boxes that stand at its side and reach into its corridor
+    by at most `most_m`; those that reach in farther are not passed."""
+    across, lengthwise = find_extents(places, boxes)
+    distance = places.arc - arc[:, None]
+    half = 0.5 * size[:, :1]
+    beside = places.valid & stands & (distance > -lengthwise - half) & (distance < lengthwise + half + ahead_m)
+    need = 0.5 * size[:, 1:] + margin_m + across - jnp.abs(places.offset)
+    need = jnp.where(beside & (need > 0) & (need <= most_m), need, 0.0)
+    right = jnp.max(jnp.where(places.offset < 0, need, 0.0), axis=1, initial=0.0)
+    return right - jnp.max(jnp.where(places.offset > 0, need, 0.0), axis=1, initial=0.0)
 
 
 def compute_target_speed(
@@ -114,8 +143,10 @@ def compute_target_speed(
     radius = jnp.where(sound, spacing / jnp.maximum(turn, 1e-4), jnp.inf)
     bend = jnp.sqrt(lateral_mps2 * jnp.minimum(radius, 1e6))
     bend = jnp.concatenate([bend[:, :1], bend, bend[:, -1:]], axis=1)  # of the points
-    distance = jnp.maximum(window.arc - arc[:, None], 0.0)
-    return jnp.min(jnp.sqrt(jnp.minimum(bend, limit) ** 2 + 2.0 * braking_mps2 * distance), axis=1)
+    distance = window.arc - arc[:, None]
+    speed = jnp.sqrt(jnp.minimum(bend, limit) ** 2 + 2.0 * braking_mps2 * jnp.maximum(distance, 0.0))
+    following = jnp.concatenate([distance[:, 1:], jnp.full_like(distance[:, :1], jnp.inf)], axis=1)
+    return jnp.min(jnp.where(following < 0, jnp.inf, speed), axis=1)  # chords that lie behind do not matter
 
 
 def place_on_route(

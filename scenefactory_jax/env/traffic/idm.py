@@ -5,47 +5,28 @@ Vehicles without a route stand at their first logged place. People, cyclists and
 still where its next place would overlap a box that it does not overlap yet: so vehicles of this traffic never collide with each other.
 """
 
-import dataclasses
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame, wrap_angle
+from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
-from scenefactory_jax.core.types import YELLOW_STATES, Boxes, RoadUser, Scene, Traffic
+from scenefactory_jax.core.schema import NonNegative
+from scenefactory_jax.core.types import YELLOW_STATES, Boxes, RoadUser, Scene, Traffic, TrafficLog
 from scenefactory_jax.env.traffic import corridor, idm_law, right_of_way
-from scenefactory_jax.env.traffic.idm_law import IdmLaw
+from scenefactory_jax.env.traffic.corridor import Projection
+from scenefactory_jax.env.traffic.idm_config import IdmConfig
 from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, make_masses, read_log
-from scenefactory_jax.env.traffic.right_of_way import RightOfWay, Vehicles
+from scenefactory_jax.env.traffic.right_of_way import Vehicles
 from scenefactory_jax.roadgraph import traffic_lights
 
 WAITING, ON_ROAD, GONE = 0, 1, 2
 MOVING_MPS = 1.5  # from which a vehicle no longer counts as waiting
 STARTS_MPS2 = 0.05  # a vehicle that stands and accelerates less is blocked
+BEHIND_M = 8.0  # of a vehicle's centre, from where its route is read: for boxes that it is just passing
 SIDE_M = 0.3  # beside a box whose entry place is free
-
-
-@dataclasses.dataclass(frozen=True)
-class IdmConfig:
-    """The numbers of `idm` that concern driving; described in `conf/traffic/idm.yaml`."""
-
-    law: IdmLaw
-    target_mps: Positive
-    lateral_mps2: Positive
-    max_braking_mps2: Positive
-    look_ahead_m: Positive
-    chord_m: Count
-    corridor_margin_m: NonNegative
-    foresight_s: NonNegative
-    settle_m: Positive
-    stop_sign_s: NonNegative
-    stand_mps: Positive
-    stand_distance_m: Positive
-    stuck_s: Annotated[float, Bounds(above=0)] | None
-    right_of_way: RightOfWay
 
 
 class IdmState(NamedTuple):
@@ -59,7 +40,8 @@ class IdmState(NamedTuple):
     yaw: Float[Array, " O"]
     velocity: Float[Array, "O 2"]
     yaw_rate: Float[Array, " O"]
-    offset: Float[Array, "O 2"]  # of the position from the route
+    shift: Float[Array, " O"]  # to the left of the route
+    offset: Float[Array, "O 2"]  # further distance of the position from the route
     turn: Float[Array, " O"]  # of the yaw from the route
     waited_s: Float[Array, " O"]  # since the vehicle last drove
     served: Float[Array, " O"]  # arc length of the last stop sign at which the vehicle has stood
@@ -132,11 +114,13 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
     read = lambda table: jnp.take_along_axis(table, entry.reshape(-1, *[1] * (table.ndim - 1)), axis=1)[:, 0]  # noqa: E731
     position, yaw, zero = read(log.position), read(log.yaw), jnp.zeros(count, jnp.float32)
     speed = jnp.where(drives, safe_norm(read(log.velocity)), 0.0)
-    arc, offset, turn = zero, jnp.zeros((count, 2), jnp.float32), zero
+    arc, shift, offset, turn = zero, zero, jnp.zeros((count, 2), jnp.float32), zero
     if scene.routes.position.shape[0] and scene.routes.position.shape[1] > 1:
         arc = corridor.project_points(scene.routes, log.route, position, yaw)
         place, ahead = corridor.place_on_route(scene.routes, log.route, arc, log.size[:, 0])
-        offset, turn = position - place, wrap_angle(yaw - ahead)
+        offset, turn, side = position - place, wrap_angle(yaw - ahead), heading_vector(ahead + jnp.pi / 2)
+        shift = dot(offset, side)
+        offset = offset - shift[:, None] * side
     return IdmState(
         phase=jnp.where(~known, GONE, jnp.where(entry <= row, ON_ROAD, WAITING)).astype(jnp.int32),
         arc=arc,
@@ -146,6 +130,7 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
         yaw=yaw,
         velocity=jnp.where(drives[:, None], speed[:, None] * heading_vector(yaw), 0.0),
         yaw_rate=zero,
+        shift=shift,
         offset=offset,
         turn=turn,
         waited_s=zero,
@@ -195,14 +180,18 @@ def advance(scene: Scene, state: IdmState, cars: Boxes, time_s: Float[Array, ""]
     present = jnp.where(log.kind == VEHICLE, state.phase == ON_ROAD, scene.traffic.present)
     traffic = replace(scene.traffic, present=present)  # with those that have just entered
     boxes: Boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), traffic, cars)
-    acceleration = compute_accelerations(scene, state, boxes, drives, time_s, config, at_end=at_end)
+    acceleration, shift = compute_controls(scene, state, boxes, drives, time_s, config, at_end=at_end)
     speed = jnp.where(drives, jnp.maximum(state.speed + acceleration * dt, 0.0), state.speed)
     way = jnp.where(drives, 0.5 * (state.speed + speed) * dt, 0.0)
-    moved = follow_route(scene, state._replace(arc=state.arc + way), way, drives, config.settle_m)
+    step = config.side_step.slope * way
+    moved = state._replace(arc=state.arc + way, shift=state.shift + jnp.clip(shift - state.shift, -step, step))
+    moved = follow_route(scene, moved, way, drives, config.settle_m)
     held = find_held(scene, state, moved, boxes, drives)
     new, old = moved, state
     keep = lambda a, b: jnp.where(held.reshape(-1, *[1] * (a.ndim - 1)), b, a)  # noqa: E731
-    new = new._replace(**{name: keep(getattr(new, name), getattr(old, name)) for name in ("arc", "position", "yaw", "offset", "turn")})
+    new = new._replace(
+        **{name: keep(getattr(new, name), getattr(old, name)) for name in ("arc", "position", "yaw", "shift", "offset", "turn")}
+    )
     speed = jnp.where(held, 0.0, speed)
     stands = speed < config.stand_mps
     waited = jnp.where(stands, state.waited_s + dt, jnp.where(speed > MOVING_MPS, 0.0, state.waited_s))
@@ -217,13 +206,13 @@ def advance(scene: Scene, state: IdmState, cars: Boxes, time_s: Float[Array, ""]
     return end_routes(scene, new, drives, config, at_end=at_end)
 
 
-def compute_accelerations(
+def compute_controls(
     scene: Scene, state: IdmState, boxes: Boxes, drives: Bool[Array, " O"], time_s: Float[Array, ""], config: IdmConfig, *, at_end: str
-) -> Float[Array, " O"]:
-    """Computes the accelerations of the vehicles from everything that they brake for."""
+) -> tuple[Float[Array, " O"], Float[Array, " O"]]:
+    """Computes the accelerations of the vehicles from everything that they brake for, and the offsets from their routes that they take."""
     log, routes, law = scene.traffic_log, scene.routes, config.law
-    points = int(config.look_ahead_m // config.chord_m) + 1
-    window = corridor.read_window(routes, log.route, state.arc, points=points, stride=config.chord_m)
+    points = int((config.look_ahead_m + BEHIND_M) // config.chord_m) + 1
+    window = corridor.read_window(routes, log.route, state.arc - BEHIND_M, points=points, stride=config.chord_m)
     limit = routes.speed_limit.reshape(-1)[log.route[:, None] * routes.position.shape[1] + window.row]
     limit = jnp.where(jnp.isfinite(limit), limit, config.target_mps)
     bends = {"lateral_mps2": config.lateral_mps2, "braking_mps2": law.braking_mps2}
@@ -232,8 +221,9 @@ def compute_accelerations(
     driven = jnp.concatenate([drives, jnp.zeros(len(boxes.mass) - count, bool)])
     places = corridor.project_boxes(window, boxes)
     foresight = jnp.where(driven, 0.0, config.foresight_s)
+    shift, later_shift = choose_shift(log, state, boxes, places, driven, config)
     strip = {"arc": state.arc, "size": log.size, "margin_m": config.corridor_margin_m, "foresight_s": foresight}
-    found = corridor.find_obstacles(places, boxes, **strip)
+    found = corridor.find_obstacles(places, boxes, shift=later_shift, **strip)
     gap = jnp.where(jnp.arange(len(boxes.mass)) == jnp.arange(count)[:, None], jnp.inf, found.gap)
     blocked = (state.speed < config.stand_mps) & (state.acceleration < STARTS_MPS2) & drives
     gap = gap.at[:, :count].set(_ignore_mutual(gap[:, :count], state, blocked, config.right_of_way.patience_s))
@@ -257,7 +247,23 @@ def compute_accelerations(
         room_arc=front + room,
     )
     demand = jnp.maximum(demand, right_of_way.compute_interaction(log, vehicles, law, rules))
-    return jnp.maximum(idm_law.compute_acceleration(state.speed, target, demand, law), -config.max_braking_mps2)
+    return jnp.maximum(idm_law.compute_acceleration(state.speed, target, demand, law), -config.max_braking_mps2), shift
+
+
+def choose_shift(
+    log: TrafficLog, state: IdmState, boxes: Boxes, places: Projection, driven: Bool[Array, " B"], config: IdmConfig
+) -> tuple[Float[Array, " O"], Float[Array, "O B"]]:
+    """Chooses the offset from its route that each vehicle takes, and computes the one that it has reached at each box that stands; at
+    the others it has its present one."""
+    stands = ~driven & (safe_norm(boxes.velocity) < config.stand_mps)
+    rules = config.side_step
+    side = {"margin_m": rules.margin_m, "ahead_m": rules.ahead_m, "most_m": rules.most_m}
+    shift = corridor.find_side_step(places, boxes, stands, arc=state.arc, size=log.size, **side)
+    way = places.arc - corridor.find_extents(places, boxes)[1] - (state.arc + 0.5 * log.size[:, 0])[:, None]
+    reach = rules.slope * jnp.maximum(way, 0.0)
+    present = state.shift[:, None]
+    later = present + jnp.clip(shift[:, None] - present, -reach, reach)
+    return shift, jnp.where(stands, later, present)
 
 
 def _ignore_mutual(gap: Float[Array, "O O"], state: IdmState, blocked: Bool[Array, " O"], patience_s: float) -> Float[Array, "O O"]:
@@ -298,8 +304,9 @@ def follow_route(scene: Scene, state: IdmState, way: Float[Array, " O"], drives:
     fade = jnp.exp(-way / settle_m)
     offset, turn = state.offset * fade[:, None], state.turn * fade
     place, ahead = corridor.place_on_route(scene.routes, log.route, state.arc, log.size[:, 0])
+    side = heading_vector(ahead + jnp.pi / 2)
     return state._replace(
-        position=jnp.where(drives[:, None], place + offset, state.position),
+        position=jnp.where(drives[:, None], place + offset + state.shift[:, None] * side, state.position),
         yaw=jnp.where(drives, wrap_angle(ahead + turn), state.yaw),
         offset=offset,
         turn=turn,
@@ -355,6 +362,7 @@ def end_routes(scene: Scene, state: IdmState, drives: Bool[Array, " O"], config:
         yaw=yaw,
         velocity=state.entry_speed[:, None] * heading_vector(yaw),
         yaw_rate=jnp.zeros_like(yaw),
+        shift=jnp.zeros_like(yaw),
         offset=jnp.zeros_like(state.offset),
         turn=jnp.zeros_like(yaw),
         waited_s=jnp.zeros_like(yaw),

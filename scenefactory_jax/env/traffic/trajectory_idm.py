@@ -1,7 +1,8 @@
 """MetaDrive's reactive traffic: some logged vehicles follow their own track by an intelligent driver model, the others replay it.
 
-Facts of MetaDrive 0.4.3 (`policy/idm_policy.py`, `manager/scenario_traffic_manager.py`); its model works in km/h and metres and gives an
-action between -1 and 1. Here the track is followed exactly; MetaDrive steers along it with two PID controllers.
+After MetaDrive 0.4.3 (`policy/idm_policy.py`, `manager/scenario_traffic_manager.py`), whose model works in km/h and metres and gives an
+action between -1 and 1. Distances are taken between the centres of vehicles. The track is followed exactly; MetaDrive steers along it with
+two PID controllers.
 """
 
 import dataclasses
@@ -198,7 +199,12 @@ def advance(
     arc = jnp.minimum(state.arc[:, None] + ahead, track.arc[:, -1:])
     window = Window(interpolate_track(track, arc)[0], arc, jnp.zeros(arc.shape, jnp.int32))
     places = corridor.project_boxes(window, boxes)
-    strip = {"size": log.size, "margin_m": driving.strip_m, "foresight_s": jnp.zeros(len(boxes.mass))}
+    strip = {
+        "size": log.size,
+        "margin_m": driving.strip_m,
+        "foresight_s": jnp.zeros(len(boxes.mass)),
+        "shift": jnp.zeros_like(places.offset),
+    }
     found = corridor.find_obstacles(places, boxes, arc=state.arc, **strip)
     own = jnp.arange(len(boxes.mass)) == jnp.arange(len(due))[:, None]
     distance = jnp.where(jnp.isfinite(found.gap) & ~own, places.arc - state.arc[:, None], jnp.inf)  # between the centres

@@ -14,6 +14,7 @@ from scenefactory_jax.visualization.birds_eye.drawing import INK, STOP, Colour, 
 LIGHTS: tuple[Colour, ...] = ((220, 36, 51), (240, 162, 2), (22, 163, 74), (154, 161, 169))  # of `traffic_lights.COLOURS`
 BAR_M = 1.5  # half the length of a stop line
 SIGN_M, SIGN_ASIDE_M = 0.9, 2.4  # radius of a stop sign, and its distance to the right of the middle of its lane
+APPROACH_M = 6.0  # nearer signs, side by side in one direction, stand as one
 ROUTE_M = 0.35  # width of a route's line
 
 
@@ -21,7 +22,7 @@ class ControlMarks(NamedTuple):
     """The traffic controls of a world."""
 
     bars: Float[np.ndarray, "C 2 2"]  # ends of the stop lines, left and right
-    signs: Float[np.ndarray, "D 2"]  # places of the stop signs, beside the lanes; one of several lanes that begin together
+    signs: Float[np.ndarray, "D 2"]  # places of the stop signs, beside the outermost lane of each approach
     stop_sign: Bool[np.ndarray, " C"]
     colour: Int[np.ndarray, "T C"]  # index into LIGHTS at every time
 
@@ -36,13 +37,21 @@ def find_marks(scene: Scene, times_s: Sequence[float] | Float[np.ndarray, " T"])
     states = np.zeros((len(times_s), len(valid)), int)
     if valid.any():
         states = np.asarray(_read_states(controls, np.asarray(times_s, np.float32)))
-    posts = (place + SIGN_ASIDE_M * right)[sign]
+    posts = (place + SIGN_ASIDE_M * right)[sign][_find_outer(place[sign], direction[sign])]
     return ControlMarks(
         bars=np.stack([place - BAR_M * right, place + BAR_M * right], axis=1),
         signs=np.unique(np.round(posts, 1), axis=0).reshape(-1, 2),
         stop_sign=sign,
         colour=np.array(traffic_lights.COLOUR_OF)[states[:, valid]],
     )
+
+
+def _find_outer(place: Float[np.ndarray, "D 2"], direction: Float[np.ndarray, "D 2"]) -> Bool[np.ndarray, " D"]:
+    """Mask of the stop places with no other one beside them, to the right in the same direction."""
+    apart = place[None] - place[:, None]
+    ahead, right = np.sum(apart * direction[:, None], axis=2), apart[..., 0] * direction[:, None, 1] - apart[..., 1] * direction[:, None, 0]
+    beside = (np.abs(ahead) < APPROACH_M) & (right > 1.0) & (right < APPROACH_M) & (direction @ direction.T > 0.9)
+    return ~beside.any(axis=1)
 
 
 _read_states = jax.jit(jax.vmap(traffic_lights.read_light_states, in_axes=(None, 0)))

@@ -1,0 +1,135 @@
+"""The suites: lists of their agents, and what rule-based planners and recorded drivers do on them.
+
+python -m experiments.suites.run --scenes WOMD/test --name womd_test [--planners idm_route] [--protocols route100] [--workers 2]
+
+Writes `experiments/suites/agents-SUITE-NAME.csv` (names and numbers of agents, no geometry), `result-NAME.json` and, from all results there
+are, `suites.md`. Planners learn nothing; recorded drivers are the cars of the log on their own routes.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from scenefactory_jax.cli import evaluate, hydra_config
+from scenefactory_jax.core import markdown, result_file
+from scenefactory_jax.data.loading import scene_source
+from scenefactory_jax.data.packing import agent_table
+
+HERE = Path(__file__).parent
+SUITES = ("route100", "conflict", "conflict_reactive")
+PLANNERS = {
+    "pure pursuit of the goal": ["policy=pure_pursuit"],
+    "pure pursuit of the route": ["policy=route_pursuit"],
+    "IDM on the route": ["policy=idm_route"],
+}
+RECORDED = "recorded drivers"
+METRICS = (
+    "clean_completion_rate", "route_completion", "success_rate", "collision_rate", "collisions_per_100_km", "road_edge_rate",
+    "red_light_rate", "stop_sign_rate", "off_route_rate",
+)  # fmt: skip
+ROUTE_M = 100.0
+
+
+def list_agents(scenes: str, suite: str, workers: int) -> list[dict[str, Any]]:
+    """Packs the scenes as a suite does, and lists its agents."""
+    settings = [word for word in hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]["settings"]]
+    packing = [word for word in settings if word.startswith("scenes")]
+    config = hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={scenes}", f"scenes.workers={workers}", *packing)
+    loaded = scene_source.load_training_scenes(config["scenes"])
+    print(loaded.account, flush=True)
+    worlds = [jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene) for index in range(len(loaded))]
+    return [row for name, world in zip(loaded.names, worlds, strict=True) for row in agent_table.list_agents(name, world)]
+
+
+def judge(scenes: str, protocol: str, overrides: list[str], workers: int) -> dict[str, Any]:
+    """Evaluates a planner under a protocol: metric -> value, low, high, number of agents."""
+    words = ",".join(["observations=drive", f"scenes.workers={workers}", *overrides])
+    quiet = ["video.enable=false", "failures.pictures.enable=false"]
+    with tempfile.TemporaryDirectory() as folder:
+        asked = ["run=town", f"protocol={protocol}", f"scenes.path={scenes}", f"overrides=[{words}]", f"out={folder}"]
+        summary = evaluate.evaluate(hydra_config.load_config("evaluate", *asked, *quiet)).summary
+    first = next(iter(summary.values()))
+    return {name: {**first[name]._asdict()} for name in METRICS if name in first}
+
+
+def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Counts of a list of agents."""
+    scenes = {row["scene"] for row in rows}
+    with_turn = {row["scene"] for row in rows if row["winding"] is True}
+    routed = [row for row in rows if row["along_lanes"] != ""]
+    return {
+        "scenes": len(scenes),
+        "scenes_with_a_turn": len(with_turn),
+        "agents": len(rows),
+        "routes": len(routed),
+        "along_lanes": sum(row["along_lanes"] is True for row in routed),
+        "long": sum(row["route_m"] >= ROUTE_M for row in rows),
+        "winding": sum(row["winding"] is True for row in rows),
+    }
+
+
+def write_report(folder: Path) -> Path:
+    """Writes `suites.md` from all results in a folder."""
+    command = "`python -m experiments.suites.run --scenes SCENES --name NAME`"
+    lines = ["# Suites", "", f"{command}; articulated car, dry road, one episode a scene."]
+    lines += ["Brackets are 95 % intervals over scenes. Planners learn nothing. A turn on red counts as a red light run.", ""]
+    for path in sorted(folder.glob("result-*.json")):
+        result = result_file.read(path)
+        lines += [f"## {result['name']}", ""]
+        counts = [[suite, *[str(value) for value in numbers.values()]] for suite, numbers in result["lists"].items()]
+        header = ["suite", *(name.replace("_", " ") for name in next(iter(result["lists"].values())))]
+        lines += [markdown.format_table(header, counts), ""]
+        rows = [
+            [suite, planner, *(_format(estimates.get(name)) for name in METRICS)]
+            for suite, planners in result["rows"].items()
+            for planner, estimates in planners.items()
+        ]
+        lines += [markdown.format_table(["suite", "planner", *(name.replace("_", " ") for name in METRICS)], rows), ""]
+    out = folder / "suites.md"
+    out.write_text("\n".join(lines), encoding="utf-8")
+    return out
+
+
+def _format(estimate: Mapping[str, Any] | None) -> str:
+    if estimate is None or estimate["value"] is None:
+        return ""
+    scale, unit = (100.0, " %") if estimate["unit"] == "fraction" else (1.0, "")
+    interval = "" if estimate["low"] is None else f" [{scale * estimate['low']:.1f}, {scale * estimate['high']:.1f}]"
+    return f"{scale * estimate['value']:.1f}{unit}{interval}"
+
+
+def main() -> None:
+    """Lists, evaluates and reports; rows that an earlier call measured are kept."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", required=True)
+    parser.add_argument("--name", required=True)
+    parser.add_argument("--protocols", nargs="*", default=list(SUITES))
+    parser.add_argument("--planners", nargs="*", default=[*PLANNERS, RECORDED])
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=HERE)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    path = given.out / f"result-{given.name}.json"
+    result = result_file.read(path) if path.exists() else {"name": given.name, "lists": {}, "rows": {}}
+    for suite in given.protocols:
+        if suite != "conflict_reactive":
+            rows = list_agents(given.scenes, suite, given.workers)
+            agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows)
+            result["lists"][suite] = summarise_lists(rows)
+        for planner in given.planners:
+            if planner == RECORDED and suite != "conflict":  # drawn routes have no driver, and reacting traffic no log to follow
+                continue
+            overrides = ["dynamics=log_playback"] if planner == RECORDED else PLANNERS[planner]
+            result["rows"].setdefault(suite, {})[planner] = judge(given.scenes, suite, overrides, given.workers)
+            result_file.write(path, result, digits=5)
+        result_file.write(path, result, digits=5)
+    print(write_report(given.out))
+
+
+if __name__ == "__main__":
+    main()
