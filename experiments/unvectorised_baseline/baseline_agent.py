@@ -235,8 +235,7 @@ def compute_metrics(
     edge_distance, edge_ttc = _edges(place.edges, agent, crowd, config.edge_half_width_m, config.edge_range_m)
     fell = agent.upright < config.upright_min or agent.elevation < config.height_min_m
     lost = distance_from_start > max(config.max_start_distance_m, config.max_start_distance_ratio * agent.route)
-    events = {
-        "numerical_error": False,
+    events = dict.fromkeys(EVENTS, False) | {  # without routes there are no events of routes
         "goal_reached": math.hypot(*to_goal) <= config.goal_radius_m,
         "collision": agent.contact_force >= config.collision_force_n and agent.age >= config.collision_grace_steps,
         "out_of_bounds": fell or lost or bool(abs(agent.position).max() > 0.5 * config.scene_size_m),

@@ -125,7 +125,7 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
     written(folder, document(name="\ud800half"), "b.json")  # half a surrogate pair
     loaded = scenes(hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={folder}", "op=check", f"out={tmp_path / 'out'}"))
     assert len(loaded) == 2 and "\\ud800half" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "sheet.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".._escaped.png", "_ud800half.png", "agents.csv", "sheet.png"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
     summary = convert(hydra_config.load_config("convert", f"source={folder}", f"out={tmp_path / 'bank'}", *HERE))
     assert [reject["scene"] for reject in summary.rejects] == ["\ud800half"]  # Arrow holds no half pair
@@ -144,11 +144,11 @@ def test_a_name_leads_nowhere_and_can_be_printed(tmp_path, capsys):
             r"step_metrics\.circles\.radius: unknown key 'radius'; step_metrics\.circles has: radius_floor_m, ",
         ),
         ("seed.value=1", r"seed\.value: unknown key 'value'; seed has: nothing: it is a value"),
-        ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, edges, lanes, road, steps, traffic"),
+        ("scenes.capacity.rod=3", r"unknown key 'rod'; scenes\.capacity has: agents, changes, controls, edges, lanes, road"),
         ("dynamics=hover", r"Could not find 'dynamics/hover' Available options in 'dynamics': articulated articulated_paper base"),
         (
             "experiment=smok",
-            r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo laptop paper quick smoke",
+            r"Could not find 'experiment/smok' Available options in 'experiment': bicycle demo drive laptop paper quick smoke",
         ),
         ("dynamics={_target_: mine.make, gain: 1.0}", r"to replace all of dynamics: ~dynamics \+dynamics=\{\.\.\.\}"),
         ("timing=null", r"timing=null: "),
@@ -183,8 +183,8 @@ def test_an_unknown_config_is_named():
         ("train", "resume=maybe", "resume: expected true or false, got 'maybe'"),
         ("train", "out=3", "out: expected a text or null, got 3"),
         ("train", "evaluation.protocols=strict", "evaluation.protocols: expected a list, each a text, got 'strict'"),
-        ("train", "evaluation.protocols=[sharp]", "evaluation.protocols: expected one or more of goal_only, strict, got ['sharp']"),
-        ("train", "evaluation.protocols=[]", "evaluation.protocols: expected one or more of goal_only, strict, got []"),
+        ("train", "evaluation.protocols=[sharp]", "evaluation.protocols: expected one or more of goal_only, rules, strict, got ['sharp']"),
+        ("train", "evaluation.protocols=[]", "evaluation.protocols: expected one or more of goal_only, rules, strict, got []"),
         ("train", "evaluation.repeats=0", "evaluation.repeats: expected an integer >= 1, got 0"),
         ("train", "evaluation.video.fps=fast", "evaluation.video.fps: expected a number >= 0.1, got 'fast'"),
         ("train", "evaluation.video.suffix=.avi", "evaluation.video.suffix: expected .gif or .mp4, got '.avi'"),
