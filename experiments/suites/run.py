@@ -1,6 +1,6 @@
 """The suites: lists of their agents, and what rule-based planners and recorded drivers do on them.
 
-python -m experiments.suites.run --scenes WOMD/test --name womd_test [--planners idm_route] [--protocols route100] [--workers 2]
+python -m experiments.suites.run --scenes WOMD/test|town --name womd_test [--planners idm_route] [--protocols route100] [--workers 2]
 
 Writes `experiments/suites/agents-SUITE-NAME.csv` (names and numbers of agents, no geometry), `result-NAME.json` and, from all results there
 are, `suites.md`. Planners learn nothing; recorded drivers are the cars of the log on their own routes.
@@ -33,13 +33,15 @@ METRICS = (
     "red_light_rate", "stop_sign_rate", "off_route_rate",
 )  # fmt: skip
 ROUTE_M = 100.0
+TOWNS = ["scenes=town", "scenes.seed=2000000", "scenes.count=64"]  # the held-out ones of `conf/scenes/base.yaml`
 
 
 def list_agents(scenes: str, suite: str, workers: int) -> list[dict[str, Any]]:
     """Packs the scenes as a suite does, and lists its agents."""
     settings = [word for word in hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]["settings"]]
     packing = [word for word in settings if word.startswith("scenes")]
-    config = hydra_config.load_config("scenes", "scenes=womd", f"scenes.path={scenes}", f"scenes.workers={workers}", *packing)
+    source = TOWNS if scenes == "town" else ["scenes=womd", f"scenes.path={scenes}"]
+    config = hydra_config.load_config("scenes", *source, f"scenes.workers={workers}", *packing)
     loaded = scene_source.load_training_scenes(config["scenes"])
     print(loaded.account, flush=True)
     worlds = [jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene) for index in range(len(loaded))]
@@ -51,7 +53,10 @@ def judge(scenes: str, protocol: str, overrides: list[str], workers: int) -> dic
     words = ",".join(["observations=drive", f"scenes.workers={workers}", *overrides])
     quiet = ["video.enable=false", "failures.pictures.enable=false"]
     with tempfile.TemporaryDirectory() as folder:
-        asked = ["run=town", f"protocol={protocol}", f"scenes.path={scenes}", f"overrides=[{words}]", f"out={folder}"]
+        if scenes == "town":  # the run's own held-out scenes
+            words += "," + ",".join(f"scenes.heldout.{word.removeprefix('scenes.')}" for word in TOWNS[1:])
+        path = "null" if scenes == "town" else scenes
+        asked = ["run=town", f"protocol={protocol}", f"scenes.path={path}", f"overrides=[{words}]", f"out={folder}"]
         summary = evaluate.evaluate(hydra_config.load_config("evaluate", *asked, *quiet)).summary
     first = next(iter(summary.values()))
     return {name: {**first[name]._asdict()} for name in METRICS if name in first}
@@ -89,7 +94,8 @@ def write_report(folder: Path) -> Path:
             for suite, planners in result["rows"].items()
             for planner, estimates in planners.items()
         ]
-        lines += [markdown.format_table(["suite", "planner", *(name.replace("_", " ") for name in METRICS)], rows), ""]
+        if rows:
+            lines += [markdown.format_table(["suite", "planner", *(name.replace("_", " ") for name in METRICS)], rows), ""]
     out = folder / "suites.md"
     out.write_text("\n".join(lines), encoding="utf-8")
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Scene
 from scenefactory_jax.roadgraph import route_sets
 
-COLUMNS = ("scene", "agent", "speed_mps", "route_m", "chord_m", "turn_deg", "winding", "along_lanes", "stop_lines")
+COLUMNS: tuple[str, ...] = ("scene", "agent", "speed_mps", "route_m", "chord_m", "turn_deg", "winding", "along_lanes", "stop_lines")
 
 
 def list_agents(name: str, scene: Scene) -> list[dict[str, Any]]:
