@@ -60,9 +60,9 @@ def summarise(records: Records, *, bootstrap: int, seed: int) -> dict[str, Estim
     estimates = _summarise({0: records}, agents=False, bootstrap=bootstrap, seed=seed)
     for name, estimate in estimates.items():
         if estimate.method == NONE and estimate.count:
-            values = np.asarray(METRICS[name].value(records), float)[np.asarray(METRICS[name].counted(records), bool)]
+            values, weights = (column[np.asarray(METRICS[name].counted(records), bool)] for column in _values(METRICS[name], records))
             draws = np.random.default_rng(seed).multinomial(len(values), np.full(len(values), 1 / len(values)), size=bootstrap)
-            interval = _compute_percentiles(draws @ values / len(values))
+            interval = _compute_percentiles(draws @ values / np.maximum(draws @ weights.astype(float), 1e-12))
             if interval is not None and _varies(interval):
                 estimates[name] = estimate._replace(low=interval[0], high=interval[1], method=AGENTS)
     return estimates

@@ -113,3 +113,13 @@ def test_runs_that_cannot_be_compared_are_named():
         statistics.summarise_runs({}, bootstrap=10, seed=0)
     with pytest.raises(RecordsError, match="'s2' is in one of the two"):
         statistics.difference_of_runs({0: records(np.ones((2, 2)))}, {0: records(np.ones((3, 2)))}, bootstrap=10, seed=0)
+
+
+def test_a_rate_over_a_distance_is_a_sum_over_a_sum():
+    """Collisions per 100 km: 3 agents of 8 collide, and all drive 500 m each, but for one that drives 4 km."""
+    collision, driven = np.arange(8)[None] < 3, np.array([[500.0] * 7 + [4000.0]])
+    rows = records(np.ones((1, 8)), collision=collision, driven_m=driven) | {"has_route": np.ones(8, bool)}
+    found = statistics.summarise(rows, bootstrap=4000, seed=0)["collisions_per_100_km"]
+    assert found.value == pytest.approx(3 / 0.075) and found.count == 8 and found.low < found.value < found.high
+    assert 0.0 <= found.low < 20.0 and 60.0 < found.high < 160.0
+    assert "collisions_per_100_km" not in statistics.summarise(records(np.ones((1, 8))), bootstrap=10, seed=0), "nobody has a route"
