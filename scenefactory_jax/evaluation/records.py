@@ -14,7 +14,7 @@ Records = Mapping[str, np.ndarray]  # column -> one value for every agent
 RESULT = "evaluation.json"  # settings of the evaluation, beside the records
 FILES = (RESULT, "agents-*.csv", "comparison-*.png", "failures.json", "failures-*", "learning.png", "outcomes.png", "safety.png")
 FILES += ("trajectories.png", "video.gif", "video.mp4", "report.md")  # of an evaluation's folder
-ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: nobody had such an event
+ROUTE_EVENTS = ("red_light", "stop_sign", "off_route")  # records of before routes lack them: no agent had such an event
 EVENTS = ("numerical_error", "goal_reached", "collision", "out_of_bounds", "road_edge_contact", *ROUTE_EVENTS)
 COLUMNS: dict[str, type] = {  # further columns are kept and may serve a breakdown
     "scene": str, "world": int, "seed": int, "agent": int, **dict.fromkeys(EVENTS, bool), "clean": bool,

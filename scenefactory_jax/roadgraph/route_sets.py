@@ -144,17 +144,17 @@ def sample_lanes(lanes: LaneMap, chain: tuple[int, ...], behind: float, max_leng
             line = np.concatenate([first, line[arc > behind]])
         pieces.append(line)
         owners.append(np.full(len(line), lane))
-    xy, length, nearest = _resample(np.concatenate(pieces), max_length_m)
+    xy, length, nearest = resample(np.concatenate(pieces), max_length_m)
     return SampledRoute(xy, np.concatenate(owners)[nearest], length, chain, on_route=False, along_lanes=True)
 
 
 def sample_track(track: Float[np.ndarray, "L 2"], max_length_m: float) -> SampledRoute:
     """Samples a track as a route of its own, beside lanes."""
-    xy, length, _ = _resample(track, max_length_m)
+    xy, length, _ = resample(track, max_length_m)
     return SampledRoute(xy, np.full(len(xy), -1), length, (), on_route=True, along_lanes=False)
 
 
-def _resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
+def resample(line: Float[np.ndarray, "V 2"], max_length_m: float) -> tuple[Float[np.ndarray, "N 2"], float, Int[np.ndarray, " N"]]:
     """Points every ROUTE_SPACING_M along a line and its end, the length, and the vertex at or after each point."""
     step = np.linalg.norm(np.diff(line, axis=0), axis=1)
     line = line[np.concatenate([[True], step > 1e-3])]

@@ -5,13 +5,13 @@ import numpy as np
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Routes, TrafficControls
-from scenefactory_jax.roadgraph.route_sets import _resample
+from scenefactory_jax.roadgraph.route_sets import resample
 from support.hand_scenes import scene_of
 
 
 def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
     """Polylines [N, 2] as routes; `stops`: for each route (arc, control) pairs; `limits` m/s."""
-    sampled = [_resample(np.asarray(line, float), 1e6) for line in lines]
+    sampled = [resample(np.asarray(line, float), 1e6) for line in lines]
     points = max(len(xy) for xy, *_ in sampled)
     position = np.stack([np.concatenate([xy, np.tile(xy[-1], (points - len(xy), 1))]) for xy, *_ in sampled])
     count, stops = len(lines), stops or [[] for _ in lines]

@@ -46,7 +46,7 @@ def route100(
 ) -> Starts:
     """Chooses drawn routes of a length, from rest, with a part or more that turns, starts apart from each other and from road users.
 
-    Routes that a standing vehicle blocks are left out: within the gates of the suite nobody could pass it.
+    Routes that a standing vehicle blocks are left out: within the gates of the suite no car can pass it.
 
     Args:
         columns: of the scene: its routes, its traffic, and `row`, the row of its log at the start.

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm, wrap_angle
+from scenefactory_jax.core import boxes as rectangles
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Boxes, Routes
 
 AXLES = 0.6  # distance of the two places that carry a box, over its length: a car's wheelbase
@@ -185,13 +186,7 @@ def project_points(routes: Routes, route: Int[Array, " V"], position: Float[Arra
 
 
 def find_overlaps(first: Boxes, second: Boxes) -> Bool[Array, "B C"]:
-    """Mask of the pairs of present boxes that share area: no side of either separates them."""
-    delta = second.position[None] - first.position[:, None]
-    turn = wrap_angle(second.yaw[None] - first.yaw[:, None])
-    cosine, sine = jnp.abs(jnp.cos(turn)), jnp.abs(jnp.sin(turn))
-    half, other = 0.5 * first.size[:, None], 0.5 * second.size[None]
-    apart = jnp.zeros(turn.shape, bool)
-    for axes, own, guest in ((heading_vector(first.yaw)[:, None], half, other), (heading_vector(second.yaw)[None], other, half)):
-        apart |= jnp.abs(dot(axes, delta)) >= own[..., 0] + cosine * guest[..., 0] + sine * guest[..., 1]
-        apart |= jnp.abs(cross(axes, delta)) >= own[..., 1] + sine * guest[..., 0] + cosine * guest[..., 1]
-    return ~apart & first.present[:, None] & second.present[None]
+    """Mask of the pairs of present boxes that share area."""
+    position, yaw, size = first.position[:, None], first.yaw[:, None], first.size[:, None]
+    overlap = rectangles.find_overlaps(position, yaw, size, second.position, second.yaw, second.size)
+    return overlap & first.present[:, None] & second.present[None]

@@ -142,7 +142,7 @@ def init(scene: Scene, row: Int[Array, ""]) -> IdmState:
 
 def enter(scene: Scene, state: IdmState, cars: Boxes, row: Float[Array, ""], config: IdmConfig) -> IdmState:
     """Puts waiting vehicles on the road whose time has come and whose place is free: in the strip of their width ahead and behind, and in
-    the zones of their routes, nobody would have to brake hard. Of those that are due, one enters in a step."""
+    the zones of their routes, no vehicle would have to brake hard. Of those that are due, one enters in a step."""
     log, law = scene.traffic_log, config.law
     due = (state.phase == WAITING) & (state.entry_row <= row)
     others: Boxes = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), scene.traffic, cars)
