@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, read_value
 from scenefactory_jax.core.types import RewardInput
+from scenefactory_jax.env import route_following
 from scenefactory_jax.env.termination import EventName
 
 Term = Callable[[RewardInput], Float[Array, " A"]]
@@ -41,6 +42,20 @@ def route_distance(step: RewardInput, *, limit_m: Positive) -> Float[Array, " A"
 def overspeed(step: RewardInput, *, limit_mps: Positive) -> Float[Array, " A"]:
     """Speed above the route's speed limit as a fraction of a limit, clamped to 1; 0 where no speed limit is known."""
     return jnp.clip(step.metrics.overspeed / limit_mps, 0.0, 1.0)
+
+
+def stop_line_speed(step: RewardInput, *, braking_mps2: Positive, limit_mps: Positive, control_dt: float) -> Float[Array, " A"]:
+    """Speed above that from which braking ends at the next line that demands a stop, as a fraction of a limit, clamped to 1.
+
+    A line on the agent's route demands a stop while its light is red, and where a stop sign is before which the car has not stood. The
+    allowed speed is sqrt(2 b d) at a distance d of the front. 0 without such a line ahead.
+    """
+    state = step.after
+    lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, state.step.astype(jnp.float32) * control_dt)
+    demands = (lines.red | (lines.stop_sign & ~state.route.stood[:, None])) & (lines.distance > 0)
+    room = jnp.min(jnp.where(demands, lines.distance, jnp.inf), axis=1, initial=jnp.inf)
+    excess = jnp.linalg.norm(state.motion.velocity[:, :2], axis=1) - jnp.sqrt(2.0 * braking_mps2 * room)
+    return jnp.where(route_following.find_routed(step.scene, state.agents), jnp.clip(excess / limit_mps, 0.0, 1.0), 0.0)
 
 
 def against_traffic(step: RewardInput) -> Float[Array, " A"]:

@@ -11,8 +11,8 @@ from support.route_scenes import controls_of, routed_scene, routes_of
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import LIGHT_STATES
-from scenefactory_jax.env import route_following, spawning
+from scenefactory_jax.core.types import LIGHT_STATES, RewardInput
+from scenefactory_jax.env import rewards, route_following, spawning
 from scenefactory_jax.roadgraph import traffic_lights
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -102,6 +102,25 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
     moving, metrics = glide(near, 20, moving)
     assert metrics.route_arc[-1, 0] > 9.0 and not metrics.events.stop_sign.any()
     assert not bool(moving.route.stood[0]), "the next sign asks anew"
+
+
+def test_speed_before_lines_that_demand_a_stop(env):
+    """Fronts 8 m before the line, the last one behind it: braking of 4 m/s^2 stops from 8 m/s."""
+    sign, red, green = 0, 1, 2
+    cases = [  # control, speed, start, whether the car has stood, the term
+        (sign, 7.9, 0.0, False, 0.0), (sign, 10.0, 0.0, False, 0.5), (sign, 20.0, 0.0, False, 1.0), (sign, 20.0, 0.0, True, 0.0),
+        (red, 7.9, 0.0, False, 0.0), (red, 10.0, 0.0, True, 0.5), (green, 20.0, 0.0, False, 0.0), (red, 20.0, 9.0, False, 0.0),
+    ]  # fmt: skip
+    control, speeds, starts, stood, expected = zip(*cases, strict=True)
+    controls = [((-40.0, 0.0), changes, np.inf) for changes in (None, [(0.0, STOP)], [(0.0, GO)])]
+    lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
+    scene = routed_scene(lines, starts=starts, speeds=speeds, controls=controls, stops=[[(10.0, which)] for which in control])
+    state = env.reset(jax.random.key(0), scene)[0]
+    state, action = replace(state, route=replace(state.route, stood=jnp.array(stood))), jnp.zeros((len(cases), 3))
+    result = jax.jit(env.step)(scene, state, action)[1]
+    step = RewardInput(scene, state, action, state, result.metrics, result.events)
+    found = rewards.stop_line_speed(step, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_lights_follow_their_changes_and_periods():
