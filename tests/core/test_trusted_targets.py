@@ -47,6 +47,11 @@ def change(folder, edit):
     (folder / "config.yaml").write_text(yaml.safe_dump(own))
 
 
+@pytest.mark.parametrize("experiment", sorted(file.stem for file in (hydra_config.find_conf() / "experiment").glob("*.yaml")))
+def test_runs_of_the_experiments_name_parts_of_the_package_alone(experiment):
+    assert not trusted_targets.find_outside_targets(hydra_config.load_config("train", f"experiment={experiment}"))
+
+
 @pytest.mark.parametrize("target", FOREIGN, ids=str)
 def test_a_run_names_parts_of_the_package_alone(folder, target):
     change(folder, lambda own: own["reward"]["goal"].update(_target_=target))

@@ -8,6 +8,7 @@ from scenefactory_jax.visualization.report import document, tables
 from scenefactory_jax.visualization.report.tables import Summary
 
 SHOWN = ("success_rate", "clean_success_rate", "clean_bend_rate", "collision_rate", "road_edge_rate", "crash_rate")
+SHOWN += ("clean_completion_rate", "route_completion", "red_light_rate", "stop_sign_rate")  # where agents have routes
 
 
 def format_card(
@@ -71,7 +72,7 @@ def _scores(scores: Mapping[str, Mapping[str, Summary]]) -> list[str]:
     if not scores:
         return []
     summaries = {
-        (evaluation, protocol): {name: summary[name] for name in SHOWN}
+        (evaluation, protocol): {name: summary[name] for name in SHOWN if name in summary}
         for evaluation, protocols in scores.items() for protocol, summary in protocols.items()
     }  # fmt: skip
     rows = [([*place, summary["success_rate"].count], summary) for place, summary in summaries.items()]
