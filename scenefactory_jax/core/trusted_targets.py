@@ -12,7 +12,7 @@ from scenefactory_jax.core.instantiate import ConfigError
 
 PACKAGE = "scenefactory_jax"
 # Modules with parts of a run. None of them starts programs, imports by a given name, or writes files
-PARTS = ("dynamics", "weather", "loggers", "env", "learning.networks", "learning.ppo", "evaluation.planners")
+PARTS = ("dynamics", "weather", "loggers", "env", "learning.networks", "learning.ppo", "learning.policy_traffic", "evaluation.planners")
 PARTS += ("data.formats", "data.packing", "data.generators", "data.loading.samplers")
 SHOWN = 3  # targets in a message
 

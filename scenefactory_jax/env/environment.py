@@ -144,7 +144,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         action_repeat=read.actions.action_repeat,
         sample_agents=spawning.make(read.spawning.sampler),
         sample_weather=road_condition.make(read.weather),
-        traffic=traffic.make(read.traffic, **context),
+        traffic=traffic.make(read.traffic, friction=mu, **context),
         advance_route=functools.partial(route_following.advance, config=read.step_metrics.route),
         compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics, control_dt=context["control_dt"]),
         evaluate_termination=functools.partial(termination.evaluate, ending=read.termination.ending),
