@@ -357,7 +357,11 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
     body = parts.dynamics.init(body_key, replace(scene, agents=new))
     waiting = ~state.active & new.present & is_finite(parts.dynamics.read(body))
     clear = spawning.is_clear(new, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
-    starts = waiting & clear
+    return start_agents(parts, replace(state, key=key), new, body, waiting & clear)
+
+
+def start_agents(parts: EnvParts, state: State, new: Agents, body: Any, starts: Bool[Array, " A"]) -> State:
+    """Starts some agents anew, with their bodies at the new starts; the others stay as they are."""
     agents, body = tree_where(starts, (new, body), (state.agents, state.body))
     return replace(
         state,
@@ -370,5 +374,4 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
         route=tree_where(starts, route_following.start_routes(new), state.route),
         history=history.restart(state.history, starts),
         previous_action=jnp.where(starts[:, None], 0.0, state.previous_action),
-        key=key,
     )

@@ -16,21 +16,24 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from scenefactory_jax.core import schema
+from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative
-from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Env, Observation, RoadUser, Scene, State, Traffic
+from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Observation, RoadUser, Scene, State, Traffic
 from scenefactory_jax.env import environment, history, observations, route_following, spawning, step_metrics, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
-from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
+from scenefactory_jax.env.traffic.log_playback import SNAP, VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.policy_io import TrainedPolicy
 from scenefactory_jax.weather.road_condition import keep_condition
 
-READ = {"timing": environment.Timing, "actions": environment.Actions, "step_metrics": step_metrics.StepMetricsConfig}  # of a policy's config
+# Groups of a policy's config that are read, besides `observations`
+READ = {"timing": environment.Timing, "actions": environment.Actions, "step_metrics": step_metrics.StepMetricsConfig}
+SIDE_M = 0.3  # beside a vehicle that enters
 Actor = Callable[[Bool[Array, ""], Scene, State, PRNGKeyArray], Float[Array, "V 3"]]
 
 
@@ -73,7 +76,7 @@ def policy_traffic(
         dynamics: of these vehicles, an entry of the config group `dynamics`.
         ending: events that end a vehicle, as in the config group `termination`.
         at_end: a vehicle that ended leaves, stays where it is, or starts again at its logged start once that is free.
-        clearance_m: a vehicle that enters or starts again waits while another car is within this distance of its start.
+        clearance_m: a vehicle enters, or starts again, once its lane is free over this distance ahead of it and behind it.
         kinds, parked_m, gap_s, mass_kg, start_row, elevation_m: as in `log_traffic`; a parked vehicle is not driven.
 
     Raises:
@@ -82,8 +85,8 @@ def policy_traffic(
     context = {"physics_dt": physics_dt, "control_dt": control_dt}
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
     trained = _load(run)
-    parts = make_parts(trained, car, ending=ending, clearance_m=clearance_m, **context)
-    env, act = environment.assemble(parts), make_actor(trained, parts, sample=sample)
+    parts = make_parts(trained, car, ending=ending, **context)
+    act, observe = make_actor(trained, parts, sample=sample), environment.assemble(parts).observe
     masses = make_masses(mass_kg)
     numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
     read_logged = functools.partial(read_log, kinds=kinds, masses=masses, **numbers)
@@ -95,15 +98,17 @@ def policy_traffic(
         row = jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1)
         others = _join(read_logged(scene, step), make_absent_boxes(len(scene.agents.present)))
         chosen = find_drivers(scene, row, parked_m=parked_m) & ("vehicle" in kinds)
-        state = init(env, key, scene, others, chosen, step, row, slots=slots)
-        _check_policy(trained, jax.eval_shape(env.observe, _make_inner_scene(scene, state, others, state.world.agents), state.world))
+        state = init(parts, key, scene, others, chosen, step, row, slots=slots)
+        _check_policy(trained, jax.eval_shape(observe, _make_inner_scene(scene, state, others, state.world.agents), state.world))
         return state
 
     def move(scene: Scene, state: Any, cars: Boxes, step: Int[Array, ""]) -> Any:
         if _is_empty(scene):
             return state
+        state, boxes, cars = jax.lax.stop_gradient((state, read(scene, state, step), cars))
         row = start_row + (step + 1) * (control_dt / scene.log.dt)
-        return advance(env, act, scene, *jax.lax.stop_gradient((state, read(scene, state, step), cars)), row, restarts=at_end == "restart")
+        enters = find_entering(state, _join(boxes, cars), row, clearance_m=clearance_m)
+        return advance(parts, act, scene, state, boxes, cars, enters, restarts=at_end == "restart")
 
     def read(scene: Scene, state: Any, step: Int[Array, ""]) -> Boxes:
         logged = read_logged(scene, step)
@@ -132,7 +137,7 @@ def _load(run: str | None) -> TrainedPolicy:
 
 
 def make_parts(
-    trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], clearance_m: float, physics_dt: float, control_dt: float
+    trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float
 ) -> EnvParts:
     """Binds the parts of the inner environment: what the policy observes and does is as its config says.
 
@@ -168,7 +173,7 @@ def make_parts(
         groups=groups,
         episode_steps=np.iinfo(np.int32).max,  # the inner world is never truncated
         control_dt=control_dt,
-        respawn_clearance_m=clearance_m,
+        respawn_clearance_m=None,  # `advance` starts vehicles
         history=spec,
     )
 
@@ -179,10 +184,9 @@ def make_actor(trained: TrainedPolicy, parts: EnvParts, *, sample: bool) -> Acto
     The worlds of a batch act together: where none of them is due, nothing is observed and the network is not computed.
     """
     env, policy = environment.assemble(parts), trained.policy
-    parameters = jax.tree.map(np.asarray, trained.parameters)
 
     def compute(scene: Scene, world: State, key: PRNGKeyArray) -> Float[Array, "V 3"]:
-        mean, log_std, _ = policy.apply(parameters, env.observe(scene, world))
+        mean, log_std, _ = policy.apply(trained.parameters, env.observe(scene, world))
         return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype) if sample else mean
 
     def skip(scene: Scene, world: State, key: PRNGKeyArray) -> Float[Array, "V 3"]:
@@ -253,7 +257,7 @@ def make_starts(scene: Scene, index: Int[Array, " V"], row: Int[Array, ""]) -> t
 
 
 def init(
-    env: Env,
+    parts: EnvParts,
     key: PRNGKeyArray,
     scene: Scene,
     others: Boxes,
@@ -271,7 +275,7 @@ def init(
     starts = replace(starts, present=drives & (entry <= row))
     others = replace(others, present=others.present.at[index].set(others.present[index] & ~drives))
     state = PolicyTrafficState(None, index, drives, entry, jnp.zeros_like(drives), key)  # pyright: ignore[reportArgumentType]
-    return state._replace(world=env.init_state(world_key, _make_inner_scene(scene, state, others, starts), step))
+    return state._replace(world=environment.assemble(parts).init_state(world_key, _make_inner_scene(scene, state, others, starts), step))
 
 
 def _make_inner_scene(scene: Scene, state: PolicyTrafficState, others: Boxes, agents: Agents) -> Scene:
@@ -281,33 +285,44 @@ def _make_inner_scene(scene: Scene, state: PolicyTrafficState, others: Boxes, ag
     return replace(scene, agents=agents, log=tracks, traffic=others)
 
 
+def find_entering(state: PolicyTrafficState, boxes: Boxes, row: Float[Array, ""], *, clearance_m: float) -> Bool[Array, " V"]:
+    """Mask of the vehicle that may enter in this step: the first whose time has come and whose lane is free around its start."""
+    start = state.world.agents
+    size = start.size + 2.0 * jnp.array([clearance_m, SIDE_M])
+    taken = find_overlaps(start.position[:, None], start.yaw[:, None], size[:, None], boxes.position, boxes.yaw, boxes.size)
+    due = state.drives & ~state.world.active & ~state.ended & (state.entry_row <= row + SNAP)
+    free = due & ~jnp.any(taken & boxes.present, axis=1)
+    return free & (jnp.cumsum(free) == 1)
+
+
 def advance(
-    env: Env,
+    parts: EnvParts,
     act: Actor,
     scene: Scene,
     state: PolicyTrafficState,
     traffic: Boxes,
     cars: Boxes,
-    row: Float[Array, ""],
+    enters: Bool[Array, " V"],
     *,
     restarts: bool,
 ) -> PolicyTrafficState:
-    """Moves the vehicles by one control step; those whose time has come enter where there is room."""
+    """Moves the vehicles by one control step; those that enter are on the road after it."""
     world = replace(state.world, weather=scene.weather)
     hidden = world.active & state.drives
     others = replace(traffic, present=traffic.present.at[state.row].set(traffic.present[state.row] & ~hidden))
-    may_start = state.drives & (state.entry_row <= row) & ~state.ended
-    inner = _make_inner_scene(scene, state, _join(others, cars), replace(world.agents, present=may_start))
-    due = world.step % env.action_repeat == 0
+    inner = _make_inner_scene(scene, state, _join(others, cars), world.agents)
+    due = world.step % parts.action_repeat == 0
     action = act(due, inner, world, jax.random.fold_in(state.key, world.step))
-    after, result = env.control_step(inner, world, action)
+    after, result = environment.assemble(parts).control_step(inner, world, action)
     ended = state.ended | (result.terminated & ~jnp.bool_(restarts))
+    starts = replace(world.agents, present=state.drives)
+    after = environment.start_agents(parts, after, starts, parts.dynamics.init(state.key, inner), enters)
     past = termination.make_empty_events(len(ended))  # nothing reads it, so that metrics of other events are not computed
     return state._replace(world=replace(after, weather=state.world.weather, past_events=past), ended=ended)
 
 
 def read_boxes(state: PolicyTrafficState, logged: Boxes, *, stays: bool) -> Boxes:
-    """Reads the boxes of the vehicles that the policy drives, and of the others from their log; vehicles that ended are there if they stay."""
+    """Reads the boxes of the vehicles that the policy drives, and of the others from their log; `stays`: also of those that ended."""
     active = state.world.active
     own = spawning.make_boxes(state.world.motion, state.world.agents, active | (state.ended & stays))
     own = replace(
