@@ -25,6 +25,7 @@ from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Obser
 from scenefactory_jax.env import environment, history, observations, route_following, spawning, step_metrics, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
+from scenefactory_jax.env.traffic.idm import SIDE_M
 from scenefactory_jax.env.traffic.log_playback import SNAP, VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import policy_io
@@ -33,7 +34,6 @@ from scenefactory_jax.weather.road_condition import keep_condition
 
 # Groups of a policy's config that are read, besides `observations`
 READ = {"timing": environment.Timing, "actions": environment.Actions, "step_metrics": step_metrics.StepMetricsConfig}
-SIDE_M = 0.3  # beside a vehicle that enters
 Actor = Callable[[Bool[Array, ""], Scene, State, PRNGKeyArray], Float[Array, "V 3"]]
 
 
@@ -136,9 +136,7 @@ def _load(run: str | None) -> TrainedPolicy:
     return trained
 
 
-def make_parts(
-    trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float
-) -> EnvParts:
+def make_parts(trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float) -> EnvParts:
     """Binds the parts of the inner environment: what the policy observes and does is as its config says.
 
     Raises:

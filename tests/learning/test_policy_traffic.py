@@ -72,22 +72,33 @@ def box_at(x, y) -> Boxes:
 ABSENT = make_absent_boxes(1)
 
 
-def simulate(kind, scene, cars=ABSENT, *, steps=STEPS, key=0, first=0):
-    """States and boxes before every control step, and after the last."""
+@functools.cache
+def program(kind, steps):
+    """(scene, agents, key, first control step) -> states and boxes before every control step, and after the last."""
 
     def run(scene, cars, key, first):
         def body(state, step):
             boxes = kind.read(scene, state, step)
             return kind.advance(replace(scene, traffic=boxes), state, cars, step), (state, boxes)
 
-        return jax.lax.scan(body, kind.init(jax.random.key(key), scene, first), first + jnp.arange(steps + 1))[1]
+        return jax.lax.scan(body, kind.init(key, scene, first), first + jnp.arange(steps + 1))[1]
 
-    return jax.device_get(jax.jit(run)(scene, cars, key, jnp.int32(first)))
+    return jax.jit(run)
+
+
+def simulate(kind, scene, cars=ABSENT, *, steps=STEPS, key=0, first=0):
+    return jax.device_get(program(kind, steps)(scene, cars, jax.random.key(key), jnp.int32(first)))
 
 
 @pytest.fixture(scope="module")
-def alone(folder):
-    return simulate(make(folder), street())
+def tiny(folder):
+    """Its traffic, as the config has it."""
+    return make(folder)
+
+
+@pytest.fixture(scope="module")
+def alone(tiny):
+    return simulate(tiny, street())
 
 
 @functools.cache
@@ -132,15 +143,15 @@ def test_vehicles_move_as_agents_with_that_policy(folder, alone):
     assert np.isinf(boxes.mass).all() and (boxes.elevation == np.float32(0.755)).all()
 
 
-def test_the_policy_sees_agents_as_its_own_see_cars(folder, alone):
+def test_the_policy_sees_agents_as_its_own_see_cars(folder, tiny, alone):
     place = (12.0, -1.0)
-    seen = simulate(make(folder), street(), box_at(*place))[1].position
+    seen = simulate(tiny, street(), box_at(*place))[1].position
     np.testing.assert_allclose(seen, drive_agents(folder, place).position[..., :2], atol=1e-3)
     assert np.abs(seen[-1] - alone[1].position[-1]).max() > 1e-2, "it drives otherwise beside the agent"
 
 
 def test_agents_see_and_hit_the_vehicles(folder):
-    config = smoke("unused", "traffic=policy", f"traffic.run={folder}", "spawning=logged")
+    config = smoke("unused", "traffic=policy", f"traffic.run={folder}", "spawning=logged", "step_metrics.collision_grace_steps=0")
     env = sf.make(config)
     agents = scene_of([[-15.0, 0.5], [0.0, 40.0]], [[40.0, 0.5], [9.0, 40.0]])
     scene = replace(street(), agents=agents.agents, log=agents.log)
@@ -155,9 +166,9 @@ def test_agents_see_and_hit_the_vehicles(folder):
     assert hit.tolist() == [True, False]
 
 
-def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(folder, alone):
+def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(tiny, alone):
     """In a batch the policy acts whenever an action is due in any world; each world takes its own only."""
-    kind = make(folder)
+    kind = tiny
     scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), street(), street(cars=[[-9.0, 1.0], *CARS[1:]]))
     first = jnp.array([0, 1])
 
@@ -179,8 +190,8 @@ def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(folder, 
         assert changed[due].all() and not changed[~due].any()
 
 
-def test_the_same_seed_gives_the_same_bits_and_samples_differ_between_seeds(folder, alone):
-    again, other = simulate(make(folder), street()), simulate(make(folder), street(), key=1)
+def test_the_same_seed_gives_the_same_bits_and_samples_differ_between_seeds(folder, tiny, alone):
+    again, other = simulate(tiny, street()), simulate(tiny, street(), key=1)
     for first, second in zip(jax.tree.leaves(alone[1]), jax.tree.leaves(again[1]), strict=True):
         np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(alone[1].position, other[1].position)
@@ -190,8 +201,8 @@ def test_the_same_seed_gives_the_same_bits_and_samples_differ_between_seeds(fold
     assert np.abs(samples[0][-1] - samples[2][-1]).max() > 1e-2
 
 
-def test_no_gradient_flows_into_it(folder):
-    kind, scene = make(folder), street()
+def test_no_gradient_flows_into_it(tiny):
+    kind, scene = tiny, street()
     state = kind.init(jax.random.key(0), scene, jnp.int32(0))
 
     @jax.jit
@@ -215,7 +226,7 @@ def constant(monkeypatch, folder, throttle):
 
 def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     constant(monkeypatch, folder, 0.0)  # it coasts
-    others = track([9.0, 5.0]), track([20.0, -5.0], (0.0, 1.0), kind="pedestrian", size=(0.7, 0.7))
+    others = track([9.0, 5.0], steps=61), track([20.0, -5.0], (0.0, 1.0), kind="pedestrian", size=(0.7, 0.7), steps=61)
     _, boxes = simulate(make(folder, slots=2), street(*others), steps=30)
     logged = traffic.make(load_config("task", "traffic=log_playback")["traffic"], control_dt=DT)
     expected = jax.jit(jax.vmap(lambda step: logged.read(street(*others), (), step)))(jnp.arange(31))
@@ -232,18 +243,18 @@ def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
 def test_a_vehicle_that_arrives_does_as_the_config_says(folder, monkeypatch, at_end):
     constant(monkeypatch, folder, 0.05)  # about as much as it rolls off
     state, boxes = simulate(make(folder, at_end=at_end), street(cars=[[0.0, 0.0]], speeds=[10.0], steps=11), steps=60)
-    x, present = boxes.position[:, 0, 0], boxes.present[:, 0]
-    last = int(np.flatnonzero(np.diff(x) > 0.1)[-1]) if at_end != "restart" else int(np.argmax(x))
+    x, present, velocity = boxes.position[:, 0, 0], boxes.present[:, 0], boxes.velocity[:, 0]
     radius = policy_io.load_policy("unused").config["step_metrics"]["goal_radius_m"]
-    assert last in (20, 21, 22) and present[:last].all() and x[20] > 10 - radius - 0.5, "its goal is 10 m ahead, less a radius"
+    end = int(np.argmax(x >= 10.0 - radius))
+    assert end == round((10.0 - radius) / (10.0 * DT)) and present[:end].all()
     if at_end == "leave":
-        assert not present[last + 1 :].any() and state.ended[-1, 0]
+        assert not present[end:].any() and state.ended[-1, 0]
     elif at_end == "park":
-        assert present.all() and (boxes.velocity[last + 1 :, 0] == 0).all() and np.ptp(x[last + 1 :]) == 0
+        assert present.all() and (velocity[end:] == 0).all() and np.ptp(x[end:]) == 0
     else:
-        np.testing.assert_array_equal(x[last + 1], 0.0)
-        np.testing.assert_allclose(boxes.velocity[last + 1, 0], [10.0, 0.0], atol=1e-4)
-        assert present.all() and not state.ended.any()
+        assert not present[end] and present[end + 1 : 2 * end].all() and not state.ended.any()
+        np.testing.assert_array_equal(x[end + 1], 0.0)
+        np.testing.assert_allclose(velocity[end + 1], [10.0, 0.0], atol=1e-4)
 
 
 def test_vehicles_enter_at_their_time_where_there_is_room(folder, monkeypatch):
@@ -251,16 +262,18 @@ def test_vehicles_enter_at_their_time_where_there_is_room(folder, monkeypatch):
     late = street(cars=[[-20.0, 0.0], [30.0, 0.0]], speeds=[10.0, 5.0])
     log = late.traffic_log
     late = replace(late, traffic_log=replace(log, valid=log.valid.at[1, :5].set(False)))
-    boxes = simulate(make(folder), late)[1]
+    kind = make(folder)
+    boxes = simulate(kind, late)[1]
     assert int(np.argmax(boxes.present[:, 1])) == 15, "row 5"
     np.testing.assert_allclose(boxes.position[15, 1], [32.5, 0.0], atol=1e-4)
     np.testing.assert_allclose(boxes.velocity[15, 1], [5.0, 0.0], atol=1e-4)
-    assert not simulate(make(folder), late, box_at(38.0, 0.0))[1].present[:, 1].any(), "the agent's tail is 3.5 m from its start"
-    assert simulate(make(folder, clearance_m=5.0), late, box_at(38.0, 0.0))[1].present[15:, 1].all()
+    free = 32.5 + 10.0 + 4.0  # an agent there has its tail `clearance_m` ahead of the start's front
+    assert not simulate(kind, late, box_at(free - 0.1, 0.0))[1].present[:, 1].any()
+    assert simulate(kind, late, box_at(free + 0.1, 0.0))[1].present[15:, 1].all()
 
 
-def test_worlds_without_traffic_are_sound(folder):
-    kind = make(folder)
+def test_worlds_without_traffic_are_sound(tiny):
+    kind = tiny
     scene = replace(street(), traffic_log=jax.tree.map(lambda leaf: leaf[:0], street().traffic_log))
     zones = jnp.zeros((0, 0, 1))
     scene = replace(scene, traffic_log=replace(scene.traffic_log, zone_enter=zones, zone_leave=zones, zone_match=zones))
@@ -268,7 +281,7 @@ def test_worlds_without_traffic_are_sound(folder):
     assert kind.read(scene, (), jnp.int32(0)).present.shape == make_empty_boxes().present.shape
 
 
-def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder):
+def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder, alone):
     entry = load_config("task", "traffic=mixed")["traffic"]
     assert entry["parts"]["policy"]["weight"] is None and entry["parts"]["policy"]["run"] is None
     scene, step = street(), jnp.int32(0)
@@ -286,9 +299,8 @@ def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder):
         return state.chosen, kind.read(scene, end, jnp.int32(STEPS)).position
 
     chosen, place = jax.device_get(run(jax.random.split(jax.random.key(2), 8)))
-    driven = simulate(make(folder), scene)[1].position[-1]
     logged = traffic.make(load_config("task", "traffic=log_playback")["traffic"], control_dt=DT)
-    expected = [driven, logged.read(scene, (), jnp.int32(STEPS)).position]
+    expected = [alone[1].position[-1], logged.read(scene, (), jnp.int32(STEPS)).position]
     assert set(chosen.tolist()) == {0, 1}
     for part, position in zip(chosen, place, strict=True):
         np.testing.assert_allclose(position, expected[part], atol=1e-4)
