@@ -86,8 +86,7 @@ def policy_traffic(
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
     trained = _load(run)
     parts = make_parts(trained, car, ending=ending, **context)
-    act, observe = make_actor(trained, parts, sample=sample), environment.assemble(parts).observe
-    masses = make_masses(mass_kg)
+    act, masses = make_actor(trained, parts, sample=sample), make_masses(mass_kg)
     numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
     read_logged = functools.partial(read_log, kinds=kinds, masses=masses, **numbers)
 
@@ -96,11 +95,8 @@ def policy_traffic(
             return ()
         row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
         row = jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1)
-        others = _join(read_logged(scene, step), make_absent_boxes(len(scene.agents.present)))
         chosen = find_drivers(scene, row, parked_m=parked_m) & ("vehicle" in kinds)
-        state = init(parts, key, scene, others, chosen, step, row, slots=slots)
-        _check_policy(trained, jax.eval_shape(observe, _make_inner_scene(scene, state, others, state.world.agents), state.world))
-        return state
+        return init(trained, parts, key, scene, read_logged(scene, step), chosen, step, row, slots=slots)
 
     def move(scene: Scene, state: Any, cars: Boxes, step: Int[Array, ""]) -> Any:
         if _is_empty(scene):
@@ -255,25 +251,34 @@ def make_starts(scene: Scene, index: Int[Array, " V"], row: Int[Array, ""]) -> t
 
 
 def init(
+    trained: TrainedPolicy,
     parts: EnvParts,
     key: PRNGKeyArray,
     scene: Scene,
-    others: Boxes,
+    logged: Boxes,
     chosen: Bool[Array, " O"],
     step: Int[Array, ""],
     row: Int[Array, ""],
     *,
     slots: int | None,
 ) -> PolicyTrafficState:
-    """Places the chosen vehicles as their log has them at a row; those that appear later are absent until then."""
+    """Places the chosen vehicles as their log has them at a row; those that appear later are absent until then.
+
+    Raises:
+        ConfigError: a policy whose parameters do not fit what it observes.
+    """
+    env = environment.assemble(parts)
     world_key, key = jax.random.split(key)
     index = jnp.argsort(~chosen, stable=True)[:slots].astype(jnp.int32)
     drives = chosen[index]
     starts, entry = make_starts(scene, index, row)
     starts = replace(starts, present=drives & (entry <= row))
-    others = replace(others, present=others.present.at[index].set(others.present[index] & ~drives))
+    others = replace(logged, present=logged.present.at[index].set(logged.present[index] & ~drives))
     state = PolicyTrafficState(None, index, drives, entry, jnp.zeros_like(drives), key)  # pyright: ignore[reportArgumentType]
-    return state._replace(world=environment.assemble(parts).init_state(world_key, _make_inner_scene(scene, state, others, starts), step))
+    inner = _make_inner_scene(scene, state, _join(others, make_absent_boxes(len(scene.agents.present))), starts)
+    state = state._replace(world=env.init_state(world_key, inner, step))
+    _check_policy(trained, jax.eval_shape(env.observe, inner, state.world))
+    return state
 
 
 def _make_inner_scene(scene: Scene, state: PolicyTrafficState, others: Boxes, agents: Agents) -> Scene:

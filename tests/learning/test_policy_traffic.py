@@ -101,14 +101,14 @@ def alone(tiny):
     return simulate(tiny, street())
 
 
-@functools.cache
-def drive_agents(folder, parked):
-    """Positions of the same vehicles as agents of an environment with that policy, perhaps with a parked car."""
+@pytest.fixture(scope="module")
+def agents(folder):
+    """(place of a parked car or None) -> motion of the same vehicles as agents of an environment with that policy."""
     config = run_config.read(folder) | {"termination": {"ending": ["numerical_error", "goal_reached"]}}
     config |= {name: load_config("task", f"{name}={choice}")[name] for name, choice in (("traffic", "parked"), ("spawning", "logged"))}
     trained, env = policy_io.load_policy(folder), environment.make_env(config)
     scene = scene_of(CARS, np.add(CARS, [[6 * speed, 0.0] for speed in SPEEDS]), speeds=SPEEDS)
-    scene = with_tracks(scene, track(parked or (0.0, 0.0), size=(4.0, 2.0), valid=[parked is not None] * 21))
+    assert env.action_repeat == 3
 
     @jax.jit
     def run(scene):
@@ -124,17 +124,19 @@ def drive_agents(folder, parked):
         first = env.init_state(jax.random.key(0), scene)
         return first.motion, jax.lax.scan(act, first, None, length=STEPS // env.action_repeat)[1]
 
-    first, later = jax.device_get(run(scene))
-    assert env.action_repeat == 3
-    join = lambda start, rest: np.concatenate([start[None], rest.reshape(-1, *rest.shape[2:])])  # noqa: E731
-    return jax.tree.map(join, first, later)
+    def drive(parked):
+        box = track(parked or (0.0, 0.0), size=(4.0, 2.0), valid=[parked is not None] * 21)
+        join = lambda start, rest: np.concatenate([start[None], rest.reshape(-1, *rest.shape[2:])])  # noqa: E731
+        return jax.tree.map(join, *jax.device_get(run(with_tracks(scene, box))))
+
+    return drive
 
 
 # ---- what the policy does
 
 
-def test_vehicles_move_as_agents_with_that_policy(folder, alone):
-    motion, (_, boxes) = drive_agents(folder, None), alone
+def test_vehicles_move_as_agents_with_that_policy(agents, alone):
+    motion, (_, boxes) = agents(None), alone
     assert boxes.present[:, :3].all()
     assert np.abs(motion.position[-1, :, :2] - (np.array(CARS) + 1.2 * np.array(SPEEDS)[:, None] * [1, 0])).max() > 0.3, "not as logged"
     np.testing.assert_allclose(boxes.position, motion.position[..., :2], atol=1e-3)
@@ -143,10 +145,10 @@ def test_vehicles_move_as_agents_with_that_policy(folder, alone):
     assert np.isinf(boxes.mass).all() and (boxes.elevation == np.float32(0.755)).all()
 
 
-def test_the_policy_sees_agents_as_its_own_see_cars(folder, tiny, alone):
+def test_the_policy_sees_agents_as_its_own_see_cars(agents, tiny, alone):
     place = (12.0, -1.0)
     seen = simulate(tiny, street(), box_at(*place))[1].position
-    np.testing.assert_allclose(seen, drive_agents(folder, place).position[..., :2], atol=1e-3)
+    np.testing.assert_allclose(seen, agents(place).position[..., :2], atol=1e-3)
     assert np.abs(seen[-1] - alone[1].position[-1]).max() > 1e-2, "it drives otherwise beside the agent"
 
 
@@ -203,14 +205,13 @@ def test_the_same_seed_gives_the_same_bits_and_samples_differ_between_seeds(fold
 
 def test_no_gradient_flows_into_it(tiny):
     kind, scene = tiny, street()
-    state = kind.init(jax.random.key(0), scene, jnp.int32(0))
 
-    @jax.jit
     def place(position):
+        state = kind.init(jax.random.key(0), scene, jnp.int32(0))
         cars = replace(box_at(0, 0), position=position)
         return jnp.sum(kind.read(scene, kind.advance(scene, state, cars, jnp.int32(0)), jnp.int32(1)).position)
 
-    np.testing.assert_array_equal(jax.grad(place)(jnp.array([[12.0, -1.0]])), 0.0)
+    np.testing.assert_array_equal(jax.jit(jax.grad(place))(jnp.array([[12.0, -1.0]])), 0.0)
 
 
 # ---- who drives, from when and until when
@@ -235,8 +236,9 @@ def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     rolling = load_config("task", "traffic=policy")["traffic"]["dynamics"]["rolling"]
     way = np.array(SPEEDS[:2]) - 0.5 * rolling  # after a second; air drag takes 8 mm
     np.testing.assert_allclose(boxes.position[-1, :2, 0] - boxes.position[0, :2, 0], way, atol=0.01)
-    people = simulate(make(folder, kinds=["pedestrian"]), street(*others), steps=1)[1]
-    assert people.present[0].tolist() == [False, False, False, False, True]
+    people, scene = make(folder, kinds=["pedestrian"]), street(*others)
+    start = jax.jit(lambda step: people.read(scene, people.init(jax.random.key(0), scene, step), step))
+    assert start(jnp.int32(0)).present.tolist() == [False, False, False, False, True]
 
 
 @pytest.mark.parametrize("at_end", ["leave", "park", "restart"])
@@ -343,7 +345,7 @@ def test_a_policy_that_does_not_fit_its_observation_is_refused(folder, tmp_path,
     def see_more(config):
         config["observations"]["turning"] = {"_target_": "yaw_rate_and_steer", "turn_scale_radps": 1.0, "steer_scale_rad": 0.5}
 
-    begin = lambda run: make(run).init(jax.random.key(0), street(), jnp.int32(0))  # noqa: E731
+    begin = lambda run: jax.eval_shape(make(run).init, jax.random.key(0), street(), jnp.int32(0))  # noqa: E731
     with pytest.raises(ConfigError, match=r"^traffic\.run: .*expected a policy of this version without memory"):
         begin(spoil(folder, tmp_path, see_more))
     trained = policy_io.load_policy(folder)
