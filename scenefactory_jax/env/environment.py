@@ -144,7 +144,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         action_repeat=read.actions.action_repeat,
         sample_agents=spawning.make(read.spawning.sampler),
         sample_weather=road_condition.make(read.weather),
-        traffic=traffic.make(read.traffic, **context),
+        traffic=traffic.make(read.traffic, friction=mu, **context),
         advance_route=functools.partial(route_following.advance, config=read.step_metrics.route),
         compute_metrics=functools.partial(step_metrics.compute, config=read.step_metrics, control_dt=context["control_dt"]),
         evaluate_termination=functools.partial(termination.evaluate, ending=read.termination.ending),
@@ -357,7 +357,11 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
     body = parts.dynamics.init(body_key, replace(scene, agents=new))
     waiting = ~state.active & new.present & is_finite(parts.dynamics.read(body))
     clear = spawning.is_clear(new, state.motion.position[:, :2], state.active, scene.traffic, clear_m=clear_m)
-    starts = waiting & clear
+    return start_agents(parts, replace(state, key=key), new, body, waiting & clear)
+
+
+def start_agents(parts: EnvParts, state: State, new: Agents, body: Any, starts: Bool[Array, " A"]) -> State:
+    """Starts some agents anew, with their bodies at the new starts; the others stay as they are."""
     agents, body = tree_where(starts, (new, body), (state.agents, state.body))
     return replace(
         state,
@@ -370,5 +374,4 @@ def _respawn(parts: EnvParts, scene: Scene, state: State, *, clear_m: float) -> 
         route=tree_where(starts, route_following.start_routes(new), state.route),
         history=history.restart(state.history, starts),
         previous_action=jnp.where(starts[:, None], 0.0, state.previous_action),
-        key=key,
     )

@@ -1,6 +1,7 @@
 """What decides the episodes of an evaluation, in words, from its config: starts, weather, background traffic, dynamics, scenes."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 STARTS = {
@@ -16,6 +17,7 @@ TRAFFIC = {
     "log_traffic": "as recorded, it does not react",
     "idm_traffic": "vehicles with a route drive and react (IDM), people and cyclists as recorded",
     "trajectory_idm_traffic": "as recorded, some vehicles react along their tracks (MetaDrive's IDM)",
+    "scenefactory_jax.learning.policy_traffic.policy_traffic": "vehicles that move drive by the policy {run}, all others as recorded",
     "mixed": "one kind of several in each episode",
 }
 
@@ -33,7 +35,8 @@ def describe(config: Mapping[str, Any]) -> dict[str, str]:
         labels["Weather"] = _weather(config["weather"])
     if "traffic" in config:
         name = config["traffic"]["_target_"]
-        labels["Background traffic"] = TRAFFIC.get(name, f"`{name}`")
+        run = Path(str(config["traffic"].get("run"))).name
+        labels["Background traffic"] = TRAFFIC[name].format(run=f"`{run}`") if name in TRAFFIC else f"`{name}`"
     if "dynamics" in config:
         labels["Dynamics"] = _dynamics(config["dynamics"])
     if "timing" in config:

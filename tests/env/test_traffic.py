@@ -10,13 +10,14 @@ from support.gliding import CIRCLES, build_env, drive
 from support.hand_scenes import road_of, scene_of
 from support.scene_banks import packed_scenes, stacked_scenes
 from support.scene_documents import STEPS, checker, document, packer, parsed, prepared, thing
+from support.traffic_scenes import KINDS, track, with_tracks
 
 import scenefactory_jax
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
 from scenefactory_jax.core.pytree import replace
-from scenefactory_jax.core.types import ROAD_USERS, Boxes, TrafficLog
+from scenefactory_jax.core.types import ROAD_USERS, Boxes
 from scenefactory_jax.data.bank import bank_reader
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.packing import columns, pack, stack, validation
@@ -25,7 +26,6 @@ from scenefactory_jax.env import environment, spawning, traffic
 pytestmark = pytest.mark.usefixtures("quickly")
 
 CONTROL = 1 / 30
-KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 
 
 def numbers_of(name, **changes):
@@ -41,28 +41,6 @@ def made(name, *, control_dt=CONTROL, **changes):
 def bound(name, **changes):
     """(scene, control step) -> boxes of traffic without a state."""
     return lambda scene, step: made(name, **changes).read(scene, (), step)
-
-
-def track(start, velocity=(0.0, 0.0), *, kind="vehicle", valid=None, size=(4.5, 1.9), turn=0.0, steps=21):
-    """One other that moves evenly; hidden rows hold zeros, as packing leaves them."""
-    t = 0.1 * np.arange(steps)
-    valid = np.ones(steps, bool) if valid is None else np.asarray(valid, bool)
-    hide = lambda x: np.where(valid.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)  # noqa: E731
-    place = np.asarray(start, float) + t[:, None] * np.asarray(velocity, float)
-    yaw = np.arctan2(velocity[1], velocity[0]) + turn * t
-    return hide(place), hide(yaw), hide(np.tile(np.asarray(velocity, float), (steps, 1))), valid, np.asarray(size, float), KINDS[kind]
-
-
-def tracks_of(*rows) -> TrafficLog:
-    position, yaw, velocity, valid, size, kind = (np.stack([row[i] for row in rows]) for i in range(6))
-    f = jnp.float32
-    return TrafficLog(jnp.asarray(position, f), jnp.asarray(yaw, f), jnp.asarray(velocity, f), jnp.asarray(valid), jnp.asarray(size, f),
-                  jnp.asarray(kind, jnp.int32), jnp.zeros(len(rows), jnp.int32), jnp.zeros(len(rows), bool),
-                  **track_interpolation.make_no_zones(len(rows)))  # fmt: skip
-
-
-def with_tracks(scene, *rows):
-    return replace(scene, traffic_log=tracks_of(*rows))
 
 
 def at(scene, name, step, **changes) -> Boxes:
