@@ -38,8 +38,8 @@ TOWNS = ["scenes=town", "scenes.seed=2000000", "scenes.count=64"]  # the held-ou
 
 def list_agents(scenes: str, suite: str, workers: int) -> list[dict[str, Any]]:
     """Packs the scenes as a suite does, and lists its agents."""
-    settings = [word for word in hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]["settings"]]
-    packing = [word for word in settings if word.startswith("scenes")]
+    protocol = hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]
+    packing = [word for word in hydra_config.list_overrides(protocol["settings"]) if word.startswith("scenes")]
     source = TOWNS if scenes == "town" else ["scenes=womd", f"scenes.path={scenes}"]
     config = hydra_config.load_config("scenes", *source, f"scenes.workers={workers}", *packing)
     loaded = scene_source.load_training_scenes(config["scenes"])

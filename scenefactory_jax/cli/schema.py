@@ -50,7 +50,7 @@ class Protocol:
     """An option of the group `protocol`."""
 
     name: str
-    settings: list[str]
+    settings: Group
     termination: list[str]
     seed: Seed
     repeats: Count
@@ -247,7 +247,7 @@ class StudyPlan:
     common: list[str]
     trainings: dict[str, list]
     seeds: list[int]
-    evaluation_overrides: list[str]
+    evaluation_overrides: list[str] | None
     conditions: dict[str, list]
     protocols: list[str]
     evaluated: dict[str, list] | None

@@ -631,7 +631,7 @@ def test_a_protocol_decides_all_of_an_episode_but_what_the_policy_sees_and_does(
     settings = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
     schema.check_evaluate(settings)
     runs = [hydra_config.load_config("train", *words) for words in RUNS]
-    judged = [hydra_config.apply_overrides(run, settings["protocol"]["settings"]) for run in runs]
+    judged = [hydra_config.apply_overrides(run, hydra_config.list_overrides(settings["protocol"]["settings"])) for run in runs]
     assert settings["protocol"]["name"] == name and (settings["seed"], settings["repeats"]) == (1000, 1)
     if name == "trained":
         assert judged == runs
