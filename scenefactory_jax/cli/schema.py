@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
-from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed, check
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
 from scenefactory_jax.evaluation.settings import Episodes, Failures, Video
 
 Group = dict[str, Any]
@@ -54,6 +54,7 @@ class Protocol:
     termination: list[str]
     seed: Seed
     repeats: Count
+    mu: Positive | None = None  # friction coefficient of a suite whose settings read it
 
 
 @dataclass(frozen=True)
@@ -308,9 +309,24 @@ def check_terminations(names: list[str], *, where: str) -> None:
         raise ConfigError(f"{where}: expected one or more of {', '.join(valid)}, got {names}")
 
 
+def check_mu(config: Mapping[str, Any]) -> None:
+    """Checks that the starts of the suite grip are drawn for the friction that the weather's strips have.
+
+    Raises:
+        ConfigError: naming both keys and their values.
+    """
+    starts = config["scenes"]["pack"].get("starts") or {}
+    given = {name: entry["mu"] for name, entry in config["weather"]["friction"]["surfaces"].items() if entry.get("mu") is not None}
+    if "mu" in starts and (not given or set(given.values()) != {starts["mu"]}):
+        found = ", ".join(f"weather.friction.surfaces.{name}.mu={mu}" for name, mu in given.items()) or "a weather without such a surface"
+        hint = "one word sets both: protocol.mu=... of evaluate, or weather=grip weather.friction.surfaces.ICE.mu=... of train"
+        raise ConfigError(f"scenes.pack.starts.mu: expected the mu of a surface of the weather, got {starts['mu']} and {found}; {hint}")
+
+
 def check_train(config: Mapping[str, Any]) -> None:
     """Checks the config of `train`, also the keys of the evaluation that follows hours later."""
     check(config, Train)
+    check_mu(config)
     check_terminations(config["evaluation"]["protocols"], where="evaluation.protocols")
 
 

@@ -192,6 +192,7 @@ def _plan_evaluations(
             try:
                 merged = [*list_evaluation_overrides(config), *study["conditions"][condition], *overrides]
                 settings = configs.apply_overrides(training.config, merged)
+                schema.check_mu(settings)
             except ConfigError as error:
                 raise ConfigError(f"study.conditions.{condition}: {error}") from None
             for protocol, termination in terminations.items():

@@ -2,7 +2,9 @@
 
 import pytest
 
-from scenefactory_jax.cli import hydra_config
+from scenefactory_jax.cli import hydra_config, schema
+from scenefactory_jax.cli.evaluate import format_rerun_command
+from scenefactory_jax.core.instantiate import ConfigError
 
 
 def overrides_of(name, *words):
@@ -15,8 +17,8 @@ def overrides_of(name, *words):
         ("strict", "recorded", []),
         ("paper", "recorded", ["spawning=from_rest"]),
         ("conflict_reactive", "conflict", ["traffic=idm"]),
-        ("grip_hidden", "grip", ["observations.weather._target_=hidden_weather"]),
-        ("grip_stops", "grip", ["scenes/pack/starts=grip_stops"]),
+        ("grip_hidden", "grip", ["weather.hidden=true"]),
+        ("grip_stops", "grip", ["scenes/pack/starts=grip_stops", "weather.patches.routes.end_m=4.0"]),
     ],
 )
 def test_a_protocol_says_what_differs_from_another(name, parent, own):
@@ -51,3 +53,42 @@ def test_values_read_back_as_they_were():
 
 def test_one_setting_changes_on_the_command_line():
     assert "weather=wet" in overrides_of("recorded", "protocol.settings.weather=wet")
+
+
+# ---- the friction of the suite grip
+
+
+def judged(*overrides, mu="0.3"):
+    run = hydra_config.load_config("train", "experiment=smoke")
+    return hydra_config.apply_overrides(run, [*overrides_of("grip", f"protocol.mu={mu}"), *overrides])
+
+
+def test_one_word_gives_the_starts_and_the_road_their_friction():
+    found = judged()
+    assert found["scenes"]["pack"]["starts"]["mu"] == found["weather"]["friction"]["surfaces"]["ICE"]["mu"] == 0.3
+    schema.check_mu(found)
+    words = ["scenes/pack/starts=grip", "scenes/pack/routes=route100", "weather=grip", "weather.friction.surfaces.ICE.mu=0.15"]
+    trained = hydra_config.load_config("train", "experiment=smoke", *words)
+    assert trained["scenes"]["pack"]["starts"]["mu"] == 0.15
+    schema.check_train(trained)
+
+
+@pytest.mark.parametrize("override", ["scenes.pack.starts.mu=0.6", "weather.friction.surfaces.ICE.mu=0.6", "weather=ice"])
+def test_a_road_with_another_friction_than_the_starts_is_refused(override):
+    with pytest.raises(
+        ConfigError, match=r"scenes\.pack\.starts\.mu: expected the mu of a surface of the weather, got 0\.[36] and .*protocol\.mu="
+    ):
+        schema.check_mu(judged(override))
+
+
+def test_protocols_without_a_friction_and_wrong_ones_are_refused():
+    with pytest.raises(ConfigError, match=r"protocol\.mu"):
+        hydra_config.load_config("evaluate", "run=x", "protocol=recorded", "protocol.mu=0.3")
+    with pytest.raises(ConfigError, match=r"protocol\.mu: expected a number > 0 or null, got 0"):
+        schema.check_evaluate(hydra_config.load_config("evaluate", "run=x", "protocol=grip", "protocol.mu=0"))
+
+
+def test_the_command_of_a_report_names_the_friction():
+    config = hydra_config.load_config("evaluate", "run=x", "protocol=grip_stops", "protocol.mu=0.3")
+    request = {"run": "x", "overrides": [], "protocol": "grip_stops", "protocols": ["strict"], "scenes": None, "trust": False}
+    assert format_rerun_command(request, config) == "python -m scenefactory_jax evaluate run=x protocol=grip_stops protocol.mu=0.3"
