@@ -10,6 +10,7 @@ from support.hand_scenes import scene_of
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import unchecked
 from scenefactory_jax.core.types import Agents, Scene
+from scenefactory_jax.data.loading.scene_source import load_training_scenes
 from scenefactory_jax.data.packing.friction_use import spread_uses
 
 G, SLOTS = 9.81, 4
@@ -47,3 +48,22 @@ def test_other_starts_are_left_as_they_are(name):
     packed = scenes([2], np.ones((1, SLOTS)))
     found, columns = spread_uses(packed, entry)
     assert found is packed and columns == {}
+
+
+def test_loaded_scenes_have_the_columns_also_of_a_sample():
+    words = [
+        "scenes=streets",
+        "scenes.count=3",
+        "scenes/pack/routes=route100",
+        "scenes/pack/starts=grip_stops",
+        "scenes.pack.routes.attempts=200",
+    ]
+    config = load_config("train", *words, "scenes.pack.routes.drawn_length_m=[40,60]", "scenes.pack.routes.drawn=12")["scenes"]
+    every, part = (load_training_scenes(config | {"take": {"count": count, "seed": 0}}) for count in (None, 2))
+    present = every.scene.agents.present
+    use, distance = (every.agent_columns[name][present] for name in ("friction_use", "stop_distance_m"))
+    assert present.sum() >= 3 and np.ptp(np.unique(use, return_counts=True)[1]) <= 1
+    np.testing.assert_allclose(distance, config["pack"]["starts"]["distance_m"], rtol=1e-5)
+    np.testing.assert_allclose(every.scene.agents.speed[present], np.sqrt(2 * use * G * distance), rtol=1e-6)
+    rows = [every.names.index(name) for name in part.names]
+    np.testing.assert_array_equal(part.agent_columns["friction_use"], every.agent_columns["friction_use"][rows])
