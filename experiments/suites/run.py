@@ -27,6 +27,7 @@ from scenefactory_jax.evaluation.records import read_folder, select_rows
 
 HERE = Path(__file__).parent
 SUITES = ("route100", "conflict", "conflict_reactive")
+SAME_AGENTS = ("conflict_reactive", "grip_hidden")  # as another suite
 MU = [1.0, 0.6, 0.3, 0.15]  # friction coefficients of the suite grip
 PLANNERS = {
     "pure pursuit of the goal": ["policy=pure_pursuit"],
@@ -95,7 +96,7 @@ def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def write_report(folder: Path) -> Path:
     """Writes `suites.md` from all results in a folder."""
     command = "`python -m experiments.suites.run --scenes SCENES --name NAME`"
-    lines = ["# Suites", "", f"{command}; articulated car, dry road, one episode a scene."]
+    lines = ["# Suites", "", f"{command}; articulated car, dry road, in the suite grip with a strip of friction mu; one episode a scene."]
     lines += ["Brackets are 95 % intervals over scenes. Planners learn nothing. A turn on red counts as a red light run.", ""]
     for path in sorted(folder.glob("result-*.json")):
         result = result_file.read(path)
@@ -138,7 +139,7 @@ def main() -> None:
     path = given.out / f"result-{given.name}.json"
     result = result_file.read(path) if path.exists() else {"name": given.name, "lists": {}, "rows": {}}
     for suite in given.protocols:
-        if suite != "conflict_reactive":
+        if suite not in SAME_AGENTS:
             rows = list_agents(given.scenes, suite, given.workers)
             agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows)
             result["lists"][suite] = summarise_lists(rows)
