@@ -316,8 +316,9 @@ def check_mu(config: Mapping[str, Any]) -> None:
         ConfigError: naming both keys and their values.
     """
     starts = config["scenes"]["pack"].get("starts") or {}
-    given = {name: entry["mu"] for name, entry in config["weather"]["friction"]["surfaces"].items() if entry.get("mu") is not None}
-    if "mu" in starts and (not given or set(given.values()) != {starts["mu"]}):
+    surfaces = config["weather"]["friction"].get("surfaces") or {}
+    given = {name: entry["mu"] for name, entry in surfaces.items() if entry.get("mu") is not None}
+    if "mu" in starts and set(given.values()) != {starts["mu"]}:
         found = ", ".join(f"weather.friction.surfaces.{name}.mu={mu}" for name, mu in given.items()) or "a weather without such a surface"
         hint = "one word sets both: protocol.mu=... of evaluate, or weather=grip weather.friction.surfaces.ICE.mu=... of train"
         raise ConfigError(f"scenes.pack.starts.mu: expected the mu of a surface of the weather, got {starts['mu']} and {found}; {hint}")
