@@ -1,12 +1,15 @@
 """The suites: lists of their agents, and what rule-based planners and recorded drivers do on them.
 
 python -m experiments.suites.run --scenes WOMD/test|town --name womd_test [--planners idm_route] [--protocols route100] [--workers 2]
+python -m experiments.suites.run --scenes WOMD/test --name womd_test --protocols grip grip_stops --mu 1.0 0.6 0.3 0.15
 
 Writes `experiments/suites/agents-SUITE-NAME.csv` (names and numbers of agents, no geometry), `result-NAME.json` and, from all results there
-are, `suites.md`. Planners learn nothing; recorded drivers are the cars of the log on their own routes.
+are, `suites.md`; the suite grip has rows for each friction and each u. Planners learn nothing; recorded drivers are the cars of the log on
+their own routes.
 """
 
 import argparse
+import itertools
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,9 +22,13 @@ from scenefactory_jax.cli import evaluate, hydra_config
 from scenefactory_jax.core import markdown, result_file
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.data.packing import agent_table
+from scenefactory_jax.evaluation import statistics
+from scenefactory_jax.evaluation.records import read_folder, select_rows
 
 HERE = Path(__file__).parent
 SUITES = ("route100", "conflict", "conflict_reactive")
+SAME_AGENTS = ("conflict_reactive", "grip_hidden")  # as another suite
+MU = [1.0, 0.6, 0.3, 0.15]  # friction coefficients of the suite grip
 PLANNERS = {
     "pure pursuit of the goal": ["policy=pure_pursuit"],
     "pure pursuit of the route": ["policy=route_pursuit"],
@@ -38,18 +45,21 @@ TOWNS = ["scenes=town", "scenes.seed=2000000", "scenes.count=64"]  # the held-ou
 
 def list_agents(scenes: str, suite: str, workers: int) -> list[dict[str, Any]]:
     """Packs the scenes as a suite does, and lists its agents."""
-    settings = [word for word in hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]["settings"]]
-    packing = [word for word in settings if word.startswith("scenes")]
+    protocol = hydra_config.load_config("evaluate", "run=null", f"protocol={suite}")["protocol"]
+    packing = [word for word in hydra_config.list_overrides(protocol["settings"]) if word.startswith("scenes")]
     source = TOWNS if scenes == "town" else ["scenes=womd", f"scenes.path={scenes}"]
     config = hydra_config.load_config("scenes", *source, f"scenes.workers={workers}", *packing)
     loaded = scene_source.load_training_scenes(config["scenes"])
     print(loaded.account, flush=True)
     worlds = [jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), loaded.scene) for index in range(len(loaded))]
-    return [row for name, world in zip(loaded.names, worlds, strict=True) for row in agent_table.list_agents(name, world)]
+    rows = [row for name, world in zip(loaded.names, worlds, strict=True) for row in agent_table.list_agents(name, world)]
+    present = np.asarray(loaded.scene.agents.present)
+    added = {name: np.round(column[present], 3).tolist() for name, column in loaded.agent_columns.items()}
+    return [row | {name: column[index] for name, column in added.items()} for index, row in enumerate(rows)]
 
 
-def judge(scenes: str, protocol: str, overrides: list[str], workers: int) -> dict[str, Any]:
-    """Evaluates a planner under a protocol: metric -> value, low, high, number of agents."""
+def judge(scenes: str, protocol: str, overrides: list[str], workers: int, mu: float | None) -> dict[str, dict[str, Any]]:
+    """Evaluates a planner under a protocol: "" -> metric -> value, low, high, number of agents; and by u for agents that have one."""
     words = ",".join(["observations=drive", f"scenes.workers={workers}", *overrides])
     quiet = ["video.enable=false", "failures.pictures.enable=false"]
     with tempfile.TemporaryDirectory() as folder:
@@ -57,9 +67,14 @@ def judge(scenes: str, protocol: str, overrides: list[str], workers: int) -> dic
             words += "," + ",".join(f"scenes.heldout.{word.removeprefix('scenes.')}" for word in TOWNS[1:])
         path = "null" if scenes == "town" else scenes
         asked = ["run=town", f"protocol={protocol}", f"scenes.path={path}", f"overrides=[{words}]", f"out={folder}"]
-        summary = evaluate.evaluate(hydra_config.load_config("evaluate", *asked, *quiet)).summary
-    first = next(iter(summary.values()))
-    return {name: {**first[name]._asdict()} for name in METRICS if name in first}
+        asked += [] if mu is None else [f"protocol.mu={mu}"]
+        config = hydra_config.load_config("evaluate", *asked, *quiet)
+        parts = {"": next(iter(evaluate.evaluate(config).summary.values()))}
+        records = next(iter(read_folder(Path(folder)).values()))
+    for use in np.unique(records.get("friction_use", [])).tolist():
+        rows = select_rows(records, records["friction_use"] == use)
+        parts[f", u {use:g}"] = statistics.summarise(rows, bootstrap=config["bootstrap"], seed=config["seed"])
+    return {part: {name: {**found[name]._asdict()} for name in METRICS if name in found} for part, found in parts.items()}
 
 
 def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -81,7 +96,7 @@ def summarise_lists(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def write_report(folder: Path) -> Path:
     """Writes `suites.md` from all results in a folder."""
     command = "`python -m experiments.suites.run --scenes SCENES --name NAME`"
-    lines = ["# Suites", "", f"{command}; articulated car, dry road, one episode a scene."]
+    lines = ["# Suites", "", f"{command}; articulated car, dry road, in the suite grip with a strip of friction mu; one episode a scene."]
     lines += ["Brackets are 95 % intervals over scenes. Planners learn nothing. A turn on red counts as a red light run.", ""]
     for path in sorted(folder.glob("result-*.json")):
         result = result_file.read(path)
@@ -116,6 +131,7 @@ def main() -> None:
     parser.add_argument("--name", required=True)
     parser.add_argument("--protocols", nargs="*", default=list(SUITES))
     parser.add_argument("--planners", nargs="*", default=[*PLANNERS, RECORDED])
+    parser.add_argument("--mu", nargs="*", type=float, default=MU, help="of the suite grip")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
@@ -123,15 +139,17 @@ def main() -> None:
     path = given.out / f"result-{given.name}.json"
     result = result_file.read(path) if path.exists() else {"name": given.name, "lists": {}, "rows": {}}
     for suite in given.protocols:
-        if suite != "conflict_reactive":
+        if suite not in SAME_AGENTS:
             rows = list_agents(given.scenes, suite, given.workers)
             agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows)
             result["lists"][suite] = summarise_lists(rows)
-        for planner in given.planners:
+        for planner, mu in itertools.product(given.planners, given.mu if suite.startswith("grip") else [None]):
             if planner == RECORDED and suite != "conflict":  # drawn routes have no driver, and reacting traffic no log to follow
                 continue
             overrides = ["dynamics=log_playback"] if planner == RECORDED else PLANNERS[planner]
-            result["rows"].setdefault(suite, {})[planner] = judge(given.scenes, suite, overrides, given.workers)
+            row = suite if mu is None else f"{suite}, mu {mu:g}"
+            for part, found in judge(given.scenes, suite, overrides, given.workers, mu).items():
+                result["rows"].setdefault(row, {})[f"{planner}{part}"] = found
             result_file.write(path, result, digits=5)
         result_file.write(path, result, digits=5)
     print(write_report(given.out))

@@ -1,7 +1,5 @@
 """`evaluate`: the policy of a run on held-out scenes: tables of agents, estimates with intervals, a report and a video."""
 
-import json
-import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -30,7 +28,9 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     schema.check_evaluate(config)
     scene_source.use_compilation_cache()
     run, protocol = policy_io.find(config["run"]), config["protocol"]
-    trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), [*protocol["settings"], *config["overrides"]])
+    overrides = [*configs.list_overrides(protocol["settings"]), *config["overrides"]]
+    trained = configs.apply_overrides(configs.read(run, trust=config["trust"]), overrides)
+    schema.check_mu(trained)
     out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     request = {name: config[name] for name in ("overrides", "trust")} | {"run": str(config["run"]), "scenes": config["scenes"]["path"]}
     request |= {"protocol": protocol["name"], "protocols": protocol["termination"]}
@@ -94,17 +94,12 @@ def make_training_callback(
 
 def format_rerun_command(request: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """Formats the command that repeats an evaluation, with every setting that differs from its default."""
-    default = configs.load_config("evaluate", "run=null", f"protocol={request['protocol']}")
+    named = [] if request["protocol"] == "trained" else [f"protocol={request['protocol']}"]
+    named += [f"protocol.mu={mu}"] if (mu := settings.get("protocol", {}).get("mu")) is not None else []  # its settings read it
+    default = configs.load_config("evaluate", "run=null", *named)
     protocol = {**settings.get("protocol", default["protocol"]), "termination": request["protocols"]}
     given = {name: request[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": request["scenes"]}}
     given = {**settings, **given, "out": None, "protocol": protocol}
     values, defaults = flatten({name: given[name] for name in ("run", *default)}), flatten(default)
-    run, *words = [f"{key}={_format_value(value)}" for key, value in values.items() if value != defaults.get(key)]
-    named = [] if request["protocol"] == "trained" else [f"protocol={request['protocol']}"]
+    run, *words = [f"{key}={configs.format_value(value)}" for key, value in values.items() if value != defaults.get(key)]
     return f"python -m scenefactory_jax evaluate {shlex.join([run, *named, *words])}"
-
-
-def _format_value(value: Any) -> str:
-    """Formats a value in Hydra's grammar."""
-    bare = isinstance(value, str) and re.fullmatch(r"[A-Za-z/._][\w/.+-]*", value)
-    return value if bare else json.dumps(value, ensure_ascii=False, separators=(",", ":"), default=str)

@@ -3,6 +3,7 @@
 import argparse
 import copy
 import functools
+import json
 import re
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
@@ -28,7 +29,7 @@ from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.instantiate import ConfigError
 
 # Keys whose values are lists of overrides
-LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.evaluation_overrides", r"protocol\.settings")
+LISTS = ("overrides", "common", r"study\.base", r"study\.common", r"study\.evaluation_overrides")
 
 
 def find_conf() -> Path:
@@ -238,6 +239,18 @@ def _find_package(group: str, option: str) -> list[list[str]]:
     if head is None or head.group(1) == group.replace("/", "."):
         return [group.split("/")]
     return [[*head.group(1).split("."), key] for key in yaml.safe_load(file.read_text()) if key != "defaults"]
+
+
+def list_overrides(settings: Mapping[str, Any]) -> list[str]:
+    """Lists the settings of a protocol, key -> value, as overrides: options of groups before values, and a group before its parts."""
+    order = sorted(settings, key=lambda key: (not (find_conf() / key).is_dir(), key.count("/")))
+    return [f"{key}={format_value(settings[key])}" for key in order]
+
+
+def format_value(value: Any) -> str:
+    """Formats a value in Hydra's grammar."""
+    bare = isinstance(value, str) and re.fullmatch(r"[A-Za-z/._][\w/.+-]*", value)
+    return value if bare else json.dumps(value, ensure_ascii=False, separators=(",", ":"), default=str)
 
 
 def quote_override(override: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
-from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Seed, check
+from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
 from scenefactory_jax.evaluation.settings import Episodes, Failures, Video
 
 Group = dict[str, Any]
@@ -50,10 +50,11 @@ class Protocol:
     """An option of the group `protocol`."""
 
     name: str
-    settings: list[str]
+    settings: Group
     termination: list[str]
     seed: Seed
     repeats: Count
+    mu: Positive | None = None  # friction coefficient of a suite whose settings read it
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ class StudyPlan:
     common: list[str]
     trainings: dict[str, list]
     seeds: list[int]
-    evaluation_overrides: list[str]
+    evaluation_overrides: list[str] | None
     conditions: dict[str, list]
     protocols: list[str]
     evaluated: dict[str, list] | None
@@ -308,9 +309,25 @@ def check_terminations(names: list[str], *, where: str) -> None:
         raise ConfigError(f"{where}: expected one or more of {', '.join(valid)}, got {names}")
 
 
+def check_mu(config: Mapping[str, Any]) -> None:
+    """Checks that the starts of the suite grip are drawn for the friction that the weather's strips have.
+
+    Raises:
+        ConfigError: naming both keys and their values.
+    """
+    starts = config["scenes"]["pack"].get("starts") or {}
+    surfaces = config["weather"]["friction"].get("surfaces") or {}
+    given = {name: entry["mu"] for name, entry in surfaces.items() if entry.get("mu") is not None}
+    if "mu" in starts and set(given.values()) != {starts["mu"]}:
+        found = ", ".join(f"weather.friction.surfaces.{name}.mu={mu}" for name, mu in given.items()) or "a weather without such a surface"
+        hint = "one word sets both: protocol.mu=... of evaluate, or weather=grip weather.friction.surfaces.ICE.mu=... of train"
+        raise ConfigError(f"scenes.pack.starts.mu: expected the mu of a surface of the weather, got {starts['mu']} and {found}; {hint}")
+
+
 def check_train(config: Mapping[str, Any]) -> None:
     """Checks the config of `train`, also the keys of the evaluation that follows hours later."""
     check(config, Train)
+    check_mu(config)
     check_terminations(config["evaluation"]["protocols"], where="evaluation.protocols")
 
 

@@ -136,6 +136,12 @@ def check(config: Mapping[str, Any]) -> None:
         raise ConfigError(f"study.baselines: expected names that no variant has, got {sorted(doubled)[0]!r}")
 
 
+def list_evaluation_overrides(config: Mapping[str, Any]) -> list[str]:
+    """Lists the overrides of every evaluation: the study's own, or those of the protocol."""
+    own = config["study"]["evaluation_overrides"]
+    return configs.list_overrides(config["protocol"]["settings"]) if own is None else list(own)
+
+
 def merge_overrides(overrides: Sequence[str]) -> list[str]:
     """Drops overrides that a later one of the same key replaces; Hydra takes no group twice."""
     last = {override.partition("=")[0].lstrip("+"): index for index, override in enumerate(overrides)}
@@ -184,8 +190,9 @@ def _plan_evaluations(
     for row, weights, chosen, overrides in rows:
         for condition in chosen:
             try:
-                merged = [*study["evaluation_overrides"], *study["conditions"][condition], *overrides]
+                merged = [*list_evaluation_overrides(config), *study["conditions"][condition], *overrides]
                 settings = configs.apply_overrides(training.config, merged)
+                schema.check_mu(settings)
             except ConfigError as error:
                 raise ConfigError(f"study.conditions.{condition}: {error}") from None
             for protocol, termination in terminations.items():

@@ -107,7 +107,7 @@ def collect(plan: Plan, config: Mapping[str, Any], records: RowRecords) -> dict[
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
     scenes = {name: config[name] and Path(config[name]).name for name in ("train_scenes", "test_scenes")}
     return {
-        "study": dict(study),
+        "study": {**study, "evaluation_overrides": study_plan.list_evaluation_overrides(config)},
         "settings": {name: config[name] for name in ("seeds", "common", "cut", "target", "evaluation")},
         "scenes": {name: scene or "the recipe's own" for name, scene in scenes.items()},
         "missing": [task.label for task in (*plan.trainings, *plan.evaluations) if not task.file.is_file()],

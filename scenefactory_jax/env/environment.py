@@ -114,6 +114,7 @@ class EnvParts(NamedTuple):
     episode_steps: int  # control steps after which a world is truncated
     control_dt: float  # s
     respawn_clearance_m: float | None  # see `Spawning`
+    hides_weather: bool = False  # from the observations: `weather.hidden`
     history: HistorySpec | None = None  # rows of `State.history`; None: nothing reads it
 
 
@@ -136,7 +137,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
     context: dict[str, Any] = {"physics_dt": 1.0 / read.timing.physics_hz, "control_dt": 1.0 / read.timing.control_hz}
     mu = friction.make(config["weather"]["friction"])
     package = __name__.rpartition(".")[0]
-    terms, groups = rewards.make(read.reward, **context), observations.make(read.observations, **context)
+    terms, groups = rewards.make(read.reward, **context), observations.make(read.observations, friction=mu, **context)
     readers = [*groups.values(), *(term for _, term in terms.values())]
     return EnvParts(
         dynamics=instantiate(read.dynamics, builtins="scenefactory_jax.dynamics", where="dynamics", friction=mu, **context)(),
@@ -153,6 +154,7 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
         episode_steps=episode_steps(config["timing"]),
         control_dt=context["control_dt"],
         respawn_clearance_m=read.spawning.respawn_clearance_m,
+        hides_weather=read.weather.get("hidden", False),
         history=history.make_spec(readers, control_dt=context["control_dt"]),
     )
 
@@ -266,7 +268,7 @@ def _init_state(parts: EnvParts, key: PRNGKeyArray, scene: Scene, step: Int[Arra
     others = parts.traffic.init(jax.random.fold_in(body_key, 0), scene, step)
     scene = replace(scene, traffic=parts.traffic.read(scene, others, step))
     agents = spawning.admit_cars(parts.sample_agents(agents_key, scene))
-    weather = rain.advance_rain(parts.sample_weather(weather_key, scene), dt=parts.control_dt * step)
+    weather = rain.advance_rain(parts.sample_weather(weather_key, replace(scene, agents=agents)), dt=parts.control_dt * step)
     body = parts.dynamics.init(body_key, replace(scene, agents=agents, weather=weather))
     count, motion = agents.present.shape[0], parts.dynamics.read(body)
     agents = replace(agents, present=agents.present & is_finite(motion))
@@ -309,6 +311,7 @@ def _control_step(parts: EnvParts, scene: Scene, state: State, action: Float[Arr
 
 
 def _observe(parts: EnvParts, scene: Scene, state: State) -> Observation:
+    state = replace(state, weather=road_condition.make_dry()) if parts.hides_weather else state
     return observations.observe(_scene_at(parts, scene, state), state, parts.groups)
 
 

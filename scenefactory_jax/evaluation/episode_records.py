@@ -85,6 +85,7 @@ def make_episode_runner(
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
         records = _make_all_columns(metrics, first, state, distance, names, settings=settings, control_hz=control_hz)
+        records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
         if not worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)

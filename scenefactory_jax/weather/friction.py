@@ -47,6 +47,7 @@ class Surface:
 
     theta: Positive
     texture_mm: Positive
+    mu: Positive | None = None  # friction coefficient at any speed and film, in place of what the model computes
 
 
 def make(entry: Mapping[str, Any]) -> Callable[[Weather, Float[Array, "*shape 2"], Float[Array, "*shape"]], Float[Array, "*shape"]]:
@@ -149,7 +150,11 @@ def compute_mu(
     s = jnp.full_like(speed, slip_dynamic if mode == "dynamic" else slip_static)
     theta = jnp.array([surfaces[name].theta for name in SURFACES], jnp.float32)[surface]
     texture = jnp.array([surfaces[name].texture_mm for name in SURFACES], jnp.float32)[surface]
-    return jnp.maximum(compute_lugre_friction(v, film_mm, theta, texture, s, tyre=tyre), floor)
+    mu = compute_lugre_friction(v, film_mm, theta, texture, s, tyre=tyre)
+    if any(entry.mu is not None for entry in surfaces.values()):
+        given = jnp.array([surfaces[name].mu or 0.0 for name in SURFACES], jnp.float32)[surface]
+        mu = jnp.where(given > 0.0, given, mu)
+    return jnp.maximum(mu, floor)
 
 
 def make_uniform(film_mm: Float[Array, ""], surface: Int[Array, ""]) -> Weather:

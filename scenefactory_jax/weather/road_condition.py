@@ -30,6 +30,7 @@ class WeatherConfig:
     patches: Mapping[str, Mapping[str, Any] | None] | None = None
     rain: Mapping[str, Any] | None = None
     friction: Mapping[str, Any] | None = None  # of the dynamics
+    hidden: bool = False  # observations read a dry road, whatever it is like
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,6 +80,11 @@ def sample_condition(key: PRNGKeyArray, scene: Scene, *, cases: list[Case]) -> W
     film = jnp.asarray([case.film_mm for case in cases], jnp.float32)
     surface = jnp.asarray([SURFACES.index(case.surface) for case in cases], jnp.int32)
     return make_uniform(film[index], surface[index])
+
+
+def make_dry() -> Weather:
+    """Makes the weather that observations read with `weather.hidden`: dry asphalt concrete without patches."""
+    return make_uniform(jnp.float32(0.0), jnp.int32(SURFACES.index("AC")))
 
 
 def keep_condition(key: PRNGKeyArray, scene: Scene) -> Weather:

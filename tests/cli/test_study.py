@@ -385,7 +385,7 @@ def test_protocols_are_the_conditions_of_the_readmes_rows(tmp_path):
         asked = hydra_config.load_config("evaluate", "run=x", f"protocol={name}")
         rows = [one for one in plan.evaluations if (one.row, one.condition) == ("rigid body", condition)]
         assert {one.protocol for one in rows} >= set(asked["protocol"]["termination"])
-        expected = hydra_config.apply_overrides(rows[0].training.config, asked["protocol"]["settings"])
+        expected = hydra_config.apply_overrides(rows[0].training.config, hydra_config.list_overrides(asked["protocol"]["settings"]))
         assert rows[0].config | {"termination": None} == expected | {"termination": None}
         assert [asked[key] for key in entry["evaluation"]] == list(entry["evaluation"].values())
 

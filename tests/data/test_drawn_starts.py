@@ -115,9 +115,12 @@ def test_grip_enters_bends_with_a_part_of_the_friction():
     assert fast["agents.present"].sum() == 4 and fast["agents.route"][:4].tolist() == [0, 1, 2, 3]
     expected = np.sqrt(np.array([0.6, 0.8, 1.0, 0.6]) * 0.6 * GRAVITY * np.array(radii))
     np.testing.assert_allclose(fast["agents.speed"][:4], expected, rtol=0.03)
+    found = [route_bends.find_bends(line, window_m=8.0, radius_m=(8.0, 80.0), turn_deg=20.0)[0].radius for line in lines]
+    exact = np.sqrt(np.array([0.6, 0.8, 1.0, 0.6]) * 0.6 * GRAVITY * np.array(found))
+    np.testing.assert_allclose(fast["agents.speed"][:4], exact, rtol=1e-6)
     np.testing.assert_allclose(slow["agents.speed"], fast["agents.speed"] / 2, rtol=1e-6)
     np.testing.assert_array_equal(slow["agents.position"], fast["agents.position"])  # the same places for every friction
-    assert ((fast["agents.route_start"][:4] > 25.0) & (fast["agents.route_start"][:4] <= 31.0)).all()
+    assert ((fast["agents.route_start"][:4] > 33.0) & (fast["agents.route_start"][:4] <= 39.0)).all()  # the front where the bend begins
     assert (fast["agents.route_end"][:4] > 40 + np.deg2rad(60.0) * np.array(radii)).all()
     assert not fast["controls.valid"].size and np.isinf(fast["routes.stop_arc"]).all()  # lights and signs of the scene are left out
     assert draw("grip", [lines[0], lines[0] + [0.0, 4.0]])["agents.present"].sum() == 1  # ways too near

@@ -1,5 +1,6 @@
-"""The roads of the suite grip, and what a policy sees of them."""
+"""The road of the suite grip: strips of another friction along the agents' routes, and what a policy sees of them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,29 +9,103 @@ from support.planning_scenes import state_of, street
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import SURFACES
-from scenefactory_jax.env import observations
-from scenefactory_jax.weather import friction
+from scenefactory_jax.env import environment, observations
+from scenefactory_jax.weather import friction, road_condition
 
-FILM_MM = 0.5
-
-
-@pytest.mark.parametrize("percent", [100, 60, 30, 15])
-def test_a_road_has_the_friction_of_its_name(percent):
-    weather = load_config("task", f"weather=mu_{percent:03d}")["weather"]
-    (case,) = weather["sampler"]["cases"]
-    road = friction.make_uniform(jnp.float32(case["film_mm"]), jnp.int32(SURFACES.index(case["surface"])))
-    mu = friction.make(weather["friction"])(road, jnp.zeros((1, 2)), jnp.full(1, 10.0))
-    assert float(mu[0]) == pytest.approx(percent / 100, rel=0.01) and not weather["patches"] and weather["rain"] is None
+MU, DRY = 0.3, 1.105
+START, RADIUS = 40.0, 20.0  # of the agent on its route; the bend begins 10 m later
+BEND_END = START + 10.0 + RADIUS * np.pi / 2
+CONFIG = load_config("task", "weather=grip", f"weather.friction.surfaces.ICE.mu={MU}", "observations=drive")
+FRICTION = friction.make(CONFIG["weather"]["friction"])
+ENTRY = {"friction_ahead": CONFIG["observations"]["friction_ahead"]}
+AHEAD = ENTRY["friction_ahead"]["ahead_m"]
 
 
-def test_hidden_weather_reads_a_dry_road():
-    scene = street()
-    entry = {"film_scale_mm": 1.0, "surfaces": ["AC", "SMA", "ICE"]}
-    groups = observations.make({name: {"_target_": name, **entry} for name in ("weather", "hidden_weather")})
-    seen = {}
-    for surface, film in (("AC", 0.0), ("ICE", FILM_MM)):
-        road = friction.make_uniform(jnp.float32(film), jnp.int32(SURFACES.index(surface)))
-        seen[surface] = observations.observe(scene, replace(state_of(scene), weather=road), groups)
-    np.testing.assert_allclose(seen["ICE"]["weather"][0], [FILM_MM, 0.0, 0.0, 1.0])
-    np.testing.assert_array_equal(seen["ICE"]["hidden_weather"], seen["AC"]["weather"])
-    assert seen["AC"]["weather"].any()
+def find_place(arc):
+    """Point and left normal of the route: east, a quarter of a circle to the left, north."""
+    turn = np.clip((arc - 50.0) / RADIUS, 0.0, np.pi / 2)
+    before, after = min(arc, 50.0), max(arc - BEND_END, 0.0)
+    point = np.array([before + RADIUS * np.sin(turn), RADIUS * (1 - np.cos(turn)) + after])
+    return point, np.array([-np.sin(turn), np.cos(turn)])
+
+
+@pytest.fixture(scope="module")
+def bend():
+    """Two cars: the first on the route at START, its goal 15 m behind the bend; the second without a route, 50 m north of the first."""
+    scene = street(starts=((START, 0.0), (START, 50.0)))
+    line = jnp.asarray([find_place(arc)[0] for arc in range(scene.routes.position.shape[1])], jnp.float32)
+    agents = replace(scene.agents, route_start=jnp.array([START, 0.0]), route_end=jnp.array([BEND_END + 15.0, 0.0]))
+    return replace(scene, agents=agents, routes=replace(scene.routes, position=line[None]))
+
+
+@pytest.fixture(scope="module")
+def weather(bend):
+    return road_condition.make(CONFIG["weather"])(jax.random.key(0), bend)
+
+
+def see(scene, weather, place, *, arc=0.0, yaw=0.0, agent=0):
+    """What an agent reads at a place, with its place on its route."""
+    state = state_of(scene)
+    motion = replace(state.motion, position=state.motion.position.at[agent, :2].set(jnp.asarray(place)), yaw=jnp.full(2, yaw))
+    state = replace(state, motion=motion, weather=weather, route=replace(state.route, arc=jnp.full(2, arc)))
+    return np.asarray(observations.observe(scene, state, observations.make(ENTRY, friction=FRICTION))["friction_ahead"][agent])
+
+
+@pytest.mark.parametrize("mode", ["static", "speed"])
+def test_a_surface_with_a_given_friction_has_it_at_any_speed_and_film(mode):
+    bound = friction.make(CONFIG["weather"]["friction"] | {"mode": mode})
+    roads = [
+        friction.make_uniform(jnp.float32(film), jnp.int32(SURFACES.index(name)))
+        for name, film in (("ICE", 0.0), ("ICE", 2.0), ("AC", 0.0))
+    ]
+    found = np.array([bound(road, jnp.zeros((2, 2)), jnp.array([1.0, 30.0])) for road in roads])
+    np.testing.assert_allclose(found[:2], MU, rtol=1e-6)
+    assert found[2, 0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("arc", "left", "inside"),
+    [
+        (START - 3.8, 0.0, True),
+        (START - 4.3, 0.0, False),
+        (START - 2.0, 1.0, True),  # all of a car of 4 x 2 m
+        (START - 2.0, -1.0, True),
+        (65.0, 3.7, True),
+        (65.0, -3.7, True),
+        (65.0, 4.3, False),
+        (65.0, -4.3, False),
+        (BEND_END + 4.7, 0.0, True),
+        (BEND_END + 5.3, 0.0, False),
+    ],
+)
+def test_the_strip_covers_the_bend_and_the_road_outside_is_dry(weather, arc, left, inside):
+    point, normal = find_place(arc)
+    found = FRICTION(weather, jnp.asarray(point + left * normal, jnp.float32)[None], jnp.full(1, 10.0))
+    assert float(found[0]) == pytest.approx(MU if inside else DRY, rel=1e-3)
+    assert weather.patches.present.tolist() == [True, False]  # the second car has no route
+
+
+def test_a_car_sees_the_friction_30_m_ahead_along_its_route(bend, weather):
+    edge = START - 4.0
+    assert AHEAD[-1] == 30.0
+    for before, count in ((30.5, 0), (29.5, 1), (19.5, 3)):
+        seen = see(bend, weather, (edge - before, 0.0), arc=edge - before)
+        np.testing.assert_allclose(seen, [DRY] * (7 - count) + [MU] * count, rtol=1e-3)
+    seen = see(bend, weather, find_place(BEND_END - 12.0)[0], arc=BEND_END - 12.0)  # it ends 17 m ahead, around the bend
+    np.testing.assert_allclose(seen, [MU] * 4 + [DRY] * 3, rtol=1e-3)
+
+
+def test_a_car_without_a_route_sees_straight_ahead(bend, weather):
+    seen = see(bend, weather, (50.0, 12.0), yaw=-np.pi / 2, agent=1)  # southwards, across the strip on the x-axis, 8 m wide
+    np.testing.assert_allclose(seen, [DRY, DRY, MU, MU, DRY, DRY, DRY], rtol=1e-3)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_hidden_weather_reads_a_dry_road(bend, weather, hidden):
+    groups = {name: CONFIG["observations"][name] for name in ("weather", "friction_ahead")}
+    env = environment.make_env(CONFIG | {"weather": CONFIG["weather"] | {"hidden": hidden}, "observations": groups})
+    state = replace(state_of(bend), weather=weather)
+    seen = env.observe(bend, state)
+    np.testing.assert_allclose(seen["friction_ahead"][0], np.full(7, DRY if hidden else MU), rtol=1e-3)
+    np.testing.assert_array_equal(seen["weather"][0], [0.0, float(hidden), 0.0, 0.0])
+    assert env.current_scene(bend, state).weather is not None and state.weather.patches.present[0]  # the road itself stays

@@ -4,7 +4,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from scenefactory_jax.core.types import Scene
 from scenefactory_jax.data.bank import bank_index, bank_reader, shard_files
 from scenefactory_jax.data.formats import reader_selection
 from scenefactory_jax.data.loading.scenes_config import check_config
+from scenefactory_jax.data.packing import friction_use
 from scenefactory_jax.data.packing.pack import Packed, prepare
 from scenefactory_jax.data.packing.stack import describe, stack
 from scenefactory_jax.data.packing.summary import Summary, shorten_path, summarise_packed
@@ -240,6 +241,7 @@ class Scenes:
     scene: Scene
     names: tuple[str, ...]
     account: str
+    agent_columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # numbers of the agents for tables, [W, A]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -268,7 +270,8 @@ def load_all_scenes(config: Mapping[str, Any]) -> Scenes:
         raise ConfigError(f"scenes.path={config['path']}: no usable scene\n" + "\n".join(lines[1:]))
     scene, cuts = stack([one.scene for one in packed], capacity=config["capacity"])
     names = tuple(escape_for_terminal(one.report.name) for one in packed)
-    return Scenes(attach_grids(scene, config), names, "\n".join([*lines, *describe(cuts)]))
+    scene, added = friction_use.spread_uses(scene, config["pack"].get("starts"))
+    return Scenes(attach_grids(scene, config), names, "\n".join([*lines, *describe(cuts)]), added)
 
 
 def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
@@ -282,7 +285,8 @@ def take_scenes(scenes: Scenes, config: Mapping[str, Any]) -> Scenes:
     chosen = np.sort(np.random.default_rng(seed).permutation(len(scenes))[:count])
     scene = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], scenes.scene)
     account = f"{scenes.account}\n{len(chosen)} of the {len(scenes)} scenes, drawn with seed {seed}"
-    return Scenes(scene, tuple(scenes.names[index] for index in chosen), account)
+    added = {name: column[chosen] for name, column in scenes.agent_columns.items()}
+    return Scenes(scene, tuple(scenes.names[index] for index in chosen), account, added)
 
 
 def load_heldout_scenes(config: Mapping[str, Any], *, path: str | None) -> Scenes:

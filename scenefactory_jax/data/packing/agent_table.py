@@ -43,8 +43,9 @@ def _describe_route(scene: Scene, route: int, start: float, end: float) -> dict[
 
 
 def write(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes rows of `list_agents` as CSV."""
+    """Writes rows of `list_agents` as CSV, with the columns that a suite adds to the first."""
+    rows = list(rows)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, [*COLUMNS, *(name for name in (rows[0] if rows else {}) if name not in COLUMNS)])
         writer.writeheader()
         writer.writerows(rows)

@@ -21,14 +21,14 @@ from scenefactory_jax.env.observations.metadrive import metadrive
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_vector import route
-from scenefactory_jax.env.observations.state_vectors import ego, hidden_weather, weather, yaw_rate_and_steer
+from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, weather, yaw_rate_and_steer
 from scenefactory_jax.env.observations.vmax import vmax_base, vmax_lane, vmax_road, vmax_segment
 
 __all__ = ["ANY", "FRACTION", "LENGTH", "SIGNED", "Group", "bound_observation", "make", "observe"]
 __all__ += [
     "closest_approach",
     "ego",
-    "hidden_weather",
+    "friction_ahead",
     "lane",
     "leader",
     "lights",

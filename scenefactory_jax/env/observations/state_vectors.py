@@ -1,11 +1,14 @@
 """Observation vectors of the car's own state and road condition."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from scenefactory_jax.core.geometry import safe_norm, to_frame
-from scenefactory_jax.core.schema import ConfigError, Positive
+from scenefactory_jax.core.geometry import heading_vector, safe_norm, to_frame
+from scenefactory_jax.core.schema import ConfigError, NonNegative, Positive
 from scenefactory_jax.core.types import SURFACES, Scene, State
+from scenefactory_jax.env import route_following
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
 from scenefactory_jax.weather.patches import read_condition
 
@@ -41,14 +44,28 @@ def weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: li
     return jnp.concatenate([film_mm[:, None] / film_scale_mm, one_hot], axis=1)
 
 
-@bound_observation(LENGTH, FRACTION)
-def hidden_weather(scene: Scene, state: State, *, film_scale_mm: Positive, surfaces: list[str]) -> Float[Array, "A F"]:
-    """The columns of `weather` as they read on dry asphalt concrete, whatever the road is like: for a road that the policy must feel.
+@bound_observation(LENGTH)
+def friction_ahead(
+    scene: Scene, state: State, *, ahead_m: list[NonNegative], friction: Callable[..., Float[Array, "*shape"]]
+) -> Float[Array, "A F"]:
+    """Friction coefficient at each car and ahead of it: what sensors of the road's condition, or messages of cars ahead, would tell.
 
-    `observations.weather._target_=hidden_weather` hides the road from a policy that learnt to see it.
+    Columns: mu under the car's centre, then at each of `ahead_m` along the agent's own route, measured from its place on it; behind the
+    route's end the end is repeated. Straight ahead of the car for an agent without a route.
+
+    Args:
+        friction: `weather.friction` of the config, bound; the environment supplies it.
     """
-    row = [0.0, *(float(name == "AC") for name in surfaces)]
-    return jnp.broadcast_to(jnp.array(row, jnp.float32), (len(state.active), len(row)))
+    agents, motion = state.agents, state.motion
+    here, ahead = motion.position[:, None, :2], jnp.array(ahead_m, jnp.float32)
+    points = here + ahead[:, None] * heading_vector(motion.yaw)[:, None]
+    if scene.routes.length.shape[0]:
+        row = jnp.broadcast_to(agents.route[:, None], points.shape[:2])
+        along, _ = route_following.find_point(scene, row, state.route.arc[:, None] + ahead)
+        points = jnp.where(route_following.find_routed(scene, agents)[:, None, None], along, points)
+    points = jnp.concatenate([here, points], axis=1)
+    speed = jnp.broadcast_to(safe_norm(motion.velocity[:, :2])[:, None], points.shape[:2])
+    return friction(state.weather, points, speed)
 
 
 def yaw_rate_and_steer(scene: Scene, state: State, *, turn_scale_radps: Positive, steer_scale_rad: Positive) -> Float[Array, "A 2"]:

@@ -1,0 +1,48 @@
+"""Patches of the road on the agents' routes: a layout as those of `weather.patch_layouts`, here because it reads routes."""
+
+from typing import Annotated
+
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from scenefactory_jax.core.schema import Bounds, NonNegative, Positive
+from scenefactory_jax.core.types import SURFACES, Patches, Scene, SurfaceName, Weather
+from scenefactory_jax.env import route_following
+
+
+def route_strips(
+    key: PRNGKeyArray,
+    scene: Scene,
+    weather: Weather,
+    *,
+    begin_m: float,
+    end_m: float,
+    width_m: Positive,
+    points: Annotated[int, Bounds(min=2)],
+    surface: SurfaceName,
+    film_mm: NonNegative,
+) -> Patches:
+    """Makes a strip along the route of every agent; its ends are round. An agent without a route has none.
+
+    Args:
+        begin_m: where the strip begins on the route's line, from the agent's start; below 0: behind it.
+        end_m: where it ends, from the agent's goal.
+        points: vertices of the strip's middle line, equidistant along the route.
+    """
+    agents, count = scene.agents, scene.agents.present.shape[0]
+    radius = 0.5 * width_m
+    first, last = agents.route_start + begin_m + radius, agents.route_end + end_m - radius
+    arc = first[:, None] + (last - first)[:, None] * jnp.linspace(0.0, 1.0, points)
+    routed = route_following.find_routed(scene, agents)
+    vertices = jnp.zeros((count, points, 2), jnp.float32)
+    if scene.routes.length.shape[0]:
+        vertices, _ = route_following.find_point(scene, jnp.broadcast_to(agents.route[:, None], arc.shape), arc)
+    return Patches(
+        vertices=vertices,
+        closed=jnp.zeros(count, bool),
+        radius=jnp.full(count, radius, jnp.float32),
+        surface=jnp.full(count, SURFACES.index(surface), jnp.int32),
+        film_mm=jnp.full(count, film_mm, jnp.float32),
+        open_road_film_fraction=jnp.zeros(count, jnp.float32),
+        present=routed,
+    )
