@@ -1,5 +1,6 @@
 """Fixtures that several test modules share."""
 
+import gc
 from pathlib import Path
 
 from support import compiler, type_checks  # noqa: F401  # before anything imports JAX or the package
@@ -10,18 +11,25 @@ from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
-    "test_train", "test_study", "test_digests", "test_adapters_gymnasium", "test_validation_run", "test_environment", "test_traffic",
-    "test_benchmark", "test_troubleshooting", "test_ppo", "test_adapters", "test_randomization", "test_equations_of_motion",
-    "test_operations", "test_dynamics", "test_validation", "test_film", "test_contact_solver", "test_docs", "test_gpu_processes",
-    "test_failures", "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
+    "test_train", "test_study", "test_environment", "test_digests", "test_adapters_gymnasium", "test_validation_run", "test_traffic",
+    "test_idm_traffic", "test_benchmark", "test_troubleshooting", "test_ppo", "test_planning_rewards", "test_vmax_observations",
+    "test_metadrive_observation", "test_adapters", "test_randomization", "test_equations_of_motion", "test_operations", "test_dynamics",
+    "test_validation", "test_film", "test_contact_solver", "test_docs", "test_gpu_processes", "test_waymax_golden", "test_failures",
+    "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
 )  # fmt: skip
 
 composing.share()
+gc.set_threshold(50_000, 20, 20)  # a search for cycles passes JAX's many objects; at Python's 700 they took a twentieth of all the time
 
 
 def pytest_collection_modifyitems(items):
     """The longest files first; `--no-loadscope-reorder` keeps xdist from ordering by the number of tests instead."""
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish(session):
+    """What was imported stays: later searches for cycles leave it out."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

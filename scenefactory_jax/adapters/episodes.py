@@ -176,6 +176,7 @@ def unpack_car_step(pool: Pool, row: np.ndarray) -> CarStep:
     return CarStep(row[: pool.columns], reward, bool(terminated), bool(truncated), bool(over), info)
 
 
+@jax.jit  # traced once for all programs, not a hundred indexings in each
 def _select(scenes: Scene, index: Int[Array, ""]) -> Scene:
     return jax.tree.map(lambda leaf: leaf[index], scenes)
 

@@ -160,29 +160,32 @@ def make_parts(config: Mapping[str, Any]) -> EnvParts:
 
 
 def assemble(parts: EnvParts) -> Env:
-    """Joins bound parts into an environment; its functions check the shapes of their arguments when they are traced."""
+    """Joins bound parts into an environment; its functions check the shapes of their arguments when they are traced.
+
+    The parts of its functions are traced once for arguments of the same shapes, also where several programs have them.
+    """
+    start, control, look = (jax.jit(functools.partial(function, parts)) for function in (_init_state, _control_step, _observe))
 
     def reset(key: PRNGKeyArray, scene: Scene) -> tuple[State, Observation]:
         (scene,) = _checked("env.reset", scene)
-        state = _init_state(parts, key, scene)
+        state = start(key, scene)
         # copies: the state shares no buffer, so that a step may be given it to keep (`donate_argnums`)
-        return jax.tree.map(jnp.copy, state), _observe(parts, scene, state)
+        return jax.tree.map(jnp.copy, state), look(scene, state)
 
     def init_state(key: PRNGKeyArray, scene: Scene, step: Int[Array, ""] | int = 0) -> State:
         (scene,) = _checked("env.init_state", scene)
-        return _init_state(parts, key, scene, step)
+        return start(key, scene) if isinstance(step, int) and step == 0 else start(key, scene, step)
 
     def step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
         scene, state, action = _checked("env.step", scene, state, action)
-        control = functools.partial(_control_step, parts, scene, action=action)
-        state, _, result, _ = repeat_action(control, state, action_repeat=parts.action_repeat)
-        return state, replace(result, observation=_observe(parts, scene, state))
+        state, _, result, _ = repeat_action(lambda now: control(scene, now, action), state, action_repeat=parts.action_repeat)
+        return state, replace(result, observation=look(scene, state))
 
     def control_step(scene: Scene, state: State, action: Float[Array, "A 3"]) -> tuple[State, StepResult]:
-        return _control_step(parts, *_checked("env.control_step", scene, state, action))
+        return control(*_checked("env.control_step", scene, state, action))
 
     def observe(scene: Scene, state: State) -> Observation:
-        return _observe(parts, *_checked("env.observe", scene, state))
+        return look(*_checked("env.observe", scene, state))
 
     def current_scene(scene: Scene, state: State) -> Scene:
         return _scene_at(parts, *_checked("env.current_scene", scene, state))

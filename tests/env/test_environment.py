@@ -69,14 +69,19 @@ def brute_force_ttc(centres, radius, velocity, yaw, dt=0.002, until=12.0):
     return found
 
 
+@jax.jit  # a conflict is seventy operations, each of which would be compiled by itself
+def compare_cars(position, yaw, velocity):
+    """Circles of cars of 4 x 2 m, their radius, and the surrogates of every pair."""
+    position, yaw, velocity = (jnp.asarray(table, jnp.float32) for table in (position, yaw, velocity))
+    circles = geometry.cover_with_circles(position, yaw, jnp.tile(jnp.array([4.0, 2.0]), (len(yaw), 1)), **CIRCLES)
+    return *circles, surrogate_safety.compare_pairs(*circles, velocity, yaw, drac_gap_floor_m=1.0)
+
+
 def test_ttc_equals_a_simulated_one():
     rng = np.random.default_rng(0)
     position, yaw = rng.uniform(-12, 12, (5, 2)), rng.uniform(-3, 3, 5)
     velocity = rng.uniform(2, 8, (5, 1)) * np.stack([np.cos(yaw), np.sin(yaw)], -1)
-    sizes = jnp.tile(jnp.array([4.0, 2.0]), (5, 1))
-    centres, radius = geometry.cover_with_circles(jnp.asarray(position, jnp.float32), jnp.asarray(yaw, jnp.float32), sizes, **CIRCLES)
-    moving = (jnp.asarray(velocity, jnp.float32), jnp.asarray(yaw, jnp.float32))
-    ttc, drac, *_ = surrogate_safety.compare_pairs(centres, radius, *moving, drac_gap_floor_m=1.0)
+    centres, radius, (ttc, drac, *_) = compare_cars(position, yaw, velocity)
     ttc = np.where(np.asarray(ttc) < 12, np.asarray(ttc), np.inf)
     expected = brute_force_ttc(np.asarray(centres, float), np.asarray(radius, float), velocity, yaw, dt=0.01)
     assert np.isfinite(expected).sum() >= 2, "the draw has no conflict to compare"
@@ -85,10 +90,8 @@ def test_ttc_equals_a_simulated_one():
 
 
 def test_head_on_ttc_and_drac_by_hand():
-    yaw, size = jnp.array([0.0, jnp.pi]), jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
-    centres, radius = geometry.cover_with_circles(jnp.array([[0.0, 0], [20.0, 0]]), yaw, size, **CIRCLES)
-    velocity = jnp.array([[5.0, 0], [-5.0, 0]])
-    ttc, drac, away, ahead = surrogate_safety.compare_pairs(centres, radius, velocity, jnp.array([0.0, jnp.pi]), drac_gap_floor_m=1.0)
+    places, yaw, velocity = np.array([[0.0, 0], [20.0, 0]]), np.array([0.0, np.pi]), np.array([[5.0, 0], [-5.0, 0]])
+    ttc, drac, away, ahead = compare_cars(places, yaw, velocity)[2]
     gap = 20 - 2 * 1.12 - 2 * 1.1
     for distances in (away, ahead):
         np.testing.assert_allclose(distances, [[np.inf, gap], [gap, np.inf]], rtol=1e-5)
@@ -97,18 +100,14 @@ def test_head_on_ttc_and_drac_by_hand():
 
 
 def test_parting_cars_never_meet():
-    size = jnp.tile(jnp.array([4.0, 2.0]), (2, 1))
-    centres, radius = geometry.cover_with_circles(jnp.array([[0.0, 0], [20.0, 0]]), jnp.zeros(2), size, **CIRCLES)
-    ttc, *_ = surrogate_safety.compare_pairs(centres, radius, jnp.array([[5.0, 0], [6.0, 0]]), jnp.zeros(2), drac_gap_floor_m=1.0)
-    assert jnp.isinf(ttc).all()
+    places, velocity = np.array([[0.0, 0], [20.0, 0]]), np.array([[5.0, 0], [6.0, 0]])
+    assert np.isinf(compare_cars(places, np.zeros(2), velocity)[2].ttc).all()
 
 
 def test_the_way_ahead_ends_where_circles_touch_and_is_free_beside_them():
     """Followers 10 m behind, 1.5 m to the side; the third car is 2.3 m beside the first, just out of its way."""
-    size = jnp.tile(jnp.array([4.0, 2.0]), (3, 1))
-    place = jnp.array([[0.0, 0], [10.0, 1.5], [10.0, -2.3]])
-    centres, radius = geometry.cover_with_circles(place, jnp.zeros(3), size, **CIRCLES)
-    ahead = surrogate_safety.compare_pairs(centres, radius, jnp.zeros((3, 2)), jnp.zeros(3), drac_gap_floor_m=1.0).ahead
+    place = np.array([[0.0, 0], [10.0, 1.5], [10.0, -2.3]])
+    ahead = compare_cars(place, np.zeros(3), np.zeros((3, 2)))[2].ahead
     free = 10 - 2 * 1.12 - np.sqrt(2.2**2 - 1.5**2)
     np.testing.assert_allclose(ahead, [[np.inf, free, np.inf], [np.inf] * 3, [np.inf] * 3], rtol=1e-5)
 

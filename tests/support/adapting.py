@@ -4,9 +4,11 @@ import functools
 
 import numpy as np
 
+from scenefactory_jax.adapters import episodes
 from scenefactory_jax.cli import hydra_config
 from scenefactory_jax.data.loading import scene_source
 
+make_pool, POOLS = episodes.make_pool, {}
 SMOKE = "experiment=smoke"
 ALONE = [SMOKE, "scenes.pack.agents=1"]
 
@@ -22,3 +24,14 @@ def actions(steps, worlds, *, seed=0):
     drawn = np.random.default_rng(seed).uniform(-1, 1, (steps, worlds, 3)).astype(np.float32)
     drawn[:, 0] = [1.0, 0.6, -1.0]
     return drawn
+
+
+def share_pool(config, overrides, given, **options):
+    """In place of `episodes.make_pool`: adapters of the same settings and scenes share an environment, which is traced once."""
+    key = repr(config), tuple(overrides), id(given), *options.items()
+    if given is None or key not in POOLS:
+        POOLS[key] = given, make_pool(config, overrides, given, **options)  # with the scenes: their id stays theirs
+    return POOLS[key][1]
+
+
+episodes.make_pool = share_pool

@@ -35,13 +35,21 @@ def choose_check(function):
     return "types"
 
 
-def check_types(function, checked):
-    """Calls the checked function unless a test turns the checks off (`jaxtyping_disable`)."""
+def check_from_first_call(function, check):
+    """Prepares the check of a function when it is first called: most functions are not called in a process that runs a few tests.
+
+    Without shapes, a test may turn the check off (`jaxtyping_disable`), as jaxtyping's own.
+    """
+    checked = None
 
     @functools.wraps(function)
     def call(*arguments, **named):
         __tracebackhide__ = True
-        return (function if jaxtyping.config.jaxtyping_disable else checked)(*arguments, **named)
+        nonlocal checked
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*arguments, **named)
+        checked = checked or check(function)
+        return checked(*arguments, **named)
 
     return call
 
@@ -52,8 +60,10 @@ def check_lightly(function=jaxtyping._decorator._sentinel, *, typechecker=jaxtyp
         code = function.__code__
         if code not in NEEDS:
             NEEDS[code] = choose_check(function)
-        if NEEDS[code] != "shapes":
-            return function if NEEDS[code] == "nothing" else check_types(function, typechecker(function))
+        if NEEDS[code] == "nothing":
+            return function
+        check = typechecker if NEEDS[code] == "types" else functools.partial(jaxtyped, typechecker=typechecker)
+        return check_from_first_call(function, check)
     elif function is jaxtyping._decorator._sentinel:
         return lambda function: check_lightly(function, typechecker=typechecker)
     return jaxtyped(function, typechecker=typechecker)
