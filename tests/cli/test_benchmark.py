@@ -166,7 +166,8 @@ def test_variants_change_values_and_replace_entries():
 
 @pytest.mark.parametrize("suite", sorted(path.stem for path in (configs.find_conf() / "suite").glob("*.yaml")))
 def test_every_variant_of_a_suite_is_a_config(suite):
-    config = load_config("benchmark", "experiment=paper", f"suite={suite}")
+    experiment = "drive" if suite == "driving" else "paper"
+    config = load_config("benchmark", f"experiment={experiment}", f"suite={suite}")
     for name, changes in config["variants"].items():
         schema.check(command.change(config, changes, where=name), schema.Benchmark)
 
