@@ -19,8 +19,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 comma := ,
 
-demo: $(STAMP) ## a page of the package's policy driving; then train cars on generated roads, and judge them on unseen ones
-	$(BIN)/python -m scenefactory_jax view run=town out=runs/town.html
+demo: $(STAMP) ## a page of a policy of the package that drives among traffic; then train cars on generated roads, and judge them on unseen ones
+	$(BIN)/python -m scenefactory_jax view run=drive overrides='[traffic=idm]' out=runs/drive.html
 	$(BIN)/python -m scenefactory_jax train experiment=demo
 
 test: $(STAMP) ## the fast tests

@@ -26,15 +26,17 @@ from scenefactory_jax.evaluation import statistics
 from scenefactory_jax.evaluation.records import read_folder, select_rows
 
 HERE = Path(__file__).parent
-SUITES = ("route100", "conflict", "conflict_reactive")
+SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive")
 SAME_AGENTS = ("conflict_reactive", "grip_hidden")  # as another suite
 MU = [1.0, 0.6, 0.3, 0.15]  # friction coefficients of the suite grip
-PLANNERS = {
-    "pure pursuit of the goal": ["policy=pure_pursuit"],
-    "pure pursuit of the route": ["policy=route_pursuit"],
-    "IDM on the route": ["policy=idm_route"],
-}
 RECORDED = "recorded drivers"
+PLANNERS = {  # name -> overrides of the run `town`, whose policy none of them asks
+    "pure pursuit of the goal": ["observations=drive", "policy=pure_pursuit"],
+    "pure pursuit of the route": ["observations=drive", "policy=route_pursuit"],
+    "IDM on the route": ["observations=drive", "policy=idm_route"],
+    RECORDED: ["dynamics=log_playback"],
+}
+DRIVEN = ("recorded_routes", "conflict")  # have recorded drivers: drawn routes have none, and reacting traffic has no log to follow
 METRICS = (
     "clean_completion_rate", "route_completion", "success_rate", "collision_rate", "collisions_per_100_km", "road_edge_rate",
     "red_light_rate", "stop_sign_rate", "off_route_rate",
@@ -60,7 +62,7 @@ def list_agents(scenes: str, suite: str, workers: int) -> list[dict[str, Any]]:
 
 def judge(scenes: str, protocol: str, overrides: list[str], workers: int, mu: float | None) -> dict[str, dict[str, Any]]:
     """Evaluates a planner under a protocol: "" -> metric -> value, low, high, number of agents; and by u for agents that have one."""
-    words = ",".join(["observations=drive", f"scenes.workers={workers}", *overrides])
+    words = ",".join([f"scenes.workers={workers}", *overrides])
     quiet = ["video.enable=false", "failures.pictures.enable=false"]
     with tempfile.TemporaryDirectory() as folder:
         if scenes == "town":  # the run's own held-out scenes
@@ -130,7 +132,7 @@ def main() -> None:
     parser.add_argument("--scenes", required=True)
     parser.add_argument("--name", required=True)
     parser.add_argument("--protocols", nargs="*", default=list(SUITES))
-    parser.add_argument("--planners", nargs="*", default=[*PLANNERS, RECORDED])
+    parser.add_argument("--planners", nargs="*", default=list(PLANNERS))
     parser.add_argument("--mu", nargs="*", type=float, default=MU, help="of the suite grip")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=HERE)
@@ -144,11 +146,10 @@ def main() -> None:
             agent_table.write(given.out / f"agents-{suite}-{given.name}.csv", rows)
             result["lists"][suite] = summarise_lists(rows)
         for planner, mu in itertools.product(given.planners, given.mu if suite.startswith("grip") else [None]):
-            if planner == RECORDED and suite != "conflict":  # drawn routes have no driver, and reacting traffic no log to follow
+            if planner == RECORDED and suite not in DRIVEN:
                 continue
-            overrides = ["dynamics=log_playback"] if planner == RECORDED else PLANNERS[planner]
             row = suite if mu is None else f"{suite}, mu {mu:g}"
-            for part, found in judge(given.scenes, suite, overrides, given.workers, mu).items():
+            for part, found in judge(given.scenes, suite, PLANNERS[planner], given.workers, mu).items():
                 result["rows"].setdefault(row, {})[f"{planner}{part}"] = found
             result_file.write(path, result, digits=5)
         result_file.write(path, result, digits=5)

@@ -320,7 +320,7 @@ def spoil(folder, tmp_path, change):
 
 
 def test_what_it_cannot_drive_with_is_refused_by_name(folder, tmp_path):
-    with pytest.raises(ConfigError, match=r"^traffic\.run: config\.yaml not found in None; .*a bundled policy: town"):
+    with pytest.raises(ConfigError, match=r"^traffic\.run: config\.yaml not found in None; .*a bundled policy: drive, town"):
         make(None)
     with pytest.raises(ConfigError, match=r"^traffic\.run: config\.yaml not found in elsewhere"):
         traffic.make(entry_of("elsewhere"), **CONTEXT)
