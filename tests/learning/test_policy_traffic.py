@@ -285,7 +285,7 @@ def test_worlds_without_traffic_are_sound(tiny):
 
 def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder, alone):
     entry = load_config("task", "traffic=mixed")["traffic"]
-    assert entry["parts"]["policy"]["weight"] is None and entry["parts"]["policy"]["run"] is None
+    assert entry["parts"]["policy"]["weight"] is None
     scene, step = street(), jnp.int32(0)
     state = jax.eval_shape(lambda: traffic.make(entry, **CONTEXT).init(jax.random.key(0), scene, step))
     assert len(state.states) == 3, "left out"

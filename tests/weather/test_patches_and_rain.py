@@ -310,8 +310,10 @@ def test_every_option_samples_the_weather_of_an_episode(option):
     later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(first)
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
     assert {"drying": (moved < 0).all(), "onset": (moved > 0).all(), "storm": (moved != 0).any()}.get(option, not moved.any())
-    assert count == {"ice": 6, "puddles": 10, "split": 8, "storm": 10}.get(option, 0)
-    if count:  # every reset samples anew
+    assert count == {"ice": 6, "puddles": 10, "split": 8, "storm": 10, "grip": 1}.get(option, 0)
+    if option == "grip":
+        assert not first.patches.present.any(), "an agent without a route has no strip"
+    elif count:  # every reset samples anew
         assert len(np.unique(first.patches.vertices[:, 0, 0, 0])) == 6
         assert 0 < first.patches.present.mean() < 1
 
@@ -392,7 +394,7 @@ def test_the_report_says_how_the_film_changed():
         ("weather.patches.ice.scatter_m=-1.0", r"weather\.patches\.ice\.scatter_m: expected a number >= 0, got -1\.0"),
         ("weather.patches.ice.count=many", r"weather\.patches\.ice\.count: expected an integer >= 0, got 'many'"),
         ("weather.patches=wet", r"weather\.patches: expected a mapping or null, got 'wet'"),
-        ("+weather.rian=3", r"weather\.rian: unknown key; valid: friction, patches, rain, sampler"),
+        ("+weather.rian=3", r"weather\.rian: unknown key; valid: friction, hidden, patches, rain, sampler"),
         ("weather.rain={_target_: flood}", r"weather\.rain\._target_: 'flood' is not in .*valid: advance_rain, drying, onset, schedule"),
         ("weather.rain={_target_: drying, tau_s: [-1.0, 2.0], knots: 8}", r"weather\.rain\.tau_s: expected .*>= 0"),
         ("weather.rain={_target_: drying, tau_s: [1.0, 2.0], knots: 1}", r"weather\.rain\.knots: expected an integer >= 2, got 1"),
