@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Fraction, NonNegative, Positive, read_value
 from scenefactory_jax.core.types import RewardInput
@@ -54,7 +55,7 @@ def stop_line_speed(step: RewardInput, *, braking_mps2: Positive, limit_mps: Pos
     lines = route_following.find_stop_lines(step.scene, state.agents, state.route.arc, state.step.astype(jnp.float32) * control_dt)
     demands = (lines.red | (lines.stop_sign & ~state.route.stood[:, None])) & (lines.distance > 0)
     room = jnp.min(jnp.where(demands, lines.distance, jnp.inf), axis=1, initial=jnp.inf)
-    excess = jnp.linalg.norm(state.motion.velocity[:, :2], axis=1) - jnp.sqrt(2.0 * braking_mps2 * room)
+    excess = safe_norm(state.motion.velocity[:, :2]) - jnp.sqrt(2.0 * braking_mps2 * room)
     return jnp.where(route_following.find_routed(step.scene, state.agents), jnp.clip(excess / limit_mps, 0.0, 1.0), 0.0)
 
 

@@ -21,7 +21,7 @@ from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative
-from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Observation, RoadUser, Scene, State, Traffic
+from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Env, Observation, RoadUser, Scene, State, Traffic
 from scenefactory_jax.env import environment, history, observations, route_following, spawning, step_metrics, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
@@ -86,7 +86,8 @@ def policy_traffic(
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
     trained = _load(run)
     parts = make_parts(trained, car, ending=ending, **context)
-    act, masses = make_actor(trained, parts, sample=sample), make_masses(mass_kg)
+    env, masses = environment.assemble(parts), make_masses(mass_kg)
+    act = make_actor(trained, env, sample=sample)
     numbers = {"parked_m": parked_m, "gap_s": gap_s, "start_row": start_row, "elevation_m": elevation_m, "control_dt": control_dt}
     read_logged = functools.partial(read_log, kinds=kinds, masses=masses, **numbers)
 
@@ -96,7 +97,7 @@ def policy_traffic(
         row = start_row + jnp.round(step * (control_dt / scene.log.dt)).astype(jnp.int32)
         row = jnp.minimum(row, scene.traffic_log.valid.shape[1] - 1)
         chosen = find_drivers(scene, row, parked_m=parked_m) & ("vehicle" in kinds)
-        return init(trained, parts, key, scene, read_logged(scene, step), chosen, step, row, slots=slots)
+        return init(trained, env, key, scene, read_logged(scene, step), chosen, step, row, slots=slots)
 
     def move(scene: Scene, state: Any, cars: Boxes, step: Int[Array, ""]) -> Any:
         if _is_empty(scene):
@@ -104,7 +105,7 @@ def policy_traffic(
         state, boxes, cars = jax.lax.stop_gradient((state, read(scene, state, step), cars))
         row = start_row + (step + 1) * (control_dt / scene.log.dt)
         enters = find_entering(state, _join(boxes, cars), row, clearance_m=clearance_m)
-        return advance(parts, act, scene, state, boxes, cars, enters, restarts=at_end == "restart")
+        return advance(parts, env, act, scene, state, boxes, cars, enters, restarts=at_end == "restart")
 
     def read(scene: Scene, state: Any, step: Int[Array, ""]) -> Boxes:
         logged = read_logged(scene, step)
@@ -172,12 +173,12 @@ def make_parts(trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[Event
     )
 
 
-def make_actor(trained: TrainedPolicy, parts: EnvParts, *, sample: bool) -> Actor:
+def make_actor(trained: TrainedPolicy, env: Env, *, sample: bool) -> Actor:
     """Makes the function that gives the vehicles' actions, and zeros where none is due.
 
     The worlds of a batch act together: where none of them is due, nothing is observed and the network is not computed.
     """
-    env, policy = environment.assemble(parts), trained.policy
+    policy = trained.policy
 
     def compute(scene: Scene, world: State, key: PRNGKeyArray) -> Float[Array, "V 3"]:
         mean, log_std, _ = policy.apply(trained.parameters, env.observe(scene, world))
@@ -252,7 +253,7 @@ def make_starts(scene: Scene, index: Int[Array, " V"], row: Int[Array, ""]) -> t
 
 def init(
     trained: TrainedPolicy,
-    parts: EnvParts,
+    env: Env,
     key: PRNGKeyArray,
     scene: Scene,
     logged: Boxes,
@@ -267,7 +268,6 @@ def init(
     Raises:
         ConfigError: a policy whose parameters do not fit what it observes.
     """
-    env = environment.assemble(parts)
     world_key, key = jax.random.split(key)
     index = jnp.argsort(~chosen, stable=True)[:slots].astype(jnp.int32)
     drives = chosen[index]
@@ -300,6 +300,7 @@ def find_entering(state: PolicyTrafficState, boxes: Boxes, row: Float[Array, ""]
 
 def advance(
     parts: EnvParts,
+    env: Env,
     act: Actor,
     scene: Scene,
     state: PolicyTrafficState,
@@ -316,7 +317,7 @@ def advance(
     inner = _make_inner_scene(scene, state, _join(others, cars), world.agents)
     due = world.step % parts.action_repeat == 0
     action = act(due, inner, world, jax.random.fold_in(state.key, world.step))
-    after, result = environment.assemble(parts).control_step(inner, world, action)
+    after, result = env.control_step(inner, world, action)
     ended = state.ended | (result.terminated & ~jnp.bool_(restarts))
     starts = replace(world.agents, present=state.drives)
     after = environment.start_agents(parts, after, starts, parts.dynamics.init(state.key, inner), enters)
