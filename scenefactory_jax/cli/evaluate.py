@@ -13,6 +13,7 @@ from scenefactory_jax.core.config import flatten
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
+from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.learning import checkpoint, policy_io
 from scenefactory_jax.visualization.report import evaluation_files, tables
 from scenefactory_jax.visualization.report.evaluation_files import Result
@@ -54,7 +55,11 @@ def _evaluate(config: Mapping[str, Any], run: Path, out: Path, *, request: Mappi
     filmed_worlds = settings["video"]["worlds"] if settings["video"]["enable"] else 0
     recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds
     terminations = load_terminations(request["protocols"])
-    evaluated = protocols.evaluate_protocols(config, scenes, policies, terminations, settings=settings, recorded_worlds=recorded_worlds)
+    scores = settings.get("protocol", {}).get("scores")
+    evaluated = protocols.evaluate_protocols(
+        config, scenes, policies, terminations, settings=settings, recorded_worlds=recorded_worlds,
+        scores=scores and ScoreSettings(**scores),
+    )  # fmt: skip
     result = evaluation_files.write(
         out, evaluated, config=config, run=run, request=request, settings=settings, versions=run_config.versions(),
         command=format_rerun_command(request, settings),

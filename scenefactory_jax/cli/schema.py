@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
 from scenefactory_jax.core.schema import Bounds, ConfigError, Count, NonNegative, Positive, Seed, check
-from scenefactory_jax.evaluation.settings import Episodes, Failures, Video
+from scenefactory_jax.evaluation.settings import Episodes, Failures, ScoreSettings, Video
 
 Group = dict[str, Any]
 
@@ -55,6 +55,7 @@ class Protocol:
     seed: Seed
     repeats: Count
     mu: Positive | None = None  # friction coefficient of a suite whose settings read it
+    scores: ScoreSettings | None = None  # how episodes are scored; null: they are not
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.core.geometry import wrap_angle
 from scenefactory_jax.core.types import Boxes, TrafficLog
 
+SNAP = 1e-3  # rows; a time this near to a logged row is at it, since float32 times do not meet exactly
+
 
 def find_bracketing_rows(row: Float[Array, ""], valid: Bool[Array, " L"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Finds the valid rows next to a fractional row: the last at or before it (-1: none) and the first after it (L: none)."""
@@ -27,7 +29,7 @@ def interpolate_track(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
     """Computes position, velocity, yaw and yaw rate of a track at a fractional row, linear between valid rows `dt` seconds apart.
 
-    At rest before the first valid row and from the last one on; a track without valid rows stays at its first row, at rest.
+    At rest before the first valid row and behind the last one; a track without valid rows stays at its first row, at rest.
     """
     length = valid.shape[0]
     before, after = find_bracketing_rows(row, valid)
@@ -40,7 +42,8 @@ def interpolate_track(
     moved = position[before_row] + fraction * (position[after_row] - position[before_row])
     speed = velocity[before_row] + fraction * (velocity[after_row] - velocity[before_row])
     yaw_rate = turn / (jnp.maximum(gap, 1.0) * dt)
-    return moved, jnp.where(moving, speed, 0.0), wrap_angle(yaw[before_row] + fraction * turn), jnp.where(moving, yaw_rate, 0.0)
+    at_row = (before >= 0) & (row - before_row < SNAP)  # the last valid row has its logged velocity
+    return moved, jnp.where(moving | at_row, speed, 0.0), wrap_angle(yaw[before_row] + fraction * turn), jnp.where(moving, yaw_rate, 0.0)
 
 
 def make_empty_log(steps: int) -> TrafficLog:

@@ -13,15 +13,16 @@ from scenefactory_jax.core.types import SURFACES, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
-from scenefactory_jax.evaluation import episodes, failures, route_signals
+from scenefactory_jax.evaluation import episodes, failures, route_signals, scoring
 from scenefactory_jax.evaluation.failure_signals import FAILURE_EVENTS, Moment, SignalThresholds
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.evaluation.route_signals import CourseThresholds
+from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.learning.training_loop import make_policy
 
 
 class Recording(NamedTuple):
-    """The first worlds of an evaluation, on the host: 33 bytes a slot and step, 21 bytes a road user of the traffic and step."""
+    """The first worlds of an evaluation, on the host: 41 bytes a slot and step, 29 bytes a road user of the traffic and step."""
 
     batch: Scene  # of all worlds, on the device
     frames: episodes.EpisodeFrame  # numpy, [W, T, ...]
@@ -33,7 +34,12 @@ class Recording(NamedTuple):
 
 
 def make_episode_runner(
-    config: Mapping[str, Any], scenes: scene_source.Scenes, *, settings: Mapping[str, Any], worlds: int | None
+    config: Mapping[str, Any],
+    scenes: scene_source.Scenes,
+    *,
+    settings: Mapping[str, Any],
+    worlds: int | None,
+    scores: ScoreSettings | None = None,
 ) -> Callable[[Any], tuple[dict[str, np.ndarray], Recording | None]]:
     """Returns a function parameters -> (records, recording) that runs one deterministic episode for every scene and repeat.
 
@@ -42,6 +48,7 @@ def make_episode_runner(
     Args:
         config: its group `termination` is the protocol.
         worlds: how many of the worlds to record; None: all.
+        scores: how episodes are scored; None: they are not.
     """
     spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
     env, policy = environment.make_env({**config, "spawning": spawning}), make_policy(config)
@@ -55,6 +62,8 @@ def make_episode_runner(
     thresholds = settings["failures"]
     limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
     hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
+    score = None if scores is None else scoring.make_scorer(scores, control_dt=1 / control_hz)
+    recorded_worlds = worlds if score is None else len(index)
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -69,26 +78,33 @@ def make_episode_runner(
 
     def run_chunks(parameters, batch, episode):
         episode, frames = jax.vmap(run_chunk, in_axes=(None, 0, 0))(parameters, batch, episode)
-        return episode, jax.tree.map(lambda leaf: leaf[:worlds], frames)
+        return episode, jax.tree.map(lambda leaf: leaf[:recorded_worlds], frames)
 
     run_chunks = jax.jit(run_chunks, donate_argnums=2)
 
     def run(parameters):
         episode = start(keys, batch)
-        first, distance = jax.device_get((episode.state, episode.carry.goal_distance))
+        traffic = jax.vmap(env.current_scene)(batch, episode.state).traffic if score else None
+        first, distance, traffic = jax.device_get((episode.state, episode.carry.goal_distance, traffic))
         frames = []
         for _ in range(0, limit, chunk):
             episode, chunk_frames = run_chunks(parameters, batch, episode)
-            if worlds:
+            if recorded_worlds:
                 frames.append(jax.device_get(chunk_frames))
             if bool(episode.world_done.all()):
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
         records = _make_all_columns(metrics, first, state, distance, names, settings=settings, control_hz=control_hz)
         records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
-        if not worlds:
+        if not recorded_worlds:
             return records, None
         recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
+        if score:
+            values = score(batch, scoring.Start(first.agents, first.motion, traffic), recorded)
+            records |= {name: column[records["world"], records["agent"]] for name, column in values.items()}
+        if not worlds:
+            return records, None
+        recorded = jax.tree.map(lambda leaf: leaf[:worlds], recorded)
         goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
         return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m)
 
@@ -190,7 +206,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
         scene=replace(scene, weather=weather),
         position=frames.position,
         yaw=frames.yaw,
-        speed=frames.speed,
+        speed=np.linalg.norm(frames.velocity, axis=-1),
         active=frames.active,
         events=vars(frames.events),
         size=agents.size,

@@ -42,17 +42,19 @@ class TrafficFrame:
 
     position: Float[Array, "O 2"]
     yaw: Float[Array, " O"]
+    velocity: Float[Array, "O 2"]
     size: Float[Array, "O 2"]
     present: Bool[Array, " O"]
 
 
 @pytree_dataclass
 class EpisodeFrame:
-    """The agents in one control step, for pictures from above."""
+    """The agents after one control step, for scores and for pictures from above."""
 
     position: Float[Array, "A 2"]
     yaw: Float[Array, " A"]
-    speed: Float[Array, " A"]
+    velocity: Float[Array, "A 2"]
+    friction_utilization: Float[Array, " A"]
     active: Bool[Array, " A"]
     goal: Float[Array, "A 2"]
     events: Events
@@ -92,9 +94,17 @@ def make_hook(
         signals = update_signals(metrics.signals, metrics.past_events, lanes, boxes, before, state, result.metrics, thresholds)
         numbers = {"course": course, "control_dt": control_dt}
         route = route_signals.update_signals(metrics.route, before, state, result.metrics, **numbers)
-        position, speed = state.motion.position[:, :2], jnp.linalg.norm(state.motion.velocity[:, :2], axis=1)
-        traffic = TrafficFrame(boxes.position, boxes.yaw, boxes.size, boxes.present)
-        frame = EpisodeFrame(position, state.motion.yaw, speed, before.active, state.agents.goal, result.events, traffic)
+        traffic = TrafficFrame(boxes.position, boxes.yaw, boxes.velocity, boxes.size, boxes.present)
+        frame = EpisodeFrame(
+            position=state.motion.position[:, :2],
+            yaw=state.motion.yaw,
+            velocity=state.motion.velocity[:, :2],
+            friction_utilization=result.metrics.friction_utilization,
+            active=before.active,
+            goal=state.agents.goal,
+            events=result.events,
+            traffic=traffic,
+        )
         return _update(metrics, step, signals, route, ttc_limit_s=ttc_limit_s), frame
 
     return hook

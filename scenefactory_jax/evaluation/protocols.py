@@ -10,6 +10,7 @@ import numpy as np
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import episode_records, statistics
 from scenefactory_jax.evaluation.episode_records import Recording, Records
+from scenefactory_jax.evaluation.settings import ScoreSettings
 from scenefactory_jax.loggers import metrics_csv
 
 Evaluator = Callable[[Any], Records]  # parameters -> one row for every agent
@@ -37,6 +38,7 @@ def evaluate_protocols(
     *,
     settings: Mapping[str, Any],
     recorded_worlds: int | None,
+    scores: ScoreSettings | None = None,
 ) -> Iterator[Evaluated]:
     """Evaluates every policy under every protocol; programs compile once a protocol.
 
@@ -46,10 +48,12 @@ def evaluate_protocols(
         terminations: protocol -> config of the group `termination`.
         settings: `seed`, `repeats`, `chunk_steps`, `ttc_limit_s` and `failures`, as `conf/evaluate.yaml` has them.
         recorded_worlds: how many worlds of the first protocol are recorded; None: all worlds of all protocols.
+        scores: how episodes are scored; None: they are not.
     """
     for number, (protocol, termination) in enumerate(terminations.items()):
         worlds = recorded_worlds if number == 0 or recorded_worlds is None else 0
-        run = episode_records.make_episode_runner({**config, "termination": termination}, scenes, settings=settings, worlds=worlds)
+        task = {**config, "termination": termination}
+        run = episode_records.make_episode_runner(task, scenes, settings=settings, worlds=worlds, scores=scores)
         for policy, parameters in policies.items():
             yield Evaluated(protocol, policy, *run(parameters))
 

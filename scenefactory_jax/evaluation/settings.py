@@ -61,3 +61,11 @@ class Episodes:
     chunk_steps: Count
     ttc_limit_s: NonNegative
     bootstrap: Count
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """How episodes are scored (`evaluation.scoring`)."""
+
+    past_rows: Seed  # rows of the log before the start: with scenes.pack.log_from=start
+    ends_at_failure: bool  # only states up to the first overlap, off-road state or red light count, as in V-Max's evaluation

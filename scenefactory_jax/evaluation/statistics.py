@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS, Metric
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.metrics.metric import Metric
 from scenefactory_jax.evaluation.records import Records, RecordsError, check_records, select_rows
 
 Runs = Mapping[int, Records]  # seed of training -> records
@@ -142,7 +143,7 @@ def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[s
         estimates[name] = _make_estimate(
             metric, values[m], float((table.counts[:, :, m] > 0).sum()), interval if _varies(interval) else None, agents, WILSON, score
         )
-    return _without_unused_routes(estimates)
+    return _without_uncounted(estimates)
 
 
 def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
@@ -164,12 +165,12 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
         rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
         score = lambda rates=rates: newcombe(*rates)  # noqa: E731
         estimates[name] = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
-    return _without_unused_routes(estimates)
+    return _without_uncounted(estimates)
 
 
-def _without_unused_routes(estimates: dict[str, Estimate]) -> dict[str, Estimate]:
-    """The estimates without those of routes that no agent has."""
-    return {name: estimate for name, estimate in estimates.items() if estimate.count or not METRICS[name].routes}
+def _without_uncounted(estimates: dict[str, Estimate]) -> dict[str, Estimate]:
+    """The estimates without those of optional metrics that no agent has."""
+    return {name: estimate for name, estimate in estimates.items() if estimate.count or not METRICS[name].optional}
 
 
 def _make_estimate(

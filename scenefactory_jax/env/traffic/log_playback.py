@@ -17,7 +17,6 @@ from scenefactory_jax.core.types import ROAD_USERS, Boxes, RoadUser, Scene, Traf
 
 Row = Annotated[int, Bounds(min=0)]
 VEHICLE = ROAD_USERS.index("vehicle")
-SNAP = 1e-3  # rows; a control step this near to a logged row is at it, since float32 times do not meet exactly
 
 
 def make_stateless(read: Callable[[Scene, Int[Array, ""]], Boxes]) -> Traffic:
@@ -115,13 +114,13 @@ def read_log(
     """Reads the boxes of logged road users at a control step, see `log_traffic`; `masses` are in the order of ROAD_USERS."""
     log, dt = scene.traffic_log, scene.log.dt
     row = start_row + step.astype(jnp.float32) * (control_dt / dt)
-    row = jnp.where(jnp.abs(row - jnp.round(row)) < SNAP, jnp.round(row), row)
+    row = jnp.where(jnp.abs(row - jnp.round(row)) < track_interpolation.SNAP, jnp.round(row), row)
     before, after = jax.vmap(lambda valid: track_interpolation.find_bracketing_rows(row, valid))(log.valid)
     tracks = (log.position, log.yaw, log.velocity, log.valid)
     position, velocity, yaw, yaw_rate = jax.vmap(lambda *track: track_interpolation.interpolate_track(row, *track, dt=dt))(*tracks)
 
     started, ahead, at_row = before >= 0, after < log.valid.shape[1], before == row
-    bridged = ahead & ((after - before) * dt <= gap_s + SNAP * dt)
+    bridged = ahead & ((after - before) * dt <= gap_s + track_interpolation.SNAP * dt)
     parked = is_parked(log, parked_m)
     logged = jnp.take_along_axis(log.velocity, jnp.maximum(before, 0)[:, None, None], axis=1)[:, 0]
     velocity = jnp.where(at_row[:, None], logged, velocity)  # also at the last row

@@ -1,35 +1,17 @@
 """Metrics of agents: success and event rates, surrogate safety, comfort. Each is a mean of a function of records."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
+from scenefactory_jax.evaluation.metrics import score_metrics
+from scenefactory_jax.evaluation.metrics.metric import FRACTION, Metric
 from scenefactory_jax.evaluation.records import EVENTS, Records
 
 HIGH_DRAC = 3.4  # m/s^2; comfortable deceleration in AASHTO's design guide, and the threshold of the published evaluation
 NEAR_MISS_TTC = 2.0  # s
 MAX_TTC = 10.0  # s
 BEND = 1.05  # length of a route over the straight line to its goal
-FRACTION = "fraction"  # unit of a value in [0, 1], printed in per cent
-
-
-class Metric(NamedTuple):
-    """A mean of `value` over the agents that are `counted`; of each world first, and then over worlds, if `by_world`.
-
-    A `rate` is a mean of Booleans. With a `weight` the metric is the sum of the values over the sum of the weights. A metric of `routes` is
-    left out where no agent has a route.
-    """
-
-    label: str
-    unit: str
-    definition: str
-    value: Callable[[Records], np.ndarray]
-    counted: Callable[[Records], np.ndarray]
-    by_world: bool = False
-    rate: bool = False
-    weight: Callable[[Records], np.ndarray] | None = None
-    routes: bool = False
 
 
 def _spawned(records: Records) -> np.ndarray:
@@ -53,7 +35,7 @@ _has_route = _on_route("has_route")
 
 
 def _rate(label: str, definition: str, value: Callable[[Records], np.ndarray], counted=_spawned, *, by_world: bool = False) -> Metric:
-    return Metric(label, FRACTION, definition, value, counted, by_world, rate=True, routes=counted is _has_route)
+    return Metric(label, FRACTION, definition, value, counted, by_world, rate=True, optional=counted is _has_route)
 
 
 METRICS: dict[str, Metric] = {
@@ -111,10 +93,10 @@ METRICS: dict[str, Metric] = {
         "driving against the lanes for more than a second, of the agents with a route.", _on_route("clean_completion"), _has_route),
     "route_completion": Metric(
         "Route completion", FRACTION, "Part of the route between start and goal that an agent has been on; mean over the agents with a "
-        "route.", _on_route("route_completion"), _has_route, routes=True),
+        "route.", _on_route("route_completion"), _has_route, optional=True),
     "collisions_per_100_km": Metric(
         "Collisions per 100 km", "1/100 km", "Agents with a route that had a collision, over the distance that all agents with a route "
-        "drove.", _column("collision"), _has_route, weight=lambda records: _on_route("driven_m")(records) / 1e5, routes=True),
+        "drove.", _column("collision"), _has_route, weight=lambda records: _on_route("driven_m")(records) / 1e5, optional=True),
     "red_light_rate": _rate(
         "Red lights run", "Agents whose front passed a stop line at a red light, of the agents with a route.", _column("red_light"),
         _has_route),
@@ -124,3 +106,4 @@ METRICS: dict[str, Metric] = {
     "off_route_rate": _rate(
         "Off-route rate", "Agents that left their route, of the agents with a route.", _column("off_route"), _has_route),
 }  # fmt: skip
+METRICS |= score_metrics.METRICS

@@ -69,7 +69,7 @@ def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: 
     counted = record.counted
     largest = lambda values: jnp.max(jnp.where(counted, values, 0))  # noqa: E731
     faults = largest(steps.at_fault)
-    red = _find_red_light_runs(record, steps)
+    red = find_red_light_runs(record, steps)
     ttc = jnp.where(counted, steps.ttc_s, jnp.inf)
     known = jnp.any(jnp.where(counted[:, None], record.lights.state, 0) != 0) & jnp.any(record.paths.valid)
     return {
@@ -84,7 +84,8 @@ def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: 
     }
 
 
-def _find_red_light_runs(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T"]:
+def find_red_light_runs(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T"]:
+    """Finds the states in which the car's front comes onto a lane with a red light."""
     lights = record.lights
     before = jnp.concatenate([steps.front_lane[:1], steps.front_lane[:-1]])
     red = jnp.isin(lights.state, jnp.array(RED_STATES)) & (lights.lane == steps.front_lane[:, None])

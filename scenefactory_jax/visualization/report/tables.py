@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from scenefactory_jax.core import markdown
-from scenefactory_jax.evaluation.metrics.agent_metrics import FRACTION, METRICS
+from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
+from scenefactory_jax.evaluation.metrics.metric import FRACTION
 from scenefactory_jax.evaluation.statistics import AGENTS, NEWCOMBE, WILSON, Estimate
 
 Summary = Mapping[str, Estimate]  # metric -> estimate

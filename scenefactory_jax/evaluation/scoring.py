@@ -1,0 +1,202 @@
+"""Scores recorded episodes: makes the record of every agent's episode from frames, and computes all metrics and scores of it on the device.
+
+States are a tenth of a second apart, as the published metrics want them. The past of an episode comes from the log, where the scene has
+rows of the log before the start (`scenes.pack.log_from: start`); without, an episode begins with the state at its start.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.track_interpolation import interpolate_track
+from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M, AgentLog, Agents, Boxes, Motion, Scene, TrafficLog
+from scenefactory_jax.evaluation.episodes import EpisodeFrame
+from scenefactory_jax.evaluation.metrics import episode_metrics, episode_scores
+from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track
+from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
+from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
+from scenefactory_jax.evaluation.settings import ScoreSettings
+from scenefactory_jax.roadgraph.signed_edge_distance import list_edge_points
+from scenefactory_jax.roadgraph.traffic_lights import read_light_states
+
+STEP_S = 0.1  # between states
+EVEN_S = 1e-3  # by which a time step may differ
+PATHS = 10  # of an agent that are read, its best ones
+WORLDS_AT_ONCE = 4  # on the device; memory grows with them
+
+
+class Start(NamedTuple):
+    """The start of an episode of one world."""
+
+    agents: Agents
+    motion: Motion
+    traffic: Boxes
+
+
+class Users(NamedTuple):
+    """Agents and then background traffic at all states of an episode, and the numbers of them that do not change."""
+
+    position: Float[Array, "B T 2"]
+    yaw: Float[Array, "B T"]
+    velocity: Float[Array, "B T 2"]
+    valid: Bool[Array, "B T"]
+    size: Float[Array, "B 2"]
+    kind: Int[Array, " B"]
+
+
+def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scene, Start, EpisodeFrame], dict[str, np.ndarray]]:
+    """Makes a function (scenes, starts, frames) -> metric -> values `[W, A]`, NaN where a metric cannot be computed.
+
+    All arguments have a leading axis of worlds; frames have the control steps behind it.
+
+    Raises:
+        ConfigError: control steps of which a tenth of a second is no multiple.
+    """
+    stride = round(STEP_S / control_dt)
+    if stride < 1 or abs(stride * control_dt - STEP_S) > 1e-6:
+        raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
+
+    @jax.jit
+    def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> dict[str, Array]:
+        score_one = lambda world: score_world(*world, settings)  # noqa: E731
+        return jax.lax.map(score_one, (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
+
+    def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> dict[str, np.ndarray]:
+        thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
+        worlds = replace(scene, road_grid=None)
+        return jax.device_get(score(worlds, start, thinned, find_speed_limits(scene)))
+
+    return score_all
+
+
+def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the speed limit of each lane segment of batched scenes, from the routes that lead along it: limits and whether one is known."""
+    lane, routes = np.asarray(scene.lanes.polyline), jax.device_get(scene.routes)
+    limit = np.zeros(lane.shape, np.float32)
+    for world in range(len(lane)):
+        known = np.isfinite(routes.speed_limit[world]) & (routes.lane[world] >= 0)
+        lanes, first = np.unique(routes.lane[world][known], return_index=True)
+        if len(lanes):
+            place = np.minimum(np.searchsorted(lanes, lane[world]), len(lanes) - 1)
+            limit[world] = np.where(lanes[place] == lane[world], routes.speed_limit[world][known][first][place], 0.0)
+    return limit, limit > 0
+
+
+def score_world(
+    scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array], settings: ScoreSettings
+) -> dict[str, Float[Array, " A"]]:
+    """Computes the metrics and scores of all agents of one world; NaN where one cannot be computed."""
+    past_rows = settings.past_rows
+    users, log = collect_users(scene, start, frames, past_rows=past_rows), read_log(scene, past_rows, len(frames.active))
+    lanes, edges = list_lane_points(scene, *limits), list_edge_points(scene.edges)
+    time = STEP_S * jnp.arange(-past_rows, len(frames.active) + 1, dtype=jnp.float32)
+    lights = Lights(scene.controls.lane, jax.vmap(lambda at: read_light_states(scene.controls, at))(time))
+    counted = jnp.arange(users.yaw.shape[1]) > past_rows
+    use = jnp.pad(frames.friction_utilization, ((past_rows + 1, 0), (0, 0)))
+
+    def score_agent(agent: Int[Array, ""]) -> dict[str, Array]:
+        others = Others(*users[:3], users.valid & (jnp.arange(len(users.yaw)) != agent)[:, None], *users[4:])
+        record = EpisodeRecord(
+            ego=Track(*(leaf[agent] for leaf in users[:4])),
+            size=users.size[agent],
+            counted=counted & users.valid[agent],
+            others=others,
+            lanes=lanes,
+            edges=edges,
+            paths=list_paths(scene, agent),
+            lights=lights,
+            log=jax.tree.map(lambda leaf: leaf[agent], log),
+            friction_utilization=use[:, agent],
+        )
+        steps = measure_steps(record, dt=STEP_S)
+        record = record._replace(counted=cut_at_failure(record, steps)) if settings.ends_at_failure else record
+        metrics = episode_metrics.collect_metrics(record, steps, dt=STEP_S)
+        values = metrics | episode_scores.compute_scores(metrics)
+        return {name: jnp.where(valid, value, jnp.nan) for name, (value, valid) in values.items()}
+
+    return jax.vmap(score_agent)(jnp.arange(len(start.agents.yaw)))
+
+
+def cut_at_failure(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T"]:
+    """The counted states up to the first with an overlap, beside the road, or in which a red light is run."""
+    failed = jnp.any(steps.touching, axis=1) | steps.off_road | episode_metrics.find_red_light_runs(record, steps)
+    failed = failed & record.counted
+    return record.counted & (jnp.cumsum(failed) - failed == 0)
+
+
+def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows: int) -> Users:
+    """Joins the logged past, the start and the frames of agents and traffic."""
+    motion, boxes, traffic = start.motion, start.traffic, frames.traffic
+    at_start = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], start.agents.present)
+    own = _join(_read_past(scene, scene.log, past_rows), at_start, (frames.position, frames.yaw, frames.velocity, frames.active))
+    follows_log = len(scene.traffic_log.kind) == len(boxes.yaw)  # without traffic there are no boxes
+    past = _read_past(scene, scene.traffic_log if follows_log else None, past_rows, len(boxes.yaw))
+    at_start = (boxes.position, boxes.yaw, boxes.velocity, boxes.present)
+    other = _join(past, at_start, (traffic.position, traffic.yaw, traffic.velocity, traffic.present))
+    kind = scene.traffic_log.kind if follows_log else jnp.zeros(len(boxes.yaw), jnp.int32)
+    columns = [jnp.concatenate(pair) for pair in zip(own, other, strict=True)]
+    size, kinds = jnp.concatenate([start.agents.size, boxes.size]), jnp.concatenate([jnp.zeros(len(motion.yaw), jnp.int32), kind])
+    return Users(columns[0], columns[1], columns[2], columns[3], size, kinds)
+
+
+def _read_past(scene: Scene, log: AgentLog | TrafficLog | None, rows: int, count: int = 0) -> tuple[Array, ...]:
+    """The rows of a log before the start; none of them is valid in a log of other time steps, or without a log."""
+    if log is None:
+        flat, pair = jnp.zeros((count, rows), jnp.float32), jnp.zeros((count, rows, 2), jnp.float32)
+        return pair, flat, pair, flat.astype(bool)
+    even = jnp.abs(scene.log.dt - STEP_S) < EVEN_S
+    return log.position[:, :rows], log.yaw[:, :rows], log.velocity[:, :rows], log.valid[:, :rows] & even
+
+
+def _join(past: tuple[Array, ...], start: tuple[Array, ...], frames: tuple[Array, ...]) -> list[Array]:
+    """Leaves with axes road user and state."""
+    parts = zip(past, start, frames, strict=True)
+    return [jnp.concatenate([before, now[:, None], jnp.swapaxes(after, 0, 1)], axis=1) for before, now, after in parts]
+
+
+def read_log(scene: Scene, past_rows: int, steps: int) -> Track:
+    """Reads the agents' logs at the states of an episode `[A, T]`, linear between rows; not valid behind a log's end and in gaps."""
+    log = scene.log
+    row = past_rows + jnp.arange(-past_rows, steps + 1) * (STEP_S / log.dt)
+    last = log.valid.shape[1] - 1
+    at = lambda *track: jax.vmap(  # noqa: E731
+        lambda r: interpolate_track(r, *track, dt=log.dt)
+    )(row)
+    position, velocity, yaw, _ = jax.vmap(at)(log.position, log.yaw, log.velocity, log.valid)
+    near = jnp.clip(jnp.round(row).astype(jnp.int32), 0, last)
+    return Track(position, yaw, velocity, log.valid[:, near] & (row <= last + EVEN_S))
+
+
+def list_lane_points(scene: Scene, limit: Float[Array, " P"], has_limit: Bool[Array, " P"]) -> Lanes:
+    """Lists the first points of the segments of driving lanes. No source of scenes says which lanes lie in intersections: none does."""
+    lanes = scene.lanes
+    return Lanes(
+        position=lanes.midpoint - lanes.half_length[:, None] * lanes.direction,
+        direction=lanes.direction,
+        lane=lanes.polyline,
+        kind=lanes.kind,
+        in_intersection=jnp.zeros_like(lanes.valid),
+        speed_limit=limit,
+        has_limit=has_limit,
+        valid=lanes.valid & jnp.isin(lanes.kind, jnp.array(DRIVABLE)),
+    )
+
+
+def list_paths(scene: Scene, agent: Int[Array, ""]) -> Paths:
+    """Lists the first PATHS routes of an agent."""
+    routes = scene.routes
+    count = min(PATHS, routes.length.shape[0])
+    own = (routes.agent == agent) & (routes.length > 0) & ~routes.drawn
+    rows = jnp.argsort(~own, stable=True)[:count]
+    if count == 0:
+        none = jnp.zeros((1, 1), bool)
+        return Paths(jnp.zeros((1, 1, 2)), none, jnp.zeros((1, 1)), jnp.zeros((1, 1), jnp.int32), jnp.zeros(1, bool))
+    arc = jnp.broadcast_to(ROUTE_SPACING_M * jnp.arange(routes.lane.shape[1], dtype=jnp.float32), routes.lane[rows].shape)
+    valid = own[rows][:, None] & (arc <= routes.length[rows][:, None])
+    return Paths(routes.position[rows], valid, arc, routes.lane[rows], routes.on_route[rows])
