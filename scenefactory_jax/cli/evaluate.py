@@ -1,8 +1,11 @@
 """`evaluate`: the policy of a run on held-out scenes: tables of agents, estimates with intervals, a report and a video."""
 
+import functools
+import itertools
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from scenefactory_jax.cli import hydra_config as configs
@@ -10,6 +13,7 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
+from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
@@ -35,7 +39,19 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     request = {name: config[name] for name in ("overrides", "trust")} | {"run": str(config["run"]), "scenes": config["scenes"]["path"]}
     request |= {"protocol": protocol["name"], "protocols": protocol["termination"]}
-    return _evaluate(trained, run, out, request=request, settings=config)
+    return _evaluate(trained, run, out, request=request, settings=config, planners=_apply_planners(trained, config))
+
+
+def _apply_planners(trained: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Returns the run's config with each of the planners in place of its policy."""
+    known, scores = settings["planner_overrides"], settings["protocol"]["scores"] or {}
+    configs_by_name = {}
+    for name in settings["planners"]:
+        if name not in known:
+            raise ConfigError(f"planners: expected names of {', '.join(known)}, got {name!r}")
+        words = [word.replace("PAST_ROWS", str(scores.get("past_rows", 0))) for word in known[name]]
+        configs_by_name[name] = configs.apply_overrides(trained, words)
+    return configs_by_name
 
 
 def evaluate_run(config: Mapping[str, Any], folder: Path) -> Result:
@@ -46,7 +62,15 @@ def evaluate_run(config: Mapping[str, Any], folder: Path) -> Result:
     return _evaluate(config, folder, folder, request=request, settings=settings)
 
 
-def _evaluate(config: Mapping[str, Any], run: Path, out: Path, *, request: Mapping[str, Any], settings: Mapping[str, Any]) -> Result:
+def _evaluate(
+    config: Mapping[str, Any],
+    run: Path,
+    out: Path,
+    *,
+    request: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    planners: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+) -> Result:
     scenes = scene_source.load_heldout_scenes(config["scenes"], path=request["scenes"])
     print(scenes.account, flush=True)
     policies = {"trained": checkpoint.restore_parameters(run / "checkpoints")}
@@ -56,10 +80,13 @@ def _evaluate(config: Mapping[str, Any], run: Path, out: Path, *, request: Mappi
     recorded_worlds = None if settings["failures"]["pictures"]["enable"] else filmed_worlds
     terminations = load_terminations(request["protocols"])
     scores = settings.get("protocol", {}).get("scores")
-    evaluated = protocols.evaluate_protocols(
-        config, scenes, policies, terminations, settings=settings, recorded_worlds=recorded_worlds,
-        scores=scores and ScoreSettings(**scores),
-    )  # fmt: skip
+    scores = scores and ScoreSettings(**scores)
+    same = {"scenes": scenes, "terminations": terminations, "settings": settings, "scores": scores}
+    run_protocols = functools.partial(protocols.evaluate_protocols, **same)
+    evaluated = itertools.chain(
+        run_protocols(config, policies=policies, recorded_worlds=recorded_worlds),
+        *(run_protocols(task, policies={name: {}}, recorded_worlds=0) for name, task in planners.items()),
+    )
     result = evaluation_files.write(
         out, evaluated, config=config, run=run, request=request, settings=settings, versions=run_config.versions(),
         command=format_rerun_command(request, settings),

@@ -74,6 +74,8 @@ class Evaluate(Episodes):
     out: str | None
     overrides: list[str]
     untrained: bool
+    planners: list[str]
+    planner_overrides: dict[str, list[str]]
     protocol: Protocol
     scenes: Scenes
     video: Video

@@ -113,4 +113,4 @@ def read_settings(folder: Path) -> dict[str, Any]:
 def read_folder(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     """Reads the records of the trained policy from an evaluation's folder, by protocol; empty: it has none."""
     files = {path.stem.removeprefix("agents-"): path for path in sorted(folder.glob("agents-*.csv"))}
-    return {name: read_records(path) for name, path in files.items() if not name.endswith("-untrained")}
+    return {name: read_records(path) for name, path in files.items() if "-" not in name}  # others: PROTOCOL-POLICY

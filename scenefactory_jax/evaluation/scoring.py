@@ -4,6 +4,7 @@ States are a tenth of a second apart, as the published metrics want them. The pa
 rows of the log before the start (`scenes.pack.log_from: start`); without, an episode begins with the state at its start.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -64,8 +65,8 @@ def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scen
 
     @jax.jit
     def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> dict[str, Array]:
-        score_one = lambda world: score_world(*world, settings)  # noqa: E731
-        return jax.lax.map(score_one, (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
+        score_one = functools.partial(score_world, settings=settings)
+        return jax.lax.map(lambda world: score_one(*world), (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
 
     def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> dict[str, np.ndarray]:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
@@ -89,7 +90,7 @@ def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def score_world(
-    scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array], settings: ScoreSettings
+    scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array], *, settings: ScoreSettings
 ) -> dict[str, Float[Array, " A"]]:
     """Computes the metrics and scores of all agents of one world; NaN where one cannot be computed."""
     past_rows = settings.past_rows

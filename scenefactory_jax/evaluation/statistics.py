@@ -6,7 +6,7 @@ resample draws seeds with replacement, scenes with replacement (the same for all
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +15,7 @@ from scenefactory_jax.evaluation.metrics.agent_metrics import METRICS
 from scenefactory_jax.evaluation.metrics.metric import Metric
 from scenefactory_jax.evaluation.records import Records, RecordsError, check_records, select_rows
 
+Key = TypeVar("Key")
 Runs = Mapping[int, Records]  # seed of training -> records
 CHUNK = 2_000_000  # numbers of one chunk of resamples
 SCENES, LEVELS = "scene bootstrap", "seed, scene and agent bootstrap"  # methods of intervals
@@ -25,7 +26,8 @@ class Estimate(NamedTuple):
     """A number with its 95 % interval.
 
     `value` is None when no agent counts, `low` and `high` are None when nothing varies. `count` is the number of agents that count,
-    `method` the method of the interval.
+    `method` the method of the interval. `p` is the probability of a difference as large by chance; None where it is no difference or
+    its resamples do not vary.
     """
 
     value: float | None
@@ -34,6 +36,7 @@ class Estimate(NamedTuple):
     count: int
     unit: str
     method: str
+    p: float | None = None
 
 
 class Table(NamedTuple):
@@ -131,6 +134,23 @@ def newcombe(before: tuple[float, int], after: tuple[float, int]) -> tuple[float
     return float(low), float(high)
 
 
+def compute_p(draws: Float[np.ndarray, " B"]) -> float:
+    """Computes the two-sided probability that a difference is 0 or of the other sign, from its bootstrap resamples; at least 2 / (B + 1)
+    (Davison and Hinkley 1997, section 4.2)."""
+    finite = draws[np.isfinite(draws)]
+    beyond = min(np.sum(finite <= 0), np.sum(finite >= 0))
+    return float(min(1.0, 2.0 * (1 + beyond) / (len(finite) + 1)))
+
+
+def adjust_holm(probabilities: Mapping[Key, float]) -> dict[Key, float]:
+    """Adjusts probabilities for that many comparisons: one below 0.05 is a finding at 5 % for all of them together (Holm 1979)."""
+    adjusted, largest = {}, 0.0
+    for rank, (key, p) in enumerate(sorted(probabilities.items(), key=lambda item: item[1])):
+        largest = max(largest, min(1.0, (len(probabilities) - rank) * p))
+        adjusted[key] = largest
+    return adjusted
+
+
 def _summarise(runs: Runs, *, agents: bool, bootstrap: int, seed: int) -> dict[str, Estimate]:
     (table,) = _tabulate([runs])
     values = _ratios(table, *_ones(table))[0]
@@ -164,7 +184,8 @@ def _difference(before: Runs, after: Runs, *, agents: bool, bootstrap: int, seed
             interval = None
         rates = [(float(rate[m]), _count_agents(table, m)) for rate, table in zip((old, new), tables, strict=True)]
         score = lambda rates=rates: newcombe(*rates)  # noqa: E731
-        estimates[name] = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
+        estimate = _make_estimate(metric, new[m] - old[m], count, interval, agents, NEWCOMBE, score)
+        estimates[name] = estimate._replace(p=compute_p(draws[:, m]) if estimate.method in (LEVELS, SCENES) else None)
     return _without_uncounted(estimates)
 
 

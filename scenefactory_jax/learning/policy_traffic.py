@@ -21,12 +21,13 @@ from scenefactory_jax.core.geometry import safe_norm
 from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError, Count, NonNegative
+from scenefactory_jax.core.track_interpolation import SNAP
 from scenefactory_jax.core.types import AgentLog, Agents, Boxes, Dynamics, Env, Observation, RoadUser, Scene, State, Traffic
 from scenefactory_jax.env import environment, history, observations, route_following, spawning, step_metrics, termination
 from scenefactory_jax.env.environment import EnvParts
 from scenefactory_jax.env.termination import EventName, Termination
 from scenefactory_jax.env.traffic.idm import SIDE_M
-from scenefactory_jax.env.traffic.log_playback import SNAP, VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
+from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, is_parked, make_masses, make_stateless, read_log
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.policy_io import TrainedPolicy

@@ -11,7 +11,7 @@ from scenefactory_jax.core.config import flatten
 from scenefactory_jax.evaluation import failures, statistics
 from scenefactory_jax.evaluation.records import Records
 from scenefactory_jax.visualization.birds_eye.drawing import MARKS
-from scenefactory_jax.visualization.report import document, tables
+from scenefactory_jax.visualization.report import document, policy_comparison, tables
 from scenefactory_jax.visualization.report.tables import Summary, format_estimate
 
 BREAKDOWNS = ("surface", "film_mm")  # columns of records
@@ -49,15 +49,17 @@ def write(
         failure_pictures: name of records -> failure type -> picture of the worst; "film" -> their video.
     """
     resampling = {"bootstrap": settings["bootstrap"], "seed": settings["seed"]}
-    trained = {name: rows for name, rows in records.items() if not name.endswith(UNTRAINED)}
+    others = {name: rows for name, rows in records.items() if ", " in name and not name.endswith(UNTRAINED)}  # planners
+    trained = {name: rows for name, rows in records.items() if ", " not in name}
     first, thresholds = next(iter(trained)), failures.list_thresholds(settings["failures"])
     return document.write(
         folder / "report.md",
         f"# {title}",
         _headline(first, summary[first], records[first]),
         document.section("Episodes", markdown.format_table(["", ""], list(episodes.items())) if episodes else ""),
-        document.section("Results", *_results({name: summary[name] for name in trained}, trained)),
+        document.section("Results", *_results({name: summary[name] for name in trained | others}, trained | others)),
         document.section("Comparison", *(_compare(name, summary, records, resampling) for name in trained if name + UNTRAINED in records)),
+        document.section("Against planners", *policy_comparison.compare_policies(records, [*others], resampling)),
         document.section("Video", *(document.picture(folder, path, caption) for caption, path in videos.items())),
         document.section("By condition", *_break_down(first, records[first], resampling)),
         document.section(
