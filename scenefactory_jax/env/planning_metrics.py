@@ -1,10 +1,12 @@
 """Step metrics of V-Max (arXiv:2503.08388) that rewards need, too: time to overlap, comfort, distance to routes."""
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from scenefactory_jax.core import savitzky_golay
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.types import Scene
@@ -20,9 +22,25 @@ def find_ahead(
     position: Float[Array, "*a 2"], yaw: Float[Array, "*b"], length: Float[Array, "*c"], other_position: Float[Array, "*d 2"]
 ) -> Bool[Array, "*k"]:
     """Finds the others whose centres bear less than 30 degrees from the heading, seen from the rear axle; leading axes broadcast."""
+    along, distance = _measure_bearings(position, yaw, length, other_position)
+    return along > AHEAD_COSINE * distance
+
+
+def find_behind(
+    position: Float[Array, "*a 2"], yaw: Float[Array, "*b"], length: Float[Array, "*c"], other_position: Float[Array, "*d 2"]
+) -> Bool[Array, "*k"]:
+    """Finds the others whose centres bear more than 150 degrees from the heading, seen from the rear axle; leading axes broadcast."""
+    along, distance = _measure_bearings(position, yaw, length, other_position)
+    return along < -AHEAD_COSINE * distance
+
+
+def _measure_bearings(
+    position: Float[Array, "*a 2"], yaw: Float[Array, "*b"], length: Float[Array, "*c"], other_position: Float[Array, "*d 2"]
+) -> tuple[Float[Array, "*k"], Float[Array, "*k"]]:
+    """Distances of others from the rear axle, along the heading and in all."""
     facing = heading_vector(yaw)
     bearing = other_position - (position - (AXLE * length)[..., None] * facing)
-    return dot(bearing, facing) > AHEAD_COSINE * safe_norm(bearing)
+    return dot(bearing, facing), safe_norm(bearing)
 
 
 def compute_time_to_overlap(
@@ -37,10 +55,16 @@ def compute_time_to_overlap(
     present: Bool[Array, "A B"],
     *,
     horizon_s: float,
+    everywhere: bool = False,
 ) -> Float[Array, " A"]:
     """Computes the time to collision of V-Max: the first multiple of PREDICTION_STEP_S at which the rectangles of a car and of one ahead of
-    it overlap, at constant velocities and headings; 0 in an overlap, `horizon_s` without one before it."""
-    present = present & find_ahead(position[:, None], yaw[:, None], size[:, None, 0], other_position)
+    it overlap, at constant velocities and headings; 0 in an overlap, `horizon_s` without one before it.
+
+    Args:
+        everywhere: all that are present count, not only those ahead.
+    """
+    if not everywhere:
+        present = present & find_ahead(position[:, None], yaw[:, None], size[:, None, 0], other_position)
     apart, closing = other_position - position[:, None], other_velocity - velocity[:, None]
     time = PREDICTION_STEP_S * jnp.arange(round(horizon_s / PREDICTION_STEP_S), dtype=jnp.float32)[:, None, None]
     place = apart + time[..., None] * closing  # [T, A, B, 2], in one loop with the minimum over it
@@ -62,28 +86,25 @@ class ComfortParts(NamedTuple):
 def compute_comfort_parts(velocity: Float[Array, "*a K 2"], yaw: Float[Array, "*a K"], *, dt: float) -> ComfortParts:
     """Computes the comfort parts of a window of states, the oldest first, by Savitzky-Golay filters of width 5.
 
-    Derivatives are those of the velocity in the frame of each state, and of the yaw.
+    Derivatives are those of the velocity in the frame of each state, and of the yaw. The published values towards the ends of the window
+    repeat the first and last of those inside and change no extreme.
     """
+    slope = functools.partial(savitzky_golay.filter_inside, width=5, order=2, derivative=1, dt=dt)
+    bend = functools.partial(savitzky_golay.filter_inside, width=5, order=3, derivative=2, dt=dt)
     turn = wrap_angle(jnp.diff(yaw, axis=-1))
     unwrapped = jnp.concatenate([jnp.zeros_like(yaw[..., :1]), jnp.cumsum(turn, axis=-1)], axis=-1)
     local = to_frame(velocity, yaw)
     along, across = local[..., 0], local[..., 1]
-    acceleration = _filter(along, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)
+    acceleration = slope(along)
     largest = lambda values: jnp.max(jnp.abs(values), axis=-1)  # noqa: E731
     return ComfortParts(
-        lateral=largest(_filter(across, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)),
+        lateral=largest(slope(across)),
         lowest=jnp.min(acceleration, axis=-1),
         highest=jnp.max(acceleration, axis=-1),
-        jerk=largest(_filter(along, (2.0, -1.0, -2.0, -1.0, 2.0), 7 * dt**2)),
-        yaw_rate=largest(_filter(unwrapped, (-2.0, -1.0, 0.0, 1.0, 2.0), 10 * dt)),
-        yaw_acceleration=largest(_filter(unwrapped, (2.0, -1.0, -2.0, -1.0, 2.0), 7 * dt**2)),
+        jerk=largest(bend(along)),
+        yaw_rate=largest(slope(unwrapped)),
+        yaw_acceleration=largest(bend(unwrapped)),
     )
-
-
-def _filter(values: Float[Array, "*a K"], weights: tuple[float, ...], divisor: float) -> Float[Array, "*a M"]:
-    """Weighted sums of all windows of five; the published end values repeat the first and last of these and change no extreme."""
-    count = values.shape[-1] - len(weights) + 1
-    return sum((weight * values[..., place : place + count] for place, weight in enumerate(weights)), start=jnp.float32(0.0)) / divisor
 
 
 def is_comfortable(parts: ComfortParts) -> Bool[Array, "*a"]:

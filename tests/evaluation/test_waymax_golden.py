@@ -4,31 +4,27 @@ Tolerances: ten times the agreement of an independent recomputation (quirk 11 of
 """
 
 import functools
-import json
-import lzma
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.running import SHARED
+from support.golden_planning import KINDS, NAMES, make_edge_points, read_records
+from support.golden_scenes import load_golden, needs_golden
 
 from scenefactory_jax.core.boxes import compute_corners, find_overlaps
 from scenefactory_jax.dynamics import bicycle_waymax
 from scenefactory_jax.env import planning_metrics
 from scenefactory_jax.evaluation.metrics import waymax_steps
-from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_signed_distance
+from scenefactory_jax.roadgraph.signed_edge_distance import compute_signed_distance
 
-GOLDEN = SHARED.parent / "reference" / "golden"
 DISTANCE, ACTION, COMFORT, FLAGS = 5e-4, 5e-4, 6e-3, 2
-KINDS = ("log", "constant_velocity", "lateral_offset", "sped_up")
-POINTS, STEPS = 4096, 82  # of the padded road edges; 9 to 90
-pytestmark = pytest.mark.skipif(not GOLDEN.is_dir(), reason=f"needs the golden values in {GOLDEN}")
+pytestmark = needs_golden
 
 
 @functools.cache
 def units():
-    return json.loads((GOLDEN / "units_planning.json").read_text())
+    return load_golden("units_planning.json")
 
 
 def split_boxes(rows):
@@ -47,29 +43,6 @@ def test_corner_units():
     cases = units()["corners"]
     position, yaw, size = split_boxes([[*case["box"][:4], case["box"][4]] for case in cases])
     np.testing.assert_allclose(compute_corners(position, yaw, size), [case["corners"] for case in cases], atol=2e-5)
-
-
-def make_edge_points(lines, *, last_direction, capacity):
-    """Polylines of points -> edge points; the last point of each has the direction before it, or zero."""
-    position, direction, edge = [], [], []
-    for number, line in enumerate(lines):
-        line = np.asarray(line, np.float64)
-        along = np.diff(line[:, :2], axis=0)
-        along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-        last = along[-1:] if last_direction == "repeated" and len(along) else np.zeros((1, 2))
-        position.append(line)
-        direction.append(np.concatenate([along, last]))
-        edge.append(np.full(len(line), number))
-    count = sum(map(len, position))
-    fill = lambda parts, tail: np.concatenate([*parts, np.zeros((capacity - count, *tail))])  # noqa: E731
-    columns = fill(position, (3,)), fill(direction, (2,)), fill(edge, ())
-    assert count <= capacity
-    return EdgePoints(
-        jnp.asarray(columns[0], jnp.float32),
-        jnp.asarray(columns[1], jnp.float32),
-        jnp.asarray(columns[2], jnp.int32),
-        jnp.arange(capacity) < count,
-    )
 
 
 def test_signed_distance_units():
@@ -95,66 +68,15 @@ def test_bicycle_units():
 
 # ---- six logged scenes
 
-OBJECTS, ROUTE, LIGHTS = 160, 256, 8
-
-
-def pad(values, size, axis=0):
-    values = np.asarray(values)
-    assert values.shape[axis] <= size
-    width = [(0, 0)] * values.ndim
-    width[axis] = (0, size - values.shape[axis])
-    return jnp.asarray(np.pad(values, width))
-
-
-def read_tracks(scene, centre, order):
-    """States of objects [O, 91, x y z yaw vx vy], sizes and valid flags; positions relative to the centre."""
-    objects = [scene["objects"][index] for index in order]
-    column = lambda name, part: np.array([[row[part] for row in one[name]] for one in objects], np.float64)  # noqa: E731
-    heading = np.array([one["heading"] for one in objects], np.float64)
-    columns = [column("position", "x") - centre[0], column("position", "y") - centre[1], column("position", "z"), heading]
-    state = np.stack([*columns, column("velocity", "x"), column("velocity", "y")], axis=-1)
-    size = np.array([[one["length"], one["width"]] for one in objects])
-    valid = np.array([one["valid"] for one in objects], bool)
-    return np.where(valid[..., None], state, 0.0).astype(np.float32), size.astype(np.float32), valid
-
-
-def read_lights(lights):
-    """Lane and state of each light over the steps 10 to 90."""
-    states = np.zeros((81, len(lights)), np.int32)
-    for column, light in enumerate(lights):
-        for first, state in light["state_from_step"]:
-            states[max(first - 10, 0) :, column] = state
-    return pad([light["lane"] for light in lights], LIGHTS), pad(states, LIGHTS, axis=1)
-
 
 def read_scene(name):
-    """A golden file, and the operands of `measure`."""
-    golden = json.loads((GOLDEN / name).read_text())
-    with lzma.open(SHARED / "womd" / "test" / f"{golden['scene']}.xz") as file:
-        scene = json.load(file)
-    centre, sdc = golden["centre"], golden["sdc_index"]
-    state, size, valid = read_tracks(scene, centre, [sdc, *(i for i in range(len(scene["objects"])) if i != sdc)])
-    egos = np.stack([state[0]] * len(KINDS))
-    for row, kind in enumerate(KINDS):
-        driven = golden["ego"][kind].get("trajectory")
-        if driven is not None:
-            egos[row, 11:] = np.stack([driven[key] for key in ("x", "y", "z", "yaw", "vx", "vy")], axis=-1)
-    roads = scene["roads"]
-    lines = [
-        [[p["x"] - centre[0], p["y"] - centre[1], p["z"]] for p in road["geometry"]] for road in roads if road["map_element_id"] in (15, 16)
-    ]
-    route = golden["route"]
-    count = len(route["x"])
-    paths = waymax_steps.Paths(
-        position=pad(np.stack([route["x"], route["y"]], axis=-1).astype(np.float32)[None], ROUTE, axis=1),
-        valid=(jnp.arange(ROUTE) < count)[None],
-        arc=jnp.arange(ROUTE, dtype=jnp.float32)[None],
-        lane=pad(np.asarray(route["lane"])[None], ROUTE, axis=1),
-        on_route=jnp.ones(1, bool),
-    )
-    others = pad(state[1:, 10:], OBJECTS), pad(size[1:], OBJECTS), pad(valid[1:, 10:], OBJECTS)
-    edges = make_edge_points(lines, last_direction="repeated", capacity=POINTS)
-    return golden, (jnp.asarray(egos), jnp.asarray(size[0]), others, edges, paths, read_lights(golden["lights"]))
+    """A golden file, and the operands of `measure`: the steps 10 to 90 of all but the egos."""
+    golden, record = read_records(name)
+    ego, others, lights = record.ego, record.others, record.lights
+    egos = jnp.concatenate([ego.position, ego.yaw[..., None], ego.velocity], axis=-1)
+    columns = [others.position, jnp.zeros_like(others.position[..., :1]), others.yaw[..., None], others.velocity]
+    seen = jnp.concatenate(columns, axis=-1)[:, 10:], others.size, others.valid[:, 10:]
+    return golden, (egos, record.size, seen, record.edges, record.paths, (lights.lane, lights.state[10:]))
 
 
 @jax.jit
@@ -196,7 +118,7 @@ def measure(egos, size, others, edges, paths, lights):
     return found | {"comfort": planning_metrics.is_comfortable(parts)}
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in GOLDEN.glob("planning_*.json")))
+@pytest.mark.parametrize("name", NAMES)
 def test_scene(name):
     golden, operands = read_scene(name)
     found = jax.tree.map(np.asarray, measure(*operands))
