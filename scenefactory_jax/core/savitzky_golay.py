@@ -43,7 +43,8 @@ def filter_range(
     Towards both ends the first and the last window's polynomials count. Of a window of even width the middle lies between two values: the
     derivative half a value later is taken, as in SciPy's `savgol_filter`.
     """
-    table = jnp.array([compute_weights(width, order, derivative, place) for place in (*range(width), (width - 1) / 2)], jnp.float32)
+    places = (*map(float, range(width)), (width - 1) / 2)
+    table = jnp.array([compute_weights(width, order, derivative, place) for place in places], jnp.float32)
     row = jnp.arange(values.shape[0])
     inside = (row >= first + width // 2) & (row <= last - width // 2)
     start = jnp.where(inside, row - (width - 1) // 2, jnp.where(row < first + width // 2, first, last - width + 1))

@@ -33,13 +33,36 @@ def compute_signed_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, h
     """
     if edges.valid.shape[0] == 0:
         return jnp.full(point.shape[:-1], -jnp.inf, jnp.float32)
-    scale = jnp.array([1.0, 1.0, height_scale][: point.shape[-1]], jnp.float32)
-    apart = (point[..., None, :] - edges.position) * scale
-    nearest = jnp.argmin(jnp.where(edges.valid, dot(apart, apart), jnp.inf), axis=-1)
-    before = jnp.maximum(nearest - 1, 0)
-    connected = (edges.edge[before] == edges.edge[nearest]) & edges.valid[before]
-    before = jnp.where(connected, before, nearest)
+    nearest = _find_nearest(point, edges, height_scale=height_scale)
+    before = _find_neighbour(nearest, -1, edges)
     flat = point[..., :2]
     side, side_before = (cross(flat - edges.position[row, :2], edges.direction[row]) for row in (nearest, before))
     distance = safe_norm(flat - edges.position[nearest, :2])
     return jnp.where(jnp.any(edges.valid), jnp.sign(jnp.minimum(side, side_before)) * distance, -jnp.inf)
+
+
+def compute_line_distance(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float = 1.0) -> Float[Array, "*n"]:
+    """Computes the signed distance as `compute_signed_distance`, but to the segments on both sides of the nearest edge point."""
+    signed = compute_signed_distance(point, edges, height_scale=height_scale)
+    if edges.valid.shape[0] == 0:
+        return signed
+    nearest = _find_nearest(point, edges, height_scale=height_scale)
+    offset = point[..., :2] - edges.position[nearest, :2]
+    to_neighbour = [edges.position[_find_neighbour(nearest, side, edges), :2] - edges.position[nearest, :2] for side in (-1, 1)]
+    distance = jnp.abs(signed)
+    for chord in to_neighbour:
+        along = jnp.clip(dot(offset, chord) / jnp.maximum(dot(chord, chord), 1e-9), 0.0, 1.0)
+        distance = jnp.minimum(distance, safe_norm(offset - along[..., None] * chord))
+    return jnp.where(jnp.any(edges.valid), jnp.sign(signed) * distance, -jnp.inf)
+
+
+def _find_nearest(point: Float[Array, "*n d"], edges: EdgePoints, *, height_scale: float) -> Int[Array, "*n"]:
+    scale = jnp.array([1.0, 1.0, height_scale][: point.shape[-1]], jnp.float32)
+    apart = (point[..., None, :] - edges.position) * scale
+    return jnp.argmin(jnp.where(edges.valid, dot(apart, apart), jnp.inf), axis=-1)
+
+
+def _find_neighbour(row: Int[Array, "*n"], step: int, edges: EdgePoints) -> Int[Array, "*n"]:
+    """The row before or after, if it is of the same edge; else the row itself."""
+    neighbour = jnp.clip(row + step, 0, edges.valid.shape[0] - 1)
+    return jnp.where((edges.edge[neighbour] == edges.edge[row]) & edges.valid[neighbour], neighbour, row)

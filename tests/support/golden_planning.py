@@ -39,7 +39,7 @@ def make_lanes(scene, centre):
     per_point = lambda values: pad(np.repeat(values, [len(line) for _, line in lines]).astype(np.int32), LANE_POINTS)  # noqa: E731
     none = jnp.zeros(LANE_POINTS, bool)
     return Lanes(
-        position=points.position[:, :2],
+        position=points.position,
         direction=points.direction,
         lane=per_point([index for index, _ in lines]),
         kind=per_point([scene["roads"][index]["map_element_id"] for index, _ in lines]),
@@ -80,17 +80,12 @@ def read_lights(lights):
     return Lights(pad([light["lane"] for light in lights], LIGHTS), pad(states, LIGHTS, axis=1))
 
 
-def order_objects(golden, scene):
-    """Indices of the objects, the ego's first, as the official code has them."""
-    sdc = golden["sdc_index"]
-    return [sdc, *(index for index in range(len(scene["objects"])) if index != sdc)]
-
-
 def read_records(name):
     """A golden file, and the records of its egos; the axis of egos is that of `ego` alone."""
     golden = load_golden(name)
     scene, centre = load_scene(golden), golden["centre"]
-    order = order_objects(golden, scene)
+    sdc = golden["sdc_index"]
+    order = [sdc, *(index for index in range(len(scene["objects"])) if index != sdc)]  # the ego first, as in the official code
     state, size, valid = read_tracks(scene, centre, order)
     egos = jnp.asarray(read_egos(golden, state[0]))
     track = lambda rows, present: Track(rows[..., :3], rows[..., 3], rows[..., 4:6], present)  # noqa: E731

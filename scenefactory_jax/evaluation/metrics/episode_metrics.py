@@ -27,11 +27,7 @@ class Value(NamedTuple):
 
 
 def compute_episode_metrics(
-    record: EpisodeRecord,
-    *,
-    dt: float = 0.1,
-    max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M,
-    as_published: bool = False,
+    record: EpisodeRecord, *, dt: float = 0.1, max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M, as_published: bool = False
 ) -> dict[str, Value]:
     """Computes the metrics of an episode. No metric is valid of an episode without counted states.
 
@@ -41,8 +37,19 @@ def compute_episode_metrics(
         as_published: V-Max's at-fault collisions and times on several lanes with the errors of its code.
     """
     steps = measure_steps(record, dt=dt, as_published=as_published)
-    found = _collect_events(record, steps, as_published=as_published)
-    found |= _collect_routes(record, steps) | _collect_comfort(record, dt=dt)
+    return collect_metrics(record, steps, dt=dt, max_lateral_m=max_lateral_m, as_published=as_published)
+
+
+def collect_metrics(
+    record: EpisodeRecord,
+    steps: StepMetrics,
+    *,
+    dt: float = 0.1,
+    max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M,
+    as_published: bool | Bool[Array, ""] = False,
+) -> dict[str, Value]:
+    """Collects the metrics of an episode from those of its steps; see `compute_episode_metrics`."""
+    found = _collect_events(record, steps, as_published=as_published) | _collect_routes(record, steps) | _collect_comfort(record, dt=dt)
     found |= _collect_lanes(record, steps, dt=dt, as_published=as_published) | _collect_nuplan(record, steps, dt=dt)
     found |= _collect_safety(record, steps) | _collect_scenarionet(record, steps, max_lateral_m=max_lateral_m)
     any_counted = jnp.any(record.counted)
@@ -53,7 +60,7 @@ def compute_episode_metrics(
 Pairs = dict[str, tuple[Array, Array | bool]]  # value and whether it is valid
 
 
-def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: bool) -> Pairs:
+def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: bool | Bool[Array, ""]) -> Pairs:
     """Metrics that concern other road users, road edges and lights: Waymax's and V-Max's."""
     counted = record.counted
     largest = lambda values: jnp.max(jnp.where(counted, values, 0))  # noqa: E731
@@ -63,9 +70,9 @@ def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: 
     known = jnp.any(jnp.where(counted[:, None], record.lights.state, 0) != 0) & jnp.any(record.paths.valid)
     return {
         "overlap": (largest(jnp.any(steps.touching, axis=1)), True),
-        "off_road": (largest(steps.outside_m > 0), jnp.any(record.edges.valid)),
+        "off_road": (largest(steps.off_road), jnp.any(record.edges.valid)),
         "red_light_run": (largest(red), known),
-        "at_fault_collision": (faults if as_published else jnp.minimum(faults, 1), True),
+        "at_fault_collision": (jnp.where(as_published, faults, jnp.minimum(faults, 1)), True),
         "min_ttc_s": (jnp.min(ttc), True),
         "mean_ttc_s": (_average(steps.ttc_s, counted), True),
         "ttc_within_bound": (jnp.min(ttc) >= nuplan_steps.TTC_BOUND_S, True),
@@ -98,9 +105,9 @@ def _collect_routes(record: EpisodeRecord, steps: StepMetrics) -> Pairs:
         ego.yaw[past], ego.velocity[past], ego.yaw[row], ego.velocity[row], dt=0.1))(rows, before)  # fmt: skip
     return {
         "progression": (steps.progression[last], routes),
-        "off_route_m": (largest(steps.off_route_m), routes),
-        "vmax_off_route_m": (largest(steps.vmax_off_route_m), routes),
-        "wrong_way_m": (largest(steps.wrong_way_m), paths),
+        "off_route_m": (_average(steps.off_route_m, counted), routes),
+        "vmax_off_route_m": (_average(steps.vmax_off_route_m, counted), routes),
+        "wrong_way_m": (_average(steps.wrong_way_m, counted), paths),
         "log_divergence_m": (_average(apart, counted & log.valid), jnp.any(counted & log.valid)),
         "kinematic_infeasibility": (largest(infeasible), True),
         "progress_ratio": (ratio, moves),
@@ -120,7 +127,7 @@ def _collect_comfort(record: EpisodeRecord, *, dt: float) -> Pairs:
     return {"comfort": (jnp.all(comfortable | ~used), jnp.any(used))}
 
 
-def _collect_lanes(record: EpisodeRecord, steps: StepMetrics, *, dt: float, as_published: bool) -> Pairs:
+def _collect_lanes(record: EpisodeRecord, steps: StepMetrics, *, dt: float, as_published: bool | Bool[Array, ""]) -> Pairs:
     """V-Max's metrics of lanes: speed limits that it estimates, several lanes, oncoming traffic."""
     counted, lanes = record.counted, record.lanes
     has_lanes = jnp.any(lanes.valid)

@@ -39,7 +39,7 @@ class Others(NamedTuple):
 class Lanes(NamedTuple):
     """Points of the lanes' centre lines."""
 
-    position: Float[Array, "P 2"]
+    position: Float[Array, "P d"]  # d as that of the car
     direction: Float[Array, "P 2"]  # unit
     lane: Int[Array, " P"]  # as in `Paths.lane` and `Lights.lane`
     kind: Int[Array, " P"]  # LANE_FREEWAY, LANE_STREET; points of other kinds are not valid

@@ -47,7 +47,7 @@ class Impact(NamedTuple):
 
 
 def compute_impact(record: EpisodeRecord, touching: Bool[Array, "T O"]) -> Impact:
-    """Computes the speeds of the impacts from the states before the first contacts, so that a simulated contact has not yet changed them."""
+    """Computes the speeds of impacts from the states before the first contacts, which no simulated contact has changed yet."""
     others, rows = record.others, touching.shape[0]
     hit = jnp.any(touching, axis=0)
     before = jnp.maximum(jnp.argmax(touching, axis=0) - 1, 0)

@@ -48,7 +48,7 @@ def _combine(metrics: Mapping[str, Value], weights: Mapping[str, int], *, factor
         score = score * _read(metrics, name)
     for name in events:
         score = score * (1.0 - jnp.where(metrics[name].valid, metrics[name].value, 0.0))
-    valid = metrics["overlap"].valid
+    valid = jnp.ones((), bool)
     for name in (*weights, *factors, *events):
         valid = valid & (metrics[name].valid | (name in NEUTRAL))
     return Value(jnp.where(valid, score, 0.0), valid)

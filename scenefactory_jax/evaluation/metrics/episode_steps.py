@@ -26,7 +26,8 @@ class StepMetrics(NamedTuple):
     """Metrics of each state of an episode."""
 
     touching: Bool[Array, "T O"]
-    outside_m: Float[Array, " T"]  # of the corner that is farthest outside of the road; -inf without road edges
+    off_road: Bool[Array, " T"]  # Waymax
+    outside_m: Float[Array, " T"]  # nuPlan; -inf without road edges
     front_lane: Int[Array, " T"]
     progression: Float[Array, " T"]
     off_route_m: Float[Array, " T"]  # Waymax; 0 on the route
@@ -87,12 +88,13 @@ def _measure_road(record: EpisodeRecord, step: Int[Array, ""]) -> dict[str, Arra
     """Where the car is on lanes, between road edges and along its paths."""
     ego, log, paths = record.ego, record.log, record.paths
     position, yaw = ego.position[step, :2], ego.yaw[step]
-    place = vmax_steps.locate_on_lanes(position, yaw, record.size, record.lanes)
+    place = vmax_steps.locate_on_lanes(ego.position[step], yaw, record.size, record.lanes)
     logged = log.valid
     ends = log.position[jnp.argmax(logged), :2], log.position[len(logged) - 1 - jnp.argmax(logged[::-1]), :2]
     track_arc, track_distance = scenarionet_steps.project_on_track(position, log.position[:, :2], logged)
     return {
-        "outside_m": jnp.max(waymax_steps.compute_edge_distances(ego.position[step], yaw, record.size, record.edges)),
+        "off_road": jnp.any(waymax_steps.compute_edge_distances(ego.position[step], yaw, record.size, record.edges) > 0),
+        "outside_m": nuplan_steps.measure_outside(ego.position[step], yaw, record.size, record.edges),
         "front_lane": waymax_steps.find_front_lane(position, yaw, record.size, paths),
         "progression": waymax_steps.compute_progression(position, *ends, paths),
         "off_route_m": waymax_steps.compute_off_route(position, paths, limits=waymax_steps.WAYMAX_OFF_ROUTE),
@@ -101,7 +103,7 @@ def _measure_road(record: EpisodeRecord, step: Int[Array, ""]) -> dict[str, Arra
         "lane_row": place.nearest,
         "several_lanes": place.several_lanes,
         "oncoming": place.oncoming,
-        "lane_direction": nuplan_steps.find_lane_direction(position, yaw, record.lanes),
+        "lane_direction": nuplan_steps.find_lane_direction(ego.position[step], yaw, record.lanes),
         "route_arc": nuplan_steps.compute_route_arc(position, paths),
         "track_arc": track_arc,
         "track_distance": track_distance,
@@ -142,7 +144,7 @@ def _judge_contacts(
     ego, others, lanes = record.ego, record.others, record.lanes
     speed, other_speed = safe_norm(ego.velocity[step]), safe_norm(others.velocity[:, step])
     vmax = vmax_steps.find_at_fault(contacts, speed, other_speed, others.kind, road["several_lanes"])
-    beside = road["several_lanes"] | (road["outside_m"] > 0)
+    beside = road["several_lanes"] | road["off_road"]
     fault = fresh & nuplan_steps.find_at_fault(contacts, speed, other_speed, beside)
     row = road["lane_row"]
     all_around = beside | (lanes.in_intersection[row] & lanes.valid[row])

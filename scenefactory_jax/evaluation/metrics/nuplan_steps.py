@@ -1,7 +1,8 @@
 """Metrics of nuPlan's closed-loop score (nuplan-devkit, its default configuration) for one car, at one step and of an episode.
 
 nuPlan reads polygons of lanes and of the drivable area. Here lanes are centre lines and the drivable area ends at road edges: a car is on
-several lanes as in V-Max, on a lane within half its usual width, and outside of the road as in Waymax.
+several lanes as in V-Max, on a lane within half its usual width, and
+outside of the road beyond the lines of road edges.
 """
 
 from typing import NamedTuple
@@ -12,9 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 from scenefactory_jax.core.geometry import dot, heading_vector, safe_norm, to_frame, wrap_angle
 from scenefactory_jax.core.savitzky_golay import filter_range
 from scenefactory_jax.env.planning_metrics import compute_time_to_overlap, find_ahead, find_behind
+from scenefactory_jax.evaluation.metrics import waymax_steps
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, OBJECT, PEDESTRIAN, VEHICLE, Lanes, find_inside
-from scenefactory_jax.evaluation.metrics.vmax_steps import STANDING_MPS, Contacts
-from scenefactory_jax.evaluation.metrics.waymax_steps import Paths, measure_path_distances
+from scenefactory_jax.evaluation.metrics.vmax_steps import STANDING_MPS, Contacts, measure_lane_distances
+from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_line_distance
 
 CLASSES = ((PEDESTRIAN, CYCLIST), (VEHICLE,), (OBJECT,))
 ALLOWED = (0, 0, 1)  # collisions of each class
@@ -47,14 +49,21 @@ def score_collisions(at_fault: Bool[Array, " O"], kind: Int[Array, " O"]) -> Flo
     return score
 
 
-def find_lane_direction(position: Float[Array, "2"], yaw: Float[Array, ""], lanes: Lanes) -> Float[Array, "2"]:
+def measure_outside(position: Float[Array, "d"], yaw: Float[Array, ""], size: Float[Array, "2"], edges: EdgePoints) -> Float[Array, ""]:
+    """Computes how far the corner farthest outside of the road is from the road edge; negative inside, -inf without edges."""
+    corners = waymax_steps.place_corners(position, yaw, size)
+    return jnp.max(compute_line_distance(corners, edges, height_scale=waymax_steps.HEIGHT_SCALE))
+
+
+def find_lane_direction(position: Float[Array, "d"], yaw: Float[Array, ""], lanes: Lanes) -> Float[Array, "2"]:
     """Finds the direction of the lane on which a car is, of several the nearest of its own direction; zero beside lanes."""
-    apart = position - lanes.position
-    squared = jnp.where(lanes.valid, dot(apart, apart), jnp.inf)
-    same = jnp.where(dot(lanes.direction, heading_vector(yaw)) >= 0, squared, jnp.inf)
-    row, own = jnp.argmin(squared), jnp.argmin(same)
-    row = jnp.where(same[own] <= HALF_LANE_M**2, own, row)
-    return jnp.where(squared[row] <= HALF_LANE_M**2, lanes.direction[row], 0.0)
+    squared = measure_lane_distances(position, lanes)
+    own = jnp.argmin(jnp.where(dot(lanes.direction, heading_vector(yaw)) >= 0, squared, jnp.inf))
+    nearest = jnp.argmin(squared)
+    is_on = lambda row: lanes.valid[row] & (safe_norm(position[:2] - lanes.position[row, :2]) <= HALF_LANE_M)  # noqa: E731
+    follows = is_on(own) & (dot(lanes.direction[own], heading_vector(yaw)) >= 0)
+    row = jnp.where(follows, own, nearest)
+    return jnp.where(is_on(row), lanes.direction[row], 0.0)
 
 
 def measure_wrong_direction(
@@ -69,11 +78,11 @@ def measure_wrong_direction(
     return jnp.maximum(0.0, -jnp.min(jnp.where(counted, sums, 0.0)))
 
 
-def compute_route_arc(position: Float[Array, "2"], paths: Paths) -> Float[Array, ""]:
+def compute_route_arc(position: Float[Array, "2"], paths: waymax_steps.Paths) -> Float[Array, ""]:
     """Computes the arc length on the longest on-route path at the place nearest to a position."""
     row = jnp.argmax(jnp.sum(paths.valid, axis=1) * paths.on_route)
     line, valid, arc = paths.position[row], paths.valid[row], paths.arc[row]
-    nearest = jnp.argmin(measure_path_distances(position, paths)[row])
+    nearest = jnp.argmin(waymax_steps.measure_path_distances(position, paths)[row])
     after = jnp.minimum(nearest + 1, len(arc) - 1)
     after, before = jnp.where(valid[after], after, nearest), jnp.maximum(nearest - 1, 0)
     chord = line[after] - line[before]

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from scenefactory_jax.core.boxes import compute_corners, find_overlaps
+from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, safe_norm
 from scenefactory_jax.core.types import LANE_FREEWAY
 from scenefactory_jax.env.planning_metrics import find_behind
 from scenefactory_jax.evaluation.metrics.episode_record import CYCLIST, PEDESTRIAN, Lanes
+from scenefactory_jax.evaluation.metrics.waymax_steps import HEIGHT_SCALE, place_corners
 
 STANDING_MPS = 0.05
 FRONT_EDGE_M = 0.01  # length of the box that stands for the car's front edge; published: 0, whose contacts depend on rounding
@@ -75,26 +76,39 @@ class LanePlace(NamedTuple):
     oncoming: Bool[Array, ""]  # a corner is beside all lanes of its direction, and all corners are on lanes of the other one
 
 
-def locate_on_lanes(position: Float[Array, "2"], yaw: Float[Array, ""], size: Float[Array, "2"], lanes: Lanes) -> LanePlace:
-    """Finds a car's place on lanes, of which it reads the points; both flags are false without lanes."""
-    corners = compute_corners(position, yaw, size)
-    apart = position - lanes.position
-    nearest = jnp.argmin(jnp.where(lanes.valid, dot(apart, apart), jnp.inf))
-    beside = jnp.abs(cross(lanes.direction[nearest], corners - lanes.position[nearest])) > HALF_LANE_M
-    along = dot(lanes.direction, heading_vector(yaw)) >= 0
-    offset = corners[:, None] - lanes.position
-    squared = dot(offset, offset)
-    same = jnp.min(jnp.where(lanes.valid & along, squared, jnp.inf), axis=1)
-    other = jnp.min(jnp.where(lanes.valid & ~along, squared, jnp.inf), axis=1)
-    oncoming = jnp.any(same > HALF_LANE_M**2) & jnp.all(other < HALF_LANE_M**2)
-    return LanePlace(nearest, jnp.any(beside) & lanes.valid[nearest], oncoming)
+def locate_on_lanes(position: Float[Array, "d"], yaw: Float[Array, ""], size: Float[Array, "2"], lanes: Lanes) -> LanePlace:
+    """Finds a car's place on lanes, of which it reads the points; both flags are false without lanes.
+
+    With heights (d = 3) they are stretched in searches for nearest points, as for road edges; distances are across a lane's direction.
+    """
+    corners = place_corners(position, yaw, size)
+    across = lambda row: jnp.abs(cross(lanes.direction[row], corners[:, :2] - lanes.position[row, :2]))  # noqa: E731
+    nearest = jnp.argmin(measure_lane_distances(position, lanes))
+    aligned = dot(lanes.direction, heading_vector(yaw)) >= 0
+    squared = measure_lane_distances(corners, lanes)
+
+    def measure_nearest(chosen: Bool[Array, " P"]) -> Float[Array, "4"]:
+        distance = across(jnp.argmin(jnp.where(chosen, squared, jnp.inf), axis=1))
+        return jnp.where(jnp.any(chosen & lanes.valid), distance, jnp.inf)
+
+    oncoming = jnp.any(measure_nearest(aligned) > HALF_LANE_M) & jnp.all(measure_nearest(~aligned) < HALF_LANE_M)
+    return LanePlace(nearest, jnp.any(across(nearest) > HALF_LANE_M) & lanes.valid[nearest], oncoming)
 
 
-def estimate_speed_limit(kind: Int[Array, "*n"], log_top_speed: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def measure_lane_distances(point: Float[Array, "*n d"], lanes: Lanes) -> Float[Array, "*n P"]:
+    """Computes the squared distances to points of lanes, heights stretched; inf where a point is not valid."""
+    apart = point[..., None, :] - lanes.position
+    squared = dot(apart, apart)
+    if point.shape[-1] == 3:
+        squared = squared + (HEIGHT_SCALE**2 - 1.0) * apart[..., 2] ** 2
+    return jnp.where(lanes.valid, squared, jnp.inf)
+
+
+def estimate_speed_limit(kind: Int[Array, "*n"], log_top_speed: Float[Array, ""]) -> Float[Array, "*n"]:
     """Estimates a lane's speed limit from its kind and the log: the smallest usual limit that the log keeps (70 mph if none), but not below
     70 mph on a freeway, and not above 45 mph elsewhere."""
     usual = jnp.array(LIMITS_MPH) * MPH
-    expert = jnp.min(jnp.where(log_top_speed[..., None] <= usual, usual, usual[-1]), axis=-1)
+    expert = jnp.min(jnp.where(log_top_speed <= usual, usual, usual[-1]))
     return jnp.where(kind == LANE_FREEWAY, jnp.maximum(expert, FREEWAY_MPH * MPH), jnp.minimum(expert, STREET_MPH * MPH))
 
 
@@ -124,13 +138,12 @@ def score_speed(overspeed: Float[Array, " T"], counted: Bool[Array, " T"], *, st
     return jnp.maximum(0.0, 1.0 - total / (OVERSPEED_MPS * jnp.maximum(steps, 1)))
 
 
-def score_several_lanes(seconds: Float[Array, "*n"], *, as_published: bool = False) -> Float[Array, "*n"]:
+def score_several_lanes(seconds: Float[Array, "*n"], *, as_published: bool | Bool[Array, ""] = False) -> Float[Array, "*n"]:
     """Scores the time that a moving car was on several lanes. Published: 1.5 between 3.0 s and 3.4 s, 0.5 at 3.4 s."""
     whole, half = SEVERAL_LANES_S
-    if not as_published:
-        return 0.5 * (seconds < whole + HALF_STEP_S) + 0.5 * (seconds < half + HALF_STEP_S)
+    score = 0.5 * (seconds < whole + HALF_STEP_S) + 0.5 * (seconds < half + HALF_STEP_S)
     middle = (seconds > PUBLISHED_BAND_S + HALF_STEP_S) & (seconds < half + HALF_STEP_S)
-    return 1.0 * (seconds < whole - HALF_STEP_S) + 0.5 * middle
+    return jnp.where(as_published, 1.0 * (seconds < whole - HALF_STEP_S) + 0.5 * middle, score)
 
 
 def score_direction(metres: Float[Array, "*n"]) -> Float[Array, "*n"]:

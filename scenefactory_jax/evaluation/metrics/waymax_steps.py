@@ -48,14 +48,14 @@ def find_overlap(
 def compute_edge_distances(
     position: Float[Array, "d"], yaw: Float[Array, ""], size: Float[Array, "2"], edges: EdgePoints
 ) -> Float[Array, "4"]:
-    """Computes the signed distances of the four corners to the nearest road-edge points; off-road: any of them is above 0.
+    """Computes the signed distances of the four corners to the nearest road-edge points; off-road: any of them is above 0."""
+    return compute_signed_distance(place_corners(position, yaw, size), edges, height_scale=HEIGHT_SCALE)
 
-    With d = 3 all corners have the height of `position`.
-    """
+
+def place_corners(position: Float[Array, "d"], yaw: Float[Array, ""], size: Float[Array, "2"]) -> Float[Array, "4 d"]:
+    """Computes the corners of a car; with d = 3 all of them have the height of `position`."""
     corners = compute_corners(position[:2], yaw, size)
-    if position.shape[-1] == 3:
-        corners = jnp.concatenate([corners, jnp.full((4, 1), position[2])], axis=1)
-    return compute_signed_distance(corners, edges, height_scale=HEIGHT_SCALE)
+    return jnp.concatenate([corners, jnp.full((4, 1), position[2])], axis=1) if position.shape[0] == 3 else corners
 
 
 def measure_path_distances(position: Float[Array, "2"], paths: Paths) -> Float[Array, "R N"]:
