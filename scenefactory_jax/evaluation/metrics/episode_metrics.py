@@ -27,7 +27,11 @@ class Value(NamedTuple):
 
 
 def compute_episode_metrics(
-    record: EpisodeRecord, *, dt: float = 0.1, max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M, as_published: bool = False
+    record: EpisodeRecord,
+    *,
+    dt: float = 0.1,
+    max_lateral_m: float = scenarionet_steps.MAX_LATERAL_M,
+    as_published: bool | Bool[Array, ""] = False,
 ) -> dict[str, Value]:
     """Computes the metrics of an episode. No metric is valid of an episode without counted states.
 

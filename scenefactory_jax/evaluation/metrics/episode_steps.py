@@ -50,7 +50,7 @@ class StepMetrics(NamedTuple):
     track_distance: Float[Array, " T"]
 
 
-def measure_steps(record: EpisodeRecord, *, dt: float, as_published: bool = False) -> StepMetrics:
+def measure_steps(record: EpisodeRecord, *, dt: float, as_published: bool | Bool[Array, ""] = False) -> StepMetrics:
     """Computes the metrics of all states; those of states that are not valid have no meaning."""
     ego, others = record.ego, record.others
     touching = find_overlaps(ego.position[:, None, :2], ego.yaw[:, None], record.size, *_at_all_steps(record), others.size)
@@ -74,14 +74,12 @@ def _at_all_steps(record: EpisodeRecord) -> tuple[Float[Array, "T O 2"], Float[A
     return record.others.position.swapaxes(0, 1), record.others.yaw.T
 
 
-def find_contacts(record: EpisodeRecord, step: Int[Array, ""], *, as_published: bool = False) -> vmax_steps.Contacts:
+def find_contacts(record: EpisodeRecord, step: Int[Array, ""], *, as_published: bool | Bool[Array, ""] = False) -> vmax_steps.Contacts:
     """Finds the contacts of one state; published: the front edge has no length, and no contacts."""
     ego, others = record.ego, record.others
     car = (ego.position[step, :2], ego.yaw[step], record.size)
-    edge_m = 0.0 if as_published else vmax_steps.FRONT_EDGE_M
-    return vmax_steps.find_contacts(
-        *car, others.position[:, step], others.yaw[:, step], others.size, others.valid[:, step], edge_m=edge_m
-    )
+    edge_m = jnp.where(as_published, 0.0, vmax_steps.FRONT_EDGE_M)
+    return vmax_steps.find_contacts(*car, others.position[:, step], others.yaw[:, step], others.size, others.valid[:, step], edge_m=edge_m)
 
 
 def _measure_road(record: EpisodeRecord, step: Int[Array, ""]) -> dict[str, Array]:

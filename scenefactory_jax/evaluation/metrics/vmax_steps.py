@@ -47,13 +47,13 @@ def find_contacts(
     other_size: Float[Array, "O 2"],
     valid: Bool[Array, " O"],
     *,
-    edge_m: float = FRONT_EDGE_M,
+    edge_m: float | Float[Array, ""] = FRONT_EDGE_M,
 ) -> Contacts:
     """Finds the overlaps of a car with other road users; those at neither end are lateral."""
     others = (other_position, other_yaw, other_size)
     touching = valid & find_overlaps(position, yaw, size, *others)
     rear = touching & find_behind(position, yaw, size[0], other_position)
-    edge = jnp.stack([jnp.float32(edge_m), size[1]])
+    edge = jnp.stack([jnp.asarray(edge_m, jnp.float32), size[1]])
     front = find_overlaps(position + 0.5 * size[0] * heading_vector(yaw), yaw, edge, *others)
     return Contacts(touching, rear, touching & front & ~rear)
 
