@@ -1,6 +1,7 @@
 """Metrics of episodes on scenes made by hand: nuPlan's bounds from both sides, surrogate safety, ScenarioNet's, and what is missing.
 
-A street along x: a lane towards +x at y = 0, one towards -x at y = 3.7, road edges at y = -2.5 and y = 6.2. A car of 4 x 2 m drives 3 s.
+A street along x: a lane towards +x at y = 0, one towards -x at y = 3.7, road edges at y = -2.5 and y = 6.2. A car of 4 x 2 m
+drives for 3 s.
 """
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from scenefactory_jax.core.types import LANE_STREET
-from scenefactory_jax.evaluation.metrics import nuplan_steps
+from scenefactory_jax.evaluation.metrics import episode_metrics, nuplan_steps
 from scenefactory_jax.evaluation.metrics.episode_metrics import compute_episode_metrics
 from scenefactory_jax.evaluation.metrics.episode_record import (
     CYCLIST,
@@ -21,8 +22,10 @@ from scenefactory_jax.evaluation.metrics.episode_record import (
     Lights,
     Others,
     Track,
+    leave_out,
 )
 from scenefactory_jax.evaluation.metrics.episode_scores import compute_scores
+from scenefactory_jax.evaluation.metrics.episode_steps import measure_steps
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints
 
@@ -102,7 +105,11 @@ COLLISIONS = {  # ego, others, nuPlan's score, V-Max's at-fault collision
     "none": (drive(), [], 1.0, 0),
     "into a slower car": (drive(), [(VEHICLE, drive(5.0, x=12.0), CAR)], 0.0, 1),
     "hit from behind": (drive(5.0), [(VEHICLE, drive(7.5, x=-10.5), CAR)], 1.0, 0),
-    "hit while standing": (drive(0.0), [(VEHICLE, drive(3.0, y=-8.0, yaw=np.pi / 2), CAR)], 1.0, 0),
+    "hit from behind, on two lanes": (drive(5.0, y=1.2), [(VEHICLE, drive(7.5, x=-10.5, y=1.2), CAR)], 1.0, 0),
+    "hit in front while standing": (drive(0.0), [(VEHICLE, drive(3.0, x=2.5, y=-8.0, yaw=np.pi / 2), CAR)], 1.0, 0),
+    "hit by a person while standing": (drive(0.0), [(PEDESTRIAN, drive(1.0, y=-3.0, yaw=np.pi / 2), CONE)], 1.0, 1),
+    # nuPlan judges the first contact only, here from behind; V-Max all of them, and later ones are at the front
+    "driven through from behind": (drive(5.0), [(VEHICLE, drive(10.0, x=-12.0), CAR)], 1.0, 1),
     "a standing car, from its side": (drive(), [(VEHICLE, drive(0.0, x=12.0, y=2.9), (4.0, 4.0))], 0.0, 1),
     "one cone, for many steps": (drive(2.0), [(OBJECT, drive(0.0, x=3.0), CONE)], 0.5, 1),
     "two cones": (drive(), [(OBJECT, drive(0.0, x=place), CONE) for place in (9.0, 15.0)], 0.0, 1),
@@ -133,6 +140,12 @@ def test_published_counts_and_edges():
     assert judge(drive(), slower)["at_fault_collision"] == 1
 
 
+def test_time_to_collision_ends_with_a_collision():
+    found = judge(drive(5.0), [(VEHICLE, drive(10.0, x=-12.0), CAR)])
+    assert found["nuplan_min_ttc_s"] == 3.0  # it is not the car's fault, and the other one counts no more
+    assert judge(drive(), [(VEHICLE, drive(5.0, x=12.0), CAR)])["nuplan_min_ttc_s"] == 0.0
+
+
 @pytest.mark.parametrize(("outside", "score"), [(0.28, 1.0), (0.32, 0.0)])
 def test_drivable_area(outside, score):
     assert judge(drive(9.7, y=-1.5 - outside))["nuplan_drivable_area"] == score
@@ -146,6 +159,14 @@ def test_direction(speed, score):
     assert found["oncoming_m"] == pytest.approx(3 * speed, abs=1e-3)
     assert judge(drive(speed))["nuplan_direction_compliance"] == 1.0
     assert judge(drive(-speed))["nuplan_direction_compliance"] == score  # in reverse
+
+
+@pytest.mark.parametrize(("y", "wrong"), [(1.7, 0.0), (1.9, 5.0)])
+def test_direction_where_lanes_overlap(y, wrong):
+    """Of lanes 3 m apart that of the car's direction counts while the car is on it, though the other one is nearer."""
+    lanes = make_record(drive()).lanes
+    near = lanes._replace(position=jnp.minimum(lanes.position, jnp.array([jnp.inf, 3.0])))
+    assert judge(drive(5.0, y=y), lanes=near)["nuplan_wrong_direction_m"] == pytest.approx(wrong, abs=1e-3)
 
 
 @pytest.mark.parametrize(("metres", "ratio", "enough"), [(-2.1, 0.0, 0), (-1.9, 2 / 30, 0), (5.7, 0.19, 0), (6.3, 0.21, 1), (33.0, 1.0, 1)])
@@ -207,10 +228,11 @@ def test_comfort_parts():
     first, last = jnp.int32(10), jnp.int32(STEPS - 1)
     yaw = jnp.asarray(0.4 * TIME, jnp.float32)
     velocity = 8.0 * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=1)
-    circle = nuplan_steps.compute_comfort(velocity, jnp.mod(yaw + 3.0, 2 * jnp.pi) - 3.0, first, last, dt=DT)
+    compute_comfort = jax.jit(nuplan_steps.compute_comfort, static_argnames="dt")
+    circle = compute_comfort(velocity, jnp.mod(yaw + 3.0, 2 * jnp.pi) - 3.0, first, last, dt=DT)
     np.testing.assert_allclose(circle, [0, 0, 3.2, 0.4, 0, 0, 0], atol=0.1)
     velocity = jnp.stack([5.0 + jnp.asarray(TIME) ** 2, jnp.zeros(STEPS)], axis=1).astype(jnp.float32)
-    ramp = nuplan_steps.compute_comfort(velocity, jnp.asarray(0.25 * TIME**2, jnp.float32) * 0.0, first, last, dt=DT)
+    ramp = compute_comfort(velocity, jnp.zeros(STEPS), first, last, dt=DT)
     np.testing.assert_allclose(ramp, [0.1, 5.95, 0, 0, 0, 2.0, 2.0], atol=0.15)
 
 
@@ -226,6 +248,8 @@ def test_encroachment():
     crossing = drive(y=-22.0, x=15.0, yaw=np.pi / 2)
     found = judge(drive(), [(VEHICLE, crossing, CAR)])
     assert found["encroachment_s"] == found["crossing_encroachment_s"] == pytest.approx(0.3, abs=1e-5)
+    users = make_others([(VEHICLE, crossing, CAR)])
+    assert "encroachment_s" not in judge(drive(), others=users._replace(valid=jnp.zeros((3, STEPS), bool)))
     found = judge(drive(), [(VEHICLE, drive(x=-15.0), CAR)])
     assert found["encroachment_s"] == pytest.approx(1.2, abs=1e-5)  # a follower: 11 m gap at 10 m/s, and both have to overlap
     assert "crossing_encroachment_s" not in found
@@ -234,13 +258,15 @@ def test_encroachment():
 
 
 def test_impact():
-    found = judge(drive(), [(VEHICLE, drive(6.0, x=8.0), CAR)])
+    position, yaw, velocity = drive()
+    velocity[21:] = [6.0, 0.0]  # the impact, after which the car is as fast as the other
+    found = judge((position, yaw, velocity), [(VEHICLE, drive(6.0, x=8.0), CAR)])
     assert found["impact_mps"] == pytest.approx(4.0, abs=1e-3)
     assert found["delta_v_equal_masses_mps"] == pytest.approx(2.0, abs=1e-3)
     assert found["delta_v_mps"] == pytest.approx(3.0, abs=1e-3)
     assert found["max_friction_utilization"] == pytest.approx(0.5)
-    side = judge(drive(), [(VEHICLE, drive(4.0, x=20.0, y=-9.0, yaw=np.pi / 2), CAR)])
-    assert side["impact_mps"] in (pytest.approx(4.0, abs=1e-3), pytest.approx(10.0, abs=1e-3))  # of the faces that meet
+    side = judge(drive(), [(VEHICLE, drive(4.0, x=15.0, y=-9.0, yaw=np.pi / 2), CAR)])
+    assert side["impact_mps"] == pytest.approx(4.0, abs=1e-3)  # across the car's side, along which it drives faster
 
 
 def test_scenarionet():
@@ -292,6 +318,20 @@ def test_missing_parts():
     assert not judge(drive(9.0), counted=jnp.zeros(STEPS, bool))
     short = judge(drive(9.0), counted=(jnp.arange(STEPS) > 10) & (jnp.arange(STEPS) < 24))  # 13 states and the first one
     assert "nuplan_comfort" not in short
+
+
+def test_no_friction_and_no_masses():
+    record = make_record(drive(), [(VEHICLE, drive(6.0, x=8.0), CAR)], friction_utilization=None, mass=None, other_mass=None)
+    steps = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), jax.eval_shape(lambda one: measure_steps(one, dt=DT), record))
+    found = jax.jit(episode_metrics._collect_safety)(record, steps)
+    valid = {name for name, (_, known) in found.items() if known}
+    assert found.keys() - valid == {"delta_v_mps", "mean_friction_utilization", "max_friction_utilization"}
+
+
+def test_a_car_is_left_out_of_the_road_users():
+    users = make_others([(VEHICLE, drive(), CAR), (VEHICLE, drive(x=20.0), CAR)])
+    assert judge(drive(), others=users)["overlap"] == 1.0
+    assert judge(drive(), others=leave_out(users, jnp.int32(0)))["overlap"] == 0.0
 
 
 def test_scores():

@@ -87,3 +87,9 @@ def find_inside(first: Int[Array, ""], last: Int[Array, ""], count: int) -> Bool
     """Mask of the rows from `first` to `last`."""
     row = jnp.arange(count)
     return (row >= first) & (row <= last)
+
+
+def leave_out(users: Others, row: Int[Array, ""]) -> Others:
+    """Masks one row of all road users of a scene: those beside the car of this row."""
+    own = jnp.arange(users.kind.shape[0]) == row
+    return users._replace(valid=users.valid & ~own[:, None])

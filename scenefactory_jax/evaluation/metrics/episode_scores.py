@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from scenefactory_jax.evaluation.metrics.episode_metrics import Value
 
-# weights of the terms; the multipliers are named in the functions
+# weights of the terms; FACTORS and EVENTS multiply
 VMAX_WEIGHTS = {"ttc_within_bound": 5, "progress_ratio": 5, "speed_compliance": 4, "several_lanes_score": 3, "comfort": 2}
 VMAX_NUPLAN_WEIGHTS = {name: weight for name, weight in VMAX_WEIGHTS.items() if name != "several_lanes_score"}
 NUPLAN_WEIGHTS = {"nuplan_progress": 5, "nuplan_ttc_within_bound": 5, "nuplan_speed_compliance": 4, "nuplan_comfort": 2}
