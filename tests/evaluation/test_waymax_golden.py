@@ -4,14 +4,12 @@ Tolerances: ten times the agreement of an independent recomputation (quirk 11 of
 """
 
 import functools
-import json
-import lzma
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.running import SHARED
+from support.golden_scenes import GOLDEN, list_lines, load_golden, load_scene, needs_golden, pad, read_tracks
 
 from scenefactory_jax.core.boxes import compute_corners, find_overlaps
 from scenefactory_jax.dynamics import bicycle_waymax
@@ -19,16 +17,15 @@ from scenefactory_jax.env import planning_metrics
 from scenefactory_jax.evaluation.metrics import waymax_steps
 from scenefactory_jax.roadgraph.signed_edge_distance import EdgePoints, compute_signed_distance
 
-GOLDEN = SHARED.parent / "reference" / "golden"
 DISTANCE, ACTION, COMFORT, FLAGS = 5e-4, 5e-4, 6e-3, 2
 KINDS = ("log", "constant_velocity", "lateral_offset", "sped_up")
 POINTS, STEPS = 4096, 82  # of the padded road edges; 9 to 90
-pytestmark = pytest.mark.skipif(not GOLDEN.is_dir(), reason=f"needs the golden values in {GOLDEN}")
+pytestmark = needs_golden
 
 
 @functools.cache
 def units():
-    return json.loads((GOLDEN / "units_planning.json").read_text())
+    return load_golden("units_planning.json")
 
 
 def split_boxes(rows):
@@ -98,26 +95,6 @@ def test_bicycle_units():
 OBJECTS, ROUTE, LIGHTS = 160, 256, 8
 
 
-def pad(values, size, axis=0):
-    values = np.asarray(values)
-    assert values.shape[axis] <= size
-    width = [(0, 0)] * values.ndim
-    width[axis] = (0, size - values.shape[axis])
-    return jnp.asarray(np.pad(values, width))
-
-
-def read_tracks(scene, centre, order):
-    """States of objects [O, 91, x y z yaw vx vy], sizes and valid flags; positions relative to the centre."""
-    objects = [scene["objects"][index] for index in order]
-    column = lambda name, part: np.array([[row[part] for row in one[name]] for one in objects], np.float64)  # noqa: E731
-    heading = np.array([one["heading"] for one in objects], np.float64)
-    columns = [column("position", "x") - centre[0], column("position", "y") - centre[1], column("position", "z"), heading]
-    state = np.stack([*columns, column("velocity", "x"), column("velocity", "y")], axis=-1)
-    size = np.array([[one["length"], one["width"]] for one in objects])
-    valid = np.array([one["valid"] for one in objects], bool)
-    return np.where(valid[..., None], state, 0.0).astype(np.float32), size.astype(np.float32), valid
-
-
 def read_lights(lights):
     """Lane and state of each light over the steps 10 to 90."""
     states = np.zeros((81, len(lights)), np.int32)
@@ -129,20 +106,16 @@ def read_lights(lights):
 
 def read_scene(name):
     """A golden file, and the operands of `measure`."""
-    golden = json.loads((GOLDEN / name).read_text())
-    with lzma.open(SHARED / "womd" / "test" / f"{golden['scene']}.xz") as file:
-        scene = json.load(file)
-    centre, sdc = golden["centre"], golden["sdc_index"]
+    golden = load_golden(name)
+    scene, centre, sdc = load_scene(golden), golden["centre"], golden["sdc_index"]
     state, size, valid = read_tracks(scene, centre, [sdc, *(i for i in range(len(scene["objects"])) if i != sdc)])
+    size = size[:, :2]
     egos = np.stack([state[0]] * len(KINDS))
     for row, kind in enumerate(KINDS):
         driven = golden["ego"][kind].get("trajectory")
         if driven is not None:
             egos[row, 11:] = np.stack([driven[key] for key in ("x", "y", "z", "yaw", "vx", "vy")], axis=-1)
-    roads = scene["roads"]
-    lines = [
-        [[p["x"] - centre[0], p["y"] - centre[1], p["z"]] for p in road["geometry"]] for road in roads if road["map_element_id"] in (15, 16)
-    ]
+    lines = [points for _, points in list_lines(scene, centre, (15, 16))]
     route = golden["route"]
     count = len(route["x"])
     paths = waymax_steps.Paths(

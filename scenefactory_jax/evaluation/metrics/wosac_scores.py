@@ -1,0 +1,211 @@
+"""Scores of the Waymo Open Sim Agents Challenge (WOSAC, arXiv:2305.12032): likelihoods of the log under 32 rollouts, and their weighted sum.
+
+Ranges, bins and weights are those of the challenges of 2023, 2024 and 2025 (waymo-open-dataset). Scores of different years do not compare.
+A score that a scene does not determine is marked by `valid`, and means over scenes leave it out.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.core.geometry import safe_norm
+from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Features, find_known_motion
+
+PSEUDOCOUNT = 0.1  # of each bin of a histogram
+INDICATION_PSEUDOCOUNT = 0.001  # of both outcomes of an indication
+
+
+class Histogram(NamedTuple):
+    """How the values of a feature are counted: bins of equal width; values beyond the range count in the first and last one."""
+
+    low: float
+    high: float
+    bins: int
+
+
+class Challenge(NamedTuple):
+    """A year's rules, by feature."""
+
+    histograms: dict[str, Histogram]
+    weights: dict[str, float]
+
+
+HISTOGRAMS = {
+    "linear_speed": Histogram(0.0, 25.0, 10),
+    "linear_acceleration": Histogram(-12.0, 12.0, 11),
+    "angular_speed": Histogram(-0.628, 0.628, 11),
+    "angular_acceleration": Histogram(-3.14, 3.14, 11),
+    "distance_to_nearest_object": Histogram(-5.0, 40.0, 10),
+    "time_to_collision": Histogram(0.0, 5.0, 10),
+    "distance_to_road_edge": Histogram(-20.0, 40.0, 10),
+}
+HISTOGRAMS_2023 = HISTOGRAMS | {
+    "linear_speed": Histogram(0.0, 35.0, 10),
+    "linear_acceleration": Histogram(-15.0, 15.0, 10),
+    "angular_speed": Histogram(-31.5, 31.5, 10),
+    "angular_acceleration": Histogram(-31.5, 31.5, 10),
+}
+BUCKETS = {
+    "kinematic": ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration"),
+    "interactive": ("distance_to_nearest_object", "collision", "time_to_collision"),
+    "map": ("distance_to_road_edge", "offroad", "light_violation"),
+}
+INDICATIONS = ("collision", "offroad", "light_violation")
+WEIGHTS = {
+    "linear_speed": 0.05, "linear_acceleration": 0.05, "angular_speed": 0.05, "angular_acceleration": 0.05,
+    "distance_to_nearest_object": 0.10, "collision": 0.25, "time_to_collision": 0.10,
+    "distance_to_road_edge": 0.05, "offroad": 0.25, "light_violation": 0.05,
+}  # fmt: skip
+WEIGHTS_2023 = {name: 0.09 for name in WEIGHTS} | {"collision": 0.18, "offroad": 0.18, "light_violation": 0.0}
+CHALLENGES = {
+    2023: Challenge(HISTOGRAMS_2023, WEIGHTS_2023),  # its weights sum to 0.99
+    2024: Challenge(HISTOGRAMS, WEIGHTS | {"distance_to_road_edge": 0.10, "light_violation": 0.0}),
+    2025: Challenge(HISTOGRAMS, WEIGHTS),
+}
+UNKNOWN_STEPS = {"linear_speed": 1, "linear_acceleration": 2, "angular_speed": 1, "angular_acceleration": 2}  # at the end of a rollout
+
+
+class Score(NamedTuple):
+    """A score, and whether the scene determines it; if not, its value means nothing, except for that of lights."""
+
+    value: Float[Array, "*s"]
+    valid: Bool[Array, "*s"]
+
+
+class SceneScores(NamedTuple):
+    """Scores of a scene."""
+
+    meta: Score  # the realism meta-metric
+    buckets: dict[str, Score]  # of BUCKETS: weighted means of their likelihoods
+    likelihoods: dict[str, Score]
+    ade: Score  # average displacement error, m; the eleven steps of history count as 0
+    min_ade: Score
+    rates: dict[str, Score]  # of INDICATIONS: part of the evaluated objects over all rollouts
+
+
+class Evaluated(NamedTuple):
+    """Which values of a scene's evaluated objects count."""
+
+    valid: Bool[Array, "E F"]  # the logged object is valid at the step of the future; false in padding
+    vehicle: Bool[Array, " E"]
+    has_edges: Bool[Array, ""]  # the map has road edges
+    has_lights: Bool[Array, ""]  # ... lanes of surface streets and lights
+
+
+def compute_histogram_likelihoods(
+    log: Float[Array, "E F"], simulated: Float[Array, "E S"], missing: Bool[Array, " S"], histogram: Histogram
+) -> Float[Array, "E F"]:
+    """Computes the log-likelihoods of logged values under the histogram of each object's simulated ones.
+
+    Args:
+        missing: simulated values that are not known. They count in the last bin, as NaN does in the published code.
+    """
+    edges = jnp.asarray(np.linspace(histogram.low, histogram.high, histogram.bins + 1)[1:-1], jnp.float32)
+    simulated = jnp.where(missing, histogram.high, simulated)
+    above = [jnp.sum(simulated >= edge, axis=-1) for edge in edges]
+    total = jnp.full(log.shape[:1], simulated.shape[-1])
+    counts = -jnp.diff(jnp.stack([total, *above, jnp.zeros_like(total)], axis=-1), axis=-1)
+    probability = (counts + PSEUDOCOUNT) / (simulated.shape[-1] + histogram.bins * PSEUDOCOUNT)
+    place = jnp.sum(log[..., None] >= edges, axis=-1)
+    return jnp.take_along_axis(jnp.log(probability), place, axis=-1)
+
+
+def compute_indication_likelihoods(log: Bool[Array, " E"], simulated: Bool[Array, "R E"]) -> Float[Array, " E"]:
+    """Computes the log-likelihoods of logged Booleans under each object's simulated ones."""
+    same = jnp.sum(simulated == log, axis=0)
+    return jnp.log((same + INDICATION_PSEUDOCOUNT) / (len(simulated) + 2 * INDICATION_PSEUDOCOUNT))
+
+
+def average(values: Float[Array, "*n"], counted: Bool[Array, "*n"]) -> Score:
+    """Computes the mean of the values that count."""
+    number = jnp.sum(counted)
+    return Score(jnp.sum(jnp.where(counted, values, 0.0)) / jnp.maximum(number, 1), number > 0)
+
+
+def compute_likelihoods(
+    log: Features, simulated: Features, evaluated: Evaluated, histograms: dict[str, Histogram]
+) -> tuple[dict[str, Score], dict[str, Score]]:
+    """Computes the likelihood of each feature, and the simulated rates of the indications.
+
+    Logarithms are averaged over all steps and objects that count (objects, for indications), and the mean is exponentiated. Time to
+    collision and lights are of vehicles alone. Without lights, no object violates any: the published code counts this likelihood of almost 1
+    in the meta-metric, so its value is kept, and `valid` is false.
+    """
+    valid, vehicle = evaluated.valid, evaluated.vehicle
+    speeds, accelerations = find_known_motion(valid)
+    everyone = jnp.ones_like(vehicle)
+    steps = {"linear_speed": speeds, "angular_speed": speeds, "linear_acceleration": accelerations, "angular_acceleration": accelerations}
+    only = {"time_to_collision": vehicle, "light_violation": vehicle}
+    known = {"distance_to_road_edge": evaluated.has_edges, "offroad": evaluated.has_edges, "light_violation": evaluated.has_lights}
+    likelihoods, rates = {}, {}
+    for name, histogram in histograms.items():
+        values = getattr(simulated, name)  # [R, E, F]
+        missing = jnp.broadcast_to(jnp.arange(values.shape[2]) >= values.shape[2] - UNKNOWN_STEPS.get(name, 0), values[:, 0].shape)
+        each = jnp.moveaxis(values, 0, 1).reshape(values.shape[1], -1)
+        logarithms = compute_histogram_likelihoods(getattr(log, name), each, missing.reshape(-1), histogram)
+        likelihoods[name] = average(logarithms, steps.get(name, valid) & only.get(name, everyone)[:, None])
+    for name in INDICATIONS:
+        happened, happened_in_log = (jnp.any(getattr(features, name) & valid, axis=-1) for features in (simulated, log))
+        counted = jnp.any(valid, axis=-1) & only.get(name, everyone)
+        likelihoods[name] = average(compute_indication_likelihoods(happened_in_log, happened), counted)
+        rates[name] = average(jnp.mean(happened, axis=0), counted)
+    mask = lambda name, score, value: Score(value, score.valid & known.get(name, True))  # noqa: E731
+    likelihoods = {name: mask(name, score, jnp.exp(score.value)) for name, score in likelihoods.items()}
+    return likelihoods, {name: mask(name, score, score.value) for name, score in rates.items()}
+
+
+def compute_weighted_mean(likelihoods: dict[str, Score], weights: dict[str, float], *, total: float) -> Score:
+    """Computes the weighted sum of likelihoods over `total`; it is valid if all that have a weight are, lights aside."""
+    used = {name: weight for name, weight in weights.items() if weight > 0}
+    value = jnp.sum(jnp.stack([weight * likelihoods[name].value for name, weight in used.items()]), axis=0) / total
+    return Score(value, jnp.all(jnp.stack([likelihoods[name].valid for name in used if name != "light_violation"]), axis=0))
+
+
+def compute_displacement_errors(
+    log: Float[Array, "E F 3"], simulated: Float[Array, "R E F 3"], valid: Bool[Array, "E F"]
+) -> tuple[Score, Score]:
+    """Computes the average displacement error of all rollouts and that of the best rollout of each object, m.
+
+    An object's error is the mean over its valid steps and the HISTORY_STEPS before them, at which it is 0.
+    """
+    error = jnp.where(valid, safe_norm(simulated - log), 0.0)
+    mean = jnp.sum(error, axis=-1) / (jnp.sum(valid, axis=-1) + HISTORY_STEPS)
+    counted = jnp.any(valid, axis=-1)
+    return average(jnp.mean(mean, axis=0), counted), average(jnp.min(mean, axis=0), counted)
+
+
+def compute_scene_scores(
+    log: Features,
+    simulated: Features,
+    log_position: Float[Array, "E F 3"],
+    position: Float[Array, "R E F 3"],
+    evaluated: Evaluated,
+    *,
+    challenge: Challenge,
+) -> SceneScores:
+    """Computes all scores of a scene.
+
+    Args:
+        log: features of the log, [E, F].
+        simulated: features of the rollouts, [R, E, F].
+        log_position, position: of the evaluated objects, in the log and in the rollouts.
+        challenge: one of CHALLENGES.
+    """
+    likelihoods, rates = compute_likelihoods(log, simulated, evaluated, challenge.histograms)
+    weights = challenge.weights
+    buckets = {}
+    for bucket, names in BUCKETS.items():
+        part = {name: weights[name] for name in names}
+        buckets[bucket] = compute_weighted_mean(likelihoods, part, total=sum(part.values()))
+    meta = compute_weighted_mean(likelihoods, weights, total=1.0)
+    ade, min_ade = compute_displacement_errors(log_position, position, evaluated.valid)
+    return SceneScores(meta, buckets, likelihoods, ade, min_ade, rates)
+
+
+def average_scenes(scores: SceneScores) -> SceneScores:
+    """Computes the means over scenes (the leading axis); each score over the scenes that determine it."""
+    is_score = lambda node: isinstance(node, Score)  # noqa: E731
+    return jax.tree.map(lambda score: average(score.value, score.valid), scores, is_leaf=is_score)
