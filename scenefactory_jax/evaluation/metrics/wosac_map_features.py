@@ -68,8 +68,8 @@ def project_on_segment(point: Float[Array, "*n 3"], start: Float[Array, "*m 3"],
     return dot((point - start)[..., :2], along[..., :2]) / jnp.where(squared > 0, squared, 1.0)
 
 
-def find_nearest_segments(point: Float[Array, "*n 3"], segments: Segments) -> Int[Array, "*n"]:
-    """Finds the valid segments that are nearest to points, heights stretched by HEIGHT_SCALE; of equal ones the first."""
+def find_nearest_segments(point: Float[Array, "*n 3"], segments: Segments, *, last: bool = False) -> Int[Array, "*n"]:
+    """Finds the valid segments that are nearest to points, heights stretched by HEIGHT_SCALE; of equal ones the first, or the `last`."""
     scale = jnp.array([1.0, 1.0, HEIGHT_SCALE], jnp.float32)
 
     def compare(best: tuple[Array, Array], row: tuple[Segments, Array]) -> tuple[tuple[Array, Array], None]:
@@ -77,7 +77,7 @@ def find_nearest_segments(point: Float[Array, "*n 3"], segments: Segments) -> In
         part = jnp.clip(project_on_segment(point, segment.start, segment.along), 0.0, 1.0)
         apart = (point - segment.start - part[..., None] * segment.along) * scale
         squared = jnp.where(segment.valid, dot(apart, apart), jnp.inf)
-        nearer = squared < best[0]
+        nearer = (squared <= best[0]) & segment.valid if last else squared < best[0]
         return (jnp.where(nearer, squared, best[0]), jnp.where(nearer, index, best[1])), None
 
     count = len(segments.valid)
@@ -153,7 +153,7 @@ def find_light_violations(position: Float[Array, "E T 3"], lanes: Lines, lights:
 
     def find_stop_segment(lane: Int[Array, ""], stop: Float[Array, "3"]) -> Float[Array, "2"]:
         own = segments._replace(valid=segments.valid & (segments.line == lane))
-        return own.along[find_nearest_segments(stop, own), :2]
+        return own.along[find_nearest_segments(stop, own, last=True), :2]  # a stop point may be the end of one and the start of the next
 
     along = jax.vmap(find_stop_segment)(lights.lane, lights.stop)
     passed = dot(position[..., None, :2] - lights.stop[:, :2], along)  # [E, T, L]

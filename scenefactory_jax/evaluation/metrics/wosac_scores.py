@@ -103,7 +103,8 @@ def compute_histogram_likelihoods(
     Args:
         missing: simulated values that are not known. They count in the last bin, as NaN does in the published code.
     """
-    edges = jnp.asarray(np.linspace(histogram.low, histogram.high, histogram.bins + 1)[1:-1], jnp.float32)
+    width = np.float32((histogram.high - histogram.low) / histogram.bins)
+    edges = np.float32(histogram.low) + np.arange(1, histogram.bins, dtype=np.float32) * width  # rounded as in the published code
     simulated = jnp.where(missing, histogram.high, simulated)
     above = [jnp.sum(simulated >= edge, axis=-1) for edge in edges]
     total = jnp.full(log.shape[:1], simulated.shape[-1])
@@ -167,14 +168,14 @@ def compute_weighted_mean(likelihoods: dict[str, Score], weights: dict[str, floa
 def compute_displacement_errors(
     log: Float[Array, "E F 3"], simulated: Float[Array, "R E F 3"], valid: Bool[Array, "E F"]
 ) -> tuple[Score, Score]:
-    """Computes the average displacement error of all rollouts and that of the best rollout of each object, m.
+    """Computes the average displacement error of all rollouts, and that of the rollout with the smallest one, m; means over objects.
 
     An object's error is the mean over its valid steps and the HISTORY_STEPS before them, at which it is 0.
     """
     error = jnp.where(valid, safe_norm(simulated - log), 0.0)
     mean = jnp.sum(error, axis=-1) / (jnp.sum(valid, axis=-1) + HISTORY_STEPS)
-    counted = jnp.any(valid, axis=-1)
-    return average(jnp.mean(mean, axis=0), counted), average(jnp.min(mean, axis=0), counted)
+    each = jax.vmap(average, in_axes=(0, None))(mean, jnp.any(valid, axis=-1))  # [R]
+    return Score(jnp.mean(each.value), each.valid[0]), Score(jnp.min(each.value), each.valid[0])
 
 
 def compute_scene_scores(
