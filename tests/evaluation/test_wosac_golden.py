@@ -129,20 +129,18 @@ def read_lights(lights, stop_points):
 
 
 def make_rollouts(state, valid, index):
-    """The golden rollouts of objects valid at step 10 [O, 91, x y z yaw vx vy]: log, constant velocity, and log with 32 kinds of noise.
+    """The golden futures of objects valid at step 10 [O, 91, x y z yaw vx vy]: log, constant velocity, and log with 32 kinds of noise.
 
     Args:
         index: of the objects in the file.
     """
-    steps = np.arange(HISTORY_STEPS + FUTURE)
-    last_valid = np.maximum.accumulate(np.where(valid, steps, 0), axis=1)
-    held = np.take_along_axis(state[..., :4], last_valid[..., None], axis=1)
-    log = np.where((steps >= HISTORY_STEPS)[:, None], held, state[..., :4])
-    u = np.maximum(steps - 10, 0)[:, None] / FUTURE
-    straight = log.copy()
-    straight[:, 10:, :2] = state[:, 10:11, :2] + FUTURE * 0.1 * u[10:] * state[:, 10:11, 4:]
-    straight[:, 11:, 2:] = log[:, 10:11, 2:]
-    k, i, u = np.arange(ROLLOUTS)[:, None, None], index[:, None], u[:, 0]
+    steps = np.arange(10, HISTORY_STEPS + FUTURE)
+    last_valid = np.maximum.accumulate(np.where(valid[:, 10:], steps, 0), axis=1)
+    log = np.take_along_axis(state[..., :4], last_valid[..., None], axis=1)[:, 1:]
+    u = np.arange(1, FUTURE + 1) / FUTURE
+    straight = np.broadcast_to(state[:, 10:11, :4], log.shape).copy()
+    straight[..., :2] += FUTURE * 0.1 * u[:, None] * state[:, 10:11, 4:]
+    k, i = np.arange(ROLLOUTS)[:, None, None], index[:, None]
     a, b = np.sin(1.7 * (k + 1) + 0.9 * (i + 1)), np.sin(2.3 * (k + 1) + 1.3 * (i + 1))
     w = np.sin(np.pi * (1 + k % 4) * u)
     along, left, cos, sin = 4 * a * u**2, 1.5 * b * w, np.cos(log[..., 3]), np.sin(log[..., 3])
@@ -169,46 +167,34 @@ def read_scene(name, capacity):
     assert len(simulated) == golden["simulated_objects"]
     state, size, valid = read_tracks(scene, centre, simulated)
     rollouts = make_rollouts(state, valid, np.array(simulated))
-    present = np.concatenate([valid[:, :HISTORY_STEPS], np.ones((len(valid), FUTURE), bool)], axis=1)
     evaluated = np.array([simulated.index(index) for index in golden["evaluated_object_indices"]])
-    rows = pad(evaluated, capacity)
-    kept = jnp.arange(capacity) < len(evaluated)
-    vehicle = np.array([scene["objects"][index]["type"] == "vehicle" for index in golden["evaluated_object_indices"]])
-    lanes = make_lines(list_lines(scene, centre, SURFACE_STREET), LANE_POINTS)
     road = RoadMap(
         edges=make_lines(list_lines(scene, centre, ROAD_EDGES), EDGE_POINTS),
-        lanes=lanes,
+        lanes=make_lines(list_lines(scene, centre, SURFACE_STREET), LANE_POINTS),
         lights=read_lights(plan["lights"], golden["lights_extra"]["stop_points"]),
     )
-    counted = wosac_scores.Evaluated(
-        valid=pad(valid[evaluated, HISTORY_STEPS:], capacity) & kept[:, None],
-        vehicle=pad(vehicle, capacity),
-        has_edges=jnp.array(True),
-        has_lights=jnp.any(lanes.valid),
-    )
-    states = pad(np.concatenate([state[None, ..., :4], rollouts]), OBJECTS, axis=1)
-    masks = pad(np.concatenate([valid[None], np.repeat(present[None], len(rollouts), axis=0)]), OBJECTS, axis=1)
-    return golden, (states, masks, pad(size, OBJECTS), rows, road, counted)
+    vehicle = np.array([scene["objects"][index]["type"] == "vehicle" for index in simulated])
+    log = Objects(pad(state[..., :4], OBJECTS), pad(valid, OBJECTS), pad(size, OBJECTS))
+    chosen = pad(evaluated, capacity), jnp.arange(capacity) < len(evaluated)
+    return golden, (log, pad(rollouts, OBJECTS, axis=1), *chosen, pad(vehicle, OBJECTS), road)
 
 
 @jax.jit
-def measure(states, valid, size, evaluated, road, counted):
-    """Features of the log and of all rollouts, and the scores of each kind, without lights and with them, in 2024 and 2025."""
-    compute = lambda state, valid: wosac_features.compute_features(Objects(state, valid, size), evaluated, road)  # noqa: E731
-    features = jax.vmap(compute)(states, valid)
-    log, rollouts = (jax.tree.map(lambda values, part=part: values[part], features) for part in (0, slice(1, None)))
-    position = states[:, evaluated, HISTORY_STEPS:, :3]
-
-    def score(log, rollouts, rows, counted, challenge):
-        chosen = jax.tree.map(lambda values: values[rows], rollouts)
-        return wosac_scores.compute_scene_scores(log, chosen, position[0], position[1:][rows], counted, challenge=challenge)
-
+def measure(log, rollouts, evaluated, kept, vehicle, road):
+    """Features of the log and of all rollouts, and the scores of each kind in 2024 and 2025, without lights as the golden ones are."""
+    features, simulated = wosac_scores.compute_all_features(log, rollouts, evaluated, road)
+    counted = wosac_scores.find_counted(log, evaluated, kept, vehicle, road)
+    position, log_position = rollouts[:, evaluated, :, :3], log.state[evaluated, HISTORY_STEPS:, :3]
     dark = lambda part: part._replace(light_violation=jnp.zeros_like(part.light_violation))  # noqa: E731
-    unlit = dark(log), dark(rollouts)
-    without = counted._replace(has_lights=jnp.array(False))
+
+    def score(rows, challenge):
+        chosen = jax.tree.map(lambda values: values[rows], dark(simulated))
+        unlit = counted._replace(has_lights=jnp.array(False))
+        return wosac_scores.compute_scene_scores(dark(features), chosen, log_position, position[rows], unlit, challenge=challenge)
+
     rows = jnp.array(list(ROWS.values()))
-    every = lambda year: jax.vmap(lambda row: score(*unlit, row, without, wosac_scores.CHALLENGES[year]))(rows)  # noqa: E731
-    return log, rollouts, {year: every(year) for year in (2024, 2025)}
+    scores = {year: jax.vmap(lambda row: score(row, wosac_scores.CHALLENGES[year]))(rows) for year in (2024, 2025)}  # noqa: B023
+    return features, simulated, counted, scores
 
 
 def check_features(expected, found, evaluated, valid):
@@ -255,9 +241,9 @@ def check_scores(expected, scores, row):
 
 def check_scene(name, capacity):
     golden, operands = read_scene(name, capacity)
-    log, rollouts, scores = jax.tree.map(np.asarray, measure(*operands))
-    count, counted = len(golden["evaluated_object_indices"]), operands[-1]
-    valid = np.asarray(counted.valid)[:count]
+    log, rollouts, counted, scores = jax.tree.map(np.asarray, measure(*operands))
+    count = len(golden["evaluated_object_indices"])
+    valid = counted.valid[:count]
     assert valid.sum(axis=1).tolist() == golden["log_valid_future_steps"]
     straight = jax.tree.map(lambda values: values[1], rollouts)
     wrong = [f"log {line}" for line in check_features(golden["features_log"], log, count, valid)]

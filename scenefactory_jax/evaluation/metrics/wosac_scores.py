@@ -9,10 +9,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from scenefactory_jax.core.geometry import safe_norm
-from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Features, find_known_motion
+from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Features, Objects, compute_features, find_known_motion
+from scenefactory_jax.evaluation.metrics.wosac_map_features import RoadMap, make_segments
 
 PSEUDOCOUNT = 0.1  # of each bin of a histogram
 INDICATION_PSEUDOCOUNT = 0.001  # of both outcomes of an indication
@@ -86,7 +87,7 @@ class SceneScores(NamedTuple):
     rates: dict[str, Score]  # of INDICATIONS: part of the evaluated objects over all rollouts
 
 
-class Evaluated(NamedTuple):
+class Counted(NamedTuple):
     """Which values of a scene's evaluated objects count."""
 
     valid: Bool[Array, "E F"]  # the logged object is valid at the step of the future; false in padding
@@ -127,7 +128,7 @@ def average(values: Float[Array, "*n"], counted: Bool[Array, "*n"]) -> Score:
 
 
 def compute_likelihoods(
-    log: Features, simulated: Features, evaluated: Evaluated, histograms: dict[str, Histogram]
+    log: Features, simulated: Features, counted: Counted, histograms: dict[str, Histogram]
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Computes the likelihood of each feature, and the simulated rates of the indications.
 
@@ -135,12 +136,12 @@ def compute_likelihoods(
     collision and lights are of vehicles alone. Without lights, no object violates any: the published code counts this likelihood of almost 1
     in the meta-metric, so its value is kept, and `valid` is false.
     """
-    valid, vehicle = evaluated.valid, evaluated.vehicle
+    valid, vehicle = counted.valid, counted.vehicle
     speeds, accelerations = find_known_motion(valid)
     everyone = jnp.ones_like(vehicle)
     steps = {"linear_speed": speeds, "angular_speed": speeds, "linear_acceleration": accelerations, "angular_acceleration": accelerations}
     only = {"time_to_collision": vehicle, "light_violation": vehicle}
-    known = {"distance_to_road_edge": evaluated.has_edges, "offroad": evaluated.has_edges, "light_violation": evaluated.has_lights}
+    known = {"distance_to_road_edge": counted.has_edges, "offroad": counted.has_edges, "light_violation": counted.has_lights}
     likelihoods, rates = {}, {}
     for name, histogram in histograms.items():
         values = getattr(simulated, name)  # [R, E, F]
@@ -150,9 +151,9 @@ def compute_likelihoods(
         likelihoods[name] = average(logarithms, steps.get(name, valid) & only.get(name, everyone)[:, None])
     for name in INDICATIONS:
         happened, happened_in_log = (jnp.any(getattr(features, name) & valid, axis=-1) for features in (simulated, log))
-        counted = jnp.any(valid, axis=-1) & only.get(name, everyone)
-        likelihoods[name] = average(compute_indication_likelihoods(happened_in_log, happened), counted)
-        rates[name] = average(jnp.mean(happened, axis=0), counted)
+        objects = jnp.any(valid, axis=-1) & only.get(name, everyone)
+        likelihoods[name] = average(compute_indication_likelihoods(happened_in_log, happened), objects)
+        rates[name] = average(jnp.mean(happened, axis=0), objects)
     mask = lambda name, score, value: Score(value, score.valid & known.get(name, True))  # noqa: E731
     likelihoods = {name: mask(name, score, jnp.exp(score.value)) for name, score in likelihoods.items()}
     return likelihoods, {name: mask(name, score, score.value) for name, score in rates.items()}
@@ -183,7 +184,7 @@ def compute_scene_scores(
     simulated: Features,
     log_position: Float[Array, "E F 3"],
     position: Float[Array, "R E F 3"],
-    evaluated: Evaluated,
+    counted: Counted,
     *,
     challenge: Challenge,
 ) -> SceneScores:
@@ -195,15 +196,59 @@ def compute_scene_scores(
         log_position, position: of the evaluated objects, in the log and in the rollouts.
         challenge: one of CHALLENGES.
     """
-    likelihoods, rates = compute_likelihoods(log, simulated, evaluated, challenge.histograms)
+    likelihoods, rates = compute_likelihoods(log, simulated, counted, challenge.histograms)
     weights = challenge.weights
     buckets = {}
     for bucket, names in BUCKETS.items():
         part = {name: weights[name] for name in names}
         buckets[bucket] = compute_weighted_mean(likelihoods, part, total=sum(part.values()))
     meta = compute_weighted_mean(likelihoods, weights, total=1.0)
-    ade, min_ade = compute_displacement_errors(log_position, position, evaluated.valid)
+    ade, min_ade = compute_displacement_errors(log_position, position, counted.valid)
     return SceneScores(meta, buckets, likelihoods, ade, min_ade, rates)
+
+
+def find_counted(log: Objects, evaluated: Int[Array, " E"], kept: Bool[Array, " E"], vehicle: Bool[Array, " O"], road: RoadMap) -> Counted:
+    """Finds which values of a scene count; `kept` is false in padding of `evaluated`."""
+    has_edges, has_lanes = (jnp.any(make_segments(lines).valid) for lines in (road.edges, road.lanes))
+    valid = log.valid[evaluated, HISTORY_STEPS:] & kept[:, None]
+    return Counted(valid, vehicle[evaluated], has_edges, has_lanes & jnp.any(road.lights.state > 0))
+
+
+def compute_all_features(
+    log: Objects, rollouts: Float[Array, "R O F 4"], evaluated: Int[Array, " E"], road: RoadMap
+) -> tuple[Features, Features]:
+    """Computes the features of the log, [E, F], and of rollouts of its future, [R, E, F], in one pass."""
+    history = jnp.broadcast_to(log.state[:, :HISTORY_STEPS], (len(rollouts), *log.state[:, :HISTORY_STEPS].shape))
+    states = jnp.concatenate([log.state[None], jnp.concatenate([history, rollouts], axis=2)])
+    simulated = log.valid.at[:, HISTORY_STEPS:].set(log.valid[:, HISTORY_STEPS - 1, None])  # they are simulated to the end
+    valid = jnp.concatenate([log.valid[None], jnp.broadcast_to(simulated, (len(rollouts), *simulated.shape))])
+    features = jax.vmap(lambda state, valid: compute_features(Objects(state, valid, log.size), evaluated, road))(states, valid)
+    return jax.tree.map(lambda values: values[0], features), jax.tree.map(lambda values: values[1:], features)
+
+
+def score_rollouts(
+    log: Objects,
+    rollouts: Float[Array, "R O F 4"],
+    evaluated: Int[Array, " E"],
+    kept: Bool[Array, " E"],
+    vehicle: Bool[Array, " O"],
+    road: RoadMap,
+    *,
+    challenge: Challenge,
+) -> SceneScores:
+    """Computes all scores of rollouts of a scene; `jax.vmap` adds scenes.
+
+    Args:
+        log: all objects, with history and logged future; those that are invalid at the current step are left out.
+        rollouts: x, y, z and yaw of all objects over the future.
+        evaluated, kept: rows of the objects that are scored (the car that recorded, and those to predict); not kept: padding.
+        vehicle: which objects are vehicles.
+    """
+    log = log._replace(valid=log.valid & log.valid[:, HISTORY_STEPS - 1, None])
+    features, simulated = compute_all_features(log, rollouts, evaluated, road)
+    counted = find_counted(log, evaluated, kept, vehicle, road)
+    positions = log.state[evaluated, HISTORY_STEPS:, :3], rollouts[:, evaluated, :, :3]
+    return compute_scene_scores(features, simulated, *positions, counted, challenge=challenge)
 
 
 def average_scenes(scores: SceneScores) -> SceneScores:
