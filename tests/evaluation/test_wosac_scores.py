@@ -12,6 +12,7 @@ from scenefactory_jax.evaluation.metrics.wosac_features import HISTORY_STEPS, Ob
 from scenefactory_jax.evaluation.metrics.wosac_map_features import Lights, Lines, RoadMap
 
 FUTURE, ROLLOUTS = 80, 4
+pytestmark = pytest.mark.usefixtures("quickly")
 VARIANTS = ("all", "no edges", "no lights", "no vehicle", "nothing logged")
 
 

@@ -22,7 +22,7 @@ FAR_M = 1e10  # distance to the nearest object where there is none
 LONGEST_TTC_S = 5.0
 FOLLOWING_ANGLE, PARALLEL_ANGLE = math.radians(75.0), math.radians(10.0)  # largest heading differences of a car and one that it follows
 OVERLAP_M = 0.5  # by which they overlap sideways, if not parallel
-UNROLLED = 4  # objects a turn of the loop over the others
+UNROLLED = 2  # objects a turn of the loop over the others
 
 
 class Objects(NamedTuple):
@@ -179,11 +179,11 @@ def compute_features(objects: Objects, evaluated: Int[Array, " E"], road: RoadMa
     """
     now = HISTORY_STEPS
     state = objects.state[evaluated]
-    motion = (values[:, now:] for values in compute_motion(state))
+    speed, acceleration, turn, turn_acceleration = (values[:, now:] for values in compute_motion(state))
     future = Objects(objects.state[:, now - 1 :], objects.valid[:, now - 1 :], objects.size)  # and the step before, for speeds
     distance, time = (values[:, 1:] for values in compare_with_others(future, evaluated))
     size = jnp.broadcast_to(objects.size[evaluated][:, None], (*state[:, now:, :3].shape,))
     edge = compute_road_edge_distances(state[:, now:], size, road.edges)
     lights = road.lights._replace(state=road.lights.state[now - 1 :])
     violation = find_light_violations(state[:, now - 1 :, :3], road.lanes, lights)[:, 1:]
-    return Features(*motion, distance, time, edge, distance < 0, edge > 0, violation)
+    return Features(speed, acceleration, turn, turn_acceleration, distance, time, edge, distance < 0, edge > 0, violation)

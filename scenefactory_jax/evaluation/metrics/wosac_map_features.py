@@ -17,7 +17,7 @@ from scenefactory_jax.core.geometry import cross, dot, safe_norm
 HEIGHT_SCALE = 3.0  # by which heights are stretched in the search for the nearest segment
 CYCLIC_M = 1.0  # a line whose ends are nearer than this is closed
 RED_LIGHTS = (1, 4)  # of LIGHT_STATES: arrow_stop, stop; a flashing light is none
-UNROLLED = 8  # segments a turn of the search's loop: fewer and larger kernels
+UNROLLED = 16  # segments a turn of the search's loop: fewer and larger kernels
 
 
 class Lines(NamedTuple):
@@ -70,19 +70,24 @@ def project_on_segment(point: Float[Array, "*n 3"], start: Float[Array, "*m 3"],
 
 def find_nearest_segments(point: Float[Array, "*n 3"], segments: Segments, *, last: bool = False) -> Int[Array, "*n"]:
     """Finds the valid segments that are nearest to points, heights stretched by HEIGHT_SCALE; of equal ones the first, or the `last`."""
-    scale = jnp.array([1.0, 1.0, HEIGHT_SCALE], jnp.float32)
+    x, y, z = (point[..., axis] for axis in range(3))  # columns apart: loops over contiguous values
 
-    def compare(best: tuple[Array, Array], row: tuple[Segments, Array]) -> tuple[tuple[Array, Array], None]:
-        segment, index = row
-        part = jnp.clip(project_on_segment(point, segment.start, segment.along), 0.0, 1.0)
-        apart = (point - segment.start - part[..., None] * segment.along) * scale
-        squared = jnp.where(segment.valid, dot(apart, apart), jnp.inf)
+    def compare(best: tuple[Array, Array], row: tuple[Segments, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        segment, inverse, index = row
+        along = segment.along
+        apart_x, apart_y, apart_z = x - segment.start[0], y - segment.start[1], z - segment.start[2]
+        part = jnp.clip((apart_x * along[0] + apart_y * along[1]) * inverse, 0.0, 1.0)
+        apart_z = HEIGHT_SCALE * (apart_z - part * along[2])
+        squared = (apart_x - part * along[0]) ** 2 + (apart_y - part * along[1]) ** 2 + apart_z**2
+        squared = jnp.where(segment.valid, squared, jnp.inf)
         nearer = (squared <= best[0]) & segment.valid if last else squared < best[0]
         return (jnp.where(nearer, squared, best[0]), jnp.where(nearer, index, best[1])), None
 
     count = len(segments.valid)
     first = jnp.full(point.shape[:-1], jnp.inf), jnp.zeros(point.shape[:-1], jnp.int32)
-    (_, nearest), _ = jax.lax.scan(compare, first, (segments, jnp.arange(count, dtype=jnp.int32)), unroll=UNROLLED)
+    length = dot(segments.along[:, :2], segments.along[:, :2])
+    rows = segments, 1 / jnp.where(length > 0, length, 1.0), jnp.arange(count, dtype=jnp.int32)
+    (_, nearest), _ = jax.lax.scan(compare, first, rows, unroll=UNROLLED)
     return nearest
 
 

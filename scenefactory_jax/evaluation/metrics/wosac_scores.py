@@ -1,4 +1,4 @@
-"""Scores of the Waymo Open Sim Agents Challenge (WOSAC, arXiv:2305.12032): likelihoods of the log under 32 rollouts, and their weighted sum.
+"""Scores of the Waymo Open Sim Agents Challenge (WOSAC, arXiv:2305.12032): likelihoods of the log under rollouts, and their weighted sum.
 
 Ranges, bins and weights are those of the challenges of 2023, 2024 and 2025 (waymo-open-dataset). Scores of different years do not compare.
 A score that a scene does not determine is marked by `valid`, and means over scenes leave it out.
@@ -107,9 +107,9 @@ def compute_histogram_likelihoods(
     width = np.float32((histogram.high - histogram.low) / histogram.bins)
     edges = np.float32(histogram.low) + np.arange(1, histogram.bins, dtype=np.float32) * width  # rounded as in the published code
     simulated = jnp.where(missing, histogram.high, simulated)
-    above = [jnp.sum(simulated >= edge, axis=-1) for edge in edges]
-    total = jnp.full(log.shape[:1], simulated.shape[-1])
-    counts = -jnp.diff(jnp.stack([total, *above, jnp.zeros_like(total)], axis=-1), axis=-1)
+    above = jnp.sum(simulated[..., None] >= edges, axis=-2)  # of each inner edge; compared and summed in one loop
+    above = jnp.pad(above, ((0, 0), (1, 1)), constant_values=((0, 0), (simulated.shape[-1], 0)))
+    counts = above[:, :-1] - above[:, 1:]
     probability = (counts + PSEUDOCOUNT) / (simulated.shape[-1] + histogram.bins * PSEUDOCOUNT)
     place = jnp.sum(log[..., None] >= edges, axis=-1)
     return jnp.take_along_axis(jnp.log(probability), place, axis=-1)
@@ -133,7 +133,7 @@ def compute_likelihoods(
     """Computes the likelihood of each feature, and the simulated rates of the indications.
 
     Logarithms are averaged over all steps and objects that count (objects, for indications), and the mean is exponentiated. Time to
-    collision and lights are of vehicles alone. Without lights, no object violates any: the published code counts this likelihood of almost 1
+    collision and lights are of vehicles alone. Without lights, no object violates any: the published code counts this likelihood, almost 1,
     in the meta-metric, so its value is kept, and `valid` is false.
     """
     valid, vehicle = counted.valid, counted.vehicle
@@ -159,11 +159,20 @@ def compute_likelihoods(
     return likelihoods, {name: mask(name, score, score.value) for name, score in rates.items()}
 
 
-def compute_weighted_mean(likelihoods: dict[str, Score], weights: dict[str, float], *, total: float) -> Score:
-    """Computes the weighted sum of likelihoods over `total`; it is valid if all that have a weight are, lights aside."""
+def compute_weighted_sum(likelihoods: dict[str, Score], weights: dict[str, float]) -> Score:
+    """Computes the weighted sum of likelihoods; it is valid if all that have a weight are, lights aside."""
     used = {name: weight for name, weight in weights.items() if weight > 0}
-    value = jnp.sum(jnp.stack([weight * likelihoods[name].value for name, weight in used.items()]), axis=0) / total
+    value = jnp.sum(jnp.stack([weight * likelihoods[name].value for name, weight in used.items()]), axis=0)
     return Score(value, jnp.all(jnp.stack([likelihoods[name].valid for name in used if name != "light_violation"]), axis=0))
+
+
+def weigh_likelihoods(likelihoods: dict[str, Score], weights: dict[str, float]) -> tuple[Score, dict[str, Score]]:
+    """Computes the meta-metric, a sum, and the buckets, means with the same weights."""
+    buckets = {}
+    for bucket, names in BUCKETS.items():
+        total = sum(weights[name] for name in names)
+        buckets[bucket] = compute_weighted_sum(likelihoods, {name: weights[name] / total for name in names})
+    return compute_weighted_sum(likelihoods, weights), buckets
 
 
 def compute_displacement_errors(
@@ -197,12 +206,7 @@ def compute_scene_scores(
         challenge: one of CHALLENGES.
     """
     likelihoods, rates = compute_likelihoods(log, simulated, counted, challenge.histograms)
-    weights = challenge.weights
-    buckets = {}
-    for bucket, names in BUCKETS.items():
-        part = {name: weights[name] for name in names}
-        buckets[bucket] = compute_weighted_mean(likelihoods, part, total=sum(part.values()))
-    meta = compute_weighted_mean(likelihoods, weights, total=1.0)
+    meta, buckets = weigh_likelihoods(likelihoods, challenge.weights)
     ade, min_ade = compute_displacement_errors(log_position, position, counted.valid)
     return SceneScores(meta, buckets, likelihoods, ade, min_ade, rates)
 
