@@ -80,7 +80,8 @@ def test_scores_of_the_street():
     found = scores()[0]["all"]
     stands = 1 / ROLLOUTS
     assert found.rates["light_violation"].value == 1 - stands
-    assert found.rates["collision"].value == found.rates["offroad"].value == 0  # the absent object is in no rollout
+    assert found.rates["collision"].value == found.rates["offroad"].value == 0
+    assert found.likelihoods["collision"].value > 0.99  # the absent object is left out of the log, too
     np.testing.assert_allclose(found.likelihoods["light_violation"].value, 1 - stands, atol=1e-3)
     mean = np.arange(1, FUTURE + 1).sum() / (FUTURE + HISTORY_STEPS)
     np.testing.assert_allclose([found.ade.value, found.min_ade.value], [mean * stands, 0.0], rtol=1e-5)
