@@ -56,8 +56,8 @@ class RoadMap(NamedTuple):
 def make_segments(lines: Lines) -> Segments:
     """Joins neighbouring points of lines by segments."""
     following = jax.tree.map(lambda column: jnp.roll(column, -1, axis=0), lines)
-    joined = lines.valid & following.valid & (lines.line == following.line)
-    valid = joined.at[-1].set(False) if len(joined) else joined
+    last = jnp.arange(len(lines.valid)) == len(lines.valid) - 1
+    valid = lines.valid & following.valid & (lines.line == following.line) & ~last
     along = jnp.where(valid[:, None], following.position - lines.position, 0.0)
     return Segments(lines.position, along, valid, lines.line)
 

@@ -82,7 +82,7 @@ class SceneScores(NamedTuple):
     meta: Score  # the realism meta-metric
     buckets: dict[str, Score]  # of BUCKETS: weighted means of their likelihoods
     likelihoods: dict[str, Score]
-    ade: Score  # average displacement error, m; the eleven steps of history count as 0
+    ade: Score  # average displacement error, m; the steps of history count as 0
     min_ade: Score
     rates: dict[str, Score]  # of INDICATIONS: part of the evaluated objects over all rollouts
 
@@ -91,6 +91,7 @@ class Counted(NamedTuple):
     """Which values of a scene's evaluated objects count."""
 
     valid: Bool[Array, "E F"]  # the logged object is valid at the step of the future; false in padding
+    history: Int[Array, " E"]  # number of steps up to now at which it is valid
     vehicle: Bool[Array, " E"]
     has_edges: Bool[Array, ""]  # the map has road edges
     has_lights: Bool[Array, ""]  # ... lanes of surface streets and lights
@@ -175,16 +176,15 @@ def weigh_likelihoods(likelihoods: dict[str, Score], weights: dict[str, float]) 
     return compute_weighted_sum(likelihoods, weights), buckets
 
 
-def compute_displacement_errors(
-    log: Float[Array, "E F 3"], simulated: Float[Array, "R E F 3"], valid: Bool[Array, "E F"]
-) -> tuple[Score, Score]:
+def compute_displacement_errors(log: Float[Array, "E F 3"], simulated: Float[Array, "R E F 3"], counted: Counted) -> tuple[Score, Score]:
     """Computes the average displacement error of all rollouts, and that of the rollout with the smallest one, m; means over objects.
 
-    An object's error is the mean over its valid steps and the HISTORY_STEPS before them, at which it is 0.
+    An object's error is the mean over its valid steps; those of the history are among them, and their error is 0.
     """
-    error = jnp.where(valid, safe_norm(simulated - log), 0.0)
-    mean = jnp.sum(error, axis=-1) / (jnp.sum(valid, axis=-1) + HISTORY_STEPS)
-    each = jax.vmap(average, in_axes=(0, None))(mean, jnp.any(valid, axis=-1))  # [R]
+    steps = jnp.sum(counted.valid, axis=-1)
+    error = jnp.where(counted.valid, safe_norm(simulated - log), 0.0)
+    mean = jnp.sum(error, axis=-1) / jnp.maximum(steps + counted.history, 1)
+    each = jax.vmap(average, in_axes=(0, None))(mean, steps > 0)  # [R]
     return Score(jnp.mean(each.value), each.valid[0]), Score(jnp.min(each.value), each.valid[0])
 
 
@@ -207,7 +207,7 @@ def compute_scene_scores(
     """
     likelihoods, rates = compute_likelihoods(log, simulated, counted, challenge.histograms)
     meta, buckets = weigh_likelihoods(likelihoods, challenge.weights)
-    ade, min_ade = compute_displacement_errors(log_position, position, counted.valid)
+    ade, min_ade = compute_displacement_errors(log_position, position, counted)
     return SceneScores(meta, buckets, likelihoods, ade, min_ade, rates)
 
 
@@ -215,7 +215,8 @@ def find_counted(log: Objects, evaluated: Int[Array, " E"], kept: Bool[Array, " 
     """Finds which values of a scene count; `kept` is false in padding of `evaluated`."""
     has_edges, has_lanes = (jnp.any(make_segments(lines).valid) for lines in (road.edges, road.lanes))
     valid = log.valid[evaluated, HISTORY_STEPS:] & kept[:, None]
-    return Counted(valid, vehicle[evaluated], has_edges, has_lanes & jnp.any(road.lights.state > 0))
+    history = jnp.sum(log.valid[evaluated, :HISTORY_STEPS], axis=1)
+    return Counted(valid, history, vehicle[evaluated], has_edges, has_lanes & jnp.any(road.lights.state > 0))
 
 
 def compute_all_features(
