@@ -15,7 +15,7 @@ LONGEST = (  # files that take longest, by CPU time: started first, or one worke
     "test_idm_traffic", "test_benchmark", "test_troubleshooting", "test_ppo", "test_planning_rewards", "test_vmax_observations",
     "test_metadrive_observation", "test_adapters", "test_randomization", "test_equations_of_motion", "test_operations", "test_dynamics",
     "test_validation", "test_film", "test_contact_solver", "test_docs", "test_gpu_processes", "test_waymax_golden", "test_failures",
-    "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
+    "test_wosac_golden", "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
 )  # fmt: skip
 
 composing.share()
