@@ -19,7 +19,7 @@ from scenefactory_jax.core.track_interpolation import interpolate_track
 from scenefactory_jax.core.types import DRIVABLE, ROUTE_SPACING_M, AgentLog, Agents, Boxes, Motion, Scene, TrafficLog
 from scenefactory_jax.evaluation.episodes import EpisodeFrame
 from scenefactory_jax.evaluation.metrics import episode_metrics, episode_scores
-from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track
+from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, Lanes, Lights, Others, Track, leave_out
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.evaluation.settings import ScoreSettings
@@ -38,17 +38,6 @@ class Start(NamedTuple):
     agents: Agents
     motion: Motion
     traffic: Boxes
-
-
-class Users(NamedTuple):
-    """Agents and then background traffic at all states of an episode, and the numbers of them that do not change."""
-
-    position: Float[Array, "B T 2"]
-    yaw: Float[Array, "B T"]
-    velocity: Float[Array, "B T 2"]
-    valid: Bool[Array, "B T"]
-    size: Float[Array, "B 2"]
-    kind: Int[Array, " B"]
 
 
 def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scene, Start, EpisodeFrame], dict[str, np.ndarray]]:
@@ -102,12 +91,11 @@ def score_world(
     use = jnp.pad(frames.friction_utilization, ((past_rows + 1, 0), (0, 0)))
 
     def score_agent(agent: Int[Array, ""]) -> dict[str, Array]:
-        others = Others(*users[:3], users.valid & (jnp.arange(len(users.yaw)) != agent)[:, None], *users[4:])
         record = EpisodeRecord(
             ego=Track(*(leaf[agent] for leaf in users[:4])),
             size=users.size[agent],
             counted=counted & users.valid[agent],
-            others=others,
+            others=leave_out(users, agent),
             lanes=lanes,
             edges=edges,
             paths=list_paths(scene, agent),
@@ -131,7 +119,7 @@ def cut_at_failure(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T
     return record.counted & (jnp.cumsum(failed) - failed == 0)
 
 
-def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows: int) -> Users:
+def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows: int) -> Others:
     """Joins the logged past, the start and the frames of agents and traffic."""
     motion, boxes, traffic = start.motion, start.traffic, frames.traffic
     at_start = (motion.position[:, :2], motion.yaw, motion.velocity[:, :2], start.agents.present)
@@ -143,7 +131,7 @@ def collect_users(scene: Scene, start: Start, frames: EpisodeFrame, *, past_rows
     kind = scene.traffic_log.kind if follows_log else jnp.zeros(len(boxes.yaw), jnp.int32)
     columns = [jnp.concatenate(pair) for pair in zip(own, other, strict=True)]
     size, kinds = jnp.concatenate([start.agents.size, boxes.size]), jnp.concatenate([jnp.zeros(len(motion.yaw), jnp.int32), kind])
-    return Users(columns[0], columns[1], columns[2], columns[3], size, kinds)
+    return Others(columns[0], columns[1], columns[2], columns[3], size, kinds)
 
 
 def _read_past(scene: Scene, log: AgentLog | TrafficLog | None, rows: int, count: int = 0) -> tuple[Array, ...]:

@@ -85,6 +85,7 @@ def _collect_events(record: EpisodeRecord, steps: StepMetrics, *, as_published: 
 
 
 def find_red_light_runs(record: EpisodeRecord, steps: StepMetrics) -> Bool[Array, " T"]:
+    """Finds the states in which the car's front comes onto a lane with a red light."""
     lights = record.lights
     before = jnp.concatenate([steps.front_lane[:1], steps.front_lane[:-1]])
     red = jnp.isin(lights.state, jnp.array(RED_STATES)) & (lights.lane == steps.front_lane[:, None])
