@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.trajectory import TrafficBoxes, Trajectory
-from scenefactory_jax.core.types import SURFACES, Scene, State, Weather
+from scenefactory_jax.core.types import SURFACES, Boxes, Scene, State, Weather
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.env import environment
 from scenefactory_jax.env.rollout import RolloutState, rollout, start_rollout
@@ -50,20 +51,54 @@ def make_episode_runner(
         worlds: how many of the worlds to record; None: all.
         scores: how episodes are scored; None: they are not.
     """
-    spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
-    env, policy = environment.make_env({**config, "spawning": spawning}), make_policy(config)
     index = np.tile(np.arange(len(scenes)), settings["repeats"])
     names = [scenes.names[i] for i in index]
     batch = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[index], scenes.scene))
     keys = jax.random.split(jax.random.key(settings["seed"]), len(index))
+    worlds = len(index) if worlds is None else min(worlds, len(index))
+    control_hz = float(config["timing"]["control_hz"])
+    score = None if scores is None else scoring.make_scorer(scores, control_dt=1 / control_hz)
+    drive = _make_driver(config, settings=settings, recorded_worlds=worlds if score is None else len(index))
+
+    def run(parameters):
+        driven = drive(parameters, batch, keys)
+        first, state, frames = driven.first, driven.last, driven.frames
+        records = _make_all_columns(driven.metrics, first, state, driven.distance, names, settings=settings, control_hz=control_hz)
+        records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
+        if score and frames is not None:
+            values = score(batch, scoring.Start(first.agents, first.motion, driven.first_traffic), frames)
+            records |= {name: column[records["world"], records["agent"]] for name, column in values.items()}
+        if not worlds:
+            return records, None
+        recorded = jax.tree.map(lambda leaf: leaf[:worlds], frames)
+        goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
+        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m)
+
+    return run
+
+
+class _Driven(NamedTuple):
+    """Episodes of all worlds, on the host."""
+
+    first: State
+    first_traffic: Boxes
+    distance: np.ndarray  # to the goal at the start, [W, A]
+    last: State
+    metrics: episodes.EpisodeMetrics
+    frames: episodes.EpisodeFrame | None  # of the recorded worlds, [W, T, ...]
+
+
+def _make_driver(
+    config: Mapping[str, Any], *, settings: Mapping[str, Any], recorded_worlds: int
+) -> Callable[[Any, Scene, Array], _Driven]:
+    """Returns a function (parameters, worlds, keys) that runs an episode in every world, until all worlds are done."""
+    spawning = {**config["spawning"], "respawn_clearance_m": None}  # one episode an agent, also if training respawned it
+    env, policy = environment.make_env({**config, "spawning": spawning}), make_policy(config)
     control_hz, limit = float(config["timing"]["control_hz"]), environment.episode_steps(config["timing"])
     chunk = -(-settings["chunk_steps"] // env.action_repeat) * env.action_repeat  # whole actions
-    worlds = len(index) if worlds is None else min(worlds, len(index))
     thresholds = settings["failures"]
     limits = {"thresholds": SignalThresholds(**thresholds["signals"]), "course": CourseThresholds(**thresholds["course"])}
     hook = episodes.make_hook(env, ttc_limit_s=settings["ttc_limit_s"], control_dt=1 / control_hz, **limits)
-    score = None if scores is None else scoring.make_scorer(scores, control_dt=1 / control_hz)
-    recorded_worlds = worlds if score is None else len(index)
 
     def act(parameters, observation, _):
         return policy.apply(parameters, observation)[0]
@@ -71,7 +106,9 @@ def make_episode_runner(
     @jax.jit
     def start(keys, batch):
         states = jax.vmap(env.init_state)(keys, batch)
-        return jax.tree.map(jnp.copy, jax.vmap(lambda state: start_rollout(state, episodes.make_metrics(state)))(states))  # to donate
+        traffic = jax.vmap(env.current_scene)(batch, states).traffic
+        begun = jax.vmap(lambda state: start_rollout(state, episodes.make_metrics(state)))(states)
+        return jax.tree.map(jnp.copy, begun), traffic  # to donate
 
     def run_chunk(parameters, scene, episode: RolloutState):
         return rollout(env, act, parameters, scene, episode, jax.random.key(0), steps=chunk, hook=hook)
@@ -82,33 +119,21 @@ def make_episode_runner(
 
     run_chunks = jax.jit(run_chunks, donate_argnums=2)
 
-    def run(parameters):
-        episode = start(keys, batch)
-        traffic = jax.vmap(env.current_scene)(batch, episode.state).traffic if score else None
+    def drive(parameters: Any, batch: Scene, keys: Array) -> _Driven:
+        episode, traffic = start(keys, batch)
         first, distance, traffic = jax.device_get((episode.state, episode.carry.goal_distance, traffic))
-        frames = []
+        chunks = []
         for _ in range(0, limit, chunk):
-            episode, chunk_frames = run_chunks(parameters, batch, episode)
+            episode, frames = run_chunks(parameters, batch, episode)
             if recorded_worlds:
-                frames.append(jax.device_get(chunk_frames))
+                chunks.append(jax.device_get(frames))
             if bool(episode.world_done.all()):
                 break
         state, metrics = jax.device_get((episode.state, episode.carry))
-        records = _make_all_columns(metrics, first, state, distance, names, settings=settings, control_hz=control_hz)
-        records |= {name: column[index[records["world"]], records["agent"]] for name, column in scenes.agent_columns.items()}
-        if not recorded_worlds:
-            return records, None
-        recorded = jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=1)[:, :limit], *frames)
-        if score:
-            values = score(batch, scoring.Start(first.agents, first.motion, traffic), recorded)
-            records |= {name: column[records["world"], records["agent"]] for name, column in values.items()}
-        if not worlds:
-            return records, None
-        recorded = jax.tree.map(lambda leaf: leaf[:worlds], recorded)
-        goal_radius_m = float(config["step_metrics"]["goal_radius_m"])
-        return records, Recording(batch, recorded, state, first.weather, names, control_hz, goal_radius_m)
+        frames = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :limit], *chunks) if chunks else None
+        return _Driven(first, traffic, distance, state, metrics, frames)
 
-    return run
+    return drive
 
 
 def _make_all_columns(
