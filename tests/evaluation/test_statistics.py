@@ -123,3 +123,32 @@ def test_a_rate_over_a_distance_is_a_sum_over_a_sum():
     assert found.value == pytest.approx(3 / 0.075) and found.count == 8 and found.low < found.value < found.high
     assert 0.0 <= found.low < 20.0 and 60.0 < found.high < 160.0
     assert "collisions_per_100_km" not in statistics.summarise(records(np.ones((1, 8))), bootstrap=10, seed=0), "nobody has a route"
+
+
+def test_probability_of_a_difference_is_that_of_the_binomial():
+    """Of 16 scenes 11 gain and 5 lose: a resample shows no gain if 8 or fewer of its scenes are of those that gain."""
+    before, after = np.zeros((16, 1)), np.zeros((16, 1))
+    before[:5], after[5:] = 1, 1
+    change = statistics.difference(records(before), records(after), bootstrap=20_000, seed=0)["success_rate"]
+    assert change.p == pytest.approx(2 * stats.binom(16, 11 / 16).cdf(8), abs=0.01)
+    none = statistics.difference(records(before), records(before), bootstrap=100, seed=0)["success_rate"]
+    assert none.p is None
+
+
+def test_the_smallest_probability_is_that_of_the_number_of_resamples():
+    change = statistics.difference(records(np.arange(40)[:, None] < 3), records(np.ones((40, 1))), bootstrap=999, seed=0)["success_rate"]
+    assert change.p == pytest.approx(2 / 1000)
+
+
+def test_holms_correction():
+    """By hand: sorted, the smallest times 4, the next times 3 and so on, never below the one before, at most 1."""
+    found = statistics.adjust_holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": 0.5})
+    assert found == pytest.approx({"a": 0.04, "c": 0.09, "b": 0.09, "d": 0.5})
+    assert statistics.adjust_holm({}) == {}
+
+
+def test_metrics_of_scores_are_left_out_without_scores_and_count_what_is_known():
+    assert "vmax_score" not in statistics.summarise(records(np.ones((2, 2))), bootstrap=10, seed=0)
+    scored = records(np.ones((2, 2)), vmax_score=[[0.5, np.nan], [1.0, 0.9]])
+    found = statistics.summarise(scored, bootstrap=10, seed=0)["vmax_score"]
+    assert found.count == 3 and found.value == pytest.approx(0.8)

@@ -1,6 +1,7 @@
 """Laws of the report: intervals against known values, records that round-trip, pictures that show things where they are."""
 
 import importlib.util
+import re
 
 import jax
 import jax.numpy as jnp
@@ -449,6 +450,7 @@ def test_plots_refuse_what_they_cannot_show():
 
 def test_report_says_what_happened(tmp_path):
     records = {"strict": make_records(), "strict, untrained": make_records(success=0.1, seed=9)}
+    records["strict, idm_route"] = make_records(success=0.0, seed=9)
     (tmp_path / "a film.gif").write_bytes(b"GIF89a")
     path = evaluation_report.write(
         tmp_path / "report", title="Demo", records=records, config={"seed": 3, "ppo": {"clip_eps": 0.15}}, versions={"GPU": "none"},
@@ -459,6 +461,9 @@ def test_report_says_what_happened(tmp_path):
     text = path.read_text()
     assert f"**{records['strict']['goal_reached'].sum()} of 72 cars reached their goal" in text
     assert "![Four worlds](../a%20film.gif)" in text
+    assert "| Difference to | idm_route |" in text
+    found = re.search(r"\| Success rate \| \+\d+\.\d points \[\+\d+\.\d, \+\d+\.\d\] \\\* \|", text)
+    assert found, "a difference that Holm's correction carries is marked"
     for part in ("12 scenes", "beyond what chance explains", "### By surface", "ppo.clip_eps: 0.15", "evaluate run=X", "scene, 00"):
         assert part in text, part
     assert "nan" not in text.lower() and "None" not in text
