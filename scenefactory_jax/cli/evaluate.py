@@ -13,7 +13,6 @@ from scenefactory_jax.cli import schema
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.config import flatten
-from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.data.loading import scene_source
 from scenefactory_jax.evaluation import protocols
 from scenefactory_jax.evaluation.protocols import Evaluator
@@ -44,14 +43,11 @@ def evaluate(config: Mapping[str, Any]) -> Result:
 
 def _apply_planners(trained: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Returns the run's config with each of the planners in place of its policy."""
-    known, scores = settings["planner_overrides"], settings["protocol"]["scores"] or {}
-    configs_by_name = {}
-    for name in settings["planners"]:
-        if name not in known:
-            raise ConfigError(f"planners: expected names of {', '.join(known)}, got {name!r}")
-        words = [word.replace("PAST_ROWS", str(scores.get("past_rows", 0))) for word in known[name]]
-        configs_by_name[name] = configs.apply_overrides(trained, words)
-    return configs_by_name
+    past_rows = str((settings["protocol"]["scores"] or {}).get("past_rows", 0))
+    overrides = {name: settings["planner_overrides"][name] for name in settings["planners"]}
+    return {
+        name: configs.apply_overrides(trained, [word.replace("PAST_ROWS", past_rows) for word in words]) for name, words in overrides.items()
+    }
 
 
 def evaluate_run(config: Mapping[str, Any], folder: Path) -> Result:

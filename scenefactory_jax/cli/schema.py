@@ -338,6 +338,8 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     """Checks the config of `evaluate`."""
     check(config, Evaluate)
     check_terminations(config["protocol"]["termination"], where="protocol.termination")
+    if unknown := [name for name in config["planners"] if name not in config["planner_overrides"]]:
+        raise ConfigError(f"planners: expected names of {', '.join(config['planner_overrides'])}, got {unknown[0]!r}")
 
 
 def check_study(config: Mapping[str, Any]) -> None:

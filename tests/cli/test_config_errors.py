@@ -199,6 +199,7 @@ def test_an_unknown_config_is_named():
         ("convert", "source=3", "source: expected a text or null, got 3"),
         ("evaluate", "repeats=0", "repeats: expected an integer >= 1, got 0"),
         ("evaluate", "overrides=weather", "overrides: expected a list, each a text, got 'weather'"),
+        ("evaluate", "planners=[pdm]", "planners: expected names of log, expert, pdm_closed, idm_route, route_pursuit, pure_pursuit"),
         ("evaluate", "video.worlds=-1", "video.worlds: expected an integer >= 0, got -1"),
     ],
 )
