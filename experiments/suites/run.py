@@ -104,8 +104,9 @@ def write_report(folder: Path) -> Path:
         result = result_file.read(path)
         lines += [f"## {result['name']}", ""]
         counts = [[suite, *[str(value) for value in numbers.values()]] for suite, numbers in result["lists"].items()]
-        header = ["suite", *(name.replace("_", " ") for name in next(iter(result["lists"].values())))]
-        lines += [markdown.format_table(header, counts), ""]
+        if counts:
+            header = ["suite", *(name.replace("_", " ") for name in next(iter(result["lists"].values())))]
+            lines += [markdown.format_table(header, counts), ""]
         rows = [
             [suite, planner, *(_format(estimates.get(name)) for name in METRICS)]
             for suite, planners in result["rows"].items()

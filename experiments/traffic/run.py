@@ -8,6 +8,7 @@ overlap when both were first on the road. Writes `result-NAME.json` and, from al
 
 import argparse
 import functools
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -143,8 +144,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
     numbers = {"kind": given.traffic, "restart": given.restart, "seconds": given.seconds, "workers": given.workers}
-    found = run(given.scenes.split(","), **numbers)
-    command = f"python -m experiments.traffic.run {given.name} '{','.join(_hide_path(word) for word in given.scenes.split(','))}'"
+    words = re.split(r",(?![^\[]*\])", given.scenes)  # commas of lists stay
+    found = run(words, **numbers)
+    command = f"python -m experiments.traffic.run {given.name} '{','.join(map(_hide_path, words))}'"
     command += f" --traffic {given.traffic} --seconds {given.seconds:g}" + (" --restart" if given.restart else "")
     result = {"name": given.name, **found, "command": command, "versions": run_config.versions()}
     given.out.mkdir(parents=True, exist_ok=True)
