@@ -31,6 +31,7 @@ from scenefactory_jax.env.traffic.log_playback import VEHICLE, Row, is_parked, m
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.policy_io import TrainedPolicy
+from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.weather.road_condition import keep_condition
 
 # Groups of a policy's config that are read, besides `observations`
@@ -52,6 +53,8 @@ class PolicyTrafficState(NamedTuple):
 def policy_traffic(
     *,
     run: str | None,
+    policy: dict[str, Any] | None = None,
+    observations: dict[str, Any] | None = None,
     sample: bool,
     slots: Count | None,
     dynamics: dict[str, Any],
@@ -68,13 +71,13 @@ def policy_traffic(
     physics_dt: float,
     control_dt: float,
 ) -> Traffic:
-    """Traffic of vehicles that drive by a trained policy from their logged start to their logged end.
+    """Traffic of vehicles that drive by a trained policy, or by a planner, from their logged start to their logged end.
 
     Args:
         run: a folder that `train` or `export` wrote, or the name of a bundled policy. Its config may name functions of the package only.
         sample: whether actions are sampled; else they are the policy's means.
         slots: vehicles of a world that the policy drives at most, the first of the log; further ones follow their log. None: no limit.
-        dynamics: of these vehicles, an entry of the config group `dynamics`.
+        dynamics, policy, observations: of these vehicles, entries of those groups; None: the run's. A `policy` is a planner.
         ending: events that end a vehicle, as in the config group `termination`.
         at_end: a vehicle that ended leaves, stays where it is, or starts again at its logged start once that is free.
         clearance_m: a vehicle enters, or starts again, once its lane is free over this distance ahead of it and behind it.
@@ -85,7 +88,7 @@ def policy_traffic(
     """
     context = {"physics_dt": physics_dt, "control_dt": control_dt}
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
-    trained = _load(run)
+    trained = _replace_policy(_load(run), policy, observations, dynamics)
     parts = make_parts(trained, car, ending=ending, **context)
     env, masses = environment.assemble(parts), make_masses(mass_kg)
     act = make_actor(trained, env, sample=sample)
@@ -132,6 +135,16 @@ def _load(run: str | None) -> TrainedPolicy:
     if missing := [name for name in (*READ, "observations") if name not in trained.config]:
         raise ConfigError(f"traffic.run: {trained.folder}: expected a policy of this version, whose config has the key {missing[0]}")
     return trained
+
+
+def _replace_policy(
+    trained: TrainedPolicy, policy: dict[str, Any] | None, observed: dict[str, Any] | None, dynamics: dict[str, Any]
+) -> TrainedPolicy:
+    """Replaces the policy of a run by a planner, which has no parameters and is told which cars it drives."""
+    if policy is None:
+        return trained
+    config = trained.config | {"policy": policy, "observations": observed or trained.config["observations"], "dynamics": dynamics}
+    return trained._replace(config=config, policy=make_policy(config), parameters={})
 
 
 def make_parts(trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float) -> EnvParts:

@@ -73,7 +73,7 @@ def make(
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
 
     Raises:
-        ConfigError: at `init`, an observation without groups, or widths for a set that it does not have.
+        ConfigError: at `init`, an observation without groups or with one for planners, or widths for a set that it does not have.
     """
     named = {name: tuple(sizes) for name, sizes in sorted(rows.items()) if sizes is not None}
     each = {"vector": vector, "rows_default": rows_default, "trunk": trunk} | {f"rows.{name}": sizes for name, sizes in named.items()}
@@ -86,6 +86,9 @@ def make(
     network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
+        trees = [name for name, group in observation.items() if not (isinstance(group, SetObservation) or hasattr(group, "shape"))]
+        if trees:
+            raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
