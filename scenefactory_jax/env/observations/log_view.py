@@ -8,9 +8,9 @@ from jaxtyping import Array, Bool, Float
 
 from scenefactory_jax.core.geometry import to_frame, wrap_angle
 from scenefactory_jax.core.schema import Positive
-from scenefactory_jax.core.track_interpolation import find_bracketing_rows, interpolate_track
+from scenefactory_jax.core.track_interpolation import SNAP, find_bracketing_rows, interpolate_track
 from scenefactory_jax.core.types import Scene, State
-from scenefactory_jax.env.traffic.log_playback import SNAP, Row
+from scenefactory_jax.env.traffic.log_playback import Row
 
 
 class LoggedState(NamedTuple):
