@@ -125,8 +125,9 @@ def _open_scenes(
 
 
 def make_policy(config: Mapping[str, Any]) -> Policy:
-    """Builds the policy of a config's `policy` entry."""
-    return instantiate(config["policy"], builtins=late_fusion, where="policy")()
+    """Builds the policy of a config's `policy` entry; planners are given the run's `dynamics`, which they drive."""
+    context = {name: config[name] for name in ("dynamics",) if name in config}
+    return instantiate(config["policy"], builtins=late_fusion, where="policy", **context)()
 
 
 def make_trainer(config: Mapping[str, Any], env: Env, policy: Policy, *, mesh: Mesh | None = None) -> Trainer:

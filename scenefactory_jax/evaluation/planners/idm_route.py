@@ -11,28 +11,39 @@ from scenefactory_jax.core.types import Observation, Policy
 from scenefactory_jax.env.traffic import idm_law
 from scenefactory_jax.env.traffic.idm_law import IdmLaw
 from scenefactory_jax.evaluation.planners import route_tracking
-from scenefactory_jax.evaluation.planners.route_tracking import Tracker
+from scenefactory_jax.evaluation.planners.tracker import Tracker, select_tracker
 
 RED, YELLOW = 3, 4  # columns of `observations.lights`
 STOOD = 3  # column of `observations.signs`
 
 
-def make(*, tracker: Tracker, law: IdmLaw, target_mps: Positive, max_braking_mps2: Positive, observations: dict[str, Any]) -> Policy:
+def make(
+    *,
+    trackers: dict[str, Tracker],
+    law: IdmLaw,
+    target_mps: Positive,
+    max_braking_mps2: Positive,
+    observations: dict[str, Any],
+    dynamics: dict[str, Any] | None = None,
+) -> Policy:
     """Pure pursuit of the agent's route, with the speed of the intelligent driver model.
 
     It follows the nearest box on its route (`observations.leader`) and stands before red lights, before yellow ones where it can stop
     comfortably, and before stop signs until it has stood. It gives no right of way. The policy has no parameters, and its values are zero.
 
     Args:
-        tracker: how the route is followed.
+        trackers: how the route is followed, for every backend.
         law: numbers of the model.
         target_mps: speed on a free road where the lane has no limit.
         max_braking_mps2: a red light before which the car could not even stop with this is passed.
         observations: entries of the groups that it reads, `ego`, `route`, `leader`, `lights` and `signs`, with their scales.
+        dynamics: of the run; supplied.
 
     Raises:
-        ConfigError: at `apply`, an observation without these groups.
+        ConfigError: dynamics without a tracker; at `apply`, an observation without these groups.
     """
+
+    tracker = select_tracker(trackers, dynamics)
 
     def init(key, observation):
         return {}
@@ -48,8 +59,7 @@ def make(*, tracker: Tracker, law: IdmLaw, target_mps: Positive, max_braking_mps
         demand = idm_law.compute_interaction(speed, gap, leader_speed, law)
         demand = jnp.maximum(demand, idm_law.compute_interaction(speed, line, jnp.zeros_like(line), law))
         acceleration = jnp.maximum(idm_law.compute_acceleration(speed, target, demand, law), -max_braking_mps2)
-        steer = route_tracking.compute_steering(route, speed, tracker)
-        return route_tracking.make_action(acceleration, steer, route.known, tracker), jnp.zeros(3), jnp.zeros_like(steer)
+        return route_tracking.make_action(acceleration, route, speed, tracker), jnp.zeros(3), jnp.zeros_like(speed)
 
     return Policy(init, apply)
 

@@ -1,22 +1,22 @@
 """Pure pursuit: a rule-based policy that holds a speed on the circle through its goal. A baseline for learnt policies."""
 
-import math
-from typing import Annotated
+from typing import Any
 
 import jax.numpy as jnp
 
-from scenefactory_jax.core.schema import Bounds, ConfigError, Positive
+from scenefactory_jax.core.schema import ConfigError, Positive
 from scenefactory_jax.core.types import Policy
+from scenefactory_jax.evaluation.planners.tracker import Tracker, compute_steer, select_tracker
 
 
 def make(
     *,
-    wheelbase_m: Positive,
-    steering_limit_rad: Annotated[float, Bounds(above=0, below=math.pi / 2)],
+    trackers: dict[str, Tracker],
     speed_mps: Positive,
     speed_band_mps: Positive,
     goal_scale_m: Positive,
     speed_scale_mps: Positive,
+    dynamics: dict[str, Any] | None = None,
 ) -> Policy:
     """Pure pursuit of the goal (Coulter 1992, "Implementation of the pure pursuit path tracking algorithm"), without lanes and other cars.
 
@@ -25,14 +25,17 @@ def make(
     parameters, and its values are zero.
 
     Args:
-        wheelbase_m: of the cars, with `steering_limit_rad`, the angle of the front wheels at an action of one.
+        trackers: how cars of every backend are steered.
         speed_mps: to hold.
         speed_band_mps: difference to that speed at which the throttle is at its limit.
         goal_scale_m, speed_scale_mps: `observations.ego.distance_scale_m` and `observations.ego.speed_scale_mps`.
+        dynamics: of the run; supplied.
 
     Raises:
-        ConfigError: at `apply`, an observation without `ego`.
+        ConfigError: dynamics without a tracker; at `apply`, an observation without `ego`.
     """
+
+    tracker = select_tracker(trackers, dynamics)
 
     def init(key, observation):
         return {}
@@ -43,9 +46,9 @@ def make(
             raise ConfigError(f"policy: pure pursuit needs the observation group `ego`; the observation has: {has}")
         ego = observation["ego"]
         sine, cosine, distance_m = ego[..., 2], ego[..., 3], jnp.maximum(goal_scale_m * ego[..., 4], 1.0)
-        bend = jnp.arctan(wheelbase_m * 2.0 * sine / distance_m)
-        steer = jnp.where(cosine > 0.0, bend / steering_limit_rad, jnp.copysign(1.0, sine))
-        throttle = (speed_mps - speed_scale_mps * ego[..., 5]) / speed_band_mps
+        speed = speed_scale_mps * ego[..., 5]
+        steer = jnp.where(cosine > 0.0, compute_steer(2.0 * sine / distance_m, speed, tracker), jnp.copysign(1.0, sine))
+        throttle = (speed_mps - speed) / speed_band_mps
         mean = jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1)
         return jnp.clip(mean, -1.0, 1.0), jnp.zeros(3), jnp.zeros_like(steer)
 

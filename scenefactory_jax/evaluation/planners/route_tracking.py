@@ -1,37 +1,23 @@
-"""What planners on routes share: they read the observation `route`, steer along it, slow down for bends, and press the pedals.
+"""What planners on routes share: they read the observation `route`, steer along it and slow down for bends.
 
 Everything is elementwise over leading axes and concerns the car's own frame.
 """
 
-import dataclasses
-import math
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from scenefactory_jax.core.geometry import cross, dot, safe_norm
-from scenefactory_jax.core.schema import Bounds, ConfigError, NonNegative, Positive
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.evaluation.planners import tracker as tracking
+from scenefactory_jax.evaluation.planners.tracker import Tracker
 
 HEAD, POINT = 5, 5  # columns of `observations.route` before the first point, and of a point
 SHORTEST_M = 0.2  # nearer points have no bend between them
 GENTLEST_RADPM = 1e-4  # a bend of 10 km radius is none
-
-
-@dataclasses.dataclass(frozen=True)
-class Tracker:
-    """How cars are made to follow a route; described in `conf/policy/route_pursuit.yaml`."""
-
-    wheelbase_m: Positive
-    steering_limit_rad: Annotated[float, Bounds(above=0, below=math.pi / 2)]
-    rear_m: NonNegative
-    look_ahead_m: Positive
-    look_ahead_s: NonNegative
-    lateral_mps2: Positive
-    braking_mps2: Positive
-    throttle_mps2: Positive
-    brake_mps2: Positive
+SHARPEST_RADPM = 1.0  # above any car's
 
 
 class RouteAhead(NamedTuple):
@@ -45,13 +31,13 @@ class RouteAhead(NamedTuple):
     remaining: Float[Array, "*n"]  # along the route to the goal
 
 
-def require_groups(observation: Mapping[str, Any], *names: str, planner: str) -> None:
-    """Raises a ConfigError that names the observation groups that a planner needs and does not find."""
+def require_groups(observation: Mapping[str, Any], *names: str, planner: str, option: str = "drive") -> None:
+    """Raises a ConfigError that names the observation groups that a planner needs and does not find; `option` has them."""
     if missing := [name for name in names if name not in observation]:
         has = ", ".join(sorted(observation)) or "none"
         groups = " and ".join(f"`{name}`" for name in missing)
         raise ConfigError(
-            f"policy: {planner} needs the observation groups of observations=drive; {groups} missing; the observation has: {has}"
+            f"policy: {planner} needs the observation groups of observations={option}; {groups} missing; the observation has: {has}"
         )
 
 
@@ -105,16 +91,14 @@ def find_point(route: RouteAhead, arc: Float[Array, "*n"]) -> Float[Array, "*n 2
     return bent + jnp.maximum(arc - inside, 0.0)[..., None] * second
 
 
-def compute_steering(route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n"]:
-    """Computes the steering action by pure pursuit (Coulter 1992): the circle along the rear axle's direction through a point ahead.
+def compute_curvature(route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n"]:
+    """Computes the curvature of pure pursuit (Coulter 1992): the circle along the rear axle's direction through a point ahead.
 
-    The point is `look_ahead_m` and the way of `look_ahead_s` ahead along the route. Full steering for a point behind the car.
+    The point is `look_ahead_m` and the way of `look_ahead_s` ahead along the route. SHARPEST_RADPM for a point behind the car.
     """
     target = find_point(route, tracker.look_ahead_m + tracker.look_ahead_s * speed)
     x, y = target[..., 0] + tracker.rear_m, target[..., 1]
-    curvature = 2.0 * y / jnp.maximum(x**2 + y**2, 1.0)
-    steer = jnp.arctan(tracker.wheelbase_m * curvature) / tracker.steering_limit_rad
-    return jnp.clip(jnp.where(x > 0.0, steer, jnp.copysign(1.0, y)), -1.0, 1.0)
+    return jnp.where(x > 0.0, 2.0 * y / jnp.maximum(x**2 + y**2, 1.0), jnp.copysign(SHARPEST_RADPM, y))
 
 
 def compute_target_speed(route: RouteAhead, limit: Float[Array, "*n P"], tracker: Tracker) -> Float[Array, "*n"]:
@@ -131,13 +115,8 @@ def compute_target_speed(route: RouteAhead, limit: Float[Array, "*n P"], tracker
 
 
 def make_action(
-    acceleration: Float[Array, "*n"], steer: Float[Array, "*n"], known: Float[Array, "*n"], tracker: Tracker
+    acceleration: Float[Array, "*n"], route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker
 ) -> Float[Array, "*n 3"]:
-    """Makes the action for an acceleration; an agent without a route brakes.
-
-    A throttle below zero and the brake say the same, so that actions with one pedal and with two do the same.
-    """
-    acceleration = jnp.where(known > 0, acceleration, -tracker.brake_mps2)
-    brake = jnp.clip(-acceleration / tracker.brake_mps2, 0.0, 1.0)
-    throttle = jnp.clip(acceleration / tracker.throttle_mps2, 0.0, 1.0)
-    return jnp.stack([throttle - brake, jnp.where(known > 0, steer, 0.0), jnp.where(brake > 0, brake, -1.0)], axis=-1)
+    """Makes the action that follows the route with an acceleration; an agent without a route brakes."""
+    follow = tracking.make_action(acceleration, compute_curvature(route, speed, tracker), speed, tracker)
+    return jnp.where(route.known[..., None] > 0, follow, tracking.make_braking_action(speed, tracker))
