@@ -292,7 +292,10 @@ class SetObservation:
 
 
 Observation = dict[str, Any]
-"""Group name -> Float[Array, "A F"] or SetObservation. Inactive agents read zeros and false masks."""
+"""Group name -> Float[Array, "A F"], SetObservation or, of groups for planners, another pytree of arrays [A, ...].
+
+Inactive agents read zeros and false masks.
+"""
 
 
 @pytree_dataclass

@@ -1,4 +1,4 @@
-"""Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent.
+"""Observation groups: functions of (scene, state) that give a vector or a set of rows for each agent, or a tree of arrays for planners.
 
 A group is a config entry `{_target_: road, count: 350, ...}`; `make` binds them, and the observation is the dictionary of their results. A
 group from another module has a dotted target. The policy encodes vectors and sets by their type, so that a new group needs no other change.
@@ -9,16 +9,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from scenefactory_jax.core.instantiate import instantiate
-from scenefactory_jax.core.types import Observation, Scene, SetObservation, State
+from scenefactory_jax.core.types import Observation, Scene, State
 from scenefactory_jax.env.observations.column_bounds import ANY, FRACTION, LENGTH, SIGNED, bound_observation
 from scenefactory_jax.env.observations.control_sets import lights, nearest_controls, signs
 from scenefactory_jax.env.observations.lane_vector import lane
 from scenefactory_jax.env.observations.leader_vector import leader
+from scenefactory_jax.env.observations.log_view import log
 from scenefactory_jax.env.observations.metadrive import metadrive
 from scenefactory_jax.env.observations.neighbour_sets import closest_approach, neighbours
+from scenefactory_jax.env.observations.noise_vector import noise
+from scenefactory_jax.env.observations.planning import planning
 from scenefactory_jax.env.observations.road_set import road
 from scenefactory_jax.env.observations.route_vector import route
 from scenefactory_jax.env.observations.state_vectors import ego, friction_ahead, weather, yaw_rate_and_steer
@@ -39,10 +42,10 @@ __all__ += [
     "signs",
     "weather",
 ]  # groups
-__all__ += ["yaw_rate_and_steer"]
+__all__ += ["log", "noise", "planning", "yaw_rate_and_steer"]
 __all__ += ["metadrive", "vmax_base", "vmax_lane", "vmax_road", "vmax_segment"]
 
-Group = Callable[[Scene, State], Float[Array, "A F"] | SetObservation]
+Group = Callable[[Scene, State], Any]  # a vector [A, F], a SetObservation or, for planners, another pytree of arrays [A, ...]
 
 
 def make(entries: Mapping[str, Mapping[str, Any] | None], *, where: str = "observations", **context: Any) -> dict[str, Group]:

@@ -11,7 +11,7 @@ from scenefactory_jax.core.schema import Bounds, Count, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import FRACTION, bound_observation
-from scenefactory_jax.roadgraph import nearest_rows
+from scenefactory_jax.env.observations.edge_segments import gather_edges
 
 NAVIGATION_POINTS, POINT_GAP, NAVIGATION_RANGE_M = 10, 2, 30.0  # points 2 m apart; longer vectors are shortened
 
@@ -54,7 +54,7 @@ def metadrive(
     throttle, steer, brake = state.previous_action.T
     ego = [_centre(turned / jnp.pi), speed, _centre(motion.steer / max_steer_rad), _centre(steer), _centre(throttle - brake)]
     ego += [jnp.abs(motion.yaw_rate) / max_yaw_rate_radps]
-    edges = _gather_edges(scene, position, motion.yaw, count=edge_segments, range_m=range_m)
+    edges = gather_edges(scene, position, motion.yaw, count=edge_segments, range_m=range_m)
     side_directions = make_ray_directions(side_rays) if side_rays else jnp.array([[0.0, 1.0], [0.0, -1.0]])
     sides = cast_to_segments(side_directions, *edges, range_m=range_m) / range_m
     lane = [_centre(2 * lateral / lane_width_m)]
@@ -106,19 +106,3 @@ def _gather_boxes(
     place = to_frame(users.position - motion.position[:, None, :2], motion.yaw[:, None])
     present = users.present & ~jnp.eye(cars, count, dtype=bool)
     return place, users.yaw - motion.yaw[:, None], jnp.broadcast_to(users.size, place.shape), present
-
-
-def _gather_edges(
-    scene: Scene, position: Float[Array, "A 2"], yaw: Float[Array, " A"], *, count: int, range_m: float
-) -> tuple[Float[Array, "A C 2"], Float[Array, "A C 2"], Float[Array, "A C"], Bool[Array, "A C"]]:
-    """About the `count` nearest road-edge segments that reach into a range, in the frame of each car."""
-    edges, rows = scene.edges, scene.edges.valid.shape[0]
-    if rows == 0:
-        zero = jnp.zeros((len(yaw), 0, 2))
-        return zero, zero, zero[..., 0], zero[..., 0] > 0
-    chunks = nearest_rows.make_chunks(edges.midpoint, edges.half_length, edges.polyline, edges.valid)
-    near = safe_norm(chunks.centre - position[:, None, None]) <= chunks.radius + range_m
-    index, mask = nearest_rows.gather_chunks(chunks, position, near, count=-(-count // nearest_rows.CHUNK), rows=rows)
-    turn = lambda vectors: to_frame(vectors, yaw[:, None])  # noqa: E731
-    middle = turn(edges.midpoint[index] - position[:, None])
-    return middle, turn(edges.direction[index]), edges.half_length[index], mask & edges.valid[index]

@@ -73,7 +73,7 @@ def make(
         kernels: Triton kernels for sets where there is an NVIDIA GPU; False: plain JAX.
 
     Raises:
-        ConfigError: at `init`, an observation without groups, or widths for a set that it does not have.
+        ConfigError: at `init`, an observation without groups or with one for planners, or widths for a set that it does not have.
     """
     named = {name: tuple(sizes) for name, sizes in sorted(rows.items()) if sizes is not None}
     each = {"vector": vector, "rows_default": rows_default, "trunk": trunk} | {f"rows.{name}": sizes for name, sizes in named.items()}
@@ -89,6 +89,8 @@ def make(
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
+        if trees := [name for name, group in sorted(observation.items()) if not isinstance(group, SetObservation) and not hasattr(group, "shape")]:
+            raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
         if not observation:
             raise ConfigError("policy: the observation has no group; add one to `observations`")
         return network.init(key, observation)

@@ -1,0 +1,149 @@
+"""What a planner reads of each agent's surroundings: its own motion, its route, stop lines, road users and road edges."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from scenefactory_jax.core.geometry import dot, to_frame, wrap_angle
+from scenefactory_jax.core.schema import Count, NonNegative, Positive
+from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Scene, State
+from scenefactory_jax.env import route_following, surrogate_safety
+from scenefactory_jax.env.observations.edge_segments import EdgeSegments, gather_edges
+from scenefactory_jax.roadgraph import nearest_rows
+
+SPACING_M = 1.0  # between the points of the centre line
+
+
+class CentreLine(NamedTuple):
+    """The agent's route around its place on it, every SPACING_M; it goes on straight beyond both ends."""
+
+    arc: Float[Array, "*n P"]  # from the agent's place, below zero behind it
+    point: Float[Array, "*n P 2"]
+    direction: Float[Array, "*n P 2"]  # unit
+    limit: Float[Array, "*n P"]  # m/s; 0 where none is known
+    known: Bool[Array, "*n"]  # the agent has a route
+    remaining: Float[Array, "*n"]  # to the goal along the route
+
+
+class StopLinesAhead(NamedTuple):
+    """Stop lines on the route as they are now."""
+
+    distance: Float[Array, "*n S"]  # from the agent's front along the route; inf for lines behind it
+    red: Bool[Array, "*n S"]
+    yellow: Bool[Array, "*n S"]
+    stop_sign: Bool[Array, "*n S"]  # before which the agent has not stood yet
+
+
+class NearUsers(NamedTuple):
+    """The nearest road users, agents and traffic alike, nearest first."""
+
+    position: Float[Array, "*n K 2"]
+    yaw: Float[Array, "*n K"]
+    velocity: Float[Array, "*n K 2"]
+    size: Float[Array, "*n K 2"]  # length, width
+    kind: Int[Array, "*n K"]  # index into ROAD_USERS
+    present: Bool[Array, "*n K"]
+
+
+class PlanningView(NamedTuple):
+    """The observation group `planning`: SI units, in the frame of the agent (origin at its box's centre, x ahead, y to the left)."""
+
+    velocity: Float[Array, "*n 2"]
+    yaw_rate: Float[Array, "*n"]
+    steer: Float[Array, "*n"]  # mean angle of the front wheels, rad
+    size: Float[Array, "*n 2"]  # length, width
+    line: CentreLine
+    stops: StopLinesAhead
+    users: NearUsers
+    edges: EdgeSegments
+
+
+def planning(
+    scene: Scene,
+    state: State,
+    *,
+    behind_m: NonNegative,
+    ahead_m: Positive,
+    users: Count,
+    edges: Count,
+    edge_range_m: Positive,
+    control_dt: float,
+) -> PlanningView:
+    """Observes everything that planners read; networks and adapters take no such group.
+
+    Args:
+        behind_m, ahead_m: length of the centre line.
+        users: nearest road users that are shown.
+        edges: nearest road-edge segments that are shown, of those that reach into `edge_range_m`.
+    """
+    motion = state.motion
+    return PlanningView(
+        velocity=to_frame(motion.velocity[:, :2], motion.yaw),
+        yaw_rate=motion.yaw_rate,
+        steer=motion.steer,
+        size=state.agents.size,
+        line=read_centre_line(scene, state, behind_m=behind_m, ahead_m=ahead_m),
+        stops=read_stop_lines(scene, state, state.step.astype(jnp.float32) * control_dt),
+        users=find_users(scene, state, count=users),
+        edges=gather_edges(scene, motion.position[:, :2], motion.yaw, count=edges, range_m=edge_range_m),
+    )
+
+
+def read_centre_line(scene: Scene, state: State, *, behind_m: float, ahead_m: float) -> CentreLine:
+    """Reads the routes around the agents; a line straight ahead of an agent without one."""
+    agents, motion = state.agents, state.motion
+    away = jnp.arange(-round(behind_m / SPACING_M), round(ahead_m / SPACING_M) + 1) * SPACING_M
+    away = jnp.broadcast_to(away.astype(jnp.float32), (len(motion.yaw), away.shape[0]))
+    known = route_following.find_routed(scene, agents)
+    point = jnp.stack([away, jnp.zeros_like(away)], axis=-1)
+    direction = jnp.zeros_like(point).at[..., 0].set(1.0)
+    limit, remaining = jnp.zeros_like(away), jnp.zeros_like(motion.yaw)
+    if scene.routes.length.shape[0]:
+        arc, row = state.route.arc[:, None] + away, jnp.broadcast_to(agents.route[:, None], away.shape)
+        inside = jnp.clip(arc, 0.0, scene.routes.length[row])
+        on_route, along = route_following.find_point(scene, row, inside)
+        on_route = on_route + (arc - inside)[..., None] * along
+        yaw = motion.yaw[:, None]
+        point = jnp.where(known[:, None, None], to_frame(on_route - motion.position[:, None, :2], yaw), point)
+        direction = jnp.where(known[:, None, None], to_frame(along, yaw), direction)
+        limit = scene.routes.speed_limit[row, jnp.floor(inside / SPACING_M).astype(jnp.int32)]
+        limit = jnp.where(jnp.isfinite(limit) & known[:, None], limit, 0.0)
+        remaining = jnp.where(known, agents.route_end - state.route.arc, 0.0)
+    return CentreLine(away, point, direction, limit, known, remaining)
+
+
+def read_stop_lines(scene: Scene, state: State, time_s: Float[Array, ""]) -> StopLinesAhead:
+    """Reads the stop lines ahead of the agents on their routes."""
+    lines = route_following.find_stop_lines(scene, state.agents, state.route.arc, time_s)
+    ahead = (lines.distance > 0) & jnp.isfinite(lines.distance) & route_following.find_routed(scene, state.agents)[:, None]
+    yellow = jnp.any(lines.state[..., None] == jnp.array(YELLOW_STATES), axis=-1)
+    next_line = jnp.cumsum(ahead, axis=1) == 1
+    waits = lines.stop_sign & ~(state.route.stood[:, None] & next_line)
+    return StopLinesAhead(jnp.where(ahead, lines.distance, jnp.inf), ahead & lines.red, ahead & yellow, ahead & waits)
+
+
+def find_users(scene: Scene, state: State, *, count: int) -> NearUsers:
+    """Finds the nearest other active agents and boxes of the traffic.
+
+    The traffic's kinds are those of the log, whose rows come first in it; boxes beyond them are vehicles, as agents are.
+    """
+    motion, cars = state.motion, len(state.active)
+    users = surrogate_safety.collect_road_users(motion, state.agents.size, state.active, scene.traffic)
+    total = len(users.present)
+    vehicle, logged = ROAD_USERS.index("vehicle"), scene.traffic_log.kind
+    kind = jnp.full(total, vehicle, jnp.int32)
+    if total - cars >= logged.shape[0]:
+        kind = kind.at[cars : cars + logged.shape[0]].set(logged.astype(jnp.int32))
+    apart = users.position - motion.position[:, None, :2]
+    others = users.present & ~jnp.eye(cars, total, dtype=bool)
+    index, mask = nearest_rows.select_nearest(jnp.where(others, dot(apart, apart), jnp.inf), count=count)
+    yaw = motion.yaw[:, None]
+    return NearUsers(
+        position=to_frame(jnp.take_along_axis(apart, index[..., None], axis=1), yaw),
+        yaw=wrap_angle(users.yaw[index] - yaw),
+        velocity=to_frame(users.velocity[index], yaw),
+        size=users.size[index],
+        kind=kind[index],
+        present=mask,
+    )
