@@ -30,6 +30,7 @@ from scenefactory_jax.env.traffic.log_playback import SNAP, VEHICLE, Row, is_par
 from scenefactory_jax.env.traffic.mixed import make_absent_boxes
 from scenefactory_jax.learning import policy_io
 from scenefactory_jax.learning.policy_io import TrainedPolicy
+from scenefactory_jax.learning.training_loop import make_policy
 from scenefactory_jax.weather.road_condition import keep_condition
 
 # Groups of a policy's config that are read, besides `observations`
@@ -51,6 +52,8 @@ class PolicyTrafficState(NamedTuple):
 def policy_traffic(
     *,
     run: str | None,
+    policy: dict[str, Any] | None = None,
+    observations: dict[str, Any] | None = None,
     sample: bool,
     slots: Count | None,
     dynamics: dict[str, Any],
@@ -67,10 +70,11 @@ def policy_traffic(
     physics_dt: float,
     control_dt: float,
 ) -> Traffic:
-    """Traffic of vehicles that drive by a trained policy from their logged start to their logged end.
+    """Traffic of vehicles that drive by a trained policy, or by a planner, from their logged start to their logged end.
 
     Args:
         run: a folder that `train` or `export` wrote, or the name of a bundled policy. Its config may name functions of the package only.
+        policy, observations: of a planner that drives in place of the run's policy, entries of those config groups; None: the run's own.
         sample: whether actions are sampled; else they are the policy's means.
         slots: vehicles of a world that the policy drives at most, the first of the log; further ones follow their log. None: no limit.
         dynamics: of these vehicles, an entry of the config group `dynamics`.
@@ -84,7 +88,7 @@ def policy_traffic(
     """
     context = {"physics_dt": physics_dt, "control_dt": control_dt}
     car = instantiate(dynamics, builtins="scenefactory_jax.dynamics", where="traffic.dynamics", friction=friction, **context)()
-    trained = _load(run)
+    trained = _replace_policy(_load(run), policy, observations, dynamics)
     parts = make_parts(trained, car, ending=ending, **context)
     env, masses = environment.assemble(parts), make_masses(mass_kg)
     act = make_actor(trained, env, sample=sample)
@@ -131,6 +135,16 @@ def _load(run: str | None) -> TrainedPolicy:
     if missing := [name for name in (*READ, "observations") if name not in trained.config]:
         raise ConfigError(f"traffic.run: {trained.folder}: expected a policy of this version, whose config has the key {missing[0]}")
     return trained
+
+
+def _replace_policy(
+    trained: TrainedPolicy, policy: dict[str, Any] | None, observed: dict[str, Any] | None, dynamics: dict[str, Any]
+) -> TrainedPolicy:
+    """Replaces the policy of a run by a planner, which has no parameters and is told which cars it drives."""
+    if policy is None:
+        return trained
+    config = trained.config | {"policy": policy, "observations": observed or trained.config["observations"], "dynamics": dynamics}
+    return trained._replace(config=config, policy=make_policy(config), parameters={})
 
 
 def make_parts(trained: TrainedPolicy, dynamics: Dynamics, *, ending: list[EventName], physics_dt: float, control_dt: float) -> EnvParts:

@@ -16,7 +16,7 @@ DT_S, BASE_M, LIMIT_RAD = 0.05, 2.6, 0.55654
 
 @pytest.fixture(scope="module")
 def pursuit():
-    config = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit"])
+    config = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit", "dynamics=bicycle"])
     policy = make_policy(config)
     return policy._replace(apply=jax.jit(policy.apply))
 
@@ -65,8 +65,9 @@ def test_missing_observations_and_wrong_numbers_are_named(pursuit):
     settings = apply_overrides(load_config("train", "experiment=laptop"), ["policy=pure_pursuit"])["policy"]
     with pytest.raises(ConfigError, match=r"pure pursuit needs the observation group `ego`; the observation has: turning"):
         pursuit.apply({}, {"turning": jnp.zeros(2)})
-    for key in ("wheelbase_m", "speed_mps", "goal_scale_m"):
+    for key in ("speed_mps", "goal_scale_m"):
         with pytest.raises(ConfigError, match=rf"policy\.{key}"):
             make_policy({"policy": {**settings, key: 0.0}})
-    with pytest.raises(ConfigError, match=r"policy\.steering_limit_rad"):
-        make_policy({"policy": {**settings, "steering_limit_rad": 2.0}})
+    car = settings["trackers"]["bicycle"]
+    with pytest.raises(ConfigError, match=r"policy\.trackers\.bicycle\.steering_limit_rad"):
+        make_policy({"policy": {**settings, "trackers": {"bicycle": {**car, "steering_limit_rad": 2.0}}}})

@@ -54,7 +54,7 @@ def scene():
 
 def run(env, scene, name, seconds=40):
     """Metrics of every action and agent, and the actions."""
-    policy = make_policy(apply_overrides(load_config("train", "experiment=laptop"), [f"policy={name}"]))
+    policy = make_policy(apply_overrides(load_config("train", "experiment=laptop"), [f"policy={name}", "dynamics=bicycle"]))
     act = jax.jit(lambda observation: policy.apply({}, observation)[0])
     state, observation = env.reset(jax.random.key(0), scene)
     found = []
@@ -92,7 +92,7 @@ def test_idm_stands_before_the_light_the_sign_and_the_car(idm):
     assert metrics.speed[-1, 4] < 0.1 and 43.0 < follows < 46.0 and not events.collision.any()
     assert (metrics.speed[:, 5] == 0.0).all() and np.abs(actions).max() <= 1.0
     braking = actions[..., 2] > 0
-    np.testing.assert_allclose(actions[..., 0][braking], -actions[..., 2][braking], atol=1e-6)
+    np.testing.assert_allclose(actions[..., 0][braking], -actions[..., 2][braking], atol=1e-6)  # one pedal and two do the same
 
 
 def test_a_length_is_read_back():
@@ -108,5 +108,5 @@ def test_missing_groups_and_wrong_numbers_are_named(name):
     groups = {"ego": jnp.zeros(7), "route": jnp.zeros(10), "leader": jnp.zeros(4), "lights": None, "signs": None}
     with pytest.raises(ConfigError, match=r"ahead_m: expected as observations.route, 80 columns, got 10"):
         policy.apply({}, groups)
-    with pytest.raises(ConfigError, match=r"policy\.tracker\.wheelbase_m"):
-        make_policy({"policy": {**settings, "tracker": {**settings["tracker"], "wheelbase_m": 0.0}}})
+    with pytest.raises(ConfigError, match=r"policy\.trackers\.bicycle\.wheelbase_m"):
+        make_policy({"policy": {**settings, "trackers": {"bicycle": {**settings["trackers"]["bicycle"], "wheelbase_m": 0.0}}}})

@@ -141,7 +141,7 @@ class PathPoints(NamedTuple):
     curvature: Float[Array, "*n"]  # 1/m, to the left
 
 
-def find_path_points(line: CentreLine, arc: Float[Array, "*n"], offset: Float[Array, "*n"]) -> PathPoints:
+def find_path_points(line: CentreLine, arc: Float[Array, "*#n"], offset: Float[Array, "*#n"]) -> PathPoints:
     """Finds the points of paths at lengths along the line; an offset counts to the left of it."""
     row = find_row(line, arc)
     fraction = ((arc - line.arc[row]) / SPACING_M)[..., None]

@@ -86,11 +86,11 @@ def make(
     network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
+        if trees := [name for name, group in sorted(observation.items()) if not isinstance(group, SetObservation) and not hasattr(group, "shape")]:
+            raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
             raise ConfigError(f"policy.rows.{unknown[0]}: the observation has no such set; valid: {', '.join(groups) or 'none'}")
-        if trees := [name for name, group in sorted(observation.items()) if not isinstance(group, SetObservation) and not hasattr(group, "shape")]:
-            raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
         if not observation:
             raise ConfigError("policy: the observation has no group; add one to `observations`")
         return network.init(key, observation)

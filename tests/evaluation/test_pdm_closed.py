@@ -1,0 +1,232 @@
+"""PDM-Closed: what it does on streets made by hand, and its parts against plain formulas."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.route_scenes import routed_scene
+
+from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
+from scenefactory_jax.core import schema
+from scenefactory_jax.core.pytree import replace
+from scenefactory_jax.core.schema import ConfigError
+from scenefactory_jax.core.types import LIGHT_STATES
+from scenefactory_jax.env.environment import make_env
+from scenefactory_jax.evaluation.planners import pdm_closed, pdm_scoring, pdm_simulation
+from scenefactory_jax.evaluation.planners.pdm_proposals import ProposalConfig
+from scenefactory_jax.evaluation.planners.pdm_scoring import ScoreConfig
+from scenefactory_jax.evaluation.planners.pdm_simulation import SimulationConfig
+from scenefactory_jax.evaluation.planners.tracker import Tracker
+from scenefactory_jax.learning.training_loop import make_policy
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+GO, STOP = (LIGHT_STATES.index(name) for name in ("go", "stop"))
+GREEN_S, SECONDS, HZ = 15.0, 16, 10
+FREE, BLOCKED, NUDGING, RED, BENT, CLOSE = range(6)  # agents; behind them the cars that stand
+STANDING = (6, 7, 8)
+OFFSETS, FRACTIONS = [0.0, -1.0, 1.0], [0.2, 0.4, 0.6, 0.8, 1.0]
+
+
+def straight(y, length=140.0):
+    return np.array([[-70.0, y], [length - 70.0, y]])
+
+
+def bend(radius, y):
+    """30 m ahead, a quarter circle to the left, and 40 m on."""
+    angle = np.linspace(0.0, np.pi / 2, 30)
+    arc = np.stack([radius * np.sin(angle), radius * (1 - np.cos(angle))], axis=1)
+    on = arc[-1] + np.linspace(1.0, 40.0, 40)[:, None] * np.array([0.0, 1.0])
+    return np.concatenate([np.stack([np.arange(-30.0, 0.0), np.zeros(30)], axis=1), arc, on]) + np.array([-60.0, y])
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return apply_overrides(load_config("train", "experiment=laptop"), ["policy=pdm_closed", "dynamics=bicycle"])
+
+
+@pytest.fixture(scope="module")
+def drive(settings):
+    """(scene, seconds) -> motions, metrics and actions of every action and agent."""
+    env = make_env(load_config("task", "observations=planning", "dynamics=bicycle", "actions=one_pedal_10hz", "termination=goal_only"))
+    policy = make_policy(settings)
+    reset = jax.jit(env.reset)
+
+    @jax.jit
+    def act(scene, state, observation):
+        action = policy.apply({}, observation)[0]
+        state, result = env.step(scene, state, action)
+        return state, result.observation, (state.motion, result.metrics, result.events, action)
+
+    def run(scene, seconds):
+        state, observation = reset(jax.random.key(0), scene)
+        found = []
+        for _ in range(round(seconds * HZ)):
+            state, observation, row = act(scene, state, observation)
+            found.append(row)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A free street; a car that stands at 60 m; one parked 1.5 m to the right, at 40 m; a light at 40 m; a bend; a car
+    that stands 1 m ahead of one that drives at 4 m/s."""
+    lines = [straight(y) for y in (-80.0, -60.0, -40.0, -20.0)] + [bend(12.0, 20.0), straight(0.0)]
+    lines += [straight(-60.0), straight(-41.5), straight(0.0)]
+    starts, speeds = [0, 0, 0, 0, 0, 0, 60, 40, 5], [8.0, 8, 8, 8, 8, 4, 0, 0, 0]
+    controls, stops = [((-30.0, -20.0), [(0.0, STOP), (GREEN_S, GO)], np.inf)], [[]] * 9
+    stops[RED] = [(40.0, 0)]
+    made = routed_scene(lines, starts=starts, speeds=speeds, controls=controls, stops=stops, limits=[10.0] * 9, half_width=200.0)
+    return replace(made, agents=replace(made.agents, route_end=made.agents.route_end.at[jnp.array(STANDING)].set(0.0)))
+
+
+@pytest.fixture(scope="module")
+def driven(drive, scene):
+    return drive(scene, SECONDS)
+
+
+def test_on_a_free_street_it_reaches_the_limit_and_its_goal(driven):
+    motion, metrics, events, action = driven
+    assert events.goal_reached[:, FREE].any() and 9.3 < metrics.speed[:, FREE].max() < 10.2
+    assert np.abs(metrics.route_distance[:100, FREE]).max() < 0.05 and np.abs(action).max() <= 1.0
+
+
+def test_it_stops_behind_a_car_that_stands(driven):
+    _, metrics, events, _ = driven
+    assert metrics.speed[-1, BLOCKED] < 0.3 and 54.0 < metrics.route_arc[-1, BLOCKED] < 56.0  # both are 4 m long
+    assert not events.collision[:, BLOCKED].any()
+
+
+def test_it_passes_a_car_parked_at_the_edge_of_the_lane_on_an_offset(driven):
+    motion, metrics, events, _ = driven
+    assert events.goal_reached[:, NUDGING].any() and not events.collision[:, NUDGING].any()
+    beside = np.abs(motion.position[:, NUDGING, 0] + 30.0) < 4.0
+    assert beside.any() and (motion.position[beside, NUDGING, 1] > -39.5).all()  # both are 2 m wide
+    assert metrics.speed[beside, NUDGING].min() > 3.0
+
+
+def test_it_waits_before_a_red_light(driven):
+    _, metrics, events, _ = driven
+    waits = int(GREEN_S * HZ) - 1
+    assert metrics.speed[waits, RED] < 0.3 and 36.0 < metrics.route_arc[waits, RED] < 38.0
+    assert not events.red_light[:, RED].any() and metrics.speed[-1, RED] > 0.4  # green for a second
+
+
+def test_it_follows_a_bend(driven):
+    _, metrics, events, _ = driven
+    active = np.cumsum(events.goal_reached[:, BENT]) == 0
+    assert events.goal_reached[:, BENT].any() and metrics.route_distance[active, BENT].max() < 1.7  # the path 1 m inside is shorter
+    assert metrics.speed[active, BENT].max() > 6.0
+
+
+def test_it_brakes_in_an_emergency_and_without_a_route(driven, settings):
+    _, _, _, action = driven
+    car = settings["policy"]["trackers"]["bicycle"]
+    hardest = (settings["policy"]["emergency"]["braking_mps2"] - car["rolling_mps2"] - car["air_drag_radpm"] * 16.0) / car["brake_mps2"]
+    np.testing.assert_allclose(action[0, CLOSE], [-hardest, 0.0, hardest], atol=1e-3)
+    np.testing.assert_allclose(action[:, STANDING], np.broadcast_to([-1.0, 0.0, 1.0], (len(action), 3, 3)))
+
+
+# ---- its parts
+
+
+def test_the_steering_rate_is_that_of_least_squares(settings):
+    numbers = schema.read(settings["policy"]["simulation"], SimulationConfig)
+    rng = np.random.default_rng(0)
+    offset, heading, steer = rng.normal(0, [[1.0], [0.2], [0.1]], (3, 5))
+    speeds, curvature = rng.uniform(1, 12, (5, numbers.horizon)), rng.normal(0, 0.05, (5, numbers.horizon))
+    found = pdm_simulation.solve_lateral(*map(jnp.asarray, (offset, heading, steer, speeds, curvature)), numbers, wheelbase=2.6)
+    dt = numbers.dt_s
+    for row in range(5):
+        matrix, inputs, drift = np.eye(3), np.zeros(3), np.zeros(3)
+        for speed, bends in zip(speeds[row], curvature[row], strict=True):
+            step = np.array([[1.0, speed * dt, 0.0], [0.0, 1.0, speed * dt / 2.6], [0.0, 0.0, 1.0]])
+            matrix, inputs, drift = step @ matrix, step @ inputs + [0, 0, dt], step @ drift - [0, speed * dt * bends, 0]
+        free = matrix @ [offset[row], heading[row], steer[row]] + drift
+        weights = np.sqrt([numbers.lateral_weight, numbers.heading_weight, 0.0])
+        rows = np.append(weights * inputs, np.sqrt(numbers.steering_rate_weight))
+        best = np.linalg.lstsq(rows[:, None], np.append(-weights * free, 0.0), rcond=None)[0]
+        np.testing.assert_allclose(found[row], best[0], rtol=1e-3, atol=1e-5)
+
+
+
+@pytest.fixture(scope="module")
+def score(settings, scene):
+    """(changes of the free agent's view) -> scores [offset, speed]."""
+    env = make_env(load_config("task", "observations=planning", "dynamics=bicycle", "actions=one_pedal_10hz", "termination=goal_only"))
+    view = jax.tree.map(lambda leaf: leaf[FREE], env.reset(jax.random.key(0), scene)[1]["planning"])
+    entry = settings["policy"]
+    parts = (
+        schema.read(entry["proposals"], ProposalConfig),
+        schema.read(entry["simulation"], SimulationConfig),
+        schema.read(entry["scores"], ScoreConfig),
+        schema.read(entry["trackers"]["bicycle"], Tracker),
+    )
+    run = jax.jit(lambda view: pdm_closed.score_proposals(view, *parts)[0])
+    return lambda **changes: jax.tree.map(lambda leaf: np.asarray(leaf).reshape(3, 5), run(view._replace(**changes))), view
+
+
+def user_at(view, x, y, vx=0.0, vy=0.0, *, kind=0, yaw=0.0):
+    users = view.users
+    return users._replace(
+        position=users.position.at[0].set(jnp.array([x, y])),
+        velocity=users.velocity.at[0].set(jnp.array([vx, vy])),
+        yaw=users.yaw.at[0].set(yaw),
+        size=users.size.at[0].set(jnp.array([4.0, 2.0])),
+        kind=users.kind.at[0].set(kind),
+        present=jnp.zeros_like(users.present).at[0].set(True),
+    )
+
+
+def test_scores_of_a_free_street_grow_with_progress(score):
+    run, _ = score
+    found = run()
+    assert (found.no_collision == 1).all() and (found.drivable == 1).all() and (found.ttc == 1).all()
+    assert (np.diff(found.progress, axis=1) > 0).all() and found.progress.max() == 1.0
+    assert (found.total.argmax(axis=1) == len(FRACTIONS) - 1).all() and np.isinf(found.collision_s).all()
+
+
+def test_a_car_that_cuts_in_is_a_collision_at_fault_and_one_from_behind_is_not(score):
+    run, view = score
+    crossing = run(users=user_at(view, 14.0, -12.0, vy=6.0, yaw=np.pi / 2))  # on the street after 2 s, where the fast proposals are
+    assert crossing.no_collision.min() == 0.0 and crossing.total[crossing.no_collision == 0].max() == 0.0
+    assert np.isfinite(crossing.collision_s[crossing.no_collision == 0]).all()
+    object_ = run(users=user_at(view, 14.0, -12.0, vy=6.0, yaw=np.pi / 2, kind=3))
+    assert set(np.unique(object_.no_collision)) == {0.5, 1.0}
+    rear = run(users=user_at(view, -8.0, 0.0, vx=14.0))
+    assert (rear.no_collision[0] == 1.0).all()
+
+
+def test_edges_rule_out_the_paths_that_touch_them(score):
+    run, view = score
+    edges = view.edges
+    x = jnp.arange(edges.half_length.shape[0], dtype=jnp.float32)
+    left = edges._replace(
+        midpoint=jnp.stack([x - 10.0, jnp.full_like(x, 1.6)], axis=1),
+        direction=jnp.tile(jnp.array([1.0, 0.0]), (len(x), 1)),
+        half_length=jnp.full_like(x, 0.5),
+        present=x < 80,
+    )
+    found = run(edges=left)
+    assert (found.drivable[:2] == 1).all() and (found.drivable[2, 2:] == 0).all()  # the path 1 m to the left
+    assert found.total.reshape(-1).argmax() < 10
+
+
+def test_comfort_and_direction_have_nuplans_bounds(settings):
+    numbers = schema.read(settings["policy"]["scores"], ScoreConfig)
+    steps = 41
+    push = jnp.array([[1.0] * steps, [3.0] * steps])
+    zero = jnp.zeros((2, steps))
+    car = pdm_simulation.Car(jnp.zeros((2, steps, 2)), zero, 5.0 + jnp.cumsum(push, axis=1) * 0.1, push, zero)
+    np.testing.assert_array_equal(pdm_scoring.check_comfort(car, numbers.comfort, dt_s=0.1), [1.0, 0.0])
+    arc = -jnp.array([[0.0], [3.0], [7.0]]) * 0.1 * jnp.arange(steps)
+    np.testing.assert_array_equal(pdm_scoring.check_direction(arc, numbers, dt_s=0.1), [1.0, 0.5, 0.0])
+
+
+def test_a_missing_group_is_named(settings):
+    with pytest.raises(ConfigError, match=r"pdm_closed needs the observation groups of observations=planning; `planning` missing; .* has: ego"):
+        make_policy(settings).apply({}, {"ego": jnp.zeros(7)})
+    with pytest.raises(ConfigError, match=r"policy\.trackers: expected numbers for the dynamics my_car, got those of articulated_car, bicycle"):
+        make_policy({**settings, "dynamics": {"_target_": "my_car.make"}})
