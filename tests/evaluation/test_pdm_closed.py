@@ -12,6 +12,7 @@ from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.schema import ConfigError
 from scenefactory_jax.core.types import LIGHT_STATES
 from scenefactory_jax.env.environment import make_env
+from scenefactory_jax.env.observations.near_segments import NearSegments
 from scenefactory_jax.evaluation.planners import pdm_closed, pdm_scoring, pdm_simulation
 from scenefactory_jax.evaluation.planners.pdm_proposals import ProposalConfig
 from scenefactory_jax.evaluation.planners.pdm_scoring import ScoreConfig
@@ -221,8 +222,11 @@ def test_comfort_and_direction_have_nuplans_bounds(settings):
     zero = jnp.zeros((2, steps))
     car = pdm_simulation.Car(jnp.zeros((2, steps, 2)), zero, 5.0 + jnp.cumsum(push, axis=1) * 0.1, push, zero)
     np.testing.assert_array_equal(pdm_scoring.check_comfort(car, numbers.comfort, dt_s=0.1), [1.0, 0.0])
-    arc = -jnp.array([[0.0], [3.0], [7.0]]) * 0.1 * jnp.arange(steps)
-    np.testing.assert_array_equal(pdm_scoring.check_direction(arc, numbers, dt_s=0.1), [1.0, 0.5, 0.0])
+    lanes = NearSegments(*(jnp.array(column) for column in ([[0.0, 0.0]], [[-1.0, 0.0]], [50.0], [True])))
+    centre = jnp.tile(jnp.array([[[0.0, 1.0]], [[0.0, 0.0]], [[0.0, 0.0]], [[0.0, 2.0]]]), (1, 21, 1))
+    cars = pdm_simulation.Car(centre, jnp.zeros((4, 21)), jnp.array([[1.5], [3.0], [7.0], [7.0]]) * jnp.ones(21), *[jnp.zeros((4, 21))] * 2)
+    found = pdm_scoring.check_direction(lanes, cars, centre, numbers, dt_s=0.2)
+    np.testing.assert_array_equal(found, [1.0, 0.5, 0.0, 1.0])  # the last one is not on the lane
 
 
 def test_a_missing_group_is_named(settings):

@@ -11,7 +11,7 @@ from scenefactory_jax.core.schema import Bounds, Count, Positive
 from scenefactory_jax.core.types import Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
 from scenefactory_jax.env.observations.column_bounds import FRACTION, bound_observation
-from scenefactory_jax.env.observations.edge_segments import gather_edges
+from scenefactory_jax.env.observations.near_segments import gather_nearest
 
 NAVIGATION_POINTS, POINT_GAP, NAVIGATION_RANGE_M = 10, 2, 30.0  # points 2 m apart; longer vectors are shortened
 
@@ -54,7 +54,7 @@ def metadrive(
     throttle, steer, brake = state.previous_action.T
     ego = [_centre(turned / jnp.pi), speed, _centre(motion.steer / max_steer_rad), _centre(steer), _centre(throttle - brake)]
     ego += [jnp.abs(motion.yaw_rate) / max_yaw_rate_radps]
-    edges = gather_edges(scene, position, motion.yaw, count=edge_segments, range_m=range_m)
+    edges = gather_nearest(scene.edges, position, motion.yaw, count=edge_segments, range_m=range_m)
     side_directions = make_ray_directions(side_rays) if side_rays else jnp.array([[0.0, 1.0], [0.0, -1.0]])
     sides = cast_to_segments(side_directions, *edges, range_m=range_m) / range_m
     lane = [_centre(2 * lateral / lane_width_m)]

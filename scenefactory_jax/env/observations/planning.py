@@ -1,4 +1,4 @@
-"""What a planner reads of each agent's surroundings: its own motion, its route, stop lines, road users and road edges."""
+"""What a planner reads of each agent's surroundings: its own motion, its route, stop lines, road users, road edges and lanes."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from scenefactory_jax.core.geometry import dot, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Count, NonNegative, Positive
 from scenefactory_jax.core.types import ROAD_USERS, YELLOW_STATES, Scene, State
 from scenefactory_jax.env import route_following, surrogate_safety
-from scenefactory_jax.env.observations.edge_segments import EdgeSegments, gather_edges
+from scenefactory_jax.env.observations.near_segments import NearSegments, gather_nearest
 from scenefactory_jax.roadgraph import nearest_rows
 
 SPACING_M = 1.0  # between the points of the centre line
@@ -56,7 +56,8 @@ class PlanningView(NamedTuple):
     line: CentreLine
     stops: StopLinesAhead
     users: NearUsers
-    edges: EdgeSegments
+    edges: NearSegments
+    lanes: NearSegments
 
 
 def planning(
@@ -67,7 +68,8 @@ def planning(
     ahead_m: Positive,
     users: Count,
     edges: Count,
-    edge_range_m: Positive,
+    lanes: Count,
+    range_m: Positive,
     control_dt: float,
 ) -> PlanningView:
     """Observes everything that planners read; networks and adapters take no such group.
@@ -75,9 +77,10 @@ def planning(
     Args:
         behind_m, ahead_m: length of the centre line.
         users: nearest road users that are shown.
-        edges: nearest road-edge segments that are shown, of those that reach into `edge_range_m`.
+        edges, lanes: nearest segments of road edges and of lanes that are shown, of those that reach into `range_m`.
     """
     motion = state.motion
+    place = (motion.position[:, :2], motion.yaw)
     return PlanningView(
         velocity=to_frame(motion.velocity[:, :2], motion.yaw),
         yaw_rate=motion.yaw_rate,
@@ -86,7 +89,8 @@ def planning(
         line=read_centre_line(scene, state, behind_m=behind_m, ahead_m=ahead_m),
         stops=read_stop_lines(scene, state, state.step.astype(jnp.float32) * control_dt),
         users=find_users(scene, state, count=users),
-        edges=gather_edges(scene, motion.position[:, :2], motion.yaw, count=edges, range_m=edge_range_m),
+        edges=gather_nearest(scene.edges, *place, count=edges, range_m=range_m),
+        lanes=gather_nearest(scene.lanes, *place, count=lanes, range_m=range_m),
     )
 
 

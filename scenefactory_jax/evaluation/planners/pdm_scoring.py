@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float
 from scipy.signal import savgol_filter
 
 from scenefactory_jax.core.boxes import find_overlaps
-from scenefactory_jax.core.geometry import cross, heading_vector, to_frame, wrap_angle
+from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
 from scenefactory_jax.core.types import ROAD_USERS
-from scenefactory_jax.env.observations.edge_segments import EdgeSegments
+from scenefactory_jax.env.observations.near_segments import NearSegments
 from scenefactory_jax.env.observations.planning import NearUsers, PlanningView
 from scenefactory_jax.evaluation.planners.pdm_simulation import Car
 
@@ -53,7 +53,10 @@ class ScoreConfig:
     lane_half_width_m: Positive
     against_m: tuple[float, float]
     against_s: Positive
+    on_lane_m: Positive
+    against_cosine: Annotated[float, Bounds(min=-1, max=1)]
     edge_margin_m: NonNegative
+    user_margin_m: NonNegative
     comfort: Comfort
 
 
@@ -86,7 +89,7 @@ def score(
     no_collision, collision_s, hit = find_collisions(view, sampled, centre, wide, times, config)
     ttc = check_ttc(view, sampled, centre, wide, times, hit, config)
     drivable = check_drivable(view.edges, centre, sampled.yaw, view.size, margin_m=config.edge_margin_m)
-    direction = check_direction(arc, config, dt_s=dt_s)
+    direction = check_direction(view.lanes, sampled, centre, config, dt_s=dt_s * config.stride)
     gates = no_collision * drivable * direction
     made = jnp.maximum(arc[:, -1] - arc[:, 0], 0.0) * gates
     best = jnp.max(made)
@@ -110,6 +113,7 @@ def find_collisions(
 ) -> tuple[Float[Array, " N"], Float[Array, " N"], Bool[Array, "N S K"]]:  # fmt: skip
     """Finds collisions at fault, as nuPlan: with road users that stand or that the car's front hits, and, where the car is not within one
     lane, with those beside it. The first collision with a road user counts; those that overlap at present do not.
+    A box with a margin around it collides, too, with road users that are not within the margin at present.
 
     Returns:
         The score, 0 after a collision with a vehicle or a person, 1/2 after one with another object; the time of the first collision at
@@ -117,7 +121,9 @@ def find_collisions(
     """
     users = view.users
     place = users.position + times[:, None, None] * users.velocity
-    overlap = _overlap(centre, car.yaw, view.size, place, users) & users.present
+    margins = (0.0, config.user_margin_m)
+    overlaps = [_overlap(centre, car.yaw, view.size + 2.0 * margin, place, users) & users.present for margin in margins]
+    overlap = jnp.any(jnp.stack([new & ~new[:, :1] for new in overlaps]), axis=0)
     bearing = find_bearings(view, car, times)
     front = centre + 0.5 * (view.size[0] - FRONT_M) * heading_vector(car.yaw)
     ahead = _overlap(front, car.yaw, view.size.at[0].set(FRONT_M), place, users)
@@ -125,8 +131,7 @@ def find_collisions(
     beside = wide[..., None] & (bearing <= jnp.deg2rad(config.behind_deg))
     fault = (car.speed > config.stopped_mps)[..., None] & (stands | ahead | beside)
     first = jnp.argmax(overlap, axis=1)  # [N, K]
-    counts = jnp.any(overlap, axis=1) & ~overlap[:, 0]
-    at_fault = counts & jnp.take_along_axis(fault, first[:, None], axis=1)[:, 0]
+    at_fault = jnp.any(overlap, axis=1) & jnp.take_along_axis(fault, first[:, None], axis=1)[:, 0]
     light = users.kind == ROAD_USERS.index("other")
     heavy, objects = jnp.any(at_fault & ~light, axis=1), jnp.sum(at_fault & light, axis=1)
     result = jnp.where(heavy, 0.0, jnp.maximum(0.0, 1.0 - 0.5 * objects))
@@ -162,7 +167,7 @@ def check_ttc(
 
 
 def check_drivable(
-    edges: EdgeSegments, centre: Float[Array, "N S 2"], yaw: Float[Array, "N S"], size: Float[Array, "2"], *, margin_m: float
+    edges: NearSegments, centre: Float[Array, "N S 2"], yaw: Float[Array, "N S"], size: Float[Array, "2"], *, margin_m: float
 ) -> Float[Array, " N"]:
     """Returns 1 for proposals whose boxes, and a margin around them, never lie on a road edge that they do not lie on at present."""
     half_length, half_width = 0.5 * size[0] + margin_m, 0.5 * size[1] + margin_m
@@ -175,11 +180,21 @@ def check_drivable(
     return (~jnp.any(touches & ~touches[:, :1], axis=(1, 2))).astype(jnp.float32)
 
 
-def check_direction(arc: Float[Array, "N T"], config: ScoreConfig, *, dt_s: float) -> Float[Array, " N"]:
-    """Returns 1, 1/2 or 0 by how far a proposal goes against the route's direction within `against_s`."""
-    span = min(round(config.against_s / dt_s), arc.shape[1] - 1)
-    back = jnp.max(arc[:, :-span] - arc[:, span:], axis=1)
-    return jnp.where(back > config.against_m[1], 0.0, jnp.where(back > config.against_m[0], 0.5, 1.0))
+def check_direction(
+    lanes: NearSegments, car: Car, centre: Float[Array, "N S 2"], config: ScoreConfig, *, dt_s: float
+) -> Float[Array, " N"]:  # fmt: skip
+    """Returns 1, 1/2 or 0 by the metres that a proposal drives within `against_s` against the direction of the lane that it is on."""
+    if lanes.present.shape[0] == 0:
+        return jnp.ones(car.speed.shape[0])
+    apart = centre[:, :, None] - lanes.midpoint
+    nearest = jnp.argmin(jnp.where(lanes.present, dot(apart, apart), jnp.inf), axis=2)
+    direction = lanes.direction[nearest]
+    offset = jnp.abs(cross(direction, centre - lanes.midpoint[nearest]))
+    against = (offset < config.on_lane_m) & (dot(direction, heading_vector(car.yaw)) < config.against_cosine) & jnp.any(lanes.present)
+    way = jnp.cumsum(jnp.pad(jnp.where(against, car.speed * dt_s, 0.0), ((0, 0), (1, 0))), axis=1)
+    span = min(round(config.against_s / dt_s), way.shape[1] - 1)
+    most = jnp.max(way[:, span:] - way[:, :-span], axis=1)
+    return jnp.where(most > config.against_m[1], 0.0, jnp.where(most > config.against_m[0], 0.5, 1.0))
 
 
 def check_comfort(car: Car, bounds: Comfort, *, dt_s: float) -> Float[Array, " N"]:

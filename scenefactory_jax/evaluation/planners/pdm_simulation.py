@@ -16,7 +16,7 @@ from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
 from scenefactory_jax.env.observations.planning import PlanningView
 from scenefactory_jax.evaluation.planners import pdm_proposals
 from scenefactory_jax.evaluation.planners.pdm_proposals import PathPoints, Proposals
-from scenefactory_jax.evaluation.planners.tracker import Tracker
+from scenefactory_jax.evaluation.planners.tracker import Tracker, find_largest_angle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +69,7 @@ def simulate(view: PlanningView, proposals: Proposals, config: SimulationConfig,
         acceleration=jnp.zeros(count, jnp.float32),
         steer=flat(view.steer),
     )
+    limit = min(config.steering_limit_rad, find_largest_angle(tracker))
     span = jnp.arange(config.steps)[:, None] + jnp.arange(config.horizon)
     steps = (
         jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, : config.steps], 1, 0), path),
@@ -79,7 +80,7 @@ def simulate(view: PlanningView, proposals: Proposals, config: SimulationConfig,
     def step(car: Car, at: tuple[PathPoints, Array, Array]) -> tuple[Car, tuple[Car, Array, Array]]:
         acceleration, rate = track(car, *at, config, wheelbase=tracker.wheelbase_m)
         asked = car.steer + rate * config.dt_s
-        return advance(car, acceleration, asked, config, wheelbase=tracker.wheelbase_m), (car, acceleration, asked)
+        return advance(car, acceleration, asked, config, wheelbase=tracker.wheelbase_m, limit=limit), (car, acceleration, asked)
 
     last, (cars, acceleration, asked) = jax.lax.scan(step, start, steps)
     cars = jax.tree.map(lambda leaf, end: jnp.moveaxis(jnp.concatenate([leaf, end[None]]), 0, 1), cars, last)
@@ -134,12 +135,14 @@ def solve_lateral(
     return -pull / (q_offset * unit_offset**2 + q_heading * unit_heading**2 + config.steering_rate_weight)
 
 
-def advance(car: Car, acceleration: Float[Array, " N"], steer: Float[Array, " N"], config: SimulationConfig, *, wheelbase: float) -> Car:
+def advance(
+    car: Car, acceleration: Float[Array, " N"], steer: Float[Array, " N"], config: SimulationConfig, *, wheelbase: float, limit: float
+) -> Car:
     """Advances the bicycle by one Euler step; acceleration and steering follow what is asked with first-order lags."""
     dt = config.dt_s
     push = car.acceleration + dt / (dt + config.acceleration_lag_s) * (acceleration - car.acceleration)
     turned = car.steer + dt / (dt + config.steering_lag_s) * (steer - car.steer)
-    turned = jnp.clip(turned, -config.steering_limit_rad, config.steering_limit_rad)
+    turned = jnp.clip(turned, -limit, limit)
     return Car(
         position=car.position + (car.speed * dt)[..., None] * heading_vector(car.yaw),
         yaw=wrap_angle(car.yaw + car.speed * dt * jnp.tan(turned) / wheelbase),

@@ -55,6 +55,12 @@ def compute_steer(curvature: Float[Array, "*n"], speed: Float[Array, "*n"], trac
     return jnp.clip(angle / tracker.steering_limit_rad, -1.0, 1.0)
 
 
+def find_largest_angle(tracker: Tracker) -> float:
+    """Finds the largest angle of the front wheels, rad; for cars that are steered by curvature, the one that belongs to it."""
+    curvature = tracker.curvature_limit_radpm
+    return tracker.steering_limit_rad if curvature is None else math.atan(tracker.wheelbase_m * curvature)
+
+
 def make_action(
     acceleration: Float[Array, "*n"], curvature: Float[Array, "*n"], speed: Float[Array, "*n"], tracker: Tracker
 ) -> Float[Array, "*n 3"]:
