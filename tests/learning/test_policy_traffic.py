@@ -11,7 +11,7 @@ from support.running import smoke
 from support.traffic_scenes import track, with_tracks
 
 import scenefactory_jax as sf
-from scenefactory_jax.cli.hydra_config import load_config
+from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
 from scenefactory_jax.core import config as run_config
 from scenefactory_jax.core import trusted_targets
 from scenefactory_jax.core.pytree import replace
@@ -130,6 +130,20 @@ def agents(folder):
         return jax.tree.map(join, *jax.device_get(run(with_tracks(scene, box))))
 
     return drive
+
+
+def test_a_planner_drives_in_place_of_the_policy(folder):
+    planner = make_planner("constant")
+    _, boxes = simulate(make(folder, policy=planner["policy"], observations=planner["observations"]), street())
+    np.testing.assert_allclose(boxes.velocity[:, :3, 0], np.broadcast_to(SPEEDS, (STEPS + 1, 3)), atol=0.02)
+    assert load_config("task", "traffic=pdm_closed")["traffic"]["policy"]["_target_"].endswith("pdm_closed.make")
+    with pytest.raises(ConfigError, match=r"pdm_closed needs the observation groups of observations=planning; `planning` missing"):
+        simulate(make(folder, policy=load_config("task", "traffic=pdm_closed")["traffic"]["policy"]), street())
+
+
+def make_planner(name):
+    config = apply_overrides(load_config("train", "experiment=laptop"), [f"policy={name}", "observations=planning"])
+    return {key: config[key] for key in ("policy", "observations")}
 
 
 # ---- what the policy does
