@@ -1,4 +1,4 @@
-"""Measures what `conf/tracker` says of each car, and how well cars follow a route with it.
+"""Checks what `conf/tracker` says of each car, and how well cars follow a route with it.
 
 python -m experiments.tracker.run [--backends articulated bicycle bicycle_waymax] [--towns 2] [--seconds 40] [--out FOLDER]
 
@@ -51,8 +51,14 @@ def make_backend(name: str) -> tuple[Dynamics, Tracker]:
 
 
 def drive(
-    dynamics: Dynamics, car: Tracker, speed: Float[np.ndarray, " A"], push: Float[np.ndarray, " A"], bend: Float[np.ndarray, " A"], *, steps: int
-) -> Motion:  # fmt: skip
+    dynamics: Dynamics,
+    car: Tracker,
+    speed: Float[np.ndarray, " A"],
+    push: Float[np.ndarray, " A"],
+    bend: Float[np.ndarray, " A"],
+    *,
+    steps: int,
+) -> Motion:
     """Drives single cars with an acceleration and a curvature through the tracker; motions over time."""
     count = len(speed)
     place = np.stack([np.zeros(count), 1000.0 * np.arange(count)], axis=1)[:, None]
@@ -92,13 +98,6 @@ def measure_bends(dynamics: Dynamics, car: Tracker) -> list[dict[str, float]]:
     along = np.sum(motion.velocity[:, -1, 0, :2] * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1), axis=-1)
     rows = zip(speed, bend, rate / along, along, strict=True)
     return [{"speed": float(v), "asked": float(k), "got": float(g), "at_mps": float(at)} for v, k, g, at in rows]
-
-
-def fit_understeer(bends: list[dict[str, float]], car: Tracker) -> float:
-    """Fits K of asked / got = (1 + K v^2) / (1 + K0 v^2) by least squares, where K0 is the number that was driven with."""
-    at, asked, got = (np.array([row[name] for row in bends]) for name in ("at_mps", "asked", "got"))
-    demand = asked / got * (1.0 + car.understeer_s2pm2 * at**2) - 1.0
-    return float(np.sum(demand * at**2) / np.sum(at**4))
 
 
 def measure_following(name: str, towns: int, seconds: float) -> dict[str, float]:
@@ -143,15 +142,18 @@ def write_report(folder: Path, result: dict[str, Any]) -> None:
         error = np.array([row["got"] - row["asked"] for row in found["pushes"]])
         ratio = np.array([row["got"] / row["asked"] for row in found["bends"]])
         follow = found["following"]
-        rows.append(
-            [name, f"{np.abs(error).mean():.2f} ({np.abs(error).max():.2f})", f"{100 * np.abs(ratio - 1).mean():.1f} ({100 * np.abs(ratio - 1).max():.1f})",
-             f"{found['understeer_s2pm2']:.5f}", *([f"{follow[key]:.2f}" for key in list(follow)[1:]] if follow else [""] * 5)]
-        )  # fmt: skip
-    header = ["backend", "acceleration error, mean (max), m/s^2", "curvature error, mean (max), %", "understeer fitted, s^2/m^2"]
-    header += ["distance from route, mean, m", "95 %", "max", "speed error, rms, m/s", "95 %"]
+        errors = [f"{np.abs(error).mean():.2f} ({np.abs(error).max():.2f})", _format_percent(ratio)]
+        rows.append([name, *errors, *([f"{follow[key]:.2f}" for key in list(follow)[1:]] if follow else [""] * 5)])
+    header = ["backend", "acceleration error, mean (max), m/s^2", "curvature error, mean (max), %", "distance from route, mean, m", "95 %"]
+    header += ["max", "speed error, rms, m/s", "95 %"]
     lines += [markdown.format_table(header, rows), ""]
     (folder / "tracker.md").write_text("\n".join(lines), encoding="utf-8")
     print("\n".join(lines))
+
+
+def _format_percent(ratio: Float[np.ndarray, " N"]) -> str:
+    error = 100.0 * np.abs(ratio - 1.0)
+    return f"{error.mean():.1f} ({error.max():.1f})"
 
 
 def main() -> None:
@@ -167,8 +169,7 @@ def main() -> None:
     result = result_file.read(path) if path.exists() else {}
     for name in given.backends:
         dynamics, car = make_backend(name)
-        bends = measure_bends(dynamics, car)
-        found = {"pushes": measure_pushes(dynamics, car), "bends": bends, "understeer_s2pm2": fit_understeer(bends, car)}
+        found = {"pushes": measure_pushes(dynamics, car), "bends": measure_bends(dynamics, car)}
         follow = measure_following(name, given.towns, given.seconds) if given.towns else result.get(name, {}).get("following", {})
         result[name] = found | {"following": follow}
         write_report(given.out, result)

@@ -207,5 +207,3 @@ def test_networks_and_planners_refuse_groups_by_name(look):
     for name, needs in (("expert", "log"), ("constant", "planning"), ("random", "noise")):
         with pytest.raises(ConfigError, match=rf"{name} needs the observation groups of observations={needs}; `{needs}` missing"):
             make_policy(config_of(f"policy={name}")).apply({}, {"ego": jnp.zeros(7)})
-
-

@@ -15,7 +15,7 @@ from scenefactory_jax.env.observations.planning import PlanningView
 from scenefactory_jax.evaluation.planners import pdm_proposals, pdm_scoring, pdm_simulation, tracker
 from scenefactory_jax.evaluation.planners.pdm_proposals import ProposalConfig
 from scenefactory_jax.evaluation.planners.pdm_scoring import ScoreConfig, Scores
-from scenefactory_jax.evaluation.planners.pdm_simulation import SimulationConfig, Simulated
+from scenefactory_jax.evaluation.planners.pdm_simulation import Simulated, SimulationConfig
 from scenefactory_jax.evaluation.planners.route_tracking import require_groups
 from scenefactory_jax.evaluation.planners.tracker import Tracker, select_tracker
 

@@ -222,4 +222,4 @@ def make_filter(steps: int, window: int, order: int, derivative: int, dt_s: floa
     """Makes the matrix of a Savitzky-Golay filter over a fixed number of steps."""
     window = min(window, steps)
     order = min(order, window - 1)
-    return savgol_filter(np.eye(steps), window, order, deriv=derivative, delta=dt_s, axis=0).astype(np.float32)
+    return np.asarray(savgol_filter(np.eye(steps), window, order, deriv=derivative, delta=dt_s, axis=0), np.float32)

@@ -152,7 +152,9 @@ def advance(
     )
 
 
-def measure_line(view: PlanningView, proposals: Proposals, centre: Float[Array, "N T 2"]) -> tuple[Float[Array, "N T"], Float[Array, "N T"]]:
+def measure_line(
+    view: PlanningView, proposals: Proposals, centre: Float[Array, "N T 2"]
+) -> tuple[Float[Array, "N T"], Float[Array, "N T"]]:
     """Measures arc and offset of boxes' centres on the centre line, from the points where the proposals have them."""
     arc = proposals.arc[:, : centre.shape[1]]
     near = pdm_proposals.find_path_points(view.line, arc, jnp.zeros_like(arc))

@@ -46,9 +46,8 @@ def make(
             raise ConfigError(f"policy: pure pursuit needs the observation group `ego`; the observation has: {has}")
         ego = observation["ego"]
         sine, cosine, distance_m = ego[..., 2], ego[..., 3], jnp.maximum(goal_scale_m * ego[..., 4], 1.0)
-        speed = speed_scale_mps * ego[..., 5]
-        steer = jnp.where(cosine > 0.0, compute_steer(2.0 * sine / distance_m, speed, tracker), jnp.copysign(1.0, sine))
-        throttle = (speed_mps - speed) / speed_band_mps
+        steer = jnp.where(cosine > 0.0, compute_steer(2.0 * sine / distance_m, tracker), jnp.copysign(1.0, sine))
+        throttle = (speed_mps - speed_scale_mps * ego[..., 5]) / speed_band_mps
         mean = jnp.stack([throttle, steer, -jnp.ones_like(steer)], axis=-1)
         return jnp.clip(mean, -1.0, 1.0), jnp.zeros(3), jnp.zeros_like(steer)
 

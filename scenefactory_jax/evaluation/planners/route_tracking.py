@@ -114,9 +114,7 @@ def compute_target_speed(route: RouteAhead, limit: Float[Array, "*n P"], tracker
     return jnp.min(jnp.sqrt(slowest**2 + 2.0 * tracker.braking_mps2 * route.arc), axis=-1)
 
 
-def make_action(
-    acceleration: Float[Array, "*n"], route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker
-) -> Float[Array, "*n 3"]:
+def make_action(acceleration: Float[Array, "*n"], route: RouteAhead, speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n 3"]:
     """Makes the action that follows the route with an acceleration; an agent without a route brakes."""
     follow = tracking.make_action(acceleration, compute_curvature(route, speed, tracker), speed, tracker)
     return jnp.where(route.known[..., None] > 0, follow, tracking.make_braking_action(speed, tracker))

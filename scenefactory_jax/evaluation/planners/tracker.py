@@ -1,4 +1,4 @@
-"""How planners drive a car: from an acceleration and a curvature to throttle, steer and brake, with the numbers of each dynamics backend."""
+"""How planners drive a car: from acceleration and curvature to throttle, steer and brake, with numbers of each dynamics backend."""
 
 import dataclasses
 import math
@@ -20,7 +20,6 @@ class Tracker:
 
     wheelbase_m: Positive
     steering_limit_rad: Annotated[float, Bounds(above=0, below=math.pi / 2)]
-    understeer_s2pm2: NonNegative
     curvature_limit_radpm: Positive | None
     rear_m: NonNegative
     throttle_mps2: Positive
@@ -47,12 +46,11 @@ def select_tracker(trackers: Mapping[str, Tracker], dynamics: Mapping[str, Any] 
     return trackers[name]
 
 
-def compute_steer(curvature: Float[Array, "*n"], speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n"]:
+def compute_steer(curvature: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n"]:
     """Computes the steering action for a curvature of the rear axle's path, 1/m."""
     if tracker.curvature_limit_radpm is not None:
         return jnp.clip(curvature / tracker.curvature_limit_radpm, -1.0, 1.0)
-    angle = jnp.arctan(tracker.wheelbase_m * curvature * (1.0 + tracker.understeer_s2pm2 * speed**2))
-    return jnp.clip(angle / tracker.steering_limit_rad, -1.0, 1.0)
+    return jnp.clip(jnp.arctan(tracker.wheelbase_m * curvature) / tracker.steering_limit_rad, -1.0, 1.0)
 
 
 def find_largest_angle(tracker: Tracker) -> float:
@@ -78,7 +76,7 @@ def make_action(
     if tracker.power_m2ps3 is not None:
         available = jnp.minimum(available, tracker.power_m2ps3 / jnp.maximum(speed, SMALLEST_MPS))
     throttle, brake = jnp.clip(push / available, 0.0, 1.0), jnp.clip(-push / tracker.brake_mps2, 0.0, 1.0)
-    return jnp.stack([throttle - brake, compute_steer(curvature, speed, tracker), jnp.where(brake > 0, brake, -1.0)], axis=-1)
+    return jnp.stack([throttle - brake, compute_steer(curvature, tracker), jnp.where(brake > 0, brake, -1.0)], axis=-1)
 
 
 def make_braking_action(speed: Float[Array, "*n"], tracker: Tracker) -> Float[Array, "*n 3"]:

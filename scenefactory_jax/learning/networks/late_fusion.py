@@ -86,7 +86,8 @@ def make(
     network = ActorCritic(architecture, tuple(map(float, mean_init)), float(log_std_init), float(actor_head_scale))
 
     def init(key: PRNGKeyArray, observation: Observation) -> Any:
-        if trees := [name for name, group in sorted(observation.items()) if not isinstance(group, SetObservation) and not hasattr(group, "shape")]:
+        trees = [name for name, group in observation.items() if not (isinstance(group, SetObservation) or hasattr(group, "shape"))]
+        if trees:
             raise ConfigError(f"observations.{trees[0]}: expected a vector or a set, got a group for planners, which no network reads")
         groups = sorted(name for name, group in observation.items() if isinstance(group, SetObservation))
         if unknown := sorted(set(named) - set(groups)):
