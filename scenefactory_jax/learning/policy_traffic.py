@@ -76,7 +76,7 @@ def policy_traffic(
         run: a folder that `train` or `export` wrote, or the name of a bundled policy. Its config may name functions of the package only.
         sample: whether actions are sampled; else they are the policy's means.
         slots: vehicles of a world that the policy drives at most, the first of the log; further ones follow their log. None: no limit.
-        dynamics, policy, observations: of these vehicles, entries of those groups; None: the run's. A `policy` is a planner, which learns nothing.
+        dynamics, policy, observations: of these vehicles, entries of those groups; None: the run's. A `policy` is a planner.
         ending: events that end a vehicle, as in the config group `termination`.
         at_end: a vehicle that ended leaves, stays where it is, or starts again at its logged start once that is free.
         clearance_m: a vehicle enters, or starts again, once its lane is free over this distance ahead of it and behind it.

@@ -50,8 +50,9 @@ def settings():
 
 @pytest.fixture(scope="module")
 def look():
-    """The group `planning`."""
-    return observations.make(load_config("task", "observations=planning")["observations"], control_dt=1 / HZ)["planning"]
+    """The group `planning`, with few rows."""
+    entry = load_config("task", "observations=planning")["observations"]["planning"] | {"users": 8, "edges": 96, "lanes": 16}
+    return observations.make({"planning": entry}, control_dt=1 / HZ)["planning"]
 
 
 @pytest.fixture(scope="module")
