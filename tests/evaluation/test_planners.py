@@ -14,7 +14,7 @@ from scenefactory_jax.core.types import AgentLog
 from scenefactory_jax.dynamics import bicycle_waymax
 from scenefactory_jax.env import observations
 from scenefactory_jax.env.environment import make_env
-from scenefactory_jax.env.observations.log_view import LoggedState
+from scenefactory_jax.env.observations.log_view import LoggedState, LogView
 from scenefactory_jax.evaluation.planners import expert, tracker
 from scenefactory_jax.evaluation.planners.tracker import Tracker
 from scenefactory_jax.learning.training_loop import make_policy
@@ -143,11 +143,14 @@ def test_the_log_is_seen_from_the_car(logged):
     np.testing.assert_array_equal(late.valid, [True, False])
 
 
-def test_the_correction_points_to_the_log():
-    logged = LoggedState(jnp.array([1.0, 0.5]), jnp.float32(0.1), jnp.array([5.0, 0.0]))
-    push, bend = expert.correct(logged, jnp.float32(5.0), jnp.float32(5.0), response_s=0.5, length=jnp.float32(4.0))
-    assert push > 0 and bend > 0
-    assert expert.correct(logged, jnp.float32(5.0), jnp.float32(0.1), response_s=0.5, length=jnp.float32(4.0))[1] == 0.0
+def test_the_feedback_points_to_the_log():
+    state = lambda x, y: LoggedState(jnp.array([x, y]), jnp.float32(0.0), jnp.array([5.0, 0.0]))  # noqa: E731
+    numbers = {"action_s": 0.1, "response_s": 0.5, "length": jnp.float32(4.0)}
+    view = LogView(jnp.array([5.0, 0.0]), state(1.0, 0.5), state(1.5, 0.5), jnp.bool_(True))
+    push, bend = expert.follow_log(view, **numbers)
+    np.testing.assert_allclose([push, bend], [1.0 / 0.5**2, 0.5 / 4.0**2], rtol=1e-5)
+    slow = view._replace(velocity=jnp.array([0.1, 0.0]))
+    assert expert.follow_log(slow, **numbers)[1] == 0.0 and expert.follow_log(slow, **numbers)[0] > push
 
 
 # ---- constant, random, and refusals
