@@ -34,6 +34,7 @@ PLANNERS = {  # name -> overrides of the run `town`, whose policy none of them a
     "pure pursuit of the goal": ["observations=drive", "policy=pure_pursuit"],
     "pure pursuit of the route": ["observations=drive", "policy=route_pursuit"],
     "IDM on the route": ["observations=drive", "policy=idm_route"],
+    "PDM-Closed": ["observations=planning", "policy=pdm_closed"],
     RECORDED: ["dynamics=log_playback"],
 }
 DRIVEN = ("recorded_routes", "conflict")  # have recorded drivers: drawn routes have none, and reacting traffic has no log to follow
