@@ -8,6 +8,11 @@ from scenefactory_jax.core.types import AgentLog, Agents, Road, Scene
 from scenefactory_jax.weather.friction import make_uniform
 
 
+def column_of(values, dtype=np.float32):
+    """Converted on the host, an array costs nothing to compile."""
+    return jnp.asarray(np.asarray(values, dtype))
+
+
 def road_of(lines, capacity=None) -> Road:
     """Polylines [(kind, points [N,2]), ...] -> padded Road, as the packer lays it out."""
     columns = {"midpoint": [], "direction": [], "half_length": [], "kind": [], "polyline": [], "arc": []}
@@ -26,16 +31,16 @@ def road_of(lines, capacity=None) -> Road:
 
     def column(name, tail, dtype):
         rows = np.concatenate([np.asarray(c, float).reshape(-1, *tail) for c in columns[name]]) if lines else np.zeros((0, *tail))
-        return jnp.asarray(np.concatenate([rows, np.zeros((capacity - count, *tail))]), dtype)
+        return column_of(np.concatenate([rows, np.zeros((capacity - count, *tail))]), dtype)
 
     return Road(
-        midpoint=column("midpoint", (2,), jnp.float32),
-        direction=column("direction", (2,), jnp.float32),
-        half_length=column("half_length", (), jnp.float32),
-        kind=column("kind", (), jnp.int32),
-        polyline=column("polyline", (), jnp.int32),
-        arc=column("arc", (), jnp.float32),
-        valid=jnp.arange(capacity) < count,
+        midpoint=column("midpoint", (2,), np.float32),
+        direction=column("direction", (2,), np.float32),
+        half_length=column("half_length", (), np.float32),
+        kind=column("kind", (), np.int32),
+        polyline=column("polyline", (), np.int32),
+        arc=column("arc", (), np.float32),
+        valid=column_of(np.arange(capacity) < count, bool),
     )
 
 
@@ -46,24 +51,25 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     x = np.arange(-length, length + 1e-6, 1.0)
     lane = (2, np.stack([x, 0 * x], -1))
     edges = [(15, np.stack([x, 0 * x + half_width], -1)), (15, np.stack([x[::-1], 0 * x - half_width], -1))]
+    still = np.zeros(count)
     agents = Agents(
-        position=jnp.asarray(starts),
-        yaw=jnp.zeros(count, jnp.float32) if yaws is None else jnp.asarray(yaws, jnp.float32),
-        speed=jnp.zeros(count, jnp.float32) if speeds is None else jnp.asarray(speeds, jnp.float32),
-        size=jnp.tile(jnp.asarray(size, jnp.float32), (count, 1)),
-        goal=jnp.asarray(goals),
-        route_length=jnp.asarray(np.linalg.norm(goals - starts, axis=1), jnp.float32),
-        present=jnp.ones(count, bool) if present is None else jnp.asarray(present, bool),
-        route=jnp.zeros(count, jnp.int32),
-        route_start=jnp.zeros(count, jnp.float32),
-        route_end=jnp.zeros(count, jnp.float32),
+        position=column_of(starts),
+        yaw=column_of(still if yaws is None else yaws),
+        speed=column_of(still if speeds is None else speeds),
+        size=column_of(np.tile(np.asarray(size), (count, 1))),
+        goal=column_of(goals),
+        route_length=column_of(np.linalg.norm(goals - starts, axis=1)),
+        present=column_of(np.ones(count) if present is None else present, bool),
+        route=column_of(still, np.int32),
+        route_start=column_of(still),
+        route_end=column_of(still),
     )
     log = AgentLog(
-        position=jnp.tile(agents.position[:, None], (1, steps, 1)),
-        yaw=jnp.tile(agents.yaw[:, None], (1, steps)),
-        velocity=jnp.zeros((count, steps, 2), jnp.float32),
-        valid=jnp.ones((count, steps), bool),
-        dt=jnp.float32(0.1),
+        position=column_of(np.tile(starts[:, None], (1, steps, 1))),
+        yaw=column_of(np.tile(np.asarray(agents.yaw)[:, None], (1, steps))),
+        velocity=column_of(np.zeros((count, steps, 2))),
+        valid=column_of(np.ones((count, steps)), bool),
+        dt=column_of(0.1),
     )
     return Scene(
         road=road_of([lane, *edges]),
