@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from scenefactory_jax.core import geometry, schema
 from scenefactory_jax.core.types import Dynamics, Motion
@@ -65,10 +66,10 @@ def jitted(function):
 
 
 def drive(env, scene, action, steps, key=0):
-    """State and results of that many actions."""
-    state, _ = jitted(env.reset)(jax.random.key(key), scene)
+    """State and results of that many actions, these as numpy."""
+    state, _ = env.reset(jax.random.key(key), scene)
     history = []
     for _ in range(steps):
         state, outcome = jitted(env.step)(scene, state, action)
-        history.append(outcome)
+        history.append(jax.tree.map(np.asarray, outcome))
     return state, history
