@@ -92,7 +92,7 @@ def run(scenes: list[str], *, kind: str, restart: bool, seconds: float, workers:
     task = hydra_config.load_config("task", f"traffic={kind}", *(["traffic.at_end=restart"] if restart else []))
     dt = 1.0 / task["timing"]["control_hz"]
     traffic = kinds.make(task["traffic"], control_dt=dt)
-    worlds, chunk = jax.tree.map(jnp.asarray, loaded.scene), round(CHUNK_S / dt)
+    worlds, chunk = jax.device_put(loaded.scene), round(CHUNK_S / dt)
 
     @jax.jit
     def advance(carry: Any, first: Int[Array, ""]) -> tuple[Any, Float[Array, "T W 2"]]:

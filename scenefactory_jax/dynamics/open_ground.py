@@ -54,4 +54,4 @@ def make_open_ground(
 
     columns = [jnp.asarray(column, jnp.float32) for column in (position, yaw, speed, friction)]
     columns.append(jnp.asarray(pattern, jnp.int32))
-    return jax.vmap(make_world)(*columns)
+    return jax.jit(jax.vmap(make_world))(*columns)

@@ -182,7 +182,7 @@ def trajectory(recording: Recording, index: int, *, steps: int | None = None) ->
     live = np.flatnonzero(frames.active.any(axis=1))
     end = int(min((live[-1] if len(live) else 0) + round(control_hz), len(frames.active)))
     frames = jax.tree.map(lambda leaf: leaf[:end], frames)
-    scene = jax.device_get(jax.tree.map(lambda leaf: leaf[index], recording.batch))
+    scene = jax.tree.map(lambda leaf: np.asarray(leaf)[index], recording.batch)
     weather = jax.tree.map(lambda leaf: leaf[index], recording.weather)
     state = jax.tree.map(lambda leaf: leaf[index], recording.state)
     agents, traffic = state.agents, frames.traffic

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import yaml
 from omegaconf import OmegaConf
-from support.running import ROOT, shell, smoke
+from support import running
+from support.running import ROOT, shell
 from support.scene_documents import document, thing, written
 
 import scenefactory_jax
@@ -43,8 +44,21 @@ from scenefactory_jax.visualization.report import evaluation_files, tables
 pytestmark = pytest.mark.usefixtures("quickly")
 
 CLOCK = {"seconds", "casps", "minutes"}  # columns that no two runs share
-# the smoke run's own shapes, so that what is trained on other scenes is compiled already
-CAPACITY = [f"scenes.capacity.{name}={size}" for name, size in dict(road=1024, lanes=768, edges=256, agents=4, steps=81).items()]
+
+
+def smoke(out, *overrides):
+    """Without the grid of the road: its size differs between scenes, and programs with it."""
+    return running.smoke(out, "scenes.road_grid.radius_m=null", *overrides)
+
+
+@pytest.fixture(scope="module")
+def capacity():
+    """The smoke run's own shapes, so that what is trained on other scenes is compiled already."""
+    scene = scene_source.load_training_scenes(smoke(None)["scenes"]).scene
+    rows = {"road": scene.road, "lanes": scene.lanes, "edges": scene.edges, "agents": scene.agents, "controls": scene.controls}
+    sizes = {name: len(jax.tree.leaves(part)[0][0]) for name, part in rows.items()}
+    sizes |= {"traffic": scene.traffic_log.valid.shape[1], "steps": scene.log.valid.shape[2]}
+    return [f"scenes.capacity.{name}={size}" for name, size in sizes.items()]
 
 
 @pytest.fixture(scope="module")
@@ -395,23 +409,23 @@ def test_a_replay_shows_what_the_evaluation_counted(whole, tmp_path):
 # ---- convert -> bank -> train
 
 
-def trained_on_bank(source, folder, prepared):
+def trained_on_bank(source, folder, prepared, capacity):
     """Convert, train on the bank, and hand back the conversion's summary and the run."""
     summary = convert(
         hydra_config.load_config("convert", f"source={source}", f"out={folder / 'bank'}", "progress=false", "scenes.pack.agents=4")
     )
-    run = train(smoke(folder / "run", "scenes=womd", f"scenes.path={folder / 'bank'}", *CAPACITY), prepared=prepared)
+    run = train(smoke(folder / "run", "scenes=womd", f"scenes.path={folder / 'bank'}", *capacity), prepared=prepared)
     assert len(bank_reader.open(folder / "bank")) == summary.scenes == 2
     assert len(run.metrics) == 2 and all(np.isfinite(value) for row in run.metrics for value in row.values())
     return summary, run
 
 
-def test_files_become_a_bank_and_a_policy(prepared, tmp_path, capsys):
+def test_files_become_a_bank_and_a_policy(prepared, capacity, tmp_path, capsys):
     (tmp_path / "in").mkdir()
     for name, offset in (("one", 0), ("two", 8)):
         objects = [thing(0, id=7, speed=40), thing(-30 + offset, id=8, speed=40)]
         written(tmp_path / "in", document(name=name, objects=objects), f"{name}.json")
-    summary, run = trained_on_bank(tmp_path / "in", tmp_path, prepared)
+    summary, run = trained_on_bank(tmp_path / "in", tmp_path, prepared, capacity)
     assert summary.agents_kept == 4 and run.metrics[0]["steps/spawned"] == 4 / 2 * 4 * run.config["ppo"]["horizon"]
     printed = capsys.readouterr().out
     assert "2 scenes with 4 agents from 2 files, 0 rejected" in printed and "4 worlds of 2 scenes, 2 to 2 worlds a scene" in printed
@@ -419,11 +433,11 @@ def test_files_become_a_bank_and_a_policy(prepared, tmp_path, capsys):
 
 
 @pytest.mark.slow  # repeats what files show, on real scenes
-def test_real_scenes_become_a_bank_and_a_policy(prepared, tmp_path, shared_data):
+def test_real_scenes_become_a_bank_and_a_policy(prepared, capacity, tmp_path, shared_data):
     (tmp_path / "in").mkdir()
     for path in sorted((shared_data / "womd" / "train").iterdir())[:2]:
         (tmp_path / "in" / path.name).symlink_to(path)
-    summary, run = trained_on_bank(tmp_path / "in", tmp_path, prepared)
+    summary, run = trained_on_bank(tmp_path / "in", tmp_path, prepared, capacity)
     assert summary.agents_kept > 2 and run.metrics[0]["steps/active"] > 0
 
 

@@ -27,7 +27,7 @@ from support.driving import (
     random_controls,
     scene_for,
 )  # fmt: skip
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 
 from scenefactory_jax.cli.hydra_config import apply_overrides, load_config
 from scenefactory_jax.core.instantiate import ConfigError, instantiate
@@ -75,10 +75,14 @@ CARS = [
 ]
 
 
+derive = jax.jit(constants.derive_constants)
+resize = jax.jit(lambda car, sizes: jax.tree.map(jnp.asarray, randomization.resize_car(car, sizes, LONG)))
+
+
 def stacked(several):
     """Parameters with an agent axis."""
     leaves = zip(*(jax.tree.leaves(one) for one in several), strict=True)
-    return jax.tree.unflatten(jax.tree.structure(CAR), [jnp.asarray(leaf, jnp.float32) for leaf in leaves])
+    return jax.tree.unflatten(jax.tree.structure(CAR), [column_of(leaf) for leaf in leaves])
 
 
 def listed(*, physics_dt: float):
@@ -96,11 +100,15 @@ def several():
 
 def started(scene, cars_of):
     """Bodies at their start, of other cars than `CARS`: what `init` does, without its trace."""
-    body = several()[2](scene)
-    crew = jax.vmap(constants.derive_constants)(stacked(cars_of))
+    return place_crew(several()[2](scene), scene.agents.speed, stacked(cars_of))
+
+
+@jax.jit
+def place_crew(body, speed, several_cars):
+    crew = jax.vmap(constants.derive_constants)(several_cars)
     height, travel = jax.vmap(functools.partial(constants.compute_rest_pose, physics_dt=1 / 120))(crew)
     qpos = body.qpos.at[:, 2].set(height).at[:, [7, 10, 13, 15]].set(travel)
-    spin = scene.agents.speed / crew.car.wheel_radius
+    spin = speed / crew.car.wheel_radius
     return replace(body, constants=crew, qpos=qpos, qvel=body.qvel.at[:, [8, 11, 13, 15]].set(spin[:, None]))
 
 
@@ -108,7 +116,7 @@ def drive(scene, action, body=None):
     body = several()[2](scene) if body is None else body
     parts = []
     for chunk in np.asarray(action, np.float32).reshape(-1, CHUNK, 8, 3):
-        body, trace = several()[1](scene, body, jnp.asarray(chunk), EVERYONE)
+        body, trace = several()[1](scene, body, chunk, EVERYONE)
         parts.append(jax.tree.map(np.asarray, trace))
     return body, jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -124,7 +132,7 @@ def test_a_fitted_model_is_the_compiled_one(seed):
     """Every number that MJX's step reads, to 1e-4."""
     other = random_car(seed)
     model = models.build_standalone_model(CAR, SOLVER, **COMPILED)
-    own = constants.derive_constants(jax.tree.map(jnp.float32, other))
+    own = derive(jax.tree.map(np.float32, other))
     put = functools.partial(mjx.put_model, impl="jax")
     fitted = put(model).replace(**mjx_backend.fit_model(mjx_backend.put_model(model), own))
     # where a free body starts, its box, what only other solvers, engines or sensors read: no step looks at it
@@ -149,7 +157,8 @@ def test_standing_height_is_where_the_c_engine_settles(seed):
     """Of level cars: the centre of mass amidships. A car that leans is 'level' at its axles' mean."""
     for other in (dataclasses.replace(random_car(seed), mass_forward=0.0, wheel_damping=0.5), changed(mass=2.5, suspension_stiffness=0.5)):
         settled = models.find_rest_pose(models.build_standalone_model(other, SOLVER, **COMPILED), other)
-        height, travel = constants.compute_rest_pose(constants.derive_constants(jax.tree.map(jnp.float32, other)), physics_dt=1 / 120)
+        rest = jax.jit(functools.partial(constants.compute_rest_pose, physics_dt=1 / 120))
+        height, travel = rest(derive(jax.tree.map(np.float32, other)))
         assert float(height) == pytest.approx(settled[2], abs=2e-3)
         np.testing.assert_allclose(travel, settled[[7, 10, 13, 15]], atol=2e-3)
 
@@ -200,10 +209,10 @@ def test_axles_carry_what_statics_say():
 
 
 def test_cars_of_another_size_accelerate_and_stop_like_the_reference():
-    sizes = jnp.array([[4.0, 2.0], [4.0, 2.0], [12.0, 2.5], [2.5, 1.2], [5.0, 2.0], [4.0, 1.6], [3.2, 1.6], [6.0, 2.4]])
-    reference = jax.tree.map(lambda leaf: jnp.full((8,), leaf, jnp.float32), CAR)
-    resized = randomization.resize_car(reference, sizes, LONG)
-    crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in jax.tree.leaves(resized)]) for i in range(8)]
+    sizes = np.float32([[4.0, 2.0], [4.0, 2.0], [12.0, 2.5], [2.5, 1.2], [5.0, 2.0], [4.0, 1.6], [3.2, 1.6], [6.0, 2.4]])
+    resized = resize(stacked([CAR] * 8), sizes)
+    leaves = list(map(np.asarray, jax.tree.leaves(resized)))
+    crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in leaves]) for i in range(8)]
     assert crew[2].mass == pytest.approx(1800 * 3.75) and crew[2].wheelbase == pytest.approx(7.8)
     for one in crew:
         cars.check_stability(one, physics_dt=1 / 120, where="")
@@ -254,10 +263,10 @@ def test_long_vehicles_carry_their_mass_high_and_far_back(length, width):
 
 def test_a_bus_stands_and_turns_without_tipping_over():
     """Eight buses and trucks: 3 s at rest, then 4 s in a turn of 3 m/s^2 at 10 m/s."""
-    sizes = jnp.tile(jnp.array([[12.0, 2.5], [9.0, 2.4], [7.0, 2.2], [12.0, 2.6]]), (2, 1))
-    reference = jax.tree.map(lambda leaf: jnp.full((8,), leaf, jnp.float32), CAR)
-    resized = randomization.resize_car(reference, sizes, LONG)
-    crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in jax.tree.leaves(resized)]) for i in range(8)]
+    sizes = np.tile(np.float32([[12.0, 2.5], [9.0, 2.4], [7.0, 2.2], [12.0, 2.6]]), (2, 1))
+    resized = resize(stacked([CAR] * 8), sizes)
+    leaves = list(map(np.asarray, jax.tree.leaves(resized)))
+    crew = [jax.tree.unflatten(jax.tree.structure(CAR), [float(leaf[i]) for leaf in leaves]) for i in range(8)]
     scene = scene_for()
     _, (body, motion) = drive(scene, constant(seconds=3), body=started(scene, crew))
     assert np.ptp(motion.position[..., 2], axis=0).max() < 0.02 and motion.upright.min() > 0.9999
@@ -283,8 +292,8 @@ def sampler(**changes):
 
 
 def test_draws_are_pure_in_the_key_and_within_their_ranges():
-    draw, scene = sampler(), scene_of(np.zeros((400, 2)), np.ones((400, 2)))
-    one, again, other = (draw(jax.random.key(seed), scene) for seed in (0, 0, 1))
+    draw, scene = jax.jit(sampler()), scene_of(np.zeros((400, 2)), np.ones((400, 2)))
+    one, again, other = (jax.device_get(draw(jax.random.key(seed), scene)) for seed in (0, 0, 1))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     for name, (least, most) in spread()["scale"].items():
@@ -300,7 +309,7 @@ def test_logged_sizes_are_cut_to_the_range():
     draw = sampler(size="logged", scale={})
     scene = scene_of(np.zeros((3, 2)), np.ones((3, 2)))
     scene = replace(scene, agents=replace(scene.agents, size=jnp.array([[4.0, 2.0], [30.0, 2.0], [1.0, 0.5]])))
-    drawn = draw(KEY, scene)
+    drawn = jax.device_get(jax.jit(draw)(KEY, scene))
     np.testing.assert_allclose(drawn.length, [4.0, 12.0, 2.5])
     np.testing.assert_allclose(drawn.width, [2.0, 2.0, 1.2])
     np.testing.assert_allclose(drawn.mass, 1800 * drawn.length * drawn.width / 8.0, rtol=1e-6)
@@ -363,7 +372,7 @@ def test_sizes_of_real_scenes_build_and_step(shared_data):
         instantiate(scenes["pack"], builtins=pack, where="pack"),
     )
     path = sorted((shared_data / "womd" / "train").iterdir())[0]
-    scene = jax.tree.map(jnp.asarray, pack.prepare(next(iter(reader_selection.read(path, formats))), check=check, pack=packing).scene)
+    scene = jax.device_put(pack.prepare(next(iter(reader_selection.read(path, formats))), check=check, pack=packing).scene)
     entry = load_config("task", "dynamics/randomization=sizes")["dynamics"]["randomization"]
     dynamics = make("articulated", randomization=entry)
     present = scene.agents.present

@@ -348,7 +348,7 @@ def test_terms_beyond_the_published_ones_by_hand(env):
     goals = [[50, 3.5], [50, -4.0], [90, 0], [90, 0]]
     scene = scene_of([[0, 3.5], [0, -4.0], [60, 0], [66, 0]], goals, yaws=[np.pi, 0.0, 0.0, 0.0], speeds=[0.0, 0, 3, 3])
     state, (outcome,) = drive(env, scene, jnp.zeros((4, 3)), 1)
-    metrics, events = jax.tree.map(jnp.asarray, (outcome.metrics, outcome.events))
+    metrics, events = jax.device_put((outcome.metrics, outcome.events))
     step = RewardInput(scene=scene, before=state, action=jnp.zeros((4, 3)), after=state, metrics=metrics, events=events)
     paid = lambda term, step, **limits: jax.jit(functools.partial(term, **limits))(step)  # noqa: E731
     beside, behind = 7.5 - 2.2, 6.0 - 2.24 - 2.2

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 
 from scenefactory_jax.cli.hydra_config import load_config
 from scenefactory_jax.core import schema
@@ -65,16 +65,17 @@ def world(*cars, controls=None, stop_arc=None):
     columns = {"traffic_log.has_route": log["has_route"], "traffic_log.size": size, "traffic_log.route": log["route"]}
     zones = route_conflicts.find_zones(columns | {"routes.length": length, "routes.position": LINES})
     stops = np.full((len(LINES), 1), np.inf) if stop_arc is None else np.asarray(stop_arc, float).reshape(-1, 1)
+    every = np.ones(len(LINES))
     routes = Routes(
-        position=jnp.asarray(LINES, jnp.float32), length=jnp.asarray(length, jnp.float32),
-        speed_limit=jnp.full((len(LINES), POINTS), jnp.inf), lane=jnp.zeros((len(LINES), POINTS), jnp.int32),
-        along_lanes=jnp.ones(len(LINES), bool), agent=jnp.full(len(LINES), -1, jnp.int32), drawn=jnp.zeros(len(LINES), bool),
-        on_route=jnp.ones(len(LINES), bool), stop_arc=jnp.asarray(stops, jnp.float32), stop_control=jnp.zeros((len(LINES), 1), jnp.int32),
+        position=column_of(LINES), length=column_of(length),
+        speed_limit=column_of(np.full((len(LINES), POINTS), np.inf)), lane=column_of(np.zeros((len(LINES), POINTS)), np.int32),
+        along_lanes=column_of(every, bool), agent=column_of(every - 2, np.int32), drawn=column_of(every - 1, bool),
+        on_route=column_of(every, bool), stop_arc=column_of(stops), stop_control=column_of(np.zeros((len(LINES), 1)), np.int32),
     )  # fmt: skip
     tracks = TrafficLog(
-        **{name: jnp.asarray(log[name], jnp.float32) for name in ("position", "yaw", "velocity")}, valid=jnp.asarray(log["valid"], bool),
-        size=jnp.asarray(size, jnp.float32), kind=jnp.asarray(log["kind"], jnp.int32), route=jnp.asarray(log["route"], jnp.int32),
-        has_route=jnp.asarray(log["has_route"]), **{name.split(".")[1]: jnp.asarray(zone, jnp.float32) for name, zone in zones.items()},
+        **{name: column_of(log[name]) for name in ("position", "yaw", "velocity")}, valid=column_of(log["valid"], bool),
+        size=column_of(size), kind=column_of(log["kind"], np.int32), route=column_of(log["route"], np.int32),
+        has_route=column_of(log["has_route"], bool), **{name.split(".")[1]: column_of(zone) for name, zone in zones.items()},
     )  # fmt: skip
     scene = replace(scene_of([[0, 50]], [[5, 50]]), traffic_log=tracks, routes=routes)
     return replace(scene, controls=controls or light([(0.0, "go")]))
@@ -85,9 +86,9 @@ def light(changes, *, sign=False) -> TrafficControls:
     states = [(time, LIGHT_STATES.index(name)) for time, name in changes]
     states += [(np.inf, 0)] * (3 - len(states))
     return TrafficControls(
-        position=jnp.zeros((1, 2)), direction=jnp.zeros((1, 2)), lane=jnp.zeros(1, jnp.int32), stop_sign=jnp.array([sign]),
-        change_s=jnp.asarray([[time for time, _ in states]], jnp.float32), state=jnp.asarray([[code for _, code in states]], jnp.int32),
-        period_s=jnp.array([jnp.inf]), valid=jnp.ones(1, bool),
+        position=column_of([[0.0, 0.0]]), direction=column_of([[0.0, 0.0]]), lane=column_of([0], np.int32),
+        stop_sign=column_of([sign], bool), change_s=column_of([[time for time, _ in states]]),
+        state=column_of([[code for _, code in states]], np.int32), period_s=column_of([np.inf]), valid=column_of(np.ones(1), bool),
     )  # fmt: skip
 
 
@@ -120,7 +121,7 @@ def car_far_away() -> Boxes:
 
 def run(scene, beside=None, **how):
     """States after and boxes before every step of a world, which does not depend on the world beside it."""
-    scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), scene, beside or scene)
+    scenes = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), scene, beside or scene))
     states, boxes = jax.tree.map(lambda leaf: leaf[0], jax.device_get(simulation(**how)(scenes)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states)), "no NaN, whatever happens"
     return states, boxes

@@ -1,10 +1,9 @@
 """Observation groups of routes, lights and stop signs, on a route made by hand: 60 m east, then north."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 
 from scenefactory_jax.adapters import bounds
 from scenefactory_jax.cli.hydra_config import load_config
@@ -26,52 +25,61 @@ def world(place=(10.0, -1.0), yaw=0.0, arc=10.0, stood=False, step=0):
     along = np.arange(LENGTH + 1.0)
     line = np.stack([np.minimum(along, CORNER), np.maximum(along - CORNER, 0.0)], axis=1)
     routes = Routes(
-        position=jnp.asarray(line[None], jnp.float32),
-        length=jnp.array([float(LENGTH)]),
-        speed_limit=jnp.where(jnp.arange(LENGTH + 1) < 30, 10.0, jnp.inf)[None],
-        lane=jnp.zeros((1, LENGTH + 1), jnp.int32),
-        along_lanes=jnp.array([True]),
-        agent=jnp.array([0]),
-        drawn=jnp.array([False]),
-        on_route=jnp.array([True]),
-        stop_arc=jnp.array([[20.0, 40.0, 70.0, jnp.inf]]),
-        stop_control=jnp.array([[1, 2, 0, 0]]),
+        position=column_of(line[None]),
+        length=column_of([float(LENGTH)]),
+        speed_limit=column_of(np.where(np.arange(LENGTH + 1) < 30, 10.0, np.inf)[None]),
+        lane=column_of(np.zeros((1, LENGTH + 1)), np.int32),
+        along_lanes=column_of([True], bool),
+        agent=column_of([0], np.int32),
+        drawn=column_of([False], bool),
+        on_route=column_of([True], bool),
+        stop_arc=column_of([[20.0, 40.0, 70.0, np.inf]]),
+        stop_control=column_of([[1, 2, 0, 0]], np.int32),
     )
     controls = TrafficControls(
-        position=jnp.array([[60.0, 10.0], [20.0, 0.0], [40.0, 0.0], [12.0, 8.0]]),
-        direction=jnp.array([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0], [0.0, -1.0]]),
-        lane=jnp.zeros(4, jnp.int32),
-        stop_sign=jnp.array([False, False, True, False]),
-        change_s=jnp.array([[0.0, jnp.inf], [0.0, 1.0], [jnp.inf, jnp.inf], [5.0, jnp.inf]]),
-        state=jnp.array([[GO, 0], [STOP, CAUTION], [0, 0], [GO, 0]]),
-        period_s=jnp.array([jnp.inf, 2.0, jnp.inf, jnp.inf]),
-        valid=jnp.ones(4, bool),
+        position=column_of([[60.0, 10.0], [20.0, 0.0], [40.0, 0.0], [12.0, 8.0]]),
+        direction=column_of([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0], [0.0, -1.0]]),
+        lane=column_of(np.zeros(4), np.int32),
+        stop_sign=column_of([False, False, True, False], bool),
+        change_s=column_of([[0.0, np.inf], [0.0, 1.0], [np.inf, np.inf], [5.0, np.inf]]),
+        state=column_of([[GO, 0], [STOP, CAUTION], [0, 0], [GO, 0]], np.int32),
+        period_s=column_of([np.inf, 2.0, np.inf, np.inf]),
+        valid=column_of(np.ones(4), bool),
     )
     scene = scene_of([place, place], [(60.0, 30.0)] * 2)
-    agents = replace(scene.agents, route_start=jnp.full(2, 5.0), route_end=jnp.array([90.0, 0.0]))
+    agents = replace(scene.agents, route_start=column_of([5.0, 5.0]), route_end=column_of([90.0, 0.0]))
     scene = replace(scene, agents=agents, routes=routes, controls=controls)
-    zero, none = jnp.zeros(2), jnp.zeros(2, bool)
-    position = jnp.tile(jnp.array([*place, 0.5]), (2, 1))
-    motion = Motion(position, jnp.zeros((2, 3)), jnp.full(2, yaw), zero, zero + 1, zero, zero, zero + 1, zero, zero)
+    zero, one, none, still = column_of([0.0, 0.0]), column_of([1.0, 1.0]), column_of([False, False], bool), column_of(np.zeros((2, 3)))
+    position = column_of([[*place, 0.5]] * 2)
+    motion = Motion(position, still, column_of([yaw, yaw]), zero, one, zero, zero, one, zero, zero)
     state = State(
         body=None,
         motion=motion,
         agents=agents,
         weather=scene.weather,
-        active=~none,
+        active=column_of([True, True], bool),
         past_events=Events(*[none] * len(Events.__dataclass_fields__)),
-        steps_since_spawn=jnp.zeros(2, jnp.int32),
-        previous_action=jnp.zeros((2, 3)),
-        step=jnp.int32(step),
+        steps_since_spawn=column_of([0, 0], np.int32),
+        previous_action=still,
+        step=column_of(step, np.int32),
         key=jax.random.key(0),
-        route=RouteState(jnp.array([arc, 0.0]), jnp.array([arc, 0.0]), jnp.array([stood, stood])),
+        route=RouteState(column_of([arc, 0.0]), column_of([arc, 0.0]), column_of([stood, stood], bool)),
     )
     return scene, state
 
 
 def observe(**changes):
     scene, state = world(**changes)
+    return look(scene, state)
+
+
+@jax.jit
+def look(scene, state):
     return observations.observe(scene, state, GROUPS)
+
+
+def squash(length):
+    return np.asarray(jax.jit(lambda length: compress_length(length, 20.0))(np.float32(length)))
 
 
 def test_the_route_is_seen_from_the_car():
@@ -88,27 +96,27 @@ def test_the_route_is_seen_from_the_car():
 
 
 def test_lights_and_signs_ahead_of_the_front_come_in_the_order_of_the_route():
-    seen = observe()
+    seen = jax.device_get(observe())
     lights, signs = np.asarray(seen["lights"].features[0]), np.asarray(seen["signs"].features[0])
-    front = compress_length(jnp.array([8.0, 58.0, 28.0]), 20.0)  # the car is 4 m long
+    front = squash([8.0, 58.0, 28.0])  # the car is 4 m long
     np.testing.assert_allclose(lights[:, 0], front[:2], rtol=1e-5)
-    np.testing.assert_allclose(lights[0, 1:3], compress_length(jnp.array([10.0, 1.0]), 20.0), rtol=1e-5)
+    np.testing.assert_allclose(lights[0, 1:3], squash([10.0, 1.0]), rtol=1e-5)
     np.testing.assert_allclose(lights[:, 3:], [[1, 0, 0, 0], [0, 0, 1, 0]])
-    np.testing.assert_allclose(signs[0], [front[2], *compress_length(jnp.array([30.0, 1.0]), 20.0), 0.0], rtol=1e-5)
+    np.testing.assert_allclose(signs[0], [front[2], *squash([30.0, 1.0]), 0.0], rtol=1e-5)
     assert seen["lights"].mask.tolist() == [[True, True], [False, False]] and seen["signs"].mask.tolist() == [[True, False], [False, False]]
-    later = observe(step=round(1.5 / DT), stood=True)
+    later = jax.device_get(observe(step=round(1.5 / DT), stood=True))
     np.testing.assert_allclose(later["lights"].features[0, 0, 3:], [0, 1, 0, 0])
     assert later["signs"].features[0, 0, 3] == 1.0
-    passed = observe(arc=18.5, place=(18.5, 0.0))  # the front is half a metre behind the first line
+    passed = jax.device_get(observe(arc=18.5, place=(18.5, 0.0)))  # the front is half a metre behind the first line
     np.testing.assert_allclose(passed["lights"].features[0, 0, 3:], [0, 0, 1, 0])
     assert passed["lights"].mask.tolist()[0] == [True, False]
 
 
 def test_the_nearest_controls_are_seen_without_a_route():
-    seen = observe()["nearest"]
+    seen = jax.device_get(observe()["nearest"])
     rows = np.asarray(seen.features[1])
     assert seen.mask.tolist() == [[True, True, True]] * 2
-    np.testing.assert_allclose(rows[0], [*compress_length(jnp.array([2.0, 9.0]), 20.0), 0, -1, 0, 0, 0, 1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(rows[0], [*squash([2.0, 9.0]), 0, -1, 0, 0, 0, 1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(rows[:, 8:], [[0, 0], [0, 0], [1, 0]])  # unknown light, red light, sign
     np.testing.assert_allclose(seen.features[0, :, 9], [0, 1, 1])  # on the first car's route
     assert not rows[2, 4:8].any()
@@ -116,11 +124,11 @@ def test_the_nearest_controls_are_seen_without_a_route():
 
 def test_worlds_without_routes_or_controls_give_the_same_shapes_without_rows():
     scene, state = world()
-    whole = observations.observe(scene, state, GROUPS)
+    whole = look(scene, state)
     bare = scene_of([(0.0, 0.0)] * 2, [(9.0, 0.0)] * 2)
     for empty in (bare, replace(scene, controls=bare.controls), replace(scene, routes=bare.routes)):
-        seen = observations.observe(empty, state, GROUPS)
-        assert list(map(jnp.shape, jax.tree.leaves(seen))) == list(map(jnp.shape, jax.tree.leaves(whole)))
+        seen = jax.device_get(look(empty, state))
+        assert list(map(np.shape, jax.tree.leaves(seen))) == list(map(np.shape, jax.tree.leaves(whole)))
         assert not seen["lights"].mask.any() and not seen["signs"].mask.any()
         assert seen["route"].any() == bool(len(empty.routes.length)) and seen["nearest"].mask.any() == bool(len(empty.controls.valid))
 
@@ -128,7 +136,7 @@ def test_worlds_without_routes_or_controls_give_the_same_shapes_without_rows():
 @pytest.mark.parametrize("yaw", [0.3, 2.5])
 def test_columns_are_within_their_declared_bounds(yaw):
     scene, state = world(yaw=yaw, place=(30.0, 5.0), arc=30.0)
-    seen = observations.observe(scene, state, GROUPS)
+    seen = look(scene, state)
     low, high = bounds.flat_bounds(GROUPS, seen)
     flat = np.concatenate(
         [

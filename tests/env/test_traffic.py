@@ -331,7 +331,7 @@ def test_real_scenes_have_others(shared_data):
     packed = real(shared_data, 4)
     assert_sound(packed)
     worlds, _ = stack.stack([one.scene for one in packed], capacity={})
-    worlds = jax.tree.map(jnp.asarray, worlds)
+    worlds = jax.device_put(worlds)
     count = lambda name, step: jax.vmap(lambda scene: at(scene, name, step).present.sum())(worlds)  # noqa: E731
     parked, first, end = count("parked", 0), count("log_playback", 0), count("log_playback", 1499)
     assert (first >= parked).all() and (end >= parked).all() and parked.sum() > 60

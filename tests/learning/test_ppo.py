@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.stats import norm
+from scipy import stats
 from support.probes import NUMBERS, PRESENT, SMALL, make_trainer, ppo_config, probe, scenes
 
 from scenefactory_jax.cli import hydra_config as configs
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
 from scenefactory_jax.core.pytree import unchecked
-from scenefactory_jax.core.types import Env
+from scenefactory_jax.core.types import Env, State
 from scenefactory_jax.learning import gaussian, rollout
 from scenefactory_jax.learning.networks import late_fusion
 from scenefactory_jax.learning.ppo import gae, loss, minibatches, train_iteration
@@ -27,15 +27,13 @@ WORLDS = 8
 
 
 def test_advantages_equal_a_plain_loop():
-    keys = jax.random.split(jax.random.key(0), 6)
-    reward, value = jax.random.normal(keys[0], (T, W, A)), jax.random.normal(keys[1], (T, W, A))
-    bootstrap = jax.random.normal(keys[2], (W, A))
-    active, done = jax.random.bernoulli(keys[3], 0.8, (T, W, A)), jax.random.bernoulli(keys[4], 0.2, (T, W, A))
-    truncated = jax.random.bernoulli(keys[5], 0.2, (T, W, A))
+    rng = np.random.default_rng(0)
+    reward, value = rng.normal(size=(2, T, W, A)).astype(np.float32)
+    bootstrap = rng.normal(size=(W, A)).astype(np.float32)
+    active, done, truncated = (rng.random((T, W, A)) < share for share in (0.8, 0.2, 0.2))
     estimate = jax.jit(functools.partial(gae.compute_gae, gamma=0.9, gae_lambda=0.8))
     advantage, returns = estimate(reward, value, bootstrap, active, done, truncated)
 
-    reward, value, bootstrap, active, done, truncated = map(np.asarray, (reward, value, bootstrap, active, done, truncated))
     expected = np.zeros((T, W, A))
     for index in np.ndindex(W, A):
         following, carried = float(bootstrap[index]), 0.0
@@ -53,49 +51,57 @@ def test_advantages_equal_a_plain_loop():
 
 
 def test_gaussians_agree_with_their_definitions():
-    action, mean, other = jax.random.normal(jax.random.key(1), (3, 4, 3))
-    log_std, log_std_old = jnp.array([-0.5, 0.0, 0.4]), jnp.array([-0.2, 0.1, 0.3])
-    expected = norm.logpdf(action, mean, jnp.exp(log_std)).sum(-1)
-    np.testing.assert_allclose(gaussian.log_probability(action, mean, log_std), expected, rtol=1e-5)
+    action, mean, other = np.random.default_rng(1).normal(size=(3, 4, 3)).astype(np.float32)
+    log_std, log_std_old = np.float32([-0.5, 0.0, 0.4]), np.float32([-0.2, 0.1, 0.3])
+    log_probability, kl_divergence = jax.jit(gaussian.log_probability), jax.jit(gaussian.kl_divergence)
+    expected = stats.norm.logpdf(action, mean, np.exp(log_std)).sum(-1)
+    np.testing.assert_allclose(log_probability(action, mean, log_std), expected, rtol=1e-5)
 
-    draws = other + jnp.exp(log_std_old) * jax.random.normal(jax.random.key(2), (20_000, 4, 3))
-    own = gaussian.log_probability(draws, jnp.broadcast_to(other, draws.shape), log_std_old)
-    difference = own - gaussian.log_probability(draws, jnp.broadcast_to(mean, draws.shape), log_std)
-    np.testing.assert_allclose(gaussian.kl_divergence(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
-    np.testing.assert_allclose(gaussian.entropy(log_std_old), -own.mean(), rtol=0.01)
-    assert float(jnp.abs(gaussian.kl_divergence(mean, log_std, mean, log_std)).max()) == 0.0
+    draws = other + np.exp(log_std_old) * np.random.default_rng(2).normal(size=(20_000, 4, 3)).astype(np.float32)
+    own = np.asarray(log_probability(draws, np.broadcast_to(other, draws.shape), log_std_old))
+    difference = own - np.asarray(log_probability(draws, np.broadcast_to(mean, draws.shape), log_std))
+    np.testing.assert_allclose(kl_divergence(other, log_std_old, mean, log_std), difference.mean(0), rtol=0.05)
+    np.testing.assert_allclose(jax.jit(gaussian.entropy)(log_std_old), -own.mean(), rtol=0.01)
+    assert np.abs(kl_divergence(mean, log_std, mean, log_std)).max() == 0.0
 
 
 @pytest.fixture(scope="module")
 def batch():
     """Policy, parameters and samples; every third one without weight."""
-    policy, keys, count = late_fusion.make(**SMALL), jax.random.split(jax.random.key(3), 8), 24
-    observation = {"cue": jax.random.normal(keys[0], (count, 1))}
-    parameters = jax.jit(policy.init)(keys[1], observation)
-    mean, log_std, value = policy.apply(parameters, observation)
-    action = mean + jnp.exp(log_std) * jax.random.normal(keys[2], mean.shape)
-    old = mean + 0.1 * jax.random.normal(keys[3], mean.shape)
-    samples = loss.Batch(
-        observation=observation,
-        action=action,
-        mean=old,
-        log_probability=gaussian.log_probability(action, old, log_std),
-        value=value + 0.3 * jax.random.normal(keys[4], value.shape),
-        advantage=jax.random.normal(keys[5], value.shape),
-        returns=jax.random.normal(keys[6], value.shape),
-        weight=(jnp.arange(count) % 3 > 0).astype(jnp.float32),
-    )
-    return policy, parameters, samples, log_std
+    policy, count = late_fusion.make(**SMALL), 24
+
+    @jax.jit
+    def draw(key):
+        keys = jax.random.split(key, 8)
+        observation = {"cue": jax.random.normal(keys[0], (count, 1))}
+        parameters = policy.init(keys[1], observation)
+        mean, log_std, value = policy.apply(parameters, observation)
+        action = mean + jnp.exp(log_std) * jax.random.normal(keys[2], mean.shape)
+        old = mean + 0.1 * jax.random.normal(keys[3], mean.shape)
+        samples = loss.Batch(
+            observation=observation,
+            action=action,
+            mean=old,
+            log_probability=gaussian.log_probability(action, old, log_std),
+            value=value + 0.3 * jax.random.normal(keys[4], value.shape),
+            advantage=jax.random.normal(keys[5], value.shape),
+            returns=jax.random.normal(keys[6], value.shape),
+            weight=(jnp.arange(count) % 3 > 0).astype(jnp.float32),
+        )
+        return parameters, samples, log_std
+
+    return policy, *draw(jax.random.key(3))
 
 
 def test_loss_equals_its_definition(batch):
     policy, parameters, samples, log_std_old = batch
     config = ppo_config(ent_coef=0.01, vf_coef=0.5)
-    total, metrics = loss.compute_loss(parameters, samples, log_std_old, policy=policy, config=config)
-    mean, log_std, estimate = (np.asarray(x, float) for x in policy.apply(parameters, samples.observation))
+    total, metrics = jax.jit(functools.partial(loss.compute_loss, policy=policy, config=config))(parameters, samples, log_std_old)
+    mean, log_std, estimate = (np.asarray(x, float) for x in jax.jit(policy.apply)(parameters, samples.observation))
+    samples = jax.device_get(samples)
     surrogates, values = [], []
     for i in np.flatnonzero(np.asarray(samples.weight)):
-        now = norm.logpdf(samples.action[i], mean[i], np.exp(log_std)).sum()
+        now = stats.norm.logpdf(samples.action[i], mean[i], np.exp(log_std)).sum()
         ratio, gain = np.exp(now - samples.log_probability[i]), float(samples.advantage[i])
         surrogates.append(min(ratio * gain, np.clip(ratio, 0.8, 1.2) * gain))
         old, target = float(samples.value[i]), float(samples.returns[i])
@@ -107,20 +113,22 @@ def test_loss_equals_its_definition(batch):
 
 def test_samples_without_weight_change_nothing(batch):
     policy, parameters, samples, log_std = batch
-    empty = samples.weight == 0
+    empty, number = np.asarray(samples.weight == 0), lambda *arguments: jax.device_put(np.where(*arguments).astype(np.float32))
     garbage = dataclasses.replace(
         samples,
-        observation={"cue": jnp.where(empty[:, None], 9.0, samples.observation["cue"])},
-        action=jnp.where(empty[:, None], 50.0, samples.action),
-        advantage=jnp.where(empty, jnp.nan, samples.advantage),
-        returns=jnp.where(empty, 1e6, samples.returns),
+        observation={"cue": number(empty[:, None], 9.0, samples.observation["cue"])},
+        action=number(empty[:, None], 50.0, samples.action),
+        advantage=number(empty, np.nan, samples.advantage),
+        returns=number(empty, 1e6, samples.returns),
     )
     gradient = jax.jit(jax.grad(lambda p, b: loss.compute_loss(p, b, log_std, policy=policy, config=ppo_config(ent_coef=0.01))[0]))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(parameters, garbage), gradient(parameters, samples))
-    normal, weight = loss.normalize_advantages(garbage.advantage, samples.weight), samples.weight
-    np.testing.assert_allclose([loss.weighted_mean(normal, weight), loss.weighted_mean(normal**2, weight)], [0, 1], atol=1e-5)
-    assert float(loss.weighted_mean(garbage.returns, jnp.zeros(24))) == 0.0
-    assert not loss.normalize_advantages(garbage.returns, jnp.zeros(24)).any()
+    normalize, mean = jax.jit(loss.normalize_advantages), jax.jit(loss.weighted_mean)
+    weight, none = samples.weight, np.zeros(24, np.float32)
+    normal = np.asarray(normalize(garbage.advantage, weight))
+    np.testing.assert_allclose([mean(normal, weight), mean(normal**2, weight)], [0, 1], atol=1e-5)
+    assert float(mean(garbage.returns, none)) == 0.0
+    assert not np.asarray(normalize(garbage.returns, none)).any()
 
 
 def test_empty_slots_and_truncated_samples_have_no_weight():
@@ -131,16 +139,19 @@ def test_empty_slots_and_truncated_samples_have_no_weight():
         rollout.Sample, observation=observation, action=pair, mean=pair, log_probability=none, value=none, reward=none, active=active,
         terminated=jnp.zeros((T, W, A), bool), truncated=truncated,
     )  # fmt: skip
-    batch = train_iteration.compute_batch(PPO(probe(), late_fusion.make(**SMALL), ppo_config()), samples, none[0])
-    np.testing.assert_array_equal(batch.weight, np.ravel(active & ~truncated))
+    ppo = PPO(probe(), late_fusion.make(**SMALL), ppo_config())
+    batch = jax.jit(lambda samples: train_iteration.compute_batch(ppo, samples, samples.value[0]))(samples)
+    np.testing.assert_array_equal(batch.weight, np.ravel(np.asarray(active) & ~np.asarray(truncated)))
 
 
 def test_minibatches_are_disjoint_and_share_the_active_samples_evenly():
-    weight = jax.random.bernoulli(jax.random.key(4), 0.4, (96,)).astype(jnp.float32)
-    whole = minibatches.split_minibatches(jax.random.key(5), weight, minibatches=4, size=24)
+    weight = (np.random.default_rng(4).random(96) < 0.4).astype(np.float32)
+    split = lambda size: np.asarray(  # noqa: E731
+        jax.jit(functools.partial(minibatches.split_minibatches, minibatches=4, size=size))(jax.random.key(5), weight)
+    )
+    whole, part = split(24), split(12)
     assert sorted(whole.reshape(-1).tolist()) == list(range(96))
-    assert np.ptp(np.asarray(weight[whole].sum(1))) <= 1
-    part = minibatches.split_minibatches(jax.random.key(5), weight, minibatches=4, size=12)
+    assert np.ptp(weight[whole].sum(1)) <= 1
     assert len(set(part.reshape(-1).tolist())) == 48 and float(weight[part].sum()) == float(weight.sum())
 
 
@@ -217,8 +228,13 @@ def run(trainer, stage, iterations, seed=0):
     train_state, history = trainer.init(jax.random.key(seed), stage), []
     for _ in range(iterations):
         train_state, metrics = trainer.train_iteration(train_state, stage)
-        history.append(metrics)
+        history.append(jax.device_get(metrics))
     return train_state, history
+
+
+def unkeyed(state):
+    """With the numbers of its key, which NumPy can compare."""
+    return unchecked(State, **vars(state) | {"key": jax.random.key_data(state.key)})
 
 
 def test_one_trace_same_seed_same_numbers_and_scenes_survive_donation(course):
@@ -226,14 +242,14 @@ def test_one_trace_same_seed_same_numbers_and_scenes_survive_donation(course):
     stage = scenes(WORLDS)
     first, history = run(trainer, stage, 3)
     second, _ = run(trainer, stage, 3)
-    other = jax.tree.map(lambda x: x + jnp.ones_like(x), stage)
+    other = jax.tree.map(lambda x: jax.device_put(np.asarray(x) + np.ones_like(x)), stage)
     trainer.train_iteration(second, other)
     assert len(traces) <= 2  # the scan traces its body once, or twice to settle the carry; never again in later iterations
     stage.agents.position.block_until_ready()
     again, _ = run(trainer, stage, 3)
-    same = jax.tree.map(lambda a, b: bool((a == b).all()), (first.parameters, first.worlds), (again.parameters, again.worlds))
-    assert all(jax.tree.leaves(same))
-    assert all(bool(jnp.isfinite(value)) for metrics in history for value in metrics.values())
+    plain = jax.jit(lambda state: (state.parameters, dataclasses.replace(state.worlds, state=unkeyed(state.worlds.state))))
+    jax.tree.map(np.testing.assert_array_equal, plain(first), plain(again))
+    assert all(np.isfinite(value) for metrics in history for value in metrics.values())
     assert count_spawned_steps(first) == 3 * 16 * WORLDS * int(PRESENT.sum()) and int(first.iteration) == 3
 
 
@@ -252,12 +268,17 @@ def test_metrics_count_what_happened(course):
 def test_a_repeated_action_is_one_sample(life, length):
     """Lives of 5 control steps end within the second action; worlds of 6 run out of time with it. What slots pay afterwards is nobody's."""
     env, policy, stage = probe(life=life, episode_steps=length)._replace(action_repeat=3), late_fusion.make(**SMALL), scenes(2, 1)
-    worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
-    observed = jax.vmap(env.observe)(stage, worlds)
-    parameters = policy.init(jax.random.key(1), observed)
-    begin = rollout.Worlds(worlds, observed, rollout.make_empty_episode_stats(worlds))
+
+    @jax.jit
+    def start(stage):
+        worlds = jax.vmap(env.init_state)(jax.random.split(jax.random.key(0), 2), stage)
+        observed = jax.vmap(env.observe)(stage, worlds)
+        return policy.init(jax.random.key(1), observed), rollout.Worlds(worlds, observed, rollout.make_empty_episode_stats(worlds))
+
+    parameters, begin = start(stage)
     collect = jax.jit(functools.partial(rollout.collect_rollout, env, policy, horizon=4))
-    after, samples, tally, record = collect(parameters, stage, begin, jax.random.key(2))
+    after, *found = collect(parameters, stage, begin, jax.random.key(2))
+    samples, tally, record = jax.device_get(found)
     lived = min(life, length)
     held = samples.active[..., :2]
     assert held.all() and not samples.active[..., 2].any()
@@ -268,7 +289,7 @@ def test_a_repeated_action_is_one_sample(life, length):
     assert (samples.truncated[..., 1] == (ends & (life > length))[:, None]).all()
     assert {name: float(tally[name]) for name in ("spawned", "active", "ended", "length", "return")} == {
         "spawned": 2 * 2 * 12, "active": 2 * 2 * 2 * lived, "ended": 8, "length": 8 * lived, "return": 8 * lived}  # fmt: skip
-    assert record.episodes.tolist() == [4, 4] and not after.episode_stats.steps.any() and (after.state.step == 0).all()
+    assert record.episodes.tolist() == [4, 4] and not np.any(after.episode_stats.steps) and (np.asarray(after.state.step) == 0).all()
 
 
 def test_worlds_start_at_whole_actions():

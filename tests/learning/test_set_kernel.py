@@ -11,20 +11,19 @@ from support.abstract_gpu import abstract_gpu
 from scenefactory_jax.learning.networks import late_fusion, set_kernel
 
 
-def layers(key, *sizes):
-    keys = iter(jax.random.split(key, 2 * len(sizes)))
-    normal = lambda *shape: jax.random.normal(next(keys), shape)  # noqa: E731
-    return [(normal(i, o) / i**0.5, 0.3 * normal(o)) for i, o in itertools.pairwise(sizes)]
+def layers(seed, *sizes):
+    rng = np.random.default_rng(seed)
+    normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    return jax.device_put([(normal(i, o) / np.float32(i**0.5), np.float32(0.3) * normal(o)) for i, o in itertools.pairwise(sizes)])
 
 
-def sets(key, *, batch, rows, features):
+def sets(seed, *, batch, rows, features):
     """Rows with gaps; the first set is empty, the second ends early, in the third two far rows are the same."""
-    keys = jax.random.split(key, 2)
-    x, mask = jax.random.normal(keys[0], (*batch, rows, features)), jax.random.bernoulli(keys[1], 0.7, (*batch, rows))
-    mask = mask.at[(0,) * len(batch)].set(False).at[(*(0,) * (len(batch) - 1), 1), 5:].set(False)
-    third = (*(0,) * (len(batch) - 1), 2)
-    far = 4.0 * x[(*third, 1)]
-    return x.at[(*third, 1)].set(far).at[(*third, rows - 1)].set(far), mask.at[third].set(True)
+    rng, before = np.random.default_rng(seed), (0,) * (len(batch) - 1)
+    x, mask = rng.normal(size=(*batch, rows, features)).astype(np.float32), rng.random((*batch, rows)) < 0.7
+    mask[(*before, 0)] = mask[(*before, 1)][5:] = False
+    x[(*before, 2)][[1, rows - 1]], mask[(*before, 2)] = 4.0 * x[(*before, 2)][1], True
+    return jax.device_put((x, mask))
 
 
 @pytest.mark.parametrize(
@@ -35,38 +34,43 @@ def sets(key, *, batch, rows, features):
     ],
 )  # fmt: skip
 def test_kernels_are_the_plain_encoder_and_its_gradient(activation, rows, features, widths):
-    weights = layers(jax.random.key(0), features, *widths)
-    x, mask = sets(jax.random.key(1), batch=(2, 4), rows=rows, features=features)
+    weights = layers(0, features, *widths)
+    x, mask = sets(1, batch=(2, 4), rows=rows, features=features)
 
     plain = jax.jit(lambda weights: late_fusion.encode_set(activation, "float32", False, weights, x, mask))
     wanted, pull = jax.vjp(plain, weights)
     pooled, winner = jax.jit(lambda w: set_kernel.encode(activation, "float32", w, x, mask, interpret=True))(weights)
+    affine = jax.jit(lambda weights: late_fusion.affine(activation, "float32", weights, x))(weights)
+    pooled, wanted, winner, shown = (np.asarray(part) for part in (pooled, wanted, winner, np.asarray(mask).any(-1)))
     np.testing.assert_allclose(pooled, wanted, atol=2e-5)
 
-    values = jnp.where(mask[..., None], late_fusion.affine(activation, "float32", weights, x), -jnp.inf)
-    taken = jnp.take_along_axis(values, winner[..., None, :], axis=-2)[..., 0, :]
-    shown = mask.any(-1)
+    values = np.where(np.asarray(mask)[..., None], affine, -np.inf)
+    taken = np.take_along_axis(values, winner[..., None, :], axis=-2)[..., 0, :]
     np.testing.assert_allclose(taken[shown], wanted[shown], atol=2e-5)
     assert not winner[~shown].any() and not pooled[~shown].any()
     assert (winner[0, 2] < rows - 1).all() and (winner[0, 2] == 1).any()  # of two rows that are the same the first
 
-    direction = jnp.where(shown[..., None], jax.random.normal(jax.random.key(2), pooled.shape), 0.0)
+    direction = jax.device_put(np.where(shown[..., None], np.random.default_rng(2).normal(size=pooled.shape), 0.0).astype(np.float32))
     steep = lambda w: set_kernel.gradient(activation, "float32", w, x, winner, direction, programs=3, interpret=True)  # noqa: E731
     for found, expected in zip(jax.tree.leaves(jax.jit(steep)(weights)), jax.tree.leaves(pull(direction)[0]), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_half_precision_rounds_what_plain_jax_rounds():
-    weights = layers(jax.random.key(0), 5, 96, 96)
-    x, mask = sets(jax.random.key(1), batch=(6,), rows=40, features=5)
-    pooled, _ = set_kernel.encode("elu", "bfloat16", weights, x, mask, interpret=True)
-    np.testing.assert_allclose(pooled, late_fusion.encode_set("elu", "bfloat16", False, weights, x, mask), atol=2e-2)
-    full = late_fusion.encode_set("elu", "float32", False, weights, x, mask)
+    weights = layers(0, 5, 96, 96)
+    x, mask = sets(1, batch=(6,), rows=40, features=5)
+    pooled = jax.jit(lambda weights: set_kernel.encode("elu", "bfloat16", weights, x, mask, interpret=True)[0])(weights)
+    half, full = (
+        jax.jit(lambda weights, dtype=dtype: late_fusion.encode_set("elu", dtype, False, weights, x, mask))(weights)
+        for dtype in ("bfloat16", "float32")
+    )
+    pooled, half, full = map(np.asarray, (pooled, half, full))
+    np.testing.assert_allclose(pooled, half, atol=2e-2)
     assert 1e-5 < np.abs(pooled - full).max() < 5e-2
 
 
 def test_empty_batches_and_sets_are_zeros():
-    weights = layers(jax.random.key(0), 5, 32, 32)
+    weights = layers(0, 5, 32, 32)
     for batch, rows in (((2,), 0), ((0,), 3)):
         x, mask = jnp.zeros((*batch, rows, 5)), jnp.zeros((*batch, rows), bool)
         pooled, winner = set_kernel.encode("elu", "float32", weights, x, mask)
@@ -79,13 +83,13 @@ def test_empty_batches_and_sets_are_zeros():
 @pytest.mark.parametrize(("sizes", "made"), [((5, 96, 96), True), ((15, 32, 128), True), ((16, 32, 32), False), ((5, 96), False),
                                              ((5, 48, 32), False), ((5, 32, 160), False), ((5, 32, 32, 32), False)])  # fmt: skip
 def test_supported_layers(sizes, made):
-    assert set_kernel.fits(layers(jax.random.key(0), *sizes)) == made
+    assert set_kernel.fits(layers(0, *sizes)) == made
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(dtype):
-    weights = layers(jax.random.key(0), 5, 96, 96)
-    x, mask = sets(jax.random.key(1), batch=(4,), rows=40, features=5)
+    weights = layers(0, 5, 96, 96)
+    x, mask = sets(1, batch=(4,), rows=40, features=5)
 
     def text(kernels, platform):
         loss = jax.jit(jax.grad(lambda weights: late_fusion.encode_set("elu", dtype, kernels, weights, x, mask).sum()))

@@ -27,7 +27,7 @@ def scenes():
     for valid in gaps.values():
         valid[1, ::3] = False
     tables = {name: unchecked(type(loaded.road), **(vars(getattr(loaded, name)) | {"valid": valid})) for name, valid in gaps.items()}
-    return jax.tree.map(jnp.asarray, unchecked(type(loaded), **(vars(loaded) | tables)))
+    return jax.device_put(unchecked(type(loaded), **(vars(loaded) | tables)))
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.dynamics.articulated import articulated_car, equations_of_motion
 from scenefactory_jax.dynamics.articulated import parameters as cars
 from scenefactory_jax.dynamics.articulated.actuators import Command, PlanarForce
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 
 G, DT = 9.81, 1 / 120
 MU = np.array([0.86, 0.05, 0.1, 0.3, 0.5, 0.7, 1.0, 1.1], np.float32)
@@ -81,7 +81,7 @@ def drive(name, scene, action, active=EVERYONE, body=None):
     body = init(scene) if body is None else body
     parts = []
     for chunk in np.asarray(action, np.float32).reshape(-1, CHUNK, 8, 3):
-        body, trace = second(scene, body, jnp.asarray(chunk), active)
+        body, trace = second(scene, body, chunk, active)
         parts.append(jax.tree.map(np.asarray, trace))
     return body, jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -127,11 +127,14 @@ def place(count, *, speed=0.0, aside=0.0, compiled=None):
     """Cars at rest height at the origin, with rolling wheels and tyres without deflection."""
     compiled = compiled or compiled_car()
     car = compiled.constants.car
-    qpos = jnp.tile(jnp.asarray(compiled.rest_pose, jnp.float32), (count, 1))
-    qvel = jnp.zeros((count, 16)).at[:, 0].set(speed).at[:, 1].set(aside)
-    qvel = qvel.at[:, compiled.addresses.spin_v].set(jnp.broadcast_to(speed, (count,))[:, None] / car.wheel_radius)
-    load = jnp.tile(jnp.asarray(equations_of_motion.compute_wheel_loads(car), jnp.float32), (count, 1))
-    return articulated_car.CarCarry(qpos, qvel, jnp.zeros((count, 16)), articulated_car.place_tyres(load))
+    qpos, qvel = np.tile(np.asarray(compiled.rest_pose), (count, 1)), np.zeros((count, 16))
+    qvel[:, 0], qvel[:, 1] = speed, aside
+    qvel[:, compiled.addresses.spin_v] = np.broadcast_to(speed, (count,))[:, None] / np.asarray(car.wheel_radius)
+    load = column_of(np.tile(np.asarray(equations_of_motion.compute_wheel_loads(car)), (count, 1)))
+    return articulated_car.CarCarry(column_of(qpos), column_of(qvel), column_of(np.zeros((count, 16))), place_tyres(load))
+
+
+place_tyres = jax.jit(articulated_car.place_tyres)
 
 
 def move(
@@ -143,9 +146,9 @@ def move(
         gain: rad/m; steers for the line y = `target`, by the distance to it less 30 m times the heading.
     """
     count = len(carry.qpos)
-    full = lambda value, *tail: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count, *tail))  # noqa: E731
+    full = lambda value, *tail: column_of(np.broadcast_to(value, (count, *tail)))  # noqa: E731
     numbers = compiled_car(abs_enabled=abs_enabled, car=car).constants.car
-    torque = jnp.array([numbers.brake_torque_front] * 2 + [numbers.brake_torque_rear] * 2) * full(brake)[:, None]
-    command = Command(full(steer) * numbers.steering_limit, full(throttle), torque)
+    torque = np.array([numbers.brake_torque_front] * 2 + [numbers.brake_torque_rear] * 2) * np.broadcast_to(brake, (count,))[:, None]
+    command = Command(full(np.asarray(steer) * np.asarray(numbers.steering_limit)), full(throttle), column_of(torque))
     inputs = command, PlanarForce(full(push, 2), full(0.0)), full(np.reshape(mu, (-1, 1)), 4), full(gain), full(target)
     return jax.tree.map(np.asarray, _program(abs_enabled, car)(carry, *inputs, steps))

@@ -1,5 +1,6 @@
 """Scenes made by hand for tests: a road of polylines, and a straight street with cars."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,8 +10,8 @@ from scenefactory_jax.weather.friction import make_uniform
 
 
 def column_of(values, dtype=np.float32):
-    """Converted on the host, an array costs nothing to compile."""
-    return jnp.asarray(np.asarray(values, dtype))
+    """An array of JAX that is converted on the host: `jnp.asarray` would compile a program for every shape."""
+    return jax.device_put(np.asarray(values, dtype))
 
 
 def road_of(lines, capacity=None) -> Road:

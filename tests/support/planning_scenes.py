@@ -1,6 +1,7 @@
 """A street with a route, a light and moving cars, made by hand, and the same turned and shifted in the plane."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from scenefactory_jax.core.pytree import replace, unchecked
 from scenefactory_jax.core.types import Boxes, Motion, Routes, Scene, State, TrafficControls, make_empty_rows
 from scenefactory_jax.env import route_following, termination
 from scenefactory_jax.env.history import History
-from support.hand_scenes import road_of, scene_of
+from support.hand_scenes import column_of, road_of, scene_of
 
 POINTS = 120  # of the route
 
@@ -23,22 +24,26 @@ def street(*, starts=((0.0, 0.0), (10.0, 0.0)), yaws=(0.0, 0.0), routes=True, li
     scene = replace(scene, road=road_of(lines), edges=road_of(lines[1:]))  # WOMD: the road is on the left of an edge
     count = len(starts)
     row = np.stack([np.arange(POINTS, dtype=np.float32), np.zeros(POINTS, np.float32)], -1)
-    line = lambda *values: jnp.asarray(values)  # noqa: E731
+
+    def line(*values):
+        kind = np.asarray(values).dtype.kind
+        return column_of(values, {"b": bool, "i": np.int32}.get(kind, np.float32))
+
     if routes:
         table = make_empty_rows(Routes)
         fields = {
-            "position": jnp.asarray(row)[None],
+            "position": column_of(row[None]),
             "length": line(float(POINTS - 1)),
-            "speed_limit": jnp.full((1, POINTS), 10.0),
-            "lane": jnp.zeros((1, POINTS), jnp.int32),
+            "speed_limit": column_of(np.full((1, POINTS), 10.0)),
+            "lane": column_of(np.zeros((1, POINTS)), np.int32),
             "along_lanes": line(True),
             "agent": line(0),
             "on_route": line(True),
-            "stop_arc": line(20.0)[None],
-            "stop_control": line(0)[None],
+            "stop_arc": line([20.0]),
+            "stop_control": line([0]),
         }
-        missing = {f.name: jnp.zeros(1, bool) for f in dataclasses.fields(table) if f.name not in fields}
-        agents = replace(scene.agents, route_end=jnp.zeros(count).at[0].set(100.0))
+        missing = {f.name: line(False) for f in dataclasses.fields(table) if f.name not in fields}
+        agents = replace(scene.agents, route_end=column_of(100.0 * (np.arange(count) == 0)))
         scene = replace(scene, routes=Routes(**fields, **missing), agents=agents)
     if lights:
         controls = TrafficControls(
@@ -46,18 +51,20 @@ def street(*, starts=((0.0, 0.0), (10.0, 0.0)), yaws=(0.0, 0.0), routes=True, li
             direction=line([1.0, 0.0], [1.0, 0.0]),
             lane=line(0, 0),
             stop_sign=line(False, True),
-            change_s=jnp.array([[0.0, 0.25], [jnp.inf, jnp.inf]]),
+            change_s=line([0.0, 0.25], [np.inf, np.inf]),
             state=line([4, 6], [0, 0]),
-            period_s=line(jnp.inf, jnp.inf),
+            period_s=line(np.inf, np.inf),
             valid=line(True, True),
         )
         scene = replace(scene, controls=controls)
-    flat = lambda value: jnp.full(boxes, value, jnp.float32)  # noqa: E731
-    pair = lambda value: jnp.tile(jnp.asarray(value, jnp.float32), (boxes, 1))  # noqa: E731
-    traffic = Boxes(pair([15.0, 5.0]), flat(0.7), flat(0.0), pair([0.0, 0.0]), flat(0.0), pair([2.0, 2.0]), flat(jnp.inf), flat(1.0) > 0)
+    flat = lambda value: column_of(np.full(boxes, value))  # noqa: E731
+    pair = lambda value: column_of(np.tile(value, (boxes, 1)))  # noqa: E731
+    everyone = column_of(np.ones(boxes), bool)
+    traffic = Boxes(pair([15.0, 5.0]), flat(0.7), flat(0.0), pair([0.0, 0.0]), flat(0.0), pair([2.0, 2.0]), flat(np.inf), everyone)
     return replace(scene, traffic=traffic)
 
 
+@functools.partial(jax.jit, static_argnames=("step", "past", "control_dt"))
 def state_of(scene: Scene, *, speed=(5.0, 8.0), step=3, past=4, control_dt=0.1) -> State:
     """Cars that came straight on at constant speeds, at their starts; their past rows are valid."""
     agents, count = scene.agents, len(scene.agents.yaw)
@@ -102,10 +109,11 @@ def state_of(scene: Scene, *, speed=(5.0, 8.0), step=3, past=4, control_dt=0.1) 
     )
 
 
+@jax.jit
 def turn(scene: Scene, state: State, angle: float, shift) -> tuple[Scene, State]:
     """The same world, turned about the origin and shifted."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    matrix, shift = np.array([[cos, sin], [-sin, cos]], np.float32), np.asarray(shift, np.float32)
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    matrix, shift = jnp.array([[cos, sin], [-sin, cos]], jnp.float32), jnp.asarray(shift, jnp.float32)
 
     def turn_fields(part, places=(), vectors=(), yaws=()):
         changes = {name: getattr(part, name) @ matrix + shift for name in places} | {name: getattr(part, name) @ matrix for name in vectors}

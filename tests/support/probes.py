@@ -8,6 +8,7 @@ import types
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.types import Env, Events, Motion, RouteState, Scene, State, StepMetrics, StepResult
@@ -69,7 +70,7 @@ def blank(cls, **known):
         if dataclasses.is_dataclass(kind):
             return blank(kind)
         shape = tuple(int(size) if size.isdigit() else SIZES[size] for size in kind.dim_str.split())
-        return jnp.zeros(shape, next((d for d in (jnp.float32, jnp.int32, bool) if jnp.dtype(d).name in kind.dtypes), bool))
+        return jax.device_put(np.zeros(shape, next((d for d in (np.float32, np.int32, bool) if np.dtype(d).name in kind.dtypes), bool)))
 
     return cls(**{field.name: known[field.name] if field.name in known else zeros(field.type) for field in dataclasses.fields(cls)})
 
@@ -87,7 +88,7 @@ def make_trainer(env: Env, *, episode_steps: int = 1000, mesh=None, **changes) -
 def scenes(worlds: int, task: int = 5) -> Scene:
     """Scenes that hold nothing but the number of a probe."""
     scene = blank(Scene, weather=make_uniform(jnp.float32(0.0), jnp.int32(task)))
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), scene)
+    return jax.tree.map(lambda x: jax.device_put(np.tile(x, (worlds, *[1] * x.ndim))), scene)
 
 
 def probe(*, life: int | None = None, episode_steps: int = 1000) -> Env:

@@ -1,11 +1,11 @@
 """Logged road users made by hand, for scenes with background traffic."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.core import track_interpolation
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROAD_USERS, TrafficLog
+from support.hand_scenes import column_of
 
 KINDS = {name: index for index, name in enumerate(ROAD_USERS)}
 
@@ -22,10 +22,11 @@ def track(start, velocity=(0.0, 0.0), *, kind="vehicle", valid=None, size=(4.5, 
 
 def tracks_of(*rows) -> TrafficLog:
     position, yaw, velocity, valid, size, kind = (np.stack([row[i] for row in rows]) for i in range(6))
-    f = jnp.float32
-    return TrafficLog(jnp.asarray(position, f), jnp.asarray(yaw, f), jnp.asarray(velocity, f), jnp.asarray(valid), jnp.asarray(size, f),
-                  jnp.asarray(kind, jnp.int32), jnp.zeros(len(rows), jnp.int32), jnp.zeros(len(rows), bool),
-                  **track_interpolation.make_no_zones(len(rows)))  # fmt: skip
+    none = np.zeros(len(rows))
+    return TrafficLog(
+        *map(column_of, (position, yaw, velocity)), column_of(valid, bool), column_of(size), column_of(kind, np.int32),
+        column_of(none, np.int32), column_of(none, bool), **track_interpolation.make_no_zones(len(rows)),
+    )  # fmt: skip
 
 
 def with_tracks(scene, *rows):

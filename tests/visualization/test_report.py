@@ -472,7 +472,7 @@ def test_patches_are_drawn_where_they_lie_under_the_lines(trajectory):
         {"polygon": [[-45, -3], [-30, -3], [-30, -1], [-45, -1]], "surface": "ICE", "film_mm": 0.0, "open_road_film_fraction": 0.0},
         {"strip": [[0, 20], [10, 20]], "width": 4.0, "surface": "GRAVEL", "film_mm": 0.0, "open_road_film_fraction": 0.0},
     ]
-    road = jax.tree.map(jnp.asarray, trajectory.scene.weather)
+    road = jax.device_put(trajectory.scene.weather)
     shapes = [schema.read(spot, patch_layouts.Shape) for spot in spots]
     laid = patch_layouts.fixed(jax.random.key(0), trajectory.scene, road, shapes=shapes)
     hidden = replace(laid, present=jnp.zeros(3, bool))

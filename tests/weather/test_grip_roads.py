@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.hand_scenes import column_of
 from support.planning_scenes import state_of, street
 
 from scenefactory_jax.cli.hydra_config import load_config
@@ -33,32 +34,42 @@ def find_place(arc):
 def bend():
     """Two cars: the first on the route at START, its goal 15 m behind the bend; the second without a route, 50 m north of the first."""
     scene = street(starts=((START, 0.0), (START, 50.0)))
-    line = jnp.asarray([find_place(arc)[0] for arc in range(scene.routes.position.shape[1])], jnp.float32)
-    agents = replace(scene.agents, route_start=jnp.array([START, 0.0]), route_end=jnp.array([BEND_END + 15.0, 0.0]))
-    return replace(scene, agents=agents, routes=replace(scene.routes, position=line[None]))
+    line = column_of([[find_place(arc)[0] for arc in range(scene.routes.position.shape[1])]])
+    agents = replace(scene.agents, route_start=column_of([START, 0.0]), route_end=column_of([BEND_END + 15.0, 0.0]))
+    return replace(scene, agents=agents, routes=replace(scene.routes, position=line))
 
 
 @pytest.fixture(scope="module")
 def weather(bend):
-    return road_condition.make(CONFIG["weather"])(jax.random.key(0), bend)
+    return jax.jit(road_condition.make(CONFIG["weather"]))(jax.random.key(0), bend)
 
 
 def see(scene, weather, place, *, arc=0.0, yaw=0.0, agent=0):
     """What an agent reads at a place, with its place on its route."""
     state = state_of(scene)
-    motion = replace(state.motion, position=state.motion.position.at[agent, :2].set(jnp.asarray(place)), yaw=jnp.full(2, yaw))
-    state = replace(state, motion=motion, weather=weather, route=replace(state.route, arc=jnp.full(2, arc)))
-    return np.asarray(observations.observe(scene, state, observations.make(ENTRY, friction=FRICTION))["friction_ahead"][agent])
+    position = np.array(state.motion.position)
+    position[agent, :2] = place
+    motion = replace(state.motion, position=column_of(position), yaw=column_of([yaw, yaw]))
+    state = replace(state, motion=motion, weather=weather, route=replace(state.route, arc=column_of([arc, arc])))
+    return np.asarray(look(scene, state)["friction_ahead"])[agent]
+
+
+@jax.jit
+def look(scene, state):
+    return observations.observe(scene, state, observations.make(ENTRY, friction=FRICTION))
+
+
+READ = jax.jit(FRICTION)
 
 
 @pytest.mark.parametrize("mode", ["static", "speed"])
 def test_a_surface_with_a_given_friction_has_it_at_any_speed_and_film(mode):
-    bound = friction.make(CONFIG["weather"]["friction"] | {"mode": mode})
+    bound = jax.jit(friction.make(CONFIG["weather"]["friction"] | {"mode": mode}))
     roads = [
         friction.make_uniform(jnp.float32(film), jnp.int32(SURFACES.index(name)))
         for name, film in (("ICE", 0.0), ("ICE", 2.0), ("AC", 0.0))
     ]
-    found = np.array([bound(road, jnp.zeros((2, 2)), jnp.array([1.0, 30.0])) for road in roads])
+    found = np.array([bound(road, np.zeros((2, 2), np.float32), np.float32([1.0, 30.0])) for road in roads])
     np.testing.assert_allclose(found[:2], MU, rtol=1e-6)
     assert found[2, 0] > 1.0
 
@@ -80,7 +91,7 @@ def test_a_surface_with_a_given_friction_has_it_at_any_speed_and_film(mode):
 )
 def test_the_strip_covers_the_bend_and_the_road_outside_is_dry(weather, arc, left, inside):
     point, normal = find_place(arc)
-    found = FRICTION(weather, jnp.asarray(point + left * normal, jnp.float32)[None], jnp.full(1, 10.0))
+    found = np.asarray(READ(weather, np.float32(point + left * normal)[None], np.float32([10.0])))
     assert float(found[0]) == pytest.approx(MU if inside else DRY, rel=1e-3)
     assert weather.patches.present.tolist() == [True, False]  # the second car has no route
 
@@ -105,7 +116,7 @@ def test_hidden_weather_reads_a_dry_road(bend, weather, hidden):
     groups = {name: CONFIG["observations"][name] for name in ("weather", "friction_ahead")}
     env = environment.make_env(CONFIG | {"weather": CONFIG["weather"] | {"hidden": hidden}, "observations": groups})
     state = replace(state_of(bend), weather=weather)
-    seen = env.observe(bend, state)
+    seen = jax.device_get(jax.jit(env.observe)(bend, state))
     np.testing.assert_allclose(seen["friction_ahead"][0], np.full(7, DRY if hidden else MU), rtol=1e-3)
     np.testing.assert_array_equal(seen["weather"][0], [0.0, float(hidden), 0.0, 0.0])
     assert env.current_scene(bend, state).weather is not None and state.weather.patches.present[0]  # the road itself stays

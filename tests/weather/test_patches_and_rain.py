@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 import yaml
-from support.hand_scenes import road_of, scene_of
+from support.hand_scenes import column_of, road_of, scene_of
 from support.running import ROOT
 
 import scenefactory_jax
@@ -32,6 +32,7 @@ OPTIONS = sorted(path.stem for path in (ROOT / "conf" / "weather").glob("*.yaml"
 DRY = make_uniform(jnp.float32(0.0), jnp.int32(0))
 KEY = jax.random.key(0)
 inside, read_condition = jax.jit(patches.contains_points), jax.jit(patches.read_condition)
+joined = jax.jit(patches.join_patches)
 COVER = {"chance": 1.0, "surface": "ICE", "film_mm": (0.1, 0.4), "open_road_film_fraction": 0.5}
 LAYOUTS = {
     "circles": {"count": 40, "radius_m": (0.5, 3.0), "scatter_m": 1.5, **COVER},
@@ -41,15 +42,14 @@ LAYOUTS = {
 
 
 def patch(vertices, *, radius=0.0, closed=False, surface=ICE, film=0.0, follows=0.0, present=True) -> Patches:
-    row = lambda value, dtype: jnp.asarray([value], dtype)  # noqa: E731
-    line = jnp.asarray(vertices, jnp.float32).reshape(1, -1, 2)
-    f = jnp.float32
-    return Patches(line, row(closed, bool), row(radius, f), row(surface, jnp.int32), row(film, f), row(follows, f), row(present, bool))
+    row = lambda value, dtype=np.float32: column_of([value], dtype)  # noqa: E731
+    line = column_of(np.reshape(vertices, (1, -1, 2)))
+    return Patches(line, row(closed, bool), row(radius), row(surface, np.int32), row(film), row(follows), row(present, bool))
 
 
 def on(*parts: Patches, film=0.0, surface=0):
     road = make_uniform(jnp.float32(film), jnp.int32(surface))
-    return replace(road, patches=patches.join_patches([road.patches, *parts]))
+    return replace(road, patches=joined([road.patches, *parts]))
 
 
 def blob(rng, corners):
@@ -81,7 +81,7 @@ def test_inside_agrees_with_shapely(kind):
         apart = shapely.distance(shape, shapely.points(points))
         clear = np.abs(apart - radius) > 1e-4
         closed = kind in ("polygon", "rounded polygon")
-        found = np.asarray(inside(patch(line, radius=radius, closed=closed), jnp.asarray(points, jnp.float32)))[:, 0]
+        found = np.asarray(inside(patch(line, radius=radius, closed=closed), np.float32(points)))[:, 0]
         np.testing.assert_array_equal(found[clear], (apart <= radius)[clear])
         assert not found.all()
         hits += found.sum()
@@ -90,11 +90,11 @@ def test_inside_agrees_with_shapely(kind):
 
 def test_inside_turns_with_the_plane():
     rng = np.random.default_rng(1)
-    several = patches.join_patches([patch(blob(rng, 7), closed=True), patch(blob(rng, 4), radius=1.5), patch(blob(rng, 1), radius=3.0)])
-    points = jnp.asarray(rng.uniform(-10, 10, (20, 20, 2)), jnp.float32)
-    move = lambda p: geometry.rotate(p, jnp.float32(0.7)) + jnp.array([11.0, -5.0])  # noqa: E731
-    turned = inside(replace(several, vertices=move(several.vertices)), move(points))
-    found = inside(several, points)
+    several = joined([patch(blob(rng, 7), closed=True), patch(blob(rng, 4), radius=1.5), patch(blob(rng, 1), radius=3.0)])
+    points = np.float32(rng.uniform(-10, 10, (20, 20, 2)))
+    move = jax.jit(lambda p: geometry.rotate(p, jnp.float32(0.7)) + jnp.array([11.0, -5.0]))
+    turned = np.asarray(inside(replace(several, vertices=move(several.vertices)), move(points)))
+    found = np.asarray(inside(several, points))
     assert found.shape == (20, 20, 3) and found.any((0, 1)).all()
     assert (found != turned).mean() < 2e-3  # points on a border
 
@@ -102,11 +102,11 @@ def test_inside_turns_with_the_plane():
 def test_repeated_vertices_and_absent_patches_change_nothing():
     rng = np.random.default_rng(2)
     shapes = [patch(blob(rng, n), radius=r, closed=c) for n, r, c in ((6, 0.0, True), (3, 1.0, False), (1, 2.0, False))]
-    points = jnp.asarray(rng.uniform(-12, 12, (400, 2)), jnp.float32)
-    alone = jnp.concatenate([inside(shape, points) for shape in shapes], axis=1)
-    np.testing.assert_array_equal(inside(patches.join_patches(shapes), points), alone)
-    doubled = [replace(shape, vertices=jnp.repeat(shape.vertices, 2, axis=1)) for shape in shapes]
-    np.testing.assert_array_equal(inside(patches.join_patches(doubled), points), alone)
+    points = np.float32(rng.uniform(-12, 12, (400, 2)))
+    alone = np.concatenate([inside(shape, points) for shape in shapes], axis=1)
+    np.testing.assert_array_equal(inside(joined(shapes), points), alone)
+    doubled = [replace(shape, vertices=column_of(np.repeat(shape.vertices, 2, axis=1))) for shape in shapes]
+    np.testing.assert_array_equal(inside(joined(doubled), points), alone)
     hidden = patch([[0.0, 0.0]], radius=50.0, surface=SNOW, film=9.0, present=False)
     for with_hidden in (on(*shapes, hidden), on(hidden, *shapes)):
         for got, expected in zip(read_condition(with_hidden, points), read_condition(on(*shapes), points), strict=True):
@@ -136,9 +136,9 @@ def test_drawn_areas_are_the_patches():
     for corners, radius, closed in ((6, 0.0, True), (5, 1.2, False), (4, 0.8, True), (1, 2.0, False)):
         line, points = blob(rng, corners), rng.uniform(-12, 12, (500, 2))
         area = shapely.union_all([shapely.Polygon(p) for p in patch_overlay.outline(np.repeat(line, 2, axis=0), radius, closed=closed)])
-        found = inside(patch(line, radius=radius, closed=closed), jnp.asarray(points, jnp.float32))[:, 0]
+        found = np.asarray(inside(patch(line, radius=radius, closed=closed), np.float32(points)))[:, 0]
         clear = shapely.distance(area.boundary, shapely.points(points)) > 0.05
-        np.testing.assert_array_equal(shapely.contains_xy(area, points)[clear], np.asarray(found)[clear])
+        np.testing.assert_array_equal(shapely.contains_xy(area, points)[clear], found[clear])
 
 
 # ---- friction
@@ -167,12 +167,12 @@ def test_each_wheel_reads_its_own_place_and_speed_in_every_mode():
 
 def test_time_passes_and_films_are_linear_between_knots():
     course = rain.schedule(KEY, DRY, time_s=[1.0, 2.0, 4.0], film_mm=[0.2, 0.6, 0.0])
-    now, films = replace(DRY, rain=course), []
+    now, films, advance = replace(DRY, rain=course), [], jax.jit(functools.partial(rain.advance_rain, dt=0.1))
     for _ in range(50):
-        now = rain.advance_rain(now, dt=0.1)
+        now = advance(now)
         films.append(float(now.film_mm))
     np.testing.assert_allclose(films, np.interp(np.arange(1, 51) / 10, [1, 2, 4], [0.2, 0.6, 0.0]), atol=1e-5)
-    still = rain.advance_rain(make_uniform(jnp.float32(0.3), jnp.int32(0)), dt=7.0)
+    still = jax.jit(functools.partial(rain.advance_rain, dt=7.0))(make_uniform(jnp.float32(0.3), jnp.int32(0)))
     assert float(still.film_mm) == pytest.approx(0.3) and float(still.rain.now_s) == 7.0
 
 
@@ -192,7 +192,8 @@ ONSET = {"start_s": (3.0, 3.0), "rain_mm_h": (8.0, 8.0), "film_per_rain": 0.05, 
 
 @pytest.mark.parametrize(("drawn", "change", "balance"), [(0.0, {}, 0.4), (0.2, {"film_max_mm": 0.3}, 0.3), (0.5, {"knots": 40}, 0.4)])
 def test_onset_solves_its_equation(drawn, change, balance):
-    course = rain.onset(KEY, make_uniform(jnp.float32(drawn), jnp.int32(0)), **(ONSET | change))
+    fall = jax.jit(lambda road: rain.onset(KEY, road, **(ONSET | change)))
+    course = jax.device_get(fall(make_uniform(jnp.float32(drawn), jnp.int32(0))))
     times = np.linspace(0.0, 28.0, 30)
     expected = integrated(drawn, balance, 6.0, times)
     got = np.interp(times + 3.0, course.time_s, course.film_mm)
@@ -202,7 +203,8 @@ def test_onset_solves_its_equation(drawn, change, balance):
 
 
 def test_drying_solves_its_equation():
-    course = rain.drying(KEY, make_uniform(jnp.float32(0.8), jnp.int32(0)), tau_s=(20.0, 20.0), knots=16)
+    dry = jax.jit(lambda road: rain.drying(KEY, road, tau_s=(20.0, 20.0), knots=16))
+    course = jax.device_get(dry(make_uniform(jnp.float32(0.8), jnp.int32(0))))
     times = np.linspace(0.0, 90.0, 30)
     got = np.interp(times, course.time_s, course.film_mm)
     np.testing.assert_allclose(got, integrated(0.8, 0.0, 20.0, times), atol=0.004 * 0.8)
@@ -212,7 +214,7 @@ def test_drying_solves_its_equation():
 def test_films_stay_within_their_ranges():
     numbers = ONSET | {"start_s": (2.0, 5.0), "rain_mm_h": (2.0, 10.0), "tau_s": (4.0, 8.0)}
     draw = jax.jit(jax.vmap(lambda key: rain.onset(key, DRY, **numbers)))
-    course = draw(jax.random.split(KEY, 300))
+    course = jax.device_get(draw(jax.random.split(KEY, 300)))
     start, span, last = course.time_s[:, 0], course.time_s[:, -1] - course.time_s[:, 0], course.film_mm[:, -1]
     assert 2.0 <= start.min() < 2.1 and 4.9 < start.max() <= 5.0
     assert span.min() > 19.999 and span.max() <= 40.001 and np.ptp(span) > 15

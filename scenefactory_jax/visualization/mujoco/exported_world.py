@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from scenefactory_jax.core import schema
 from scenefactory_jax.core.instantiate import ConfigError
@@ -57,33 +57,33 @@ def sample_start(settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Wor
         ConfigError: a key that does not fit, or no car starts in this scene.
     """
     env, (reference, _) = environment.make_env(settings), read_parameters(settings["dynamics"])
-    scene = jax.tree.map(jnp.asarray, scene)
-    _, key = jax.random.split(jax.random.split(jax.random.key(seed), 1)[0])  # those of `env.rollout.record`
-    state = jax.jit(env.init_state)(key, scene)
-    scene, body = env.current_scene(scene, state), state.body
-    if not bool(state.agents.present.any()):
+    compute_mu = friction.make(settings["weather"]["friction"])
+
+    @jax.jit  # by itself, each of its operations would be compiled
+    def start(key: PRNGKeyArray, scene: Scene) -> tuple[Any, ...]:
+        _, key = jax.random.split(jax.random.split(key, 1)[0])  # those of `env.rollout.record`
+        state = env.init_state(key, scene)
+        scene, body, speed = env.current_scene(scene, state), state.body, state.agents.speed
+        varied = None if body.constants is None else body.constants.car
+        wheels = articulated_car.wheel_positions(varied or reference, state.agents.position, state.agents.yaw)
+        mu = compute_mu(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
+        mean_speed = jnp.mean(speed, where=state.agents.present)
+        return scene, varied, body.qpos, body.qvel, mu, compute_surface_mu(compute_mu, scene.weather, mean_speed)
+
+    scene, varied, qpos, qvel, mu, surface_mu = jax.device_get(start(jax.random.key(seed), scene))
+    if not scene.agents.present.any():
         raise ConfigError("scenes: no car starts in this scene; for example skip=1 shows the next")
-    compute_mu, speed = friction.make(settings["weather"]["friction"]), state.agents.speed
-    varied = None if body.constants is None else body.constants.car
-    wheels = articulated_car.wheel_positions(varied or reference, state.agents.position, state.agents.yaw)
-    mu = compute_mu(scene.weather, wheels, jnp.broadcast_to(speed[:, None], wheels.shape[:-1]))
-    mean_speed = jnp.mean(speed, where=state.agents.present)
-    road_mu, patch_mu = compute_surface_mu(compute_mu, scene.weather, mean_speed)
-    slots = range(len(speed))
-    cars = [reference if varied is None else jax.tree.map(lambda leaf, slot=slot: float(leaf[slot]), varied) for slot in slots]
-    scene, qpos, qvel, mu = jax.device_get((scene, body.qpos, body.qvel, mu))
-    return WorldStart(scene, cars, np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(mu, float), road_mu, patch_mu)
+    cars = [reference if varied is None else jax.tree.map(lambda leaf, slot=slot: float(leaf[slot]), varied) for slot in range(len(qpos))]
+    qpos, qvel, mu, surface_mu = (np.asarray(table, float) for table in (qpos, qvel, mu, surface_mu))
+    return WorldStart(scene, cars, qpos, qvel, mu, float(surface_mu[0]), surface_mu[1:][scene.weather.patches.present])
 
 
-def compute_surface_mu(
-    compute_mu: Callable[..., Array], weather: Weather, speed: Float[Array, ""]
-) -> tuple[float, Float[np.ndarray, " N"]]:  # fmt: skip
-    """Computes the friction coefficients of the road outside of patches and of every present patch, for one speed, m/s."""
+def compute_surface_mu(compute_mu: Callable[..., Array], weather: Weather, speed: Float[Array, ""]) -> Float[Array, " R"]:
+    """Computes the friction coefficients for one speed, m/s: of the road outside of patches, then of every patch."""
     patches = weather.patches
     film_mm = jnp.append(weather.film_mm, patches.film_mm + patches.open_road_film_fraction * weather.film_mm)
     uniform = jax.vmap(friction.make_uniform)(film_mm, jnp.append(weather.surface, patches.surface))
-    mu = np.asarray(jax.vmap(lambda one: compute_mu(one, jnp.zeros(2), speed))(uniform), float)
-    return float(mu[0]), mu[1:][np.asarray(patches.present)]
+    return jax.vmap(lambda one: compute_mu(one, jnp.zeros(2), speed))(uniform)
 
 
 def write(out: Path, settings: Mapping[str, Any], scene: Scene, *, seed: int) -> Path:

@@ -130,7 +130,7 @@ def make_world(env: Env, scene: Scene, act: Act, parameters: Any, *, car: int, d
         distance = jnp.sqrt(jnp.min(squared, where=scene.road.valid, initial=jnp.inf))
         return after, env.observe(scene, after), make_step_record(env, scene, state, after, outcome), distance
 
-    scene = jax.tree.map(jnp.asarray, scene)
+    scene = jax.device_put(scene)
     return World(functools.partial(jax.jit(begin), scene), functools.partial(jax.jit(step), scene, parameters), dt, car, off_map_m)
 
 
