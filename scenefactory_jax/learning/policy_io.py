@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from scenefactory_jax.core import config as configs
 from scenefactory_jax.core.instantiate import ConfigError
@@ -49,9 +50,14 @@ def draw_untrained(config: Mapping[str, Any], scene: Scene) -> Any:
         scene: one world, for the shapes of the observation.
     """
     key = jax.random.key(config["seed"])
-    shapes = jax.eval_shape(environment.make_env(config).reset, key, scene)[1]
-    blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), shapes)
-    return trainer.init_parameters(key, make_policy(config), blank)
+    shapes, policy = jax.eval_shape(environment.make_env(config).reset, key, scene)[1], make_policy(config)
+
+    @jax.jit  # by itself, each of its operations would be compiled
+    def draw(key: PRNGKeyArray) -> Any:
+        blank = jax.tree.map(lambda leaf: jnp.zeros((1, *leaf.shape), leaf.dtype), shapes)
+        return trainer.init_parameters(key, policy, blank)
+
+    return draw(key)
 
 
 def find(run: str | Path) -> Path:

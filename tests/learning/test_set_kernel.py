@@ -39,9 +39,9 @@ def test_kernels_are_the_plain_encoder_and_its_gradient(activation, rows, featur
 
     plain = jax.jit(lambda weights: late_fusion.encode_set(activation, "float32", False, weights, x, mask))
     wanted, pull = jax.vjp(plain, weights)
-    pooled, winner = jax.jit(lambda w: set_kernel.encode(activation, "float32", w, x, mask, interpret=True))(weights)
+    pooled, winners = jax.jit(lambda w: set_kernel.encode(activation, "float32", w, x, mask, interpret=True))(weights)
     affine = jax.jit(lambda weights: late_fusion.affine(activation, "float32", weights, x))(weights)
-    pooled, wanted, winner, shown = (np.asarray(part) for part in (pooled, wanted, winner, np.asarray(mask).any(-1)))
+    pooled, wanted, winner, shown = (np.asarray(part) for part in (pooled, wanted, winners, np.asarray(mask).any(-1)))
     np.testing.assert_allclose(pooled, wanted, atol=2e-5)
 
     values = np.where(np.asarray(mask)[..., None], affine, -np.inf)
@@ -51,7 +51,7 @@ def test_kernels_are_the_plain_encoder_and_its_gradient(activation, rows, featur
     assert (winner[0, 2] < rows - 1).all() and (winner[0, 2] == 1).any()  # of two rows that are the same the first
 
     direction = jax.device_put(np.where(shown[..., None], np.random.default_rng(2).normal(size=pooled.shape), 0.0).astype(np.float32))
-    steep = lambda w: set_kernel.gradient(activation, "float32", w, x, winner, direction, programs=3, interpret=True)  # noqa: E731
+    steep = lambda w: set_kernel.gradient(activation, "float32", w, x, winners, direction, programs=3, interpret=True)  # noqa: E731
     for found, expected in zip(jax.tree.leaves(jax.jit(steep)(weights)), jax.tree.leaves(pull(direction)[0]), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-4)
 

@@ -53,9 +53,10 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     lane = (2, np.stack([x, 0 * x], -1))
     edges = [(15, np.stack([x, 0 * x + half_width], -1)), (15, np.stack([x[::-1], 0 * x - half_width], -1))]
     still = np.zeros(count)
+    turned = np.asarray(still if yaws is None else yaws)
     agents = Agents(
         position=column_of(starts),
-        yaw=column_of(still if yaws is None else yaws),
+        yaw=column_of(turned),
         speed=column_of(still if speeds is None else speeds),
         size=column_of(np.tile(np.asarray(size), (count, 1))),
         goal=column_of(goals),
@@ -67,7 +68,7 @@ def scene_of(starts, goals, *, yaws=None, speeds=None, present=None, half_width=
     )
     log = AgentLog(
         position=column_of(np.tile(starts[:, None], (1, steps, 1))),
-        yaw=column_of(np.tile(np.asarray(agents.yaw)[:, None], (1, steps))),
+        yaw=column_of(np.tile(turned[:, None], (1, steps))),
         velocity=column_of(np.zeros((count, steps, 2))),
         valid=column_of(np.ones((count, steps)), bool),
         dt=column_of(0.1),
