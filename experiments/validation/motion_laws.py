@@ -102,7 +102,7 @@ def tracer(backend: Dynamics, *, control_hz: float, width: int) -> Callable[[Sce
     def run(scene: Scene, controls: Float[np.ndarray, "N T 3"]) -> Trace:
         count = len(controls)
         rows = np.minimum(np.arange(-(-count // width) * width), count - 1)  # the last world again, to fill the last piece
-        pieces = [piece(jax.tree.map(lambda x, p=p: x[p], scene), controls[p]) for p in rows.reshape(-1, width)]
+        pieces = [piece(jax.tree.map(lambda x, p=p: np.asarray(x)[p], scene), controls[p]) for p in rows.reshape(-1, width)]
         columns = [np.concatenate(column)[:count] for column in zip(*pieces, strict=True)]
         return Trace(*columns, *[None] * (len(Trace._fields) - len(columns)))
 

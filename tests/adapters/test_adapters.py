@@ -19,15 +19,16 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 
 def test_a_flat_observation_holds_every_group_where_its_layout_says():
-    rows = SetObservation(jnp.arange(2 * 3 * 2.0).reshape(2, 3, 2) + 1, jnp.array([[True, False, True], [False, False, False]]))
-    observation = {"zone": jnp.ones((2, 4)), "ego": jnp.full((2, 1), 5.0), "road": rows}
-    vector, columns = flatten_observation(observation), layout(observation)
+    features, mask = np.arange(1, 13, dtype=np.float32).reshape(2, 3, 2), np.array([[True, False, True], [False, False, False]])
+    groups = {"zone": np.ones((2, 4), np.float32), "ego": np.full((2, 1), 5.0, np.float32)}
+    observation = jax.device_put(groups) | {"road": SetObservation(*jax.device_put((features, mask)))}
+    vector, columns = np.asarray(jax.jit(flatten_observation)(observation)), layout(observation)
     assert vector.shape == (2, 1 + 6 + 3 + 4) and list(columns) == ["ego", "road", "road.mask", "zone"]
     np.testing.assert_array_equal(vector[:, columns["road"]], [[1, 2, 0, 0, 5, 6], [0] * 6])  # what is masked reads zeros
     np.testing.assert_array_equal(vector[:, columns["road.mask"]], [[1, 0, 1], [0, 0, 0]])
     np.testing.assert_array_equal(vector[:, columns["ego"]], [[5], [5]])
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), observation)
-    np.testing.assert_array_equal(flatten_observation(many), jnp.stack([vector] * 7))
+    many = jax.device_put(jax.tree.map(lambda leaf: np.stack([leaf] * 7), observation))
+    np.testing.assert_array_equal(jax.jit(flatten_observation)(many), np.stack([vector] * 7))
 
 
 @pytest.mark.parametrize("observe", ["paper", "lane_preview"])  # together all groups of the package
@@ -83,8 +84,8 @@ def test_episodes_are_drawn_from_all_scenes_and_from_their_key_alone():
     again, same = begin(keys)
     for one, other in zip(jax.tree.leaves((episode.state.motion, observed)), jax.tree.leaves((again.state.motion, same)), strict=True):
         np.testing.assert_array_equal(one, other)
-    start = pool.scenes.agents.position[episode.scene]
-    np.testing.assert_allclose(episode.state.motion.position[..., :2], start, atol=1e-5)
+    start = np.asarray(pool.scenes.agents.position)[episode.scene]
+    np.testing.assert_allclose(np.asarray(episode.state.motion.position)[..., :2], start, atol=1e-5)
     following = begin(episode.key)[0]
     assert (np.asarray(following.scene) != np.asarray(episode.scene)).any()
 
@@ -95,11 +96,12 @@ def test_a_step_of_an_episode_is_the_environments_own():
     episode, observed = jax.jit(lambda key: episodes.begin_episode(pool.env, pool.scenes, key, 2))(jax.random.key(3))
     action = jnp.full((4, 3), 0.5)
     following, moment = jax.jit(lambda begun: episodes.step_world(pool.env, pool.scenes, begun, action))(episode)
-    observation = episodes.observe(pool.env, pool.scenes, following)
-    env, scene = environment.make_env(settings), jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), scenes(agents=4).scene)
+    observation = jax.jit(lambda following: episodes.observe(pool.env, pool.scenes, following))(following)
+    env, scene = environment.make_env(settings), jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[2], scenes(agents=4).scene))
     after, outcome = jax.jit(env.step)(scene, episode.state, action)
     assert observed.shape == (4, pool.columns)
-    np.testing.assert_allclose(observation, flatten_observation(outcome.observation), atol=1e-5)
+    np.testing.assert_allclose(observation, jax.jit(flatten_observation)(outcome.observation), atol=1e-5)
+    moment, outcome = jax.device_get((moment, outcome))
     driving = np.asarray(episode.state.active)
     assert 0 < driving.sum() < 4  # scene 2 leaves slots empty
     np.testing.assert_allclose(moment.reward, np.where(driving, outcome.reward, 0), atol=1e-5)
@@ -115,10 +117,10 @@ def test_a_step_is_all_control_steps_of_an_action():
     episode = jax.jit(functools.partial(episodes.start_episodes, repeating.env))(repeating.scenes, jax.random.key(3), 1)
     action = jnp.array([[1.0, 0.1, 0.0]] * repeating.agents)
     after, moment = jax.jit(functools.partial(episodes.step_world, repeating.env))(repeating.scenes, episode, action)
-    scene, state = jax.tree.map(lambda leaf: leaf[1], repeating.scenes), episode.state
+    scene, state = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[1], repeating.scenes)), episode.state
     step, paid = jax.jit(repeating.env.control_step), 0.0
     for _ in range(3):
-        driving = state.active
+        driving = np.asarray(state.active)
         state, outcome = step(scene, state, action)
         paid += np.where(driving, outcome.reward, 0.0)
     np.testing.assert_allclose(moment.reward, paid, atol=1e-4)

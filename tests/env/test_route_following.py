@@ -1,11 +1,13 @@
 """Agents on their routes: place and progress, bends and crossings, red lights, stop signs, wrong way."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.gliding import build_env
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 from support.route_scenes import controls_of, routed_scene, routes_of
 
 from scenefactory_jax.cli.hydra_config import load_config
@@ -40,7 +42,7 @@ def glide(env):
         found = []
         for _ in range(steps):
             state, metrics = step(state, scene)
-            found.append(metrics)
+            found.append(jax.device_get(metrics))
         return state, jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
     return run
@@ -73,12 +75,12 @@ def test_a_route_that_crosses_itself_is_followed_in_order():
     t = np.linspace(0, 2 * np.pi, 400)
     eight = 30 * np.stack([np.sin(t), np.sin(t) * np.cos(t)], axis=1)
     scene = routed_scene([eight])
-    arc = jnp.zeros(1)
+    arc, locate = np.zeros(1, np.float32), jax.jit(route_following.locate)
     for point in eight[::4]:
-        place = route_following.locate(scene, jnp.zeros(1, jnp.int32), arc, jnp.asarray(point[None], jnp.float32))
-        assert float(place.arc[0]) >= float(arc[0]) - 0.5 and float(place.arc[0] - arc[0]) < 4.0 and float(place.distance[0]) < 0.2
+        place = jax.device_get(locate(scene, np.zeros(1, np.int32), arc, np.float32(point[None])))
+        assert place.arc[0] >= arc[0] - 0.5 and place.arc[0] - arc[0] < 4.0 and place.distance[0] < 0.2
         arc = place.arc
-    assert float(arc[0]) == pytest.approx(float(scene.routes.length[0]), abs=3.0)
+    assert arc[0] == pytest.approx(np.asarray(scene.routes.length)[0], abs=3.0)
 
 
 @pytest.mark.parametrize(("state", "runs"), [(STOP, True), (GO, False), (CAUTION, False)])
@@ -97,11 +99,11 @@ def test_a_stop_sign_asks_for_standing_before_it(glide):
     assert metrics.events.stop_sign[:, 0].sum() == 1 and not metrics.events.red_light.any()
     near = routed_scene([STRAIGHT], starts=[6.0], speeds=[0.0], controls=signs, stops=[[(10.0, 0)]])
     state, _ = glide(near, 2)
-    assert bool(state.route.stood[0])
+    assert np.asarray(state.route.stood)[0]
     moving = replace(state, body={**state.body, "v": jnp.array([5.0])})
     moving, metrics = glide(near, 20, moving)
     assert metrics.route_arc[-1, 0] > 9.0 and not metrics.events.stop_sign.any()
-    assert not bool(moving.route.stood[0]), "the next sign asks anew"
+    assert not np.asarray(moving.route.stood)[0], "the next sign asks anew"
 
 
 def test_speed_before_lines_that_demand_a_stop(env):
@@ -116,10 +118,10 @@ def test_speed_before_lines_that_demand_a_stop(env):
     lines = [STRAIGHT + np.array([0.0, 5.0 * row]) for row in range(len(cases))]
     scene = routed_scene(lines, starts=starts, speeds=speeds, controls=controls, stops=[[(10.0, which)] for which in control])
     state = env.reset(jax.random.key(0), scene)[0]
-    state, action = replace(state, route=replace(state.route, stood=jnp.array(stood))), jnp.zeros((len(cases), 3))
+    state, action = replace(state, route=replace(state.route, stood=column_of(stood, bool))), jnp.zeros((len(cases), 3))
     result = jax.jit(env.step)(scene, state, action)[1]
     step = RewardInput(scene, state, action, state, result.metrics, result.events)
-    found = rewards.stop_line_speed(step, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30)
+    found = jax.jit(functools.partial(rewards.stop_line_speed, braking_mps2=4.0, limit_mps=4.0, control_dt=1 / 30))(step)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -129,9 +131,10 @@ def test_lights_follow_their_changes_and_periods():
         ((0.0, 0.0), [(-1.0, GO), (3.0, 0)], np.inf),
         ((0.0, 0.0), None, np.inf),
     )
-    states = [traffic_lights.read_light_states(controls, jnp.float32(time)).tolist() for time in (0.5, 2.5, 5.5, 6.5, 8.5, 61.0)]
+    read = jax.jit(traffic_lights.read_light_states)
+    states = [read(controls, np.float32(time)).tolist() for time in (0.5, 2.5, 5.5, 6.5, 8.5, 61.0)]
     assert states == [[STOP, GO, 0], [GO, GO, 0], [CAUTION, 0, 0], [STOP, 0, 0], [GO, 0, 0], [STOP, 0, 0]]
-    assert traffic_lights.read_light_states(controls, jnp.float32(-2.0)).tolist()[1] == 0, "unknown before the first change"
+    assert read(controls, np.float32(-2.0)).tolist()[1] == 0, "unknown before the first change"
     assert traffic_lights.find_red(jnp.array([STOP, GO, CAUTION, 1, 7])).tolist() == [True, False, False, True, True]
 
 
@@ -154,13 +157,14 @@ def test_starts_on_drawn_routes():
     lines = [STRAIGHT, STRAIGHT + np.array([0.0, 12.0]), STRAIGHT[::-1] + np.array([0.0, -12.0])]
     scene = routed_scene([STRAIGHT] * 3)
     with pytest.raises(ConfigError, match="scenes/pack/routes=drawn"):
-        bare = replace(scene, routes=type(scene.routes)(**{name: leaf[:0] for name, leaf in vars(scene.routes).items()}))
+        none = {name: column_of(np.asarray(leaf)[:0], leaf.dtype) for name, leaf in vars(scene.routes).items()}
+        bare = replace(scene, routes=type(scene.routes)(**none))
         spawning.make(numbers)(jax.random.key(0), bare)
     drawn = replace(scene, routes=routes_of(lines, owners=[-1, -1, -1], drawn=[False, True, True], limits=[10.0, 10.0, 10.0]))
     agents = jax.jit(jax.vmap(spawning.make(numbers), in_axes=(0, None)))(jax.random.split(jax.random.key(1), 64), drawn)
     present = np.asarray(agents.present)
     assert present.mean() > 0.6 and set(np.asarray(agents.route)[present].tolist()) == {1, 2}
-    travel = np.asarray(agents.route_end - agents.route_start)[present]
+    travel = (np.asarray(agents.route_end) - agents.route_start)[present]
     assert travel.min() >= 50.0 - 1e-3 and travel.max() <= 100.0 + 1e-3 and travel.std() > 5
     x, y = np.asarray(agents.position)[present].T
     east = np.asarray(agents.route)[present] == 1

@@ -1,5 +1,6 @@
 """Everybody who is no agent: from the log into a scene, onto the road at the right time and place, seen and hit."""
 
+import functools
 from dataclasses import replace as amend
 
 import jax
@@ -73,7 +74,7 @@ def test_nobody_is_a_road_without_rows(street):
 def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
     log = street.traffic_log
     run = jax.jit(jax.vmap(lambda step: bound("log_playback", gap_s=2.0)(street, step)))
-    trace = jax.device_get(run(jnp.arange(61)))
+    trace, log = jax.device_get((run(np.arange(61)), log))
     for row in range(21):
         boxes = jax.tree.map(lambda leaf, row=row: leaf[3 * row], trace)
         observed = np.asarray(log.valid[:, row]) & np.array([True, True, True, True, False])
@@ -83,7 +84,8 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
         np.testing.assert_allclose(boxes.yaw[observed], log.yaw[observed, row], atol=1e-6)
         assert boxes.present[observed].all()
     # 25 Hz meets every second row at 1.9999999, 3.9999998, ...: the last row too must be met
-    others_at = jax.jit(jax.vmap(lambda step: bound("log_playback", control_dt=0.04)(street, step)))(5 * jnp.arange(11))
+    others_at = jax.jit(jax.vmap(lambda step: bound("log_playback", control_dt=0.04)(street, step)))(5 * np.arange(11))
+    others_at = jax.device_get(others_at)
     np.testing.assert_array_equal(others_at.position[:, 1], log.position[1, ::2])
     assert others_at.present[:, 1].all()
     third = jax.tree.map(lambda leaf: leaf[31], trace)
@@ -95,7 +97,7 @@ def test_replay_is_at_the_log_rows_exactly_and_on_the_line_between(street):
 
 def test_who_is_there_and_when(street):
     run = jax.jit(jax.vmap(lambda step: bound("log_playback")(street, step).present))
-    present = np.asarray(run(jnp.arange(1500)))
+    present = np.asarray(run(np.arange(1500)))
     parked, mover, person, cyclist, _ = present.T
     assert parked.all(), "parked cars outlast the log"
     assert mover[:61].all() and not mover[61:].any(), "movers leave with it"
@@ -182,7 +184,7 @@ def test_ignored_others_change_no_bit_and_their_order_changes_nothing(street, co
                     jax.tree.leaves(drive(ignored, street, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
         np.testing.assert_array_equal(a, b)
     env = build_env(config, beside=made("log_playback"))
-    shuffled = replace(street, traffic_log=jax.tree.map(lambda leaf: leaf[jnp.array([3, 0, 4, 2, 1])], street.traffic_log))
+    shuffled = replace(street, traffic_log=jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[[3, 0, 4, 2, 1]], street.traffic_log)))
     for a, b in zip(jax.tree.leaves(drive(env, street, jnp.zeros((1, 3)), 3)[1]),
                     jax.tree.leaves(drive(env, shuffled, jnp.zeros((1, 3)), 3)[1]), strict=True):  # fmt: skip
         np.testing.assert_array_equal(a, b)
@@ -200,7 +202,8 @@ def test_random_starts_and_respawns_keep_clear_of_boxes():
     beyond = np.maximum(np.abs(starts[:, None] - np.asarray(scene.traffic.position)) - [2.25, 0.95], 0)
     assert len(starts) > 30 and np.linalg.norm(beyond, axis=-1).min() >= 4.0
     here = replace(scene.agents, position=jnp.array([[0.0, 0.0], [12.0, 0.0], [-9.0, 0.0], [25.0, 4.0], [-40, 0], [50, 0]]))
-    clear = spawning.is_clear(here, jnp.full((6, 2), 500.0), jnp.ones(6, bool), scene.traffic, clear_m=10.0)
+    is_clear = jax.jit(functools.partial(spawning.is_clear, clear_m=10.0))
+    clear = is_clear(here, jnp.full((6, 2), 500.0), jnp.ones(6, bool), scene.traffic)
     assert clear.tolist() == [False, True, True, False, True, True]
 
 
@@ -243,7 +246,7 @@ def test_a_real_car_stops_at_a_wall_and_drives_on_past_a_person():
 
         return jax.lax.scan(step, body, jnp.zeros((30, 4, 3), f))
 
-    _, motion = jax.device_get(second(dynamics.init(jax.random.key(0), scene)))
+    _, motion = jax.device_get(second(jax.jit(dynamics.init)(jax.random.key(0), scene)))
     speed, force = motion.velocity[:, :, 0], motion.contact_force
     assert np.isfinite(motion.position).all()
     assert force[:, 0].max() > 1e5 and -5.0 < speed[-1, 0] < 0.0, "a third of the speed comes back at most"

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.hand_scenes import column_of
 from support.planning_scenes import state_of, street, turn
 
 from scenefactory_jax.cli.hydra_config import load_config
@@ -33,12 +34,17 @@ def program(kind, *overrides):
     return jax.jit(lambda scene, state: group(scene, state))
 
 
-def blocks(kind, scene, state, *overrides):
-    """The observation of the first car, as blocks of numpy."""
+@functools.cache
+def splitting(kind, *overrides):
     numbers = entry(kind, *overrides)["vmax"]
     view = schema.read(numbers["view"], View)
     rows = numbers["lanes" if kind == "segment" else "road_points"]
-    found = split_observation(program(kind, *overrides)(scene, state)[0], view, kind=kind, road_rows=rows)
+    return jax.jit(functools.partial(split_observation, view=view, kind=kind, road_rows=rows))
+
+
+def blocks(kind, scene, state, *overrides):
+    """The observation of the first car, as blocks of numpy."""
+    found = splitting(kind, *overrides)(np.asarray(program(kind, *overrides)(scene, state))[0])
     return {name: (np.asarray(block.features), np.asarray(block.mask)) for name, block in found.items()}
 
 
@@ -110,12 +116,15 @@ def test_segments_of_the_nearest_lane(scene):
 
 def test_a_drawn_route_is_shown_in_place_of_the_agents_own(scene):
     """Row 0 is of no agent and is driven; a second row of the agent's own leads elsewhere."""
-    two = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), scene.routes)
-    own = replace(two, agent=jnp.array([0, 0]), position=two.position.at[1].add(3.0), length=two.length.at[1].add(1.0))
+    two = jax.device_put(jax.tree.map(lambda leaf: np.concatenate([leaf, leaf]), scene.routes))
+    ahead = np.array([0.0, 1.0])
+    position = column_of(np.asarray(two.position) + 3.0 * ahead[:, None, None])
+    own = replace(two, agent=column_of([0, 0], np.int32), position=position, length=column_of(np.asarray(two.length) + ahead))
     for agents, aside in (([0, 0], 3.0), ([-1, 0], 0.0)):  # the longest of its own; the one that it drives
         state = state_of(scene)
-        route, mask = select_routes(replace(scene, routes=replace(own, agent=jnp.array(agents))), state.agents)
-        assert mask.tolist() == [True, False] and own.position[route[0], 0, 1] == aside
+        driven = replace(scene, routes=replace(own, agent=column_of(agents, np.int32)))
+        route, mask = jax.device_get(jax.jit(select_routes)(driven, state.agents))
+        assert mask.tolist() == [True, False] and np.asarray(own.position)[route[0], 0, 1] == aside
 
 
 @pytest.mark.parametrize("kind", ["base", "segment"])
@@ -139,15 +148,15 @@ def test_published_velocities_are_cut_at_zero():
 def test_worlds_without_routes_lights_and_traffic(kind):
     scene = street(routes=False, lights=False, boxes=0)
     state = state_of(scene)
-    worlds = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (scene, state))
-    found = np.asarray(jax.vmap(program(kind))(*worlds))
+    twice = lambda leaf: jnp.stack([leaf, leaf])  # noqa: E731
+    found = np.asarray(jax.jit(lambda *world: jax.vmap(program(kind))(*jax.tree.map(twice, world)))(scene, state))
     assert found.shape == (2, 2, SIZES[kind]) and np.isfinite(found).all()
     assert not found[..., -20:].any() and found.any()
 
 
 def test_nearest_rows_are_those_of_a_sort():
-    squared = jax.random.uniform(jax.random.key(1), (5, 400), minval=0.0, maxval=5000.0)
-    squared = jnp.where(jax.random.uniform(jax.random.key(2), (5, 400)) < jnp.array([[0.0], [0.5], [0.9], [0.99], [1.0]]), jnp.inf, squared)
+    rng, far = np.random.default_rng(1), np.array([[0.0], [0.5], [0.9], [0.99], [1.0]])
+    squared = np.where(rng.random((5, 400)) < far, np.inf, rng.uniform(0.0, 5000.0, (5, 400))).astype(np.float32)
     index, mask = jax.jit(lambda table: nearest_rows.select_nearest(table, count=30))(squared)
     expected = np.argsort(np.asarray(squared), axis=1)[:, :30]
     finite = np.isfinite(np.take_along_axis(np.asarray(squared), expected, axis=1))

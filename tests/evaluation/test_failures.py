@@ -1,5 +1,6 @@
 """Kinds of failures: every one from a scripted drive, and what is counted, ranked and drawn of them."""
 
+import functools
 import json
 
 import jax
@@ -125,7 +126,7 @@ def played(tmp_path_factory, settings):
     with quick_compilation():
         env = environment.make_env(config)
         observation = jax.jit(env.reset)(jax.random.key(0), scenes[0])[1]
-        parameters = make_policy(config).init(jax.random.key(1), observation)
+        parameters = jax.jit(make_policy(config).init)(jax.random.key(1), observation)
         return episode_records.make_episode_runner(config, scenes, settings=settings, worlds=None)(parameters)
 
 
@@ -253,9 +254,9 @@ def test_lanes_that_cross_are_not_driven_against():
     x = np.arange(-30, 30.1, 2.0)
     along, across = np.stack([x, 0 * x], -1), np.stack([0 * x, x], -1)
     road = road_of([(2, along), (2, across)])
-    place = jnp.array([[-20.0, 0.5], [-20.0, 0.5], [0.5, 1.0], [-20.0, 9.0]])
-    velocity = jnp.array([[5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0]])
-    found = failure_signals.heading_alignment(place, velocity, road, within_m=2.0)
+    place = np.float32([[-20.0, 0.5], [-20.0, 0.5], [0.5, 1.0], [-20.0, 9.0]])
+    velocity = np.float32([[5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0], [-5.0, 0.0]])
+    found = jax.jit(functools.partial(failure_signals.heading_alignment, within_m=2.0))(place, velocity, road)
     np.testing.assert_allclose(found, [1, -1, 0, 1], atol=1e-6)
 
 

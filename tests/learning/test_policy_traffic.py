@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 from support.running import smoke
 from support.traffic_scenes import track, with_tracks
 
@@ -64,9 +64,9 @@ def street(*more, cars=CARS, speeds=SPEEDS, steps=61):
 
 def box_at(x, y) -> Boxes:
     """One agent that stands there."""
-    column = lambda value: jnp.full(1, value, jnp.float32)  # noqa: E731
-    none, pair = jnp.zeros((1, 2)), jnp.array([[4.0, 2.0]])
-    return Boxes(jnp.array([[x, y]], jnp.float32), column(0.755), column(0.0), none, column(0.0), pair, column(jnp.inf), jnp.ones(1, bool))
+    column = lambda *value: column_of([value[0] if len(value) == 1 else value])  # noqa: E731
+    there = column_of([True], bool)
+    return Boxes(column(x, y), column(0.755), column(0.0), column(0.0, 0.0), column(0.0), column(4.0, 2.0), column(np.inf), there)
 
 
 ABSENT = make_absent_boxes(1)
@@ -171,8 +171,8 @@ def test_agents_see_and_hit_the_vehicles(folder):
 def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(tiny, alone):
     """In a batch the policy acts whenever an action is due in any world; each world takes its own only."""
     kind = tiny
-    scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), street(), street(cars=[[-9.0, 1.0], *CARS[1:]]))
-    first = jnp.array([0, 1])
+    scenes = jax.tree.map(lambda *leaves: np.stack(leaves), street(), street(cars=[[-9.0, 1.0], *CARS[1:]]))
+    first = np.array([0, 1], np.int32)
 
     @jax.jit
     @jax.vmap
@@ -184,7 +184,7 @@ def test_actions_are_held_and_worlds_of_one_batch_may_be_at_other_steps(tiny, al
 
     actions, positions = jax.device_get(run(scenes, first))
     np.testing.assert_allclose(positions[0], alone[1].position, atol=1e-5)
-    lone = simulate(kind, jax.tree.map(lambda leaf: leaf[1], scenes), first=1)[1].position
+    lone = simulate(kind, jax.device_put(jax.tree.map(lambda leaf: leaf[1], scenes)), first=1)[1].position
     np.testing.assert_allclose(positions[1], lone, atol=1e-5)
     for world, phase in ((0, 1), (1, 0)):  # the previous action changes after the control steps 0, 3, 6, ...
         changed = np.any(actions[world, 1:] != actions[world, :-1], axis=(1, 2))
@@ -230,7 +230,7 @@ def test_who_stands_walks_or_has_no_slot_follows_the_log(folder, monkeypatch):
     others = track([9.0, 5.0], steps=61), track([20.0, -5.0], (0.0, 1.0), kind="pedestrian", size=(0.7, 0.7), steps=61)
     _, boxes = simulate(make(folder, slots=2), street(*others), steps=30)
     logged = traffic.make(load_config("task", "traffic=log_playback")["traffic"], control_dt=DT)
-    expected = jax.jit(jax.vmap(lambda step: logged.read(street(*others), (), step)))(jnp.arange(31))
+    expected = jax.device_get(jax.jit(jax.vmap(lambda step: logged.read(street(*others), (), step)))(np.arange(31)))
     for name in ("position", "velocity", "present", "size", "mass", "elevation"):
         np.testing.assert_array_equal(getattr(boxes, name)[:, 2:], getattr(expected, name)[:, 2:])
     rolling = load_config("task", "traffic=policy")["traffic"]["dynamics"]["rolling"]
@@ -262,8 +262,9 @@ def test_a_vehicle_that_arrives_does_as_the_config_says(folder, monkeypatch, at_
 def test_vehicles_enter_at_their_time_where_there_is_room(folder, monkeypatch):
     constant(monkeypatch, folder, 0.05)
     late = street(cars=[[-20.0, 0.0], [30.0, 0.0]], speeds=[10.0, 5.0])
-    log = late.traffic_log
-    late = replace(late, traffic_log=replace(log, valid=log.valid.at[1, :5].set(False)))
+    valid = np.array(late.traffic_log.valid)
+    valid[1, :5] = False
+    late = replace(late, traffic_log=replace(late.traffic_log, valid=column_of(valid, bool)))
     kind = make(folder)
     boxes = simulate(kind, late)[1]
     assert int(np.argmax(boxes.present[:, 1])) == 15, "row 5"
@@ -276,11 +277,12 @@ def test_vehicles_enter_at_their_time_where_there_is_room(folder, monkeypatch):
 
 def test_worlds_without_traffic_are_sound(tiny):
     kind = tiny
-    scene = replace(street(), traffic_log=jax.tree.map(lambda leaf: leaf[:0], street().traffic_log))
-    zones = jnp.zeros((0, 0, 1))
+    scene = replace(street(), traffic_log=jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[:0], street().traffic_log)))
+    zones = column_of(np.zeros((0, 0, 1)))
     scene = replace(scene, traffic_log=replace(scene.traffic_log, zone_enter=zones, zone_leave=zones, zone_match=zones))
-    assert kind.advance(scene, kind.init(jax.random.key(0), scene, jnp.int32(0)), ABSENT, jnp.int32(0)) == ()
-    assert kind.read(scene, (), jnp.int32(0)).present.shape == make_empty_boxes().present.shape
+    step = jax.jit(lambda step: kind.advance(scene, kind.init(jax.random.key(0), scene, step), ABSENT, step))
+    assert step(jnp.int32(0)) == ()
+    assert jax.eval_shape(kind.read, scene, (), jnp.int32(0)).present.shape == make_empty_boxes().present.shape
 
 
 def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder, alone):
@@ -302,7 +304,7 @@ def test_it_is_a_part_of_mixed_if_it_has_a_weight(folder, alone):
 
     chosen, place = jax.device_get(run(jax.random.split(jax.random.key(2), 8)))
     logged = traffic.make(load_config("task", "traffic=log_playback")["traffic"], control_dt=DT)
-    expected = [alone[1].position[-1], logged.read(scene, (), jnp.int32(STEPS)).position]
+    expected = [alone[1].position[-1], jax.jit(lambda step: logged.read(scene, (), step).position)(jnp.int32(STEPS))]
     assert set(chosen.tolist()) == {0, 1}
     for part, position in zip(chosen, place, strict=True):
         np.testing.assert_allclose(position, expected[part], atol=1e-4)

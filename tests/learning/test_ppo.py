@@ -22,6 +22,8 @@ from scenefactory_jax.learning.ppo.config import PPOConfig
 from scenefactory_jax.learning.ppo.train_iteration import PPO
 from scenefactory_jax.learning.trainer import TrainState, count_spawned_steps
 
+pytestmark = pytest.mark.usefixtures("quickly")
+
 T, W, A = 12, 2, 3
 WORLDS = 8
 

@@ -8,6 +8,7 @@ config are composed as ever.
 import os
 import pickle
 
+import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
@@ -49,5 +50,6 @@ def compose_once(name, overrides, *, whole=False):
 
 
 def share():
-    """For all of a process."""
+    """For all of a process. YAML is read by the same rules in C, which is what OmegaConf's loader then derives from."""
+    yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     ConfigRepository.load_config, hydra_config._compose = read_once, compose_once

@@ -1,12 +1,11 @@
 """Scenes with routes made by hand: polylines as routes, stop lines on them, and agents that start on them."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from scenefactory_jax.core.pytree import replace
 from scenefactory_jax.core.types import ROUTE_SPACING_M, Routes, TrafficControls
 from scenefactory_jax.roadgraph.route_sets import resample
-from support.hand_scenes import scene_of
+from support.hand_scenes import column_of, scene_of
 
 
 def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
@@ -21,18 +20,17 @@ def routes_of(lines, *, owners=None, limits=None, stops=None, drawn=None):
         for place, (at, which) in enumerate(passed):
             arc[row, place], control[row, place] = at, which
     limit = np.full((count, points), np.inf) if limits is None else np.repeat(np.asarray(limits, float)[:, None], points, axis=1)
-    f, i = jnp.float32, jnp.int32
     return Routes(
-        position=jnp.asarray(position, f),
-        length=jnp.asarray([length for _, length, _ in sampled], f),
-        speed_limit=jnp.asarray(limit, f),
-        lane=jnp.zeros((count, points), i),
-        along_lanes=jnp.ones(count, bool),
-        agent=jnp.asarray(np.arange(count) if owners is None else owners, i),
-        drawn=jnp.zeros(count, bool) if drawn is None else jnp.asarray(drawn, bool),
-        on_route=jnp.ones(count, bool),
-        stop_arc=jnp.asarray(arc, f),
-        stop_control=jnp.asarray(control, i),
+        position=column_of(position),
+        length=column_of([length for _, length, _ in sampled]),
+        speed_limit=column_of(limit),
+        lane=column_of(np.zeros((count, points)), np.int32),
+        along_lanes=column_of(np.ones(count), bool),
+        agent=column_of(np.arange(count) if owners is None else owners, np.int32),
+        drawn=column_of(np.zeros(count), bool) if drawn is None else column_of(drawn, bool),
+        on_route=column_of(np.ones(count), bool),
+        stop_arc=column_of(arc),
+        stop_control=column_of(control, np.int32),
     )
 
 
@@ -43,16 +41,15 @@ def controls_of(*rows):
     for row, (_, changes, _) in enumerate(rows):
         for place, (time, code) in enumerate(changes or []):
             change[row, place], state[row, place] = time, code
-    f, i = jnp.float32, jnp.int32
     return TrafficControls(
-        position=jnp.asarray([place for place, *_ in rows], f).reshape(-1, 2),
-        direction=jnp.tile(jnp.array([1.0, 0.0], f), (len(rows), 1)),
-        lane=jnp.zeros(len(rows), i),
-        stop_sign=jnp.asarray([changes is None for _, changes, _ in rows], bool),
-        change_s=jnp.asarray(change, f),
-        state=jnp.asarray(state, i),
-        period_s=jnp.asarray([period for *_, period in rows], f),
-        valid=jnp.ones(len(rows), bool),
+        position=column_of(np.reshape([place for place, *_ in rows], (-1, 2))),
+        direction=column_of(np.tile([1.0, 0.0], (len(rows), 1))),
+        lane=column_of(np.zeros(len(rows)), np.int32),
+        stop_sign=column_of([changes is None for _, changes, _ in rows], bool),
+        change_s=column_of(change),
+        state=column_of(state, np.int32),
+        period_s=column_of([period for *_, period in rows]),
+        valid=column_of(np.ones(len(rows)), bool),
     )
 
 
@@ -67,9 +64,9 @@ def routed_scene(lines, *, starts=None, ends=None, speeds=None, controls=(), sto
     made = scene_of(place(begin), place(end), yaws=np.arctan2(along[:, 1], along[:, 0]), speeds=speeds, length=120.0, **scene)
     agents = replace(
         made.agents,
-        route=jnp.arange(len(lines), dtype=jnp.int32),
-        route_start=jnp.asarray(begin, jnp.float32),
-        route_end=jnp.asarray(end, jnp.float32),
-        route_length=jnp.asarray(end - begin, jnp.float32),
+        route=column_of(np.arange(len(lines)), np.int32),
+        route_start=column_of(begin),
+        route_end=column_of(end),
+        route_length=column_of(end - begin),
     )
     return replace(made, agents=agents, routes=routes, controls=controls_of(*controls))

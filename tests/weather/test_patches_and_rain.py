@@ -230,12 +230,12 @@ def test_layouts_are_pure_lie_on_lanes_and_keep_their_ranges(name):
     scene = lanes_scene()
     road = make_uniform(jnp.float32(0.2), jnp.int32(1))
     draw = jax.jit(lambda key: getattr(patch_layouts, name)(key, scene, road, **LAYOUTS[name]))
-    laid, again, other = draw(KEY), draw(KEY), draw(jax.random.key(1))
+    laid, again, other = jax.device_get((draw(KEY), draw(KEY), draw(jax.random.key(1))))
     for a, b in zip(jax.tree.leaves(laid), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     assert (laid.vertices != other.vertices).any()
     rows = np.asarray(scene.lanes.valid)
-    middle, half = np.asarray(scene.lanes.midpoint)[rows], (scene.lanes.half_length[:, None] * scene.lanes.direction)[rows]
+    middle, half = np.asarray(scene.lanes.midpoint)[rows], (np.asarray(scene.lanes.half_length)[:, None] * scene.lanes.direction)[rows]
     lanes = shapely.MultiLineString([[m - h, m + h] for m, h in zip(middle, np.asarray(half), strict=True)])
     apart = lambda points: shapely.distance(lanes, shapely.points(points))  # noqa: E731
     assert laid.present.all() and (laid.surface == ICE).all() and (laid.open_road_film_fraction == 0.5).all()
@@ -288,7 +288,7 @@ def fixed(shapes):
 
 
 def test_given_shapes_lie_where_they_are_given():
-    laid = fixed(SHAPES)(KEY, lanes_scene(), make_uniform(jnp.float32(0.1), jnp.int32(1)))
+    laid = jax.jit(fixed(SHAPES))(KEY, lanes_scene(), make_uniform(jnp.float32(0.1), jnp.int32(1)))
     points = jnp.array([[1.0, 4.9], [1.0, 5.1], [3.0, 0.5], [3.0, 3.0], [25.0, 0.9], [25.0, 1.1]])
     expected = [[1, 0, 0], [0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 0]]
     np.testing.assert_array_equal(inside(laid, points), np.array(expected, bool))
@@ -304,12 +304,15 @@ def config_of(*overrides):
     return scenefactory_jax.load_config("task", *lean, *overrides) | {"reward": {}}
 
 
+SCENE = lanes_scene()
+
+
 @pytest.mark.parametrize("option", OPTIONS)
 def test_every_option_samples_the_weather_of_an_episode(option):
     sample = jax.jit(jax.vmap(road_condition.make(config_of(f"weather={option}")["weather"]), (0, None)))
-    first = sample(jax.random.split(KEY, 6), lanes_scene())
+    first = jax.device_get(sample(jax.random.split(KEY, 6), SCENE))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(first))
-    later = jax.vmap(functools.partial(rain.advance_rain, dt=20.0))(first)
+    later = jax.device_get(jax.jit(jax.vmap(functools.partial(rain.advance_rain, dt=20.0)))(first))
     moved, count = later.film_mm - first.film_mm, first.patches.present.shape[1]
     assert {"drying": (moved < 0).all(), "onset": (moved > 0).all(), "storm": (moved != 0).any()}.get(option, not moved.any())
     assert count == {"ice": 6, "puddles": 10, "split": 8, "storm": 10, "grip": 1}.get(option, 0)
@@ -349,7 +352,7 @@ def test_observation_and_friction_follow_each_car_and_the_rain():
     assert (np.diff(friction[:, 1]) < 0).all() and friction[0, 0] != friction[0, 1] and friction[-1, 0] == pytest.approx(friction[-1, 1])
     # the weather moves on before the dynamics read it: the step to 1 s drives on the film of 1 s
     compute_mu = instantiate.instantiate(config_of()["weather"]["friction"], builtins=friction_model, where="weather.friction")
-    assert friction[-1, 1] == pytest.approx(float(compute_mu(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1))[0]), abs=1e-4)
+    assert friction[-1, 1] == pytest.approx(float(jax.jit(compute_mu)(on(film=0.4), jnp.zeros((1, 2)), jnp.zeros(1)).item()), abs=1e-4)
 
 
 def test_the_observation_lists_the_surfaces_of_its_config():
@@ -370,7 +373,7 @@ def test_an_entry_of_null_is_left_out_and_others_may_be_added():
     laid = jax.jit(road_condition.make(added))(KEY, lanes_scene())
     assert laid.patches.present.shape == (6,) and (laid.patches.surface == ICE).all()
     old = {name: config_of()["weather"][name] for name in ("sampler", "friction")}  # without patches and rain
-    assert road_condition.make(old)(KEY, lanes_scene()).patches.present.shape == (0,)
+    assert jax.jit(road_condition.make(old))(KEY, lanes_scene()).patches.present.shape == (0,)
 
 
 def test_the_report_says_how_the_film_changed():
