@@ -118,7 +118,7 @@ def run(
     scene, start, lanes = _begin(backend, crowd, car, heap=heap, wall_m=wall_m)
     qpos, qvel = _drive(backend, scene, start, _actions(crowd, round(seconds * control_hz), round(hold_s * control_hz)))
     qpos[..., :2] -= lanes
-    rest = float(np.asarray(backend.read(backend.init(jax.random.key(0), scene)).position[0, 2]))
+    rest = float(jax.jit(lambda scene: backend.read(backend.init(jax.random.key(0), scene)).position[0, 2])(scene))
     rows = [_judge(case, car, qpos[:, i], qvel[:, i], control_hz=control_hz) for i, case in enumerate(crowd)]
     rows = [*rows[: len(cases)], *([_worst(rows[len(cases) :])] if heap else [])]
     starts = [max(rest, rest + case.above) for case in crowd]
@@ -161,7 +161,7 @@ def _begin(
     zero = np.zeros((1, len(crowd)))
     size = (car.length, car.width)
     worlds = open_ground.make_open_ground(place[None], zero, zero, np.ones(1), np.zeros(1, np.int32), size=size)
-    scene = jax.tree.map(lambda leaf: leaf[0], worlds)
+    scene = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[0], worlds))
     walls = np.flatnonzero(["wall" in case.name for case in crowd])
     scene = replace(scene, traffic=_walls(lanes[walls], wall_m, height=car.wheel_radius - car.wheel_height))  # contacts remember every pair
     body = jax.jit(backend.init)(jax.random.key(0), scene)
@@ -213,7 +213,7 @@ def _drive(
 
         return jax.lax.scan(step, body, actions)[1]
 
-    trace = drive(scene, start, jnp.asarray(actions))
+    trace = drive(scene, start, actions)
     begun = (start.qpos, start.qvel)
     qpos, qvel = (np.concatenate([np.asarray(a)[None], np.asarray(b)]).astype(float) for a, b in zip(begun, trace, strict=True))
     return qpos, qvel

@@ -106,7 +106,7 @@ def restore_parameters(folder: Path | str, iteration: int | None = None) -> Any:
         file = _find(folder, iteration)
         averaged, last = _load(file, AVERAGED), _load(file, PARAMETERS)
         arrays = {name.partition("/")[2]: value for name, value in (averaged or last).items()}
-    return jax.tree.map(jnp.array, unflatten_dict(arrays, sep="/"))
+    return jax.device_put(unflatten_dict(arrays, sep="/"), may_alias=False)  # copied; `jnp.array` would compile a program for every shape
 
 
 def write_parameters(folder: Path | str, parameters: Any) -> Path:
@@ -189,5 +189,5 @@ def _place(value: np.ndarray | None, leaf: Array) -> Array:
     """Places a value on the devices of `leaf`. It is bound to a device only if `leaf` is: otherwise a resumed run compiles again."""
     if value is None:
         return jnp.copy(leaf)  # an empty array, as a buffer of its own: donating one does not delete the other
-    placed = jax.device_put(value, leaf.sharding) if leaf.committed else jnp.array(value)
+    placed = jax.device_put(value, leaf.sharding) if leaf.committed else jax.device_put(value, may_alias=False)
     return jax.random.wrap_key_data(placed, impl=jax.random.key_impl(leaf)) if leaf.dtype != value.dtype else placed

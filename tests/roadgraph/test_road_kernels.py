@@ -41,11 +41,11 @@ def cars(scenes):
     yaw = rng.uniform(-3.0, 3.0, (worlds, CARS)).astype(np.float32)
     size = np.broadcast_to(np.array([4.0, 2.0], np.float32), position.shape)
     shape = {"radius_fraction": 0.55, "radius_floor_m": 0.45, "spacing_limit_m": 1.3}
-    circles, radius = jax.vmap(lambda *at: geometry.cover_with_circles(*at, **shape))(position, yaw, size)
+    circles, radius = jax.jit(jax.vmap(lambda *at: geometry.cover_with_circles(*at, **shape)))(position, yaw, size)
     velocity = rng.normal(0.0, 6.0, position.shape).astype(np.float32)
     velocity[:, 2] = 0.0
     active = np.broadcast_to(np.arange(CARS) % 3 > 0, (worlds, CARS))
-    return tuple(map(jnp.asarray, (circles, radius, velocity, yaw, position, active)))
+    return jax.device_put((circles, radius, velocity, yaw, position, active))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -85,7 +85,7 @@ def test_a_world_without_a_road_has_nothing_to_find(scenes, cars):
             lanes, edges, circles, radius, velocity, geometry.heading_vector(yaw), position, active, **EDGES, interpret=True
         )
 
-    row, squared, rate = jax.jit(jax.vmap(find))(scenes, *cars)
+    row, squared, rate = jax.device_get(jax.jit(jax.vmap(find))(scenes, *cars))
     assert not row.any() and np.isinf(squared).all() and not rate.any()
 
 
@@ -101,7 +101,7 @@ def test_the_gathering_kernel_finds_what_plain_jax_finds(scenes, cars, count):
             scene.road, scene.road_grid, first, last, position, turn, count=count, **ROWS, interpret=True
         )
 
-    features, mask = jax.jit(jax.vmap(kernel))(scenes, position, yaw, active)
+    features, mask = jax.device_get(jax.jit(jax.vmap(kernel))(scenes, position, yaw, active))
     plain = jax.jit(jax.vmap(lambda *given: queries.gather_segments(*given, count=count, **ROWS, kernels=False)))
     expected = plain(scenes, position, yaw, active)
     np.testing.assert_array_equal(mask, expected.mask)
@@ -111,8 +111,8 @@ def test_the_gathering_kernel_finds_what_plain_jax_finds(scenes, cars, count):
 
 def test_derivatives_are_those_of_plain_jax(scenes, cars):
     """Of both modes, through the choice between kernel and plain JAX."""
-    scene = jax.tree.map(lambda leaf: leaf[0], scenes)
-    circles, radius, velocity, yaw, position, active = (value[0, 3:] for value in cars)
+    scene = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[0], scenes))
+    circles, radius, velocity, yaw, position, active = jax.device_put([np.asarray(value)[0, 3:] for value in cars])
 
     def make_total(kernels):
         def total(pose):
@@ -130,7 +130,7 @@ def test_derivatives_are_those_of_plain_jax(scenes, cars):
     expected = jax.jit(jax.grad(make_total(False)))(pose)
     for mode in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(jax.jit(mode(make_total(True)))(pose), expected, rtol=1e-3)
-    assert (np.abs(expected) > 0).all()
+    assert (np.abs(np.asarray(expected)) > 0).all()
 
 
 def test_a_gpu_gets_kernels_and_other_devices_plain_jax(scenes, cars):
