@@ -11,11 +11,12 @@ from support import composing
 from support.running import SHARED, quick_compilation
 
 LONGEST = (  # files that take longest, by CPU time: started first, or one worker would end with one of them alone
-    "test_train", "test_study", "test_environment", "test_digests", "test_adapters_gymnasium", "test_validation_run", "test_traffic",
-    "test_idm_traffic", "test_benchmark", "test_troubleshooting", "test_ppo", "test_planning_rewards", "test_vmax_observations",
-    "test_metadrive_observation", "test_adapters", "test_randomization", "test_equations_of_motion", "test_operations", "test_dynamics",
-    "test_validation", "test_film", "test_contact_solver", "test_docs", "test_gpu_processes", "test_waymax_golden", "test_failures",
-    "test_optimization", "test_road_load", "test_set_kernel", "test_road_kernels", "test_patches_and_rain",
+    "test_train", "test_study", "test_policy_traffic", "test_environment", "test_exported_world", "test_digests", "test_validation_run",
+    "test_film", "test_benchmark", "test_randomization", "test_traffic", "test_adapters", "test_troubleshooting",
+    "test_adapters_gymnasium", "test_pretrained", "test_dynamics", "test_patches_and_rain", "test_banks", "test_gpu_processes",
+    "test_contact_solver", "test_ppo", "test_equations_of_motion", "test_collision", "test_extension", "test_tyres", "test_optimization",
+    "test_sharding", "test_unvectorised_baseline", "test_failures", "test_fault_isolation", "test_operations", "test_docs",
+    "test_actuators", "test_route_following", "test_idm_traffic", "test_streams", "test_inputs",
 )  # fmt: skip
 
 composing.share()

@@ -17,8 +17,7 @@ from scenefactory_jax.learning import phase_timing
 from scenefactory_jax.visualization.report import throughput_report as report
 
 ROOT = Path(__file__).resolve().parents[2]
-LEAN = ("~observations.road", "~observations.neighbours", "~policy.rows.road", "~policy.rows.neighbours")  # less to compile
-SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeats=1", *LEAN)
+SMALL = ("experiment=smoke", "dynamics=bicycle", "worlds=4", "warmup=0", "repeats=1")
 VARIANTS = {"training": {}} | {scope: {"scope": scope, "phases": False} for scope in ("environment", "physics")}
 VARIANTS["physics"]["worlds"] = 2
 

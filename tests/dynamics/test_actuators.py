@@ -18,8 +18,9 @@ FAST, MU = 100 / 3.6, np.array([1.1, 0.5, 0.2])
 
 
 def state_of(car, *, speed=0.0, spin=0.0):
-    qvel = jnp.zeros(16).at[0].set(speed).at[jnp.array([8, 11, 13, 15])].set(spin)
-    return states.from_mujoco(car, jnp.zeros(17).at[2].set(0.755).at[3].set(1.0), qvel)
+    qpos, qvel = np.zeros(17, np.float32), np.zeros(16, np.float32)
+    qpos[2:4], qvel[0], qvel[[8, 11, 13, 15]] = (0.755, 1.0), speed, spin
+    return jax.jit(states.from_mujoco)(jax.tree.map(np.float32, car), qpos, qvel)
 
 
 def test_commands_are_clipped_and_a_brake_below_zero_is_released():
