@@ -49,6 +49,13 @@ def test_figures_of_the_readme_are_those_of_the_card():
     assert f"it reaches the goal in {success}, without any other event in {clean}, and {collided} of its cars collide" in said
 
 
+def test_the_readme_says_what_the_card_of_drive_does():
+    card = (policy_io.SHIPPED / "drive" / "README.md").read_text()
+    header, row = ([cell.strip() for cell in line.split("|")] for line in card.splitlines() if line.startswith(("| Driven", "| 64 generated")))
+    said = " ".join((ROOT / "README.md").read_text().split())
+    assert f"completes {row[header.index('Clean completion')]} of its routes without any event" in said
+
+
 @pytest.mark.slow  # the car it learnt in, and the policy before training
 def test_town_drives_better_than_before_training(tmp_path, quickly):
     found = drive_town(tmp_path, scenes=2, untrained="true", dynamics="articulated")
