@@ -43,7 +43,7 @@ def evaluate(config: Mapping[str, Any]) -> Result:
 
 def _apply_planners(trained: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Returns the run's config with each of the planners in place of its policy."""
-    past_rows = str((settings["protocol"]["scores"] or {}).get("past_rows", 0))
+    past_rows = str((settings["protocol"].get("scores") or {}).get("past_rows", 0))
     fill_in = lambda words: [word.replace("PAST_ROWS", past_rows) for word in words]  # noqa: E731
     return {name: configs.apply_overrides(trained, fill_in(settings["planner_overrides"][name])) for name in settings["planners"]}
 

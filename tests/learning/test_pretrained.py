@@ -51,7 +51,8 @@ def test_figures_of_the_readme_are_those_of_the_card():
 
 def test_the_readme_says_what_the_card_of_drive_does():
     card = (policy_io.SHIPPED / "drive" / "README.md").read_text()
-    header, row = ([cell.strip() for cell in line.split("|")] for line in card.splitlines() if line.startswith(("| Driven", "| 64 generated")))
+    lines = [line for line in card.splitlines() if line.startswith(("| Driven", "| 64 generated"))]
+    header, row = ([cell.strip() for cell in line.split("|")] for line in lines)
     said = " ".join((ROOT / "README.md").read_text().split())
     assert f"completes {row[header.index('Clean completion')]} of its routes without any event" in said
 
