@@ -125,7 +125,7 @@ def format_rerun_command(request: Mapping[str, Any], settings: Mapping[str, Any]
     default = configs.load_config("evaluate", "run=null", *named)
     protocol = {**settings.get("protocol", default["protocol"]), "termination": request["protocols"]}
     given = {name: request[name] for name in ("run", "overrides", "trust")} | {"scenes": {"path": request["scenes"]}}
-    given = {**settings, **given, "out": None, "protocol": protocol}
+    given = {**default, **settings, **given, "out": None, "protocol": protocol}
     values, defaults = flatten({name: given[name] for name in ("run", *default)}), flatten(default)
     run, *words = [f"{key}={configs.format_value(value)}" for key, value in values.items() if value != defaults.get(key)]
     return f"python -m scenefactory_jax evaluate {shlex.join([run, *named, *words])}"
