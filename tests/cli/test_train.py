@@ -638,7 +638,8 @@ RUNS = (
 )
 
 
-SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops", "vmax", "nuplan")  # with routes
+SUITES = ("recorded_routes", "route100", "conflict", "conflict_reactive", "grip", "grip_hidden", "grip_stops")  # with routes
+SUITES += ("vmax", "nuplan")
 
 
 @pytest.mark.parametrize("name", names("protocol"))
