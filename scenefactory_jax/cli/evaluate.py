@@ -38,14 +38,8 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     request = {name: config[name] for name in ("overrides", "trust")} | {"run": str(config["run"]), "scenes": config["scenes"]["path"]}
     request |= {"protocol": protocol["name"], "protocols": protocol["termination"]}
-    return _evaluate(trained, run, out, request=request, settings=config, planners=_apply_planners(trained, config))
-
-
-def _apply_planners(trained: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Returns the run's config with each of the planners in place of its policy."""
-    past_rows = str((settings["protocol"].get("scores") or {}).get("past_rows", 0))
-    fill_in = lambda words: [word.replace("PAST_ROWS", past_rows) for word in words]  # noqa: E731
-    return {name: configs.apply_overrides(trained, fill_in(settings["planner_overrides"][name])) for name in settings["planners"]}
+    planners = {name: configs.apply_overrides(trained, config["planner_overrides"][name]) for name in config["planners"]}
+    return _evaluate(trained, run, out, request=request, settings=config, planners=planners)
 
 
 def evaluate_run(config: Mapping[str, Any], folder: Path) -> Result:

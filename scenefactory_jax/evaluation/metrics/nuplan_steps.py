@@ -1,8 +1,7 @@
 """Metrics of nuPlan's closed-loop score (nuplan-devkit, its default configuration) for one car, at one step and of an episode.
 
 nuPlan reads polygons of lanes and of the drivable area. Here lanes are centre lines and the drivable area ends at road edges: a car is on
-several lanes as in V-Max, on a lane within half its usual width, and
-outside of the road beyond the lines of road edges.
+several lanes as in V-Max, on a lane within half its usual width, and outside of the road beyond the lines of road edges.
 """
 
 from typing import NamedTuple

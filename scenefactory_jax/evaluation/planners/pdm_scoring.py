@@ -5,13 +5,14 @@ steps, `T` all steps, `K` road users, `E` road-edge segments.
 """
 
 import dataclasses
+import functools
 from typing import Annotated, NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.signal import savgol_filter
 
+from scenefactory_jax.core import savitzky_golay
 from scenefactory_jax.core.boxes import find_overlaps
 from scenefactory_jax.core.geometry import cross, dot, heading_vector, to_frame, wrap_angle
 from scenefactory_jax.core.schema import Bounds, Count, NonNegative, Positive
@@ -203,23 +204,22 @@ def check_comfort(car: Car, bounds: Comfort, *, dt_s: float) -> Float[Array, " N
     As in nuPlan, signals are smoothed and differentiated by Savitzky-Golay filters of order 2 over 8 steps, jerk over 15 steps, and yaw
     acceleration of order 3.
     """
-    steps = car.speed.shape[1]
-    smooth, slope = make_filter(steps, 8, 2, 0, dt_s), make_filter(steps, 15, 2, 1, dt_s)
+    smooth = functools.partial(filter_steps, width=8, order=2, derivative=0, dt_s=dt_s)
+    slope = functools.partial(filter_steps, width=15, order=2, derivative=1, dt_s=dt_s)
     yaw = car.yaw[:, :1] + jnp.cumsum(jnp.pad(wrap_angle(jnp.diff(car.yaw, axis=1)), ((0, 0), (1, 0))), axis=1)  # without jumps
-    rate = yaw @ make_filter(steps, 5, 2, 1, dt_s).T
-    lateral = (car.speed * rate) @ smooth.T
-    along = car.acceleration @ smooth.T
-    turn = yaw @ make_filter(steps, 5, 3, 2, dt_s).T
-    jerk = along @ slope.T
-    total = jnp.sqrt(along**2 + lateral**2) @ slope.T
+    rate = filter_steps(yaw, width=5, order=2, derivative=1, dt_s=dt_s)
+    turn = filter_steps(yaw, width=5, order=3, derivative=2, dt_s=dt_s)
+    lateral, along = smooth(car.speed * rate), smooth(car.acceleration)
+    jerk, total = slope(along), slope(jnp.sqrt(along**2 + lateral**2))
     fits = (along >= bounds.min_acceleration) & (along <= bounds.max_acceleration) & (jnp.abs(lateral) <= bounds.lateral_acceleration)
     fits &= (jnp.abs(rate) <= bounds.yaw_rate) & (jnp.abs(turn) <= bounds.yaw_acceleration)
     fits &= (jnp.abs(jerk) <= bounds.longitudinal_jerk) & (jnp.abs(total) <= bounds.jerk)
     return jnp.all(fits, axis=1).astype(jnp.float32)
 
 
-def make_filter(steps: int, window: int, order: int, derivative: int, dt_s: float) -> Float[np.ndarray, "T T"]:
-    """Makes the matrix of a Savitzky-Golay filter over a fixed number of steps."""
-    window = min(window, steps)
-    order = min(order, window - 1)
-    return np.asarray(savgol_filter(np.eye(steps), window, order, deriv=derivative, delta=dt_s, axis=0), np.float32)
+def filter_steps(values: Float[Array, "N T"], *, width: int, order: int, derivative: int, dt_s: float) -> Float[Array, "N T"]:
+    """Filters all steps of every proposal by Savitzky-Golay; the window is no longer than these."""
+    steps = values.shape[1]
+    width = min(width, steps)
+    numbers = {"width": width, "order": min(order, width - 1), "derivative": derivative, "dt": dt_s}
+    return jax.vmap(lambda row: savitzky_golay.filter_range(row, jnp.int32(0), jnp.int32(steps - 1), **numbers))(values)
