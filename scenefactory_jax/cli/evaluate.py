@@ -38,7 +38,9 @@ def evaluate(config: Mapping[str, Any]) -> Result:
     out = Path(config["out"] or (Path("runs") / run.name if policy_io.is_bundled(run) else run) / "evaluation")
     request = {name: config[name] for name in ("overrides", "trust")} | {"run": str(config["run"]), "scenes": config["scenes"]["path"]}
     request |= {"protocol": protocol["name"], "protocols": protocol["termination"]}
-    planners = {name: configs.apply_overrides(trained, config["planner_overrides"][name]) for name in config["planners"]}
+    more = protocol.get("planner_overrides", {})
+    words = {name: [*config["planner_overrides"][name], *more.get(name, [])] for name in config["planners"]}
+    planners = {name: configs.apply_overrides(trained, words[name]) for name in words}
     return _evaluate(trained, run, out, request=request, settings=config, planners=planners)
 
 

@@ -4,7 +4,7 @@ Groups whose entries have a `_target_` are mappings here; the functions that the
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from scenefactory_jax.cli.hydra_config import find_conf
@@ -56,6 +56,7 @@ class Protocol:
     repeats: Count
     mu: Positive | None = None  # friction coefficient of a suite whose settings read it
     scores: ScoreSettings | None = None  # how episodes are scored; null: they are not
+    planner_overrides: dict[str, list[str]] = field(default_factory=dict)  # behind those of `evaluate`
 
 
 @dataclass(frozen=True)
@@ -338,8 +339,10 @@ def check_evaluate(config: Mapping[str, Any]) -> None:
     """Checks the config of `evaluate`."""
     check(config, Evaluate)
     check_terminations(config["protocol"]["termination"], where="protocol.termination")
-    if unknown := [name for name in config["planners"] if name not in config["planner_overrides"]]:
-        raise ConfigError(f"planners: expected names of {', '.join(config['planner_overrides'])}, got {unknown[0]!r}")
+    known, changed = config["planner_overrides"], config["protocol"].get("planner_overrides", {})
+    for where, names in {"planners": config["planners"], "protocol.planner_overrides": changed}.items():
+        if unknown := [name for name in names if name not in known]:
+            raise ConfigError(f"{where}: expected names of {', '.join(known)}, got {unknown[0]!r}")
 
 
 def check_study(config: Mapping[str, Any]) -> None:

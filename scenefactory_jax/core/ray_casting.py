@@ -1,11 +1,13 @@
 """Distances along rays from a point to rectangles and to line segments."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from scenefactory_jax.core.geometry import cross, heading_vector, to_frame
+from scenefactory_jax.core.geometry import heading_vector, to_frame
 
 PARALLEL = 1e-6  # sine of the angle below which a ray and a segment are parallel
+SEGMENTS_AT_ONCE = 128
 
 
 def make_ray_directions(count: int) -> Float[Array, "{count} 2"]:
@@ -48,10 +50,27 @@ def cast_to_segments(
     *,
     range_m: float,
 ) -> Float[Array, "A N"]:
-    """Computes the distance to the first line segment on each ray from the origin, `range_m` without one."""
-    ray, middle, along = rays[None, None], midpoint[:, :, None], direction[:, :, None]
-    sine = cross(ray, along)
-    inverse = 1.0 / jnp.where(jnp.abs(sine) < PARALLEL, jnp.inf, sine)
-    distance, place = cross(middle, along) * inverse, cross(middle, ray) * inverse
-    hit = present[..., None] & (jnp.abs(sine) >= PARALLEL) & (distance >= 0) & (jnp.abs(place) <= half_length[..., None])
-    return jnp.min(jnp.where(hit, jnp.minimum(distance, range_m), range_m), axis=1, initial=range_m)
+    """Computes the distance to the first line segment on each ray from the origin, `range_m` without one.
+
+    Segments are looked at in chunks: one reduction over many of them and many rays compiles for minutes on GPUs.
+    """
+    chunks = -(-present.shape[1] // SEGMENTS_AT_ONCE)
+    padding = chunks * SEGMENTS_AT_ONCE - present.shape[1]
+
+    def split(leaf: Array) -> Array:
+        padded = jnp.pad(leaf, ((0, 0), (0, padding)))
+        return jnp.moveaxis(padded.reshape(len(leaf), chunks, SEGMENTS_AT_ONCE), 1, 0)
+
+    along_ray, across_ray = (axis[:, None] for axis in rays.T)
+
+    def cast(nearest: Float[Array, "A N"], chunk: tuple[Array, ...]) -> tuple[Float[Array, "A N"], None]:
+        x, y, along_x, along_y, half, there = (leaf[:, None] for leaf in chunk)
+        sine = along_ray * along_y - across_ray * along_x  # [A, N, C]
+        crosses = jnp.abs(sine) >= PARALLEL
+        inverse = 1.0 / jnp.where(crosses, sine, jnp.inf)
+        distance, place = (x * along_y - y * along_x) * inverse, (x * across_ray - y * along_ray) * inverse
+        hit = there & crosses & (distance >= 0) & (jnp.abs(place) <= half)
+        return jnp.minimum(nearest, jnp.min(jnp.where(hit, distance, range_m), axis=2)), None
+
+    columns = (midpoint[..., 0], midpoint[..., 1], direction[..., 0], direction[..., 1], half_length, present)
+    return jax.lax.scan(cast, jnp.full((len(present), len(rays)), range_m), tuple(map(split, columns)))[0]

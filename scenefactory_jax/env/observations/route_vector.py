@@ -23,6 +23,7 @@ def route(
     offset_scale_m: Positive,
     remaining_scale_m: Positive,
     speed_scale_mps: Positive,
+    beyond_goal: bool,
 ) -> Float[Array, "A F"]:
     """Points ahead on the agent's own route, in their order: what the network's vector encoder reads without sorting rows of a set.
 
@@ -30,17 +31,21 @@ def route(
     and cosine of the car's heading relative to the route; then for each of `ahead_m`, measured from the car's place on the route: x, y in
     the car's frame over `distance_scale_m`, cosine and sine of the route's direction relative to the car, and the speed limit over
     `speed_scale_mps`, 0 where none is known. Behind the goal the goal is repeated. Zeros for an agent without a route.
+
+    Args:
+        beyond_goal: the end of the route takes the place of the goal: for episodes that go on behind it.
     """
     agents, motion = state.agents, state.motion
     if scene.routes.length.shape[0] == 0:
         return jnp.zeros((len(state.active), HEAD + len(POINT) * len(ahead_m)), jnp.float32)
     arc = state.route.arc[:, None] + jnp.array([0.0, *ahead_m])
-    arc = jnp.minimum(arc, agents.route_end[:, None])
+    end = scene.routes.length[agents.route] if beyond_goal else agents.route_end
+    arc = jnp.minimum(arc, end[:, None])
     row = jnp.broadcast_to(agents.route[:, None], arc.shape)
     points, direction = route_following.find_point(scene, row, arc)
     facing = heading_vector(motion.yaw)
     here, along = motion.position[:, :2] - points[:, 0], direction[:, 0]
-    offset, remaining = cross(along, here), agents.route_end - state.route.arc
+    offset, remaining = cross(along, here), end - state.route.arc
     head = [
         jnp.ones_like(offset),
         compress_length(offset, offset_scale_m),
