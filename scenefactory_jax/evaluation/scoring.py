@@ -23,6 +23,7 @@ from scenefactory_jax.evaluation.metrics.episode_record import EpisodeRecord, La
 from scenefactory_jax.evaluation.metrics.episode_steps import StepMetrics, measure_steps
 from scenefactory_jax.evaluation.metrics.waymax_steps import Paths
 from scenefactory_jax.evaluation.settings import ScoreSettings
+from scenefactory_jax.roadgraph.lane_crossings import find_intersection_segments
 from scenefactory_jax.roadgraph.signed_edge_distance import list_edge_points
 from scenefactory_jax.roadgraph.traffic_lights import read_light_states
 
@@ -53,16 +54,34 @@ def make_scorer(settings: ScoreSettings, *, control_dt: float) -> Callable[[Scen
         raise ConfigError(f"timing.control_hz: expected a multiple of {1 / STEP_S:g} for scores, got {1 / control_dt:g}")
 
     @jax.jit
-    def score(scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array]) -> dict[str, Array]:
+    def score(scene: Scene, start: Start, frames: EpisodeFrame, lane_facts: LaneFacts) -> dict[str, Array]:
         score_one = functools.partial(score_world, settings=settings)
-        return jax.lax.map(lambda world: score_one(*world), (scene, start, frames, limits), batch_size=WORLDS_AT_ONCE)
+        return jax.lax.map(lambda world: score_one(*world), (scene, start, frames, lane_facts), batch_size=WORLDS_AT_ONCE)
 
     def score_all(scene: Scene, start: Start, frames: EpisodeFrame) -> dict[str, np.ndarray]:
         thinned = jax.tree.map(lambda leaf: leaf[:, stride - 1 :: stride], frames)
         worlds = replace(scene, road_grid=None)
-        return jax.device_get(score(worlds, start, thinned, find_speed_limits(scene)))
+        return jax.device_get(score(worlds, start, thinned, describe_lanes(scene)))
 
     return score_all
+
+
+class LaneFacts(NamedTuple):
+    """What the scenes' arrays do not say of each segment of a lane."""
+
+    speed_limit: Float[Array, "*n P"]
+    has_limit: Bool[Array, "*n P"]
+    in_intersection: Bool[Array, "*n P"]
+
+
+def describe_lanes(scene: Scene) -> LaneFacts:
+    """Finds the speed limits of lanes and those in intersections, of batched scenes."""
+    lanes = jax.device_get(scene.lanes)
+    half = lanes.half_length[..., None] * lanes.direction
+    drivable = lanes.valid & np.isin(lanes.kind, DRIVABLE)
+    places = (lanes.midpoint - half, lanes.midpoint + half, lanes.polyline, drivable)
+    inside = [find_intersection_segments(*world) for world in zip(*places, strict=True)]
+    return LaneFacts(*jax.device_put((*find_speed_limits(scene), np.stack(inside))))
 
 
 def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -79,12 +98,12 @@ def find_speed_limits(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def score_world(
-    scene: Scene, start: Start, frames: EpisodeFrame, limits: tuple[Array, Array], *, settings: ScoreSettings
+    scene: Scene, start: Start, frames: EpisodeFrame, lane_facts: LaneFacts, *, settings: ScoreSettings
 ) -> dict[str, Float[Array, " A"]]:
     """Computes the metrics and scores of all agents of one world; NaN where one cannot be computed."""
     past_rows = settings.past_rows
     users, log = collect_users(scene, start, frames, past_rows=past_rows), read_log(scene, past_rows, len(frames.active))
-    lanes, edges = list_lane_points(scene, *limits), list_edge_points(scene.edges)
+    lanes, edges = list_lane_points(scene, lane_facts), list_edge_points(scene.edges)
     time = STEP_S * jnp.arange(-past_rows, len(frames.active) + 1, dtype=jnp.float32)
     lights = Lights(scene.controls.lane, jax.vmap(lambda at: read_light_states(scene.controls, at))(time))
     counted = jnp.arange(users.yaw.shape[1]) > past_rows
@@ -162,17 +181,17 @@ def read_log(scene: Scene, past_rows: int, steps: int) -> Track:
     return Track(position, yaw, velocity, log.valid[:, near] & (row <= last + EVEN_S))
 
 
-def list_lane_points(scene: Scene, limit: Float[Array, " P"], has_limit: Bool[Array, " P"]) -> Lanes:
-    """Lists the first points of the segments of driving lanes. No source of scenes says which lanes lie in intersections: none does."""
+def list_lane_points(scene: Scene, facts: LaneFacts) -> Lanes:
+    """Lists the first points of the segments of driving lanes."""
     lanes = scene.lanes
     return Lanes(
         position=lanes.midpoint - lanes.half_length[:, None] * lanes.direction,
         direction=lanes.direction,
         lane=lanes.polyline,
         kind=lanes.kind,
-        in_intersection=jnp.zeros_like(lanes.valid),
-        speed_limit=limit,
-        has_limit=has_limit,
+        in_intersection=facts.in_intersection,
+        speed_limit=facts.speed_limit,
+        has_limit=facts.has_limit,
         valid=lanes.valid & jnp.isin(lanes.kind, jnp.array(DRIVABLE)),
     )
 

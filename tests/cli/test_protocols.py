@@ -17,6 +17,7 @@ def overrides_of(name, *words):
         ("strict", "recorded", []),
         ("paper", "recorded", ["spawning=from_rest"]),
         ("conflict_reactive", "conflict", ["traffic=idm"]),
+        ("nuplan_reactive", "nuplan", ["traffic=idm"]),
         ("grip_hidden", "grip", ["weather.hidden=true"]),
         ("grip_stops", "grip", ["scenes/pack/starts=grip_stops", "weather.patches.routes.end_m=4.0"]),
     ],
