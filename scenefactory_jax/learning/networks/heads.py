@@ -10,7 +10,7 @@ two networks can share one by mistake.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -18,12 +18,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from scenefactory_jax.core.instantiate import instantiate
 from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.core.types import Observation
+from scenefactory_jax.learning.networks.observation_blocks import make_reader
 
 Encoder = Callable[..., nn.Module]
 """`encoder(name="encoder")` returns a new module, which turns an observation with any leading axes into a feature [..., W]."""
 
+# Increasing, and zero at zero: only so may rows be pooled before the activation, and an empty set be zeros on both sides of it
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"elu": jax.nn.elu, "relu": jax.nn.relu, "tanh": jnp.tanh}
 MIN_STD = 0.001
 lecun_uniform = nn.initializers.lecun_uniform()
@@ -34,6 +37,21 @@ class Network(NamedTuple):
 
     init: Callable[..., Any]
     apply: Callable[..., Any]
+
+
+def make_encoder(entry: Mapping[str, Any], *, observations: Mapping[str, Any], dtype: str, where: str = "policy.encoder") -> Encoder:
+    """Builds the encoder of a config entry (`conf/policy/encoder`).
+
+    Args:
+        observations: the config's `observations`, whose groups say how their vectors divide into blocks.
+        dtype: of products, see `attention`.
+        where: key of the entry, for messages.
+
+    Raises:
+        ConfigError: an unknown encoder, or a number that does not fit.
+    """
+    builtins = "scenefactory_jax.learning.networks.encoders"
+    return instantiate(entry, builtins=builtins, where=where, read=make_reader(observations), dtype=dtype)()
 
 
 def make_actor(encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:

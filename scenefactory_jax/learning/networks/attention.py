@@ -1,0 +1,147 @@
+"""Parts of encoders with attention: row embeddings, multi-head attention, feed-forward layers.
+
+Sums over rows, latents and parameters are float32; matrices multiply in `dtype`, except for the first layer of an embedding, whose inputs
+are metres and radians.
+"""
+
+import dataclasses
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from scenefactory_jax.learning.networks.heads import lecun_uniform
+from scenefactory_jax.learning.networks.late_fusion import pool
+from scenefactory_jax.learning.networks.observation_blocks import Blocks
+
+Tokens = tuple[Float[Array, "B T D"], Bool[Array, "B T"]]
+ROAD_USERS = ("ego", "others")  # blocks whose time steps are the same
+normal = nn.initializers.normal(0.01)  # flax's own default
+
+
+@dataclasses.dataclass(frozen=True)
+class Widths:
+    """Widths of an encoder with attention, and how it computes."""
+
+    embedding: tuple[int, ...]  # of each block's rows; the last one is that of a token
+    heads: int
+    head_features: int
+    feed_forward: int  # hidden width of a feed-forward part, in widths of what it changes
+    dtype: str
+    attention: str  # implementation of jax.nn.dot_product_attention
+
+
+def dense(width: int, dtype: Any, *, use_bias: bool = True, name: str | None = None) -> nn.Dense:
+    """A dense layer with LeCun's uniform initialisation."""
+    return nn.Dense(width, use_bias=use_bias, kernel_init=lecun_uniform, dtype=dtype, name=name)
+
+
+class Embedding(nn.Module):
+    """Dense layers with ReLU between them and none after the last."""
+
+    widths: tuple[int, ...]
+    dtype: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch F"]) -> Float[Array, "*batch D"]:
+        for index, width in enumerate(self.widths):
+            x = dense(width, self.dtype if index else jnp.float32, name=f"layer_{index}")(x if index == 0 else jax.nn.relu(x))
+        return x
+
+
+class Tokenizer(nn.Module):
+    """Embeds each row of each block, with an embedding for each block, and adds a learnt table over its rows and steps.
+
+    `pool_steps`: a row's steps become one token, of their largest values. `time_scalars`: a learnt number for each time step is added.
+    """
+
+    widths: Widths
+    pool_steps: bool = False
+    time_scalars: bool = False
+
+    @nn.compact
+    def __call__(self, blocks: Blocks) -> dict[str, Tokens]:
+        scalars: dict[tuple[str, int], Array] = {}
+        tokens = {}
+        for name, (features, mask) in blocks.items():
+            x = Embedding(self.widths.embedding, self.widths.dtype, name=f"{name}_embedding")(features).astype(jnp.float32)
+            if self.pool_steps:
+                x, mask = pool(x, mask)[..., None, :], jnp.any(mask, axis=-1, keepdims=True)
+            x = x + self.param(f"{name}_positions", normal, x.shape[-3:])
+            if self.time_scalars and mask.shape[-1] > 1:
+                clock = "road_users" if name in ROAD_USERS else name, mask.shape[-1]
+                if clock not in scalars:
+                    scalars[clock] = self.param(f"{clock[0]}_times_{clock[1]}", normal, clock[1:])
+                x = x + scalars[clock][:, None]
+            tokens[name] = x.reshape(len(x), -1, x.shape[-1]), mask.reshape(len(x), -1)
+        return tokens
+
+
+def join_tokens(tokens: dict[str, Tokens]) -> Tokens:
+    """Joins the tokens of all blocks."""
+    rows, masks = zip(*tokens.values(), strict=True)
+    return jnp.concatenate(rows, axis=1), jnp.concatenate(masks, axis=1)
+
+
+class Attention(nn.Module):
+    """Multi-head attention of queries [B, T, width] to keys and values that `project` computes; returns the change of the queries.
+
+    Queries that have no valid key get the bias of the last layer.
+    """
+
+    width: int
+    widths: Widths
+    query_bias: bool = False
+
+    def setup(self) -> None:
+        inner = self.widths.heads * self.widths.head_features
+        self.query = dense(inner, self.widths.dtype, use_bias=self.query_bias)
+        self.key = dense(inner, self.widths.dtype, use_bias=False)
+        self.value = dense(inner, self.widths.dtype, use_bias=False)
+        self.out = dense(self.width, self.widths.dtype)
+
+    def project(self, x: Float[Array, "B S D"]) -> tuple[Float[Array, "B S H E"], Float[Array, "B S H E"]]:
+        """Computes keys and values of tokens."""
+        return self._split(self.key(x)), self._split(self.value(x))
+
+    def __call__(
+        self, x: Float[Array, "B T D"], keys_values: tuple[Array, Array], mask: Bool[Array, "B #T S"] | None = None
+    ) -> Float[Array, "B T D"]:
+        keys, values = keys_values
+        heads = None if mask is None else mask[:, None]
+        found = jax.nn.dot_product_attention(
+            self._split(self.query(x)),
+            keys,
+            values,
+            mask=heads,
+            implementation=self.widths.attention,  # pyright: ignore[reportArgumentType]
+        )
+        if mask is not None:
+            found = jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
+        return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
+
+    def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
+        return x.reshape(*x.shape[:-1], self.widths.heads, self.widths.head_features)
+
+
+class FeedForward(nn.Module):
+    """A dense layer, GELU, and a dense layer back to the width of the input."""
+
+    widths: Widths
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B T D"]) -> Float[Array, "B T D"]:
+        hidden = dense(x.shape[-1] * self.widths.feed_forward, self.widths.dtype, name="hidden")(x)
+        return dense(x.shape[-1], self.widths.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
+
+
+def select_nearest_keys(x: Float[Array, "B T D"], keys: Float[Array, "B S D"], mask: Bool[Array, "B S"], count: int) -> Bool[Array, "B T S"]:
+    """Selects for each query the `count` valid keys that are nearest in feature space."""
+    if keys.shape[1] <= count:
+        return mask[:, None]
+    square = jnp.sum(keys**2, axis=-1)[:, None] - 2.0 * jnp.einsum("btd,bsd->bts", x, keys)  # less the query's own square
+    distance = jnp.where(mask[:, None], jax.lax.stop_gradient(square), jnp.inf)
+    farthest = -jax.lax.top_k(-distance, count)[0][..., -1:]
+    return (distance <= farthest) & mask[:, None]
