@@ -5,13 +5,14 @@ are metres and radians.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from scenefactory_jax.core.schema import ConfigError, Count
 from scenefactory_jax.learning.networks.heads import lecun_uniform
 from scenefactory_jax.learning.networks.late_fusion import pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
@@ -22,15 +23,18 @@ normal = nn.initializers.normal(0.01)  # flax's own default
 
 
 @dataclasses.dataclass(frozen=True)
-class Widths:
-    """Widths of an encoder with attention, and how it computes."""
+class Transformer:
+    """Numbers of an encoder with attention."""
 
-    embedding: tuple[int, ...]  # of each block's rows; the last one is that of a token
-    heads: int
-    head_features: int
-    feed_forward: int  # hidden width of a feed-forward part, in widths of what it changes
-    dtype: str
-    attention: str  # implementation of jax.nn.dot_product_attention
+    embedding: tuple[Count, ...]  # widths of the layers that make a token of each row; the last one is the token's
+    heads: Count
+    head_features: Count
+    feed_forward: Count  # hidden width of a feed-forward part, in widths of its input
+    implementation: Literal["xla", "cudnn"]  # of jax.nn.dot_product_attention
+
+    def __post_init__(self) -> None:
+        if not self.embedding:
+            raise ConfigError("embedding: expected one width or more, got []")
 
 
 def dense(width: int, dtype: Any, *, use_bias: bool = True, name: str | None = None) -> nn.Dense:
@@ -57,7 +61,8 @@ class Tokenizer(nn.Module):
     `pool_steps`: a row's steps become one token, of their largest values. `time_scalars`: a learnt number for each time step is added.
     """
 
-    widths: Widths
+    widths: tuple[int, ...]  # of the embeddings
+    dtype: str
     pool_steps: bool = False
     time_scalars: bool = False
 
@@ -66,7 +71,7 @@ class Tokenizer(nn.Module):
         scalars: dict[tuple[str, int], Array] = {}
         tokens = {}
         for name, (features, mask) in blocks.items():
-            x = Embedding(self.widths.embedding, self.widths.dtype, name=f"{name}_embedding")(features).astype(jnp.float32)
+            x = Embedding(self.widths, self.dtype, name=f"{name}_embedding")(features).astype(jnp.float32)
             if self.pool_steps:
                 x, mask = pool(x, mask)[..., None, :], jnp.any(mask, axis=-1, keepdims=True)
             x = x + self.param(f"{name}_positions", normal, x.shape[-3:])
@@ -92,15 +97,16 @@ class Attention(nn.Module):
     """
 
     width: int
-    widths: Widths
+    numbers: Transformer
+    dtype: str
     query_bias: bool = False
 
     def setup(self) -> None:
-        inner = self.widths.heads * self.widths.head_features
-        self.query = dense(inner, self.widths.dtype, use_bias=self.query_bias)
-        self.key = dense(inner, self.widths.dtype, use_bias=False)
-        self.value = dense(inner, self.widths.dtype, use_bias=False)
-        self.out = dense(self.width, self.widths.dtype)
+        inner = self.numbers.heads * self.numbers.head_features
+        self.query = dense(inner, self.dtype, use_bias=self.query_bias)
+        self.key = dense(inner, self.dtype, use_bias=False)
+        self.value = dense(inner, self.dtype, use_bias=False)
+        self.out = dense(self.width, self.dtype)
 
     def project(self, x: Float[Array, "B S D"]) -> tuple[Float[Array, "B S H E"], Float[Array, "B S H E"]]:
         """Computes keys and values of tokens."""
@@ -111,33 +117,31 @@ class Attention(nn.Module):
     ) -> Float[Array, "B T D"]:
         keys, values = keys_values
         heads = None if mask is None else mask[:, None]
-        found = jax.nn.dot_product_attention(
-            self._split(self.query(x)),
-            keys,
-            values,
-            mask=heads,
-            implementation=self.widths.attention,  # pyright: ignore[reportArgumentType]
-        )
+        queries = self._split(self.query(x))
+        found = jax.nn.dot_product_attention(queries, keys, values, mask=heads, implementation=self.numbers.implementation)
         if mask is not None:
             found = jnp.where(jnp.any(mask, axis=-1)[..., None, None], found, 0)
         return self.out(found.reshape(*x.shape[:-1], -1)).astype(jnp.float32)
 
     def _split(self, x: Float[Array, "B T C"]) -> Float[Array, "B T H E"]:
-        return x.reshape(*x.shape[:-1], self.widths.heads, self.widths.head_features)
+        return x.reshape(*x.shape[:-1], self.numbers.heads, self.numbers.head_features)
 
 
 class FeedForward(nn.Module):
     """A dense layer, GELU, and a dense layer back to the width of the input."""
 
-    widths: Widths
+    multiple: int  # of the input's width, which is the hidden one
+    dtype: str
 
     @nn.compact
     def __call__(self, x: Float[Array, "B T D"]) -> Float[Array, "B T D"]:
-        hidden = dense(x.shape[-1] * self.widths.feed_forward, self.widths.dtype, name="hidden")(x)
-        return dense(x.shape[-1], self.widths.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
+        hidden = dense(x.shape[-1] * self.multiple, self.dtype, name="hidden")(x)
+        return dense(x.shape[-1], self.dtype, name="out")(jax.nn.gelu(hidden)).astype(jnp.float32)
 
 
-def select_nearest_keys(x: Float[Array, "B T D"], keys: Float[Array, "B S D"], mask: Bool[Array, "B S"], count: int) -> Bool[Array, "B T S"]:
+def select_nearest_keys(
+    x: Float[Array, "B T D"], keys: Float[Array, "B S D"], mask: Bool[Array, "B S"], count: int
+) -> Bool[Array, "B #T S"]:
     """Selects for each query the `count` valid keys that are nearest in feature space."""
     if keys.shape[1] <= count:
         return mask[:, None]

@@ -1,7 +1,7 @@
 """Modules of the encoders: observation -> feature. `encoders` has their config entries.
 
-ReZero (arXiv:2003.04887) in place of normalisation: each attention and each feed-forward part adds its output times a learnt number, which is
-0 at first.
+ReZero (arXiv:2003.04887) in place of normalisation: each attention and each feed-forward part adds its output times a learnt number, which
+is 0 at first.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from scenefactory_jax.learning.networks.attention import (
     Embedding,
     FeedForward,
     Tokenizer,
-    Widths,
+    Transformer,
     dense,
     join_tokens,
     normal,
@@ -91,7 +91,8 @@ class LateFusion(nn.Module):
 class LatentEncoder(BlockEncoder):
     """Base of the encoders with attention."""
 
-    widths: Widths
+    numbers: Transformer
+    dtype: str
 
     def add(self, name: str, x: Array, parts: list[Callable[[Array], Array]]) -> Array:
         """Adds what the parts compute, one after the other, times one learnt number (ReZero)."""
@@ -106,7 +107,15 @@ class LatentEncoder(BlockEncoder):
 
     def parts(self, name: str, width: int) -> tuple[Attention, FeedForward]:
         """An attention to latents or tokens of that width, and the feed-forward part behind it."""
-        return Attention(width, self.widths, name=f"{name}_attention"), FeedForward(self.widths, name=f"{name}_feed_forward")
+        return self.attention(width, f"{name}_attention"), self.feed_forward(f"{name}_feed_forward")
+
+    def attention(self, width: int, name: str, *, query_bias: bool = False) -> Attention:
+        """An attention that changes what is that wide."""
+        return Attention(width, self.numbers, self.dtype, query_bias, name=name)
+
+    def feed_forward(self, name: str) -> FeedForward:
+        """A feed-forward part."""
+        return FeedForward(self.numbers.feed_forward, self.dtype, name=name)
 
 
 class LatentQuery(LatentEncoder):
@@ -117,7 +126,7 @@ class LatentQuery(LatentEncoder):
     rounds: int
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
-        tokens, mask = join_tokens(Tokenizer(self.widths, name="tokens")(blocks))
+        tokens, mask = join_tokens(Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks))
         (cross, cross_forward), (own, own_forward) = self.parts("cross", self.width), self.parts("self", self.width)
         read = _attend(cross, cross.project(tokens), mask[:, None])  # once for all rounds
         x = self.start(self.latents, self.width, len(mask))
@@ -134,9 +143,8 @@ class HierarchicalLatentQuery(LatentEncoder):
     width: int
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
-        x = None
-        for name, (tokens, mask) in Tokenizer(self.widths, name="tokens")(blocks).items():
-            x = self.start(self.latents, self.width, len(mask)) if x is None else x
+        x = self.start(self.latents, self.width, len(next(iter(blocks.values())).mask))
+        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, name="tokens")(blocks).items():
             attention, forward = self.parts(name, self.width)
             x = self.add(name, x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])
         return jnp.mean(x, axis=1)
@@ -153,14 +161,14 @@ class MotionTransformer(LatentEncoder):
         if not (chosen := [name for name in blocks if name in self.keys]):
             valid = ", ".join(blocks)
             raise ConfigError(f"policy.encoder.keys: the encoder mtr needs one of {', '.join(self.keys)}; the observation has {valid}")
-        tokens = Tokenizer(self.widths, pool_steps=True, name="tokens")(blocks)
+        tokens = Tokenizer(self.numbers.embedding, self.dtype, pool_steps=True, name="tokens")(blocks)
         x, mask = join_tokens(tokens)
         keys, valid = join_tokens({name: tokens[name] for name in chosen})
         for index in range(self.layers):
-            attention = Attention(x.shape[-1], self.widths, query_bias=True, name=f"attention_{index}")
+            attention = self.attention(x.shape[-1], f"attention_{index}", query_bias=True)
             near = select_nearest_keys(x, keys, valid, self.nearest)
             parts: list[Any] = [_attend(attention, attention.project(keys), near)]
-            parts += [FeedForward(self.widths, name=f"feed_forward_{index}")] if index else []
+            parts += [self.feed_forward(f"feed_forward_{index}")] if index else []
             x = self.add(str(index), x, parts)
         return jnp.sum(jnp.where(mask[..., None], x, 0.0), axis=1) / jnp.maximum(jnp.sum(mask, axis=1, keepdims=True), 1)
 
@@ -174,7 +182,7 @@ class Wayformer(LatentEncoder):
 
     def encode(self, blocks: Blocks) -> Float[Array, "B W"]:
         features = []
-        for name, (tokens, mask) in Tokenizer(self.widths, time_scalars=True, name="tokens")(blocks).items():
+        for name, (tokens, mask) in Tokenizer(self.numbers.embedding, self.dtype, time_scalars=True, name="tokens")(blocks).items():
             x = self.start(self.latents, self.width, len(mask), f"{name}_latents")
             attention, forward = self.parts(f"{name}_0", self.width)
             x = self.add(f"{name}_0", x, [_attend(attention, attention.project(tokens), mask[:, None]), forward])

@@ -55,15 +55,26 @@ def make_encoder(entry: Mapping[str, Any], *, observations: Mapping[str, Any], d
 
 
 def make_actor(encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
-    """Builds `apply(parameters, observation) -> [..., outputs]`: parameters of a distribution, or of a deterministic action."""
-    module = make_tower(encoder, outputs, hidden=hidden, activation=activation, dtype=dtype)
-    return Network(module.init, module.apply)
+    """Builds `apply(parameters, observation) -> [..., outputs]`: parameters of a distribution, or of a deterministic action.
+
+    Args:
+        encoder: makes a new encoder, see `Encoder`.
+        hidden, activation: of the head, see `Head`.
+        dtype: of the head's products.
+
+    Raises:
+        ConfigError: an unknown activation; at `init`, an observation that the encoder cannot read.
+    """
+    if activation not in ACTIVATIONS:
+        raise ConfigError(f"policy.activation: expected one of {', '.join(ACTIVATIONS)}, got {activation!r}")
+    tower = Tower(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype))
+    return Network(tower.init, tower.apply)
 
 
 def make_value(encoder: Encoder, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
     """Builds `apply(parameters, observation) -> [...]`."""
-    module = make_tower(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
-    return Network(module.init, lambda parameters, observation: module.apply(parameters, observation)[..., 0])
+    value = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
+    return Network(value.init, lambda parameters, observation: value.apply(parameters, observation)[..., 0])
 
 
 def make_critic(encoder: Encoder, count: int = 2, *, hidden: Sequence[Count], activation: str, dtype: str = "float32") -> Network:
@@ -71,13 +82,13 @@ def make_critic(encoder: Encoder, count: int = 2, *, hidden: Sequence[Count], ac
 
     Each has an encoder and a head of its own; the head reads the feature joined with the action. Parameters have the axis `count` in front.
     """
-    module = make_tower(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
+    one = make_actor(encoder, 1, hidden=hidden, activation=activation, dtype=dtype)
 
     def init(key: PRNGKeyArray, observation: Observation, action: Float[Array, "*batch D"]) -> Any:
-        return jax.vmap(lambda key: module.init(key, observation, action))(jax.random.split(key, count))
+        return jax.vmap(lambda key: one.init(key, observation, action))(jax.random.split(key, count))
 
     def apply(parameters: Any, observation: Observation, action: Float[Array, "*batch D"]) -> Float[Array, "count *batch"]:
-        return jax.vmap(lambda parameters: module.apply(parameters, observation, action)[..., 0])(parameters)
+        return jax.vmap(lambda parameters: one.apply(parameters, observation, action)[..., 0])(parameters)
 
     return Network(init, apply)
 
@@ -120,14 +131,3 @@ class Tower(nn.Module):
     def __call__(self, observation: Observation, *extra: Float[Array, "*batch D"]) -> Float[Array, "*batch outputs"]:
         feature = self.encoder(name="encoder")(observation)
         return self.head(name="head")(jnp.concatenate([feature, *extra], axis=-1))
-
-
-def make_tower(encoder: Encoder, outputs: int, *, hidden: Sequence[Count], activation: str, dtype: str) -> Tower:
-    """Builds the module of an encoder and a head.
-
-    Raises:
-        ConfigError: an unknown activation.
-    """
-    if activation not in ACTIVATIONS:
-        raise ConfigError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got {activation!r}")
-    return Tower(encoder, functools.partial(Head, tuple(hidden), outputs, activation, dtype))
