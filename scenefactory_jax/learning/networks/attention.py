@@ -17,7 +17,7 @@ from scenefactory_jax.learning.networks.heads import lecun_uniform
 from scenefactory_jax.learning.networks.late_fusion import pool
 from scenefactory_jax.learning.networks.observation_blocks import Blocks
 
-Tokens = tuple[Float[Array, "B T D"], Bool[Array, "B T"]]
+Tokens = tuple[Array, Array]  # [B, T, D] and their mask [B, T]
 ROAD_USERS = ("ego", "others")  # blocks whose time steps are the same
 normal = nn.initializers.normal(0.01)  # flax's own default
 
